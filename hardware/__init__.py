@@ -1,0 +1,1 @@
+"""Cameras, arms and what of them is attached to this machine."""

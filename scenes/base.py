@@ -1,0 +1,16 @@
+"""What every specification section shares: frozen, strict, no unknown key, no NaN."""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Rgb = tuple[Fraction, Fraction, Fraction]
+
+
+class Section(BaseModel):
+    """A frozen section of a specification file; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

@@ -1,0 +1,143 @@
+"""Reading specification files: where they lie, and errors that help."""
+
+import difflib
+import os
+import tomllib
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from scenes.errors import SpecError
+from scenes.object import MeshShape, ObjectSpec
+from scenes.sensor import SensorSpec
+
+SHIPPED = Path(__file__).parent
+MESH_SUFFIXES = (".stl", ".obj", ".ply")
+Spec = TypeVar("Spec", bound=BaseModel)
+
+
+def user_spec_dir() -> Path:
+    """Where a user's own ``sensors/*.toml`` and ``objects/*.toml`` lie.
+
+    ``TACTIP_SPECS`` if set, else ``$XDG_CONFIG_HOME/tactip-twin`` (``~/.config``).
+    """
+    if own := os.environ.get("TACTIP_SPECS"):
+        return Path(own)
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "tactip-twin"
+
+
+def list_sensors() -> dict[str, Path]:
+    """Sensor names and their files; a user's own file of the same name wins."""
+    return _list("sensors")
+
+
+def list_objects() -> dict[str, Path]:
+    """Object names and their files; a user's own file of the same name wins."""
+    return _list("objects")
+
+
+def load_sensor(name_or_path: str | Path) -> SensorSpec:
+    """Load a sensor by name or by the path of its TOML file.
+
+    Raises
+    ------
+    SpecError
+        If there is no such sensor, or its file is wrong: names file, key and remedy.
+    """
+    return _read(_find(name_or_path, "sensors"), SensorSpec)
+
+
+def load_object(name_or_path: str | Path) -> ObjectSpec:
+    """Load an object by name, by the path of its TOML file, or a mesh file itself (in mm).
+
+    Raises
+    ------
+    SpecError
+        If there is no such object, or its file is wrong: names file, key and remedy.
+    """
+    path = Path(name_or_path)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        if not path.is_file():
+            raise SpecError(f"{path}: no such mesh file; give the path of an existing STL, OBJ or PLY")
+        return ObjectSpec(name=path.stem, description=f"mesh {path.name}", shape=MeshShape(kind="mesh", file=str(path.resolve())))
+    spec_path = _find(name_or_path, "objects")
+    spec = _read(spec_path, ObjectSpec)
+    if isinstance(spec.shape, MeshShape):
+        file = (spec_path.parent / spec.shape.file).resolve()
+        if not file.is_file():
+            raise SpecError(f"{spec_path}: shape.file: no such mesh file {file}; the path is relative to the specification")
+        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update={"file": str(file)})})
+    return spec
+
+
+def _list(kind: str) -> dict[str, Path]:
+    found = {}
+    for folder in (SHIPPED / kind, user_spec_dir() / kind):
+        for path in sorted(folder.glob("*.toml")):
+            found[path.stem] = path
+    return found
+
+
+def _find(name_or_path: str | Path, kind: str) -> Path:
+    path = Path(name_or_path)
+    if path.suffix == ".toml":
+        if not path.is_file():
+            raise SpecError(f"{path}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'")
+        return path
+    known = _list(kind)
+    if str(name_or_path) in known:
+        return known[str(name_or_path)]
+    near = difflib.get_close_matches(str(name_or_path), known, n=1)
+    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+    raise SpecError(f"no {kind[:-1]} named '{name_or_path}': {hint} ('twin {kind}' lists them; own files go to {user_spec_dir() / kind})")
+
+
+def _read(path: Path, model: type[Spec]) -> Spec:
+    try:
+        with path.open("rb") as file:
+            data = tomllib.load(file)
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SpecError(f"{path}: not readable as TOML: {error}") from error
+    data.setdefault("name", path.stem)
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise SpecError(f"{path}: {_explain(error, model)}") from error
+
+
+def _explain(error: ValidationError, model: type[BaseModel]) -> str:
+    problems = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"]) or "file"
+        if item["type"] == "extra_forbidden":
+            known = _keys_at(model, item["loc"][:-1])
+            near = difflib.get_close_matches(str(item["loc"][-1]), known, n=1)
+            problems.append(f"unknown key '{key}'; " + (f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"))
+        elif item["type"] == "missing":
+            problems.append(f"key '{key}' is missing; add it (see the shipped specifications for examples)")
+        else:
+            came = "" if isinstance(item["input"], dict) else f", got {item['input']!r}"
+            problems.append(f"{key}: {item['msg'].removeprefix('Value error, ')}{came}")
+    return "; ".join(problems)
+
+
+def _keys_at(model: type[BaseModel], loc: tuple) -> list[str]:
+    """Known keys of the section at ``loc`` (a tagged union's tag is one of its parts)."""
+    candidates = [model]
+    for part in loc:
+        stepped = [m for c in candidates if part in c.model_fields for m in _models_in(c.model_fields[part].annotation)]
+        tagged = [c for c in candidates if part in _tags(c)]
+        candidates = stepped or tagged or candidates
+    return sorted({key for c in candidates for key in c.model_fields})
+
+
+def _models_in(annotation) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for arg in getattr(annotation, "__args__", ()) for m in _models_in(arg)]
+
+
+def _tags(model: type[BaseModel]) -> tuple:
+    kind = model.model_fields.get("kind")
+    return getattr(kind.annotation, "__args__", ()) if kind else ()

@@ -1,0 +1,90 @@
+"""The specification of an object (stimulus) that the sensor is pressed against.
+
+Object frame: origin on the surface where the sensor touches first, z into the object. At
+rest the axes are parallel to the sensor's, so the sensor comes from -z.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from scenes.base import NonNegative, Positive, Section
+
+
+class PlaneShape(Section):
+    """Half space z >= 0."""
+
+    kind: Literal["plane"]
+
+
+class SphereShape(Section):
+    """Ball behind its pole at the origin."""
+
+    kind: Literal["sphere"]
+    radius_mm: Positive
+
+
+class CylinderShape(Section):
+    """Cylinder along y, infinitely long, touching the origin from z > 0."""
+
+    kind: Literal["cylinder"]
+    radius_mm: Positive
+
+
+class EdgeShape(Section):
+    """Quarter space x >= 0, z >= 0 with a rounded edge along y through the origin."""
+
+    kind: Literal["edge"]
+    fillet_mm: NonNegative = 0.0
+
+
+class PrismShape(Section):
+    """Upright prism: regular polygon section in the x-z plane, extruded along y.
+
+    Face ``0`` is centred on the origin. ``taper_deg`` tilts the side faces about x (a bevelled prism).
+    """
+
+    kind: Literal["prism"]
+    sides: Annotated[int, Field(ge=3, le=64)]
+    inradius_mm: Positive
+    fillet_mm: NonNegative = 0.0
+    taper_deg: Annotated[float, Field(ge=-45, le=45)] = 0.0
+
+
+class MeshShape(Section):
+    """Closed triangle mesh (STL, OBJ, PLY). ``file`` is relative to the specification.
+
+    The mesh is turned by ``rotation_deg`` (intrinsic x, y, z), then moved so that its lowest z over the x = y = 0
+    line of its bounding box centre is the origin.
+    """
+
+    kind: Literal["mesh"]
+    file: str
+    unit: Literal["mm", "cm", "m", "inch"] = "mm"
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+Shape = Annotated[
+    PlaneShape | SphereShape | CylinderShape | EdgeShape | PrismShape | MeshShape,
+    Field(discriminator="kind"),
+]
+
+
+class TextureSpec(Section):
+    """A raised wire mesh wrapped on the surface: round wires crossing at a pitch."""
+
+    kind: Literal["wire-mesh"]
+    pitch_mm: Positive
+    wire_diameter_mm: Positive
+
+
+class ObjectSpec(Section):
+    """An object, complete. ``name`` is the file's stem."""
+
+    name: str
+    description: str
+    source: str = ""
+    shape: Shape
+    texture: TextureSpec | None = None
+    friction: NonNegative = 0.5
+    compliance_mm_per_n: NonNegative = 0.0

@@ -1,0 +1,1 @@
+"""Learning from recordings and twin data: labels, graphs as tensors."""

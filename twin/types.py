@@ -1,0 +1,126 @@
+"""What flows between the stages. Frozen; shapes and units in the docstrings."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+
+class Form(StrEnum):
+    """A sensor's frames come in two forms."""
+
+    RAW = "raw"  # the camera's own frame
+    RECORDING = "recording"  # cropped, thresholded and resized at capture
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of one sensor, wherever it came from (rendered, recorded, live).
+
+    Attributes
+    ----------
+    image : (H, W) or (H, W, 3) uint8
+        Gray or RGB levels.
+    form : Form
+    name : str
+        Base name of the file, or a label.
+    time_s : float
+        Time of exposure (0 where unknown).
+    sequence : int
+    """
+
+    image: np.ndarray
+    form: Form
+    name: str = ""
+    time_s: float = 0.0
+    sequence: int = 0
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """A converged state of the sensor pressed against an object (sensor frame).
+
+    Attributes
+    ----------
+    nodes_mm : (n, 3) float
+        Deformed positions of the volume mesh's nodes, in the order of ``SensorMesh.nodes_mm``.
+    base_mm, axis, caps_mm : (N, 3) float
+        Pin feet, unit axes (foot to cap) and cap centres.
+    force_n, torque_nmm : (3,) float
+        Total contact force of the *skin on the object* and its torque about the sensor's origin.
+    area_mm2 : float
+        Deformed area of the outer skin in contact.
+    contact_nodes : (c,) int
+        Outer-surface nodes in contact, with ``traction_n (c, 3)`` the nodal contact force on the object.
+    T_sensor_object : (4, 4) float
+        The object's pose.
+    residual : float
+        Norm of the force residual relative to the contact force (N/N).
+    """
+
+    nodes_mm: np.ndarray
+    base_mm: np.ndarray
+    axis: np.ndarray
+    caps_mm: np.ndarray
+    force_n: np.ndarray
+    torque_nmm: np.ndarray
+    area_mm2: float
+    contact_nodes: np.ndarray
+    traction_n: np.ndarray
+    T_sensor_object: np.ndarray
+    residual: float
+
+
+@dataclass(frozen=True)
+class PinGraph:
+    """A graph over the N pins of a sensor, in the specification's pin order.
+
+    Attributes
+    ----------
+    nodes_px : (N, 2) float
+        Pin positions in px of the input frame (a lost pin's node is its predicted position).
+    edges : (E, 2) int
+        Directed edges, both directions present.
+    area_px2 : (N,) float
+        Voronoi cell areas (NaN for kinds without a tessellation).
+    cells : list of (k, 2) float
+        Cell polygons (empty for kinds without a tessellation).
+    """
+
+    kind: str
+    nodes_px: np.ndarray
+    edges: np.ndarray
+    area_px2: np.ndarray
+    cells: list = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the pipeline saw in one frame.
+
+    Attributes
+    ----------
+    pins_px : (N, 2) float
+        Found pins in px of the input frame, specification's order, NaN where a pin has no blob of its own.
+    predicted_px : (N, 2) float
+        The motion model's guess for the lost pins, NaN for the found ones.
+    found : int
+    valid : bool
+    reason : str
+        Why it is not valid ("" if it is).
+    graph : PinGraph or None
+        None if not valid.
+    extra_px : (K, 2) float
+        Rejected blobs (glints, bubbles).
+    ms : dict of str to float
+        Time of each stage.
+    """
+
+    pins_px: np.ndarray
+    predicted_px: np.ndarray
+    found: int
+    valid: bool
+    reason: str
+    graph: PinGraph | None
+    extra_px: np.ndarray
+    ms: dict

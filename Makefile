@@ -1,0 +1,37 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= out/demo
+export TACTIP_REAL ?= ../shared/real
+
+.PHONY: help setup demo test bench validate lint clean
+help:            ## what can be made
+	@sed -n 's/^\([a-z]*\): .*## /\1\t/p' $(MAKEFILE_LIST)
+
+setup: $(VENV)/.installed ## install everything into .venv (as root also the system packages)
+	@.ci/system-packages $(VENV)/lib/private
+
+$(VENV)/.installed: pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv: install python3-venv, remove $(VENV) and run make again"; exit 1; }
+	@echo "installing Python packages into $(VENV) (about 1.5 GB, a few minutes the first time)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
+	@touch $@
+
+demo: setup      ## the main job: press, render, detect, graph; pictures and a page in out/demo
+	@$(BIN)/twin demo --out $(OUT)
+
+test: setup      ## run the tests
+	@$(BIN)/python -m pytest -n auto
+
+bench: setup     ## speed, as ratios to named baselines in the same run
+	@$(BIN)/python tests/bench/bench_pipeline.py
+
+validate: setup  ## heavier proofs, on the recordings named by TACTIP_REAL
+	@$(BIN)/python -m pytest -m slow -n 0 -s tests
+
+lint: setup
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+clean:
+	rm -rf $(VENV) out build *.egg-info

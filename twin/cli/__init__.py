@@ -1,0 +1,34 @@
+"""The command line ``twin``: the outermost composition root, so it may import every package."""
+
+import sys
+
+import typer
+
+from scenes.errors import SpecError
+from twin.errors import TwinError
+
+app = typer.Typer(
+    name="twin",
+    help="A rendered-sensor digital twin of the TacTip optical tactile sensor.\n\n"
+    "Press a skin by finite elements, path-trace what the camera inside sees, find the pins, build the graph: "
+    "on rendered, recorded and live frames alike.\n\n"
+    "Start with 'twin doctor', then 'twin demo --out out/demo'.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+def main() -> None:
+    """Run the command line; an error meant for the user is one line on stderr and exit code 1."""
+    from twin.cli import catalog, demo, doctor, graph, preprocess, render  # noqa: F401  (each registers its commands)
+
+    try:
+        app()
+    except (TwinError, SpecError) as error:
+        print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("twin: interrupted", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,33 @@
+"""``twin sensors`` and ``twin objects``: what is shipped, and where one's own go."""
+
+from pathlib import Path
+
+from scenes import SpecError, list_objects, list_sensors, load_object, load_sensor, user_spec_dir
+from scenes.load import SHIPPED
+from twin.cli import app
+
+
+@app.command("sensors")
+def sensors() -> None:
+    """List the sensor specifications, and where to put one's own."""
+    _list(list_sensors(), load_sensor, "sensors", lambda spec: f"{spec.pins.count} pins, {spec.camera.channels}")
+
+
+@app.command("objects")
+def objects() -> None:
+    """List the object specifications, and where to put one's own."""
+    _list(list_objects(), load_object, "objects", lambda spec: spec.shape.kind)
+    print("Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl")
+
+
+def _list(found: dict[str, Path], load, kind: str, detail) -> None:
+    for name, path in found.items():
+        own = "" if path.is_relative_to(SHIPPED) else f"  [{path}]"
+        try:
+            spec = load(name)
+        except SpecError as error:
+            print(f"{name:12} BROKEN: {error}")
+        else:
+            print(f"{name:12} {spec.description} ({detail(spec)}){own}")
+    print(f"\nShipped files: {SHIPPED / kind}")
+    print(f"Your own: copy one to {user_spec_dir() / kind}/NAME.toml and edit it (or give a path: --{kind[:-1]} my.toml)")

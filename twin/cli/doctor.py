@@ -1,0 +1,61 @@
+"""``twin doctor``: what is there, what is missing, and the remedy."""
+
+import importlib.metadata
+import platform
+import sys
+
+from twin.cli import app
+
+PACKAGES = ("mitsuba", "drjit", "pyvista", "vtk", "trimesh", "torch", "scikit-image", "pyserial", "opencv-python-headless", "numba")
+
+
+@app.command("doctor")
+def doctor() -> None:
+    """Say what is there and what is missing, with the remedy.
+
+    Covers Mitsuba's variants and which one will be used and why, LLVM, GPU, offscreen 3D, camera and serial devices. Exit
+    code 1 if nothing can be rendered on this machine.
+    """
+    print(f"Python      {platform.python_version()} ({sys.executable}) on {platform.system()} {platform.machine()}")
+    for name in PACKAGES:
+        try:
+            print(f"{name:11} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            print(f"{name:11} MISSING; run 'make setup'")
+    can_render = _rendering()
+    _pictures()
+    _devices()
+    if not can_render:
+        raise SystemExit(1)
+
+
+def _rendering() -> bool:
+    from twin.optics.variant import report
+
+    found = report()
+    print("\nRendering (Mitsuba)")
+    for line in found.lines():
+        print(f"  {line}")
+    return found.usable
+
+
+def _pictures() -> None:
+    from twin.views.skin3d import probe_offscreen
+
+    print("\n3D pictures (VTK offscreen)")
+    reason = probe_offscreen()
+    print(f"  {'works' if not reason else 'PLAIN ONLY: ' + reason}")
+
+
+def _devices() -> None:
+    from hardware.devices import cameras, serial_ports
+
+    print("\nDevices")
+    for kind, devices, remedy in (
+        ("camera", cameras(), "plug in the sensor's USB camera; in a container pass --device /dev/video0"),
+        ("serial", serial_ports(), "plug in the arm's USB cable; the user must be in the group 'dialout'"),
+    ):
+        for device in devices:
+            print(f"  {kind}: {device.node} ({device.description})")
+        if not devices:
+            print(f"  {kind}: none found; {remedy}")

@@ -1,0 +1,91 @@
+"""The twin of one sensor: press it, look through its camera, get frames with ground truth."""
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from scenes.object import ObjectSpec
+from scenes.sensor import SensorSpec
+from twin.camera import expose, record
+from twin.errors import RenderError
+from twin.mechanics.path import ContactPose
+from twin.mechanics.solver import SkinSolver
+from twin.optics.render import Renderer
+from twin.stimulus import build_stimulus
+from twin.truth import CapTruth, cap_truth
+from twin.types import ContactState, Form, Frame
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A rendered frame and everything that is known about it.
+
+    Attributes
+    ----------
+    frame : Frame
+    linear : (H, W) or (H, W, 3) float32
+        Radiance before the camera's response, of the whole raw frame.
+    truth : CapTruth
+        In px of ``frame``.
+    seconds : float
+        Time to render.
+    """
+
+    frame: Frame
+    linear: np.ndarray
+    truth: CapTruth
+    seconds: float
+
+
+class Simulator:
+    """Solver and renderer of one sensor, built once and used for many contacts.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    quality : {"preview", "standard", "high"}
+        Samples per pixel of the renderer.
+    """
+
+    def __init__(self, spec: SensorSpec, *, quality: str = "standard") -> None:
+        self.spec = spec
+        self.solver = SkinSolver(spec)
+        self.rest = self.solver.rest()
+        self._quality = quality
+        self._renderer: Renderer | None = None
+
+    @property
+    def renderer(self) -> Renderer:
+        """The renderer, built when it is first needed (pressing alone needs no Mitsuba)."""
+        if self._renderer is None:
+            self._renderer = Renderer(self.spec, quality=self._quality)
+        return self._renderer
+
+    def press(self, stimulus: ObjectSpec, pose: ContactPose, *, progress=None) -> ContactState:
+        """Press an object against the sensor along approach and shear.
+
+        Raises
+        ------
+        ContactError
+            If the pose is out of reach or the solver does not converge.
+        """
+        return self.solver.press(build_stimulus(stimulus), pose, friction=stimulus.friction, progress=progress)
+
+    def shoot(self, state: ContactState, *, form: Form = Form.RAW, seed: int = 0, name: str = "frame.png") -> Shot:
+        """Render what the camera sees, and capture it in the given form.
+
+        Raises
+        ------
+        RenderError
+            If the sensor has no recording form, or nothing can be rendered here.
+        """
+        if form is Form.RECORDING and self.spec.recording is None:
+            raise RenderError(f"sensor '{self.spec.name}' has no recording form: its recordings are raw frames; use the raw form")
+        start = perf_counter()
+        linear = self.renderer.render(state, seed=seed)
+        image = expose(linear, self.spec.response, np.random.default_rng(seed))
+        if form is Form.RECORDING:
+            image = record(image, self.spec.recording)
+        seconds = perf_counter() - start
+        return Shot(Frame(image, form, name), linear, cap_truth(self.spec, self.rest, state, form), seconds)

@@ -1,0 +1,85 @@
+"""Pins, graphs and Voronoi areas, drawn with matplotlib on an axes the caller gives."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from scipy.interpolate import CloughTocher2DInterpolator
+
+from twin.types import Observation, PinGraph
+
+FOUND, LOST, EXTRA, EDGE = "#19d3a2", "#ff5c5c", "#ffb000", "#5ec8ff"
+SURFACE_GRID = 80  # samples across an interpolated surface
+
+
+def new_figure(columns: int, rows: int = 1, *, panel_inch: float = 4.0, projection: str | None = None) -> tuple[Figure, np.ndarray]:
+    """A figure without any window, and its axes as a flat array."""
+    figure = Figure(figsize=(columns * panel_inch, rows * panel_inch), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": projection})
+    return figure, axes.ravel()
+
+
+def draw_frame(ax: Axes, image: np.ndarray, title: str = "") -> None:
+    """The frame itself, in pixels with y down."""
+    ax.imshow(image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    ax.set(title=title, xticks=[], yticks=[])
+
+
+def draw_graph(ax: Axes, graph: PinGraph) -> None:
+    """The edges of a graph, and its cells where it has a tessellation."""
+    once = graph.edges[graph.edges[:, 0] < graph.edges[:, 1]] if graph.kind != "knn" else graph.edges
+    ax.add_collection(LineCollection(graph.nodes_px[once], colors=EDGE, linewidths=0.7, alpha=0.85))
+    if graph.cells:
+        ax.add_collection(PolyCollection(graph.cells, facecolors="none", edgecolors="#ffffff", linewidths=0.5, alpha=0.6))
+
+
+def draw_pins(ax: Axes, observation: Observation) -> None:
+    """Found pins, the model's guess for the lost ones, and the rejected blobs."""
+    ax.plot(*observation.pins_px.T, ".", color=FOUND, markersize=4)
+    ax.plot(*observation.predicted_px.T, "x", color=LOST, markersize=6)
+    if len(observation.extra_px):
+        ax.plot(*observation.extra_px.T, "+", color=EXTRA, markersize=6)
+
+
+def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title: str) -> None:
+    """Voronoi cells coloured by their relative change of area against no contact (percent)."""
+    change = 100 * (graph.area_px2 / rest_area_px2 - 1)
+    limit = max(5.0, float(np.nanpercentile(np.abs(change), 99)))
+    cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors="#00000030", linewidths=0.4)
+    ax.add_collection(cells)
+    _pixel_axes(ax, graph.nodes_px, title)
+    ax.figure.colorbar(cells, ax=ax, shrink=0.8, label="cell area against no contact, %")
+
+
+def draw_displacement(ax: Axes, rest_px: np.ndarray, pins_px: np.ndarray, title: str) -> None:
+    """Arrows from each pin's rest position to where it is now, to scale."""
+    moved = pins_px - rest_px
+    arrows = ax.quiver(*rest_px.T, *moved.T, np.hypot(*moved.T), angles="xy", scale_units="xy", scale=1, cmap="viridis", width=0.004)
+    _pixel_axes(ax, rest_px, title)
+    ax.figure.colorbar(arrows, ax=ax, shrink=0.8, label="displacement, px")
+
+
+def draw_area_surface(ax: Axes, nodes_px: np.ndarray, value: np.ndarray, title: str) -> None:
+    """A per-pin value as a smooth surface over the image plane (cubic interpolation; 3D axes)."""
+    low, high = nodes_px.min(axis=0), nodes_px.max(axis=0)
+    grid_x, grid_y = np.meshgrid(*[np.linspace(a, b, SURFACE_GRID) for a, b in zip(low, high, strict=True)])
+    surface = CloughTocher2DInterpolator(nodes_px, value)(grid_x, grid_y)
+    ax.plot_surface(grid_x, grid_y, surface, cmap="viridis", rcount=SURFACE_GRID, ccount=SURFACE_GRID, linewidth=0)
+    ax.set(title=title, xlabel="x, px", ylabel="y, px")
+    ax.invert_yaxis()
+
+
+def area_surface_figure(rest: PinGraph, contact: PinGraph) -> Figure:
+    """The three surfaces of the paper's figure 4: no contact, contact, and their difference (px^2)."""
+    figure, axes = new_figure(3, projection="3d")
+    draw_area_surface(axes[0], rest.nodes_px, rest.area_px2, "no contact: cell area, px²")
+    draw_area_surface(axes[1], contact.nodes_px, contact.area_px2, "contact: cell area, px²")
+    draw_area_surface(axes[2], contact.nodes_px, contact.area_px2 - rest.area_px2, "difference, px²")
+    return figure
+
+
+def _pixel_axes(ax: Axes, points_px: np.ndarray, title: str) -> None:
+    low, high = np.nanmin(points_px, axis=0), np.nanmax(points_px, axis=0)
+    margin = 0.08 * (high - low)
+    ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(high[1] + margin[1], low[1] - margin[1]), aspect="equal", title=title)
+    ax.set(xticks=[], yticks=[])

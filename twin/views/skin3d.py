@@ -1,0 +1,105 @@
+"""The deformed skin in 3D, drawn by PyVista in a process of its own.
+
+VTK ends the whole process where it finds neither a display nor EGL. So it draws in a child process; if that dies, the
+picture is drawn plainly with matplotlib instead and the caller is told why.
+"""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pyvista as pv
+
+WINDOW_PX = (1100, 900)
+CHILD_TIMEOUT_S = 120
+REMEDY = "install libegl1 and libgl1 (apt-get install libegl1 libgl1) for shaded 3D pictures"
+
+
+def draw_skin(skin: pv.PolyData, pins: pv.PolyData, stimulus: pv.PolyData, path: Path) -> str:
+    """Write a picture of the skin (coloured by ``displacement_mm``), cut open, with pins and object.
+
+    Returns
+    -------
+    str
+        "" if PyVista drew it, else the reason why it was drawn plainly.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        for name, surface in (("skin", skin), ("pins", pins), ("stimulus", stimulus)):
+            surface.save(Path(folder) / f"{name}.vtp")
+        reason = _run_child(folder, str(path))
+    if reason:
+        _draw_plain(skin, stimulus, path)
+    return reason
+
+
+def probe_offscreen() -> str:
+    """Whether VTK can draw without a window on this machine: "" if so, else why not."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("skin", "pins", "stimulus"):
+            pv.Sphere().save(Path(folder) / f"{name}.vtp")
+        return _run_child(folder, str(Path(folder) / "probe.png"))
+
+
+def stimulus_surface(distance, T_sensor_object: np.ndarray, *, bounds_mm, samples: int = 60) -> pv.PolyData:
+    """The zero level of an object's signed distance inside a box of the sensor frame.
+
+    Parameters
+    ----------
+    distance : callable
+        (k, 3) points in the object frame, mm, to (k,) signed distances, mm.
+    T_sensor_object : (4, 4) float
+    bounds_mm : (6,) float
+        x0, x1, y0, y1, z0, z1 of the box.
+    """
+    low, high = np.array(bounds_mm[::2], float), np.array(bounds_mm[1::2], float)
+    grid = pv.ImageData(dimensions=(samples,) * 3, spacing=tuple((high - low) / (samples - 1)), origin=tuple(low))
+    T_object_sensor = np.linalg.inv(T_sensor_object)
+    in_object = grid.points @ T_object_sensor[:3, :3].T + T_object_sensor[:3, 3]
+    grid["distance_mm"] = distance(in_object)
+    return grid.contour([0.0], scalars="distance_mm")
+
+
+def _run_child(folder: str, path: str) -> str:
+    command = [sys.executable, "-m", "twin.views.skin3d", folder, path]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=CHILD_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return f"the 3D picture took more than {CHILD_TIMEOUT_S} s"
+    if done.returncode == 0 and Path(path).is_file():
+        return ""
+    return f"VTK can't draw offscreen here (exit {done.returncode}); {REMEDY}"
+
+
+def _draw_with_pyvista(folder: Path, path: str) -> None:
+    skin, pins, stimulus = (pv.read(folder / f"{name}.vtp") for name in ("skin", "pins", "stimulus"))
+    plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))
+    plotter.set_background("#0d1117", top="#27313f")
+    scalars = "displacement_mm" if "displacement_mm" in skin.point_data else None
+    half_skin, half_pins = (part.clip(normal=(0, -1, 0), origin=(0, -0.01, 0)) for part in (skin, pins))
+    bar = {"title": "skin displacement, mm", "color": "white", "vertical": False, "position_x": 0.25, "position_y": 0.03}
+    plotter.add_mesh(half_skin, scalars=scalars, cmap="inferno", smooth_shading=True, scalar_bar_args=bar)
+    plotter.add_mesh(half_pins, color="#e9f3ff", smooth_shading=True)
+    if stimulus.n_points:
+        plotter.add_mesh(stimulus, color="#7aa7d9", opacity=0.45, smooth_shading=True)
+    plotter.camera_position = [(38.0, -78.0, 42.0), (0.0, 0.0, 11.0), (0.0, 0.0, 1.0)]
+    plotter.enable_anti_aliasing("ssaa")
+    plotter.screenshot(path)
+
+
+def _draw_plain(skin: pv.PolyData, stimulus: pv.PolyData, path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WINDOW_PX[0] / 100, WINDOW_PX[1] / 100), layout="constrained")
+    axes = figure.add_subplot(projection="3d")
+    for surface, color, alpha in ((skin, "#b3541e", 0.9), (stimulus, "#7aa7d9", 0.3)):
+        if surface.n_points:
+            triangles = surface.triangulate().faces.reshape(-1, 4)[:, 1:]
+            axes.plot_trisurf(*surface.points.T, triangles=triangles, color=color, alpha=alpha)
+    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", box_aspect=(1, 1, 0.7))
+    figure.savefig(path, dpi=100)
+
+
+if __name__ == "__main__":
+    _draw_with_pyvista(Path(sys.argv[1]), sys.argv[2])

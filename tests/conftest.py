@@ -1,0 +1,22 @@
+"""Shared fixtures: shipped specifications, and the real recordings where this machine has them."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from scenes import load_sensor
+
+
+@pytest.fixture(scope="session")
+def real_dir() -> Path:
+    """Folder of real recordings; tests that need it skip, with the reason, where it is missing."""
+    folder = Path(os.environ.get("TACTIP_REAL", "../shared/real"))
+    if not folder.is_dir():
+        pytest.skip(f"no real recordings at {folder} (set TACTIP_REAL)")
+    return folder
+
+
+@pytest.fixture(scope="session", params=["mg400-331", "mg400-127", "ur5-331"])
+def sensor(request):
+    return load_sensor(request.param)

@@ -1,0 +1,68 @@
+"""Specifications: shipped ones load, wrong ones say what is wrong, where, and what to do."""
+
+import pytest
+
+from scenes import SpecError, list_objects, list_sensors, load_object, load_sensor
+from scenes.load import SHIPPED
+
+
+def edited(tmp_path, source, old, new):
+    text = (SHIPPED / source).read_text()
+    assert old in text
+    path = tmp_path / "edited.toml"
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+def test_every_shipped_specification_loads():
+    assert {"mg400-331", "mg400-127", "ur5-331"} <= set(list_sensors())
+    assert {"plane", "sphere", "cylinder", "edge", "can", "mesh-can", "square", "prism", "tin-box"} <= set(list_objects())
+    for name in list_sensors():
+        assert load_sensor(name).name == name
+    for name in list_objects():
+        assert load_object(name).name == name
+
+
+@pytest.mark.parametrize(("sensor_name", "pins"), [("mg400-331", 331), ("ur5-331", 331), ("mg400-127", 127)])
+def test_pin_counts(sensor_name, pins):
+    assert load_sensor(sensor_name).pins.count == pins
+
+
+@pytest.mark.parametrize(
+    ("source", "old", "new", "words"),
+    [
+        ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thicknes_mm = 1.0", ["edited.toml", "skin.thicknes_mm", "did you mean 'thickness_mm'"]),
+        ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thickness_mm = -1.0", ["skin.thickness_mm", "greater than 0"]),
+        ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thickness_mm = 30.0", ["skin.thickness_mm must be smaller"]),
+        ("sensors/mg400-331.toml", "poisson_ratio = 0.47", "poisson_ratio = 0.5", ["skin.poisson_ratio", "less than 0.5"]),
+        ("sensors/mg400-331.toml", "threshold_block_px = 61", "threshold_block_px = 60", ["threshold_block_px must be odd"]),
+        ("sensors/mg400-331.toml", "rings = 10", "rings = nan", ["pins.rings"]),
+        ("sensors/mg400-331.toml", "[skin]", "[skin", ["not readable as TOML"]),
+        ("objects/sphere.toml", "radius_mm", "radius", ["shape.sphere.radius", "did you mean 'radius_mm'"]),
+        ("objects/sphere.toml", '"sphere"', '"ball"', ["shape", "'ball'"]),
+        ("objects/sphere.toml", "friction = 0.5", "friction = -1", ["friction", "greater than or equal to 0"]),
+    ],
+)
+def test_a_wrong_specification_names_file_key_and_remedy(tmp_path, source, old, new, words):
+    path = edited(tmp_path, source, old, new)
+    with pytest.raises(SpecError) as caught:
+        (load_sensor if "sensors" in source else load_object)(path)
+    for word in [str(path), *words]:
+        assert word in str(caught.value)
+    assert "\n" not in str(caught.value).strip() or "TOML" in str(caught.value)
+
+
+def test_unknown_names_suggest_the_nearest():
+    with pytest.raises(SpecError, match="did you mean 'mg400-331'"):
+        load_sensor("mg400-313")
+    with pytest.raises(SpecError, match="no such file"):
+        load_object("nowhere/part.toml")
+    with pytest.raises(SpecError, match="no such mesh file"):
+        load_object("nowhere/part.stl")
+
+
+def test_a_users_own_specification_is_found_and_wins(tmp_path, monkeypatch):
+    (tmp_path / "objects").mkdir()
+    (tmp_path / "objects" / "sphere.toml").write_text('description = "mine"\nshape = { kind = "sphere", radius_mm = 4.0 }\n')
+    monkeypatch.setenv("TACTIP_SPECS", str(tmp_path))
+    assert load_object("sphere").description == "mine"

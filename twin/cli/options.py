@@ -1,0 +1,28 @@
+"""Options that several commands share."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.types import Form
+
+Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
+Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
+Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
+FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; told by size and content if not given")]
+Pair = tuple[float, float]
+
+
+def writable_folder(path: Path) -> Path:
+    """Make the folder, or say in one line why it can't be written to."""
+    from twin.errors import TwinError
+
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".write-probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise TwinError(f"{path}: can't write there ({error.strerror}); give another folder with --out") from error
+    return path

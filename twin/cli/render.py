@@ -1,0 +1,80 @@
+"""``twin render``: one contact, rendered, with its exact ground truth."""
+
+from typing import Annotated
+
+import typer
+
+from twin.cli import app
+from twin.cli.options import Object, Out, Pair, Sensor, writable_folder
+from twin.types import Form
+
+HELP = """Press an object against a sensor and render what the camera inside sees.
+
+The pose is the OBJECT's, relative to the sensor. The image shows the sensor's x to the right and y down; z points out of
+the tip at the object. Angles turn right-handed about those axes.
+
+\b
+        image                        side view (y away from you)
+      +----------> x                        camera
+      |   . . .                       ___ (       ) ___  lens
+      |  . . . .                     |     gel         |
+      |   . . .                       \\_             _/   skin, pins inside
+      v                                  '---. .---'        O----> x
+      y  (z into the page,            ========v=========    |
+          towards the object)            object             v z
+
+\b
+--indent-mm D     object pushed by D along -z, counted from first touch
+--tilt-deg RX RY  object first turned about x by RX, then about y by RY, through the
+                  tip: RX > 0 brings the object closer where y < 0, RY > 0 where x > 0
+--shear-mm X Y    then dragged by X along x and Y along y (+X drags the pins right,
+                  +Y drags them down)
+--twist-deg RZ    and turned about z by RZ (RZ > 0 turns the pins from x to y,
+                  clockwise in the image)
+--offset-mm X Y   where on the object it is touched: the object is shifted by this
+                  before it approaches
+
+\b
+Writes: frame.png, frame.exr (linear), truth.npz (caps_mm, caps_px, rest_px, visible: one
+row a pin, specification's order), truth.json (force_n, torque_nmm, area_mm2, pose,
+everything resolved), skin.vtp, panel.png.
+
+Example: twin render --sensor ur5-331 --object edge --indent-mm 3 --out out/edge
+"""
+
+
+@app.command("render", help=HELP)
+def render(
+    sensor: Sensor,
+    object_: Object,
+    indent_mm: Annotated[float, typer.Option("--indent-mm", metavar="D", help="indentation from first touch; 0: no contact")],
+    out: Out,
+    tilt_deg: Annotated[Pair, typer.Option("--tilt-deg", metavar="RX RY")] = (0.0, 0.0),
+    shear_mm: Annotated[Pair, typer.Option("--shear-mm", metavar="X Y")] = (0.0, 0.0),
+    twist_deg: Annotated[float, typer.Option("--twist-deg", metavar="RZ")] = 0.0,
+    offset_mm: Annotated[Pair, typer.Option("--offset-mm", metavar="X Y")] = (0.0, 0.0),
+    form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
+    quality: Annotated[str, typer.Option(help="samples per pixel: preview, standard or high")] = "standard",
+    seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
+) -> None:
+    from scenes import load_object, load_sensor
+    from twin.cli.progress import step_bar
+    from twin.contact_files import write_contact
+    from twin.mechanics.path import ContactPose
+    from twin.simulator import Simulator
+
+    spec, stimulus = load_sensor(sensor), load_object(object_)
+    pose = ContactPose(indent_mm=indent_mm, tilt_deg=tilt_deg, shear_mm=shear_mm, twist_deg=twist_deg, offset_mm=offset_mm)
+    writable_folder(out)
+    simulator = Simulator(spec, quality=quality)
+    with step_bar(f"press {stimulus.name}") as progress:
+        state = simulator.press(stimulus, pose, progress=progress)
+    with step_bar("render"):
+        shot = simulator.shoot(state, form=form, seed=seed)
+    with step_bar("pictures"):
+        written = write_contact(out, simulator, stimulus, pose, state, shot)
+    force = state.force_n
+    print(f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {state.area_mm2:.1f} mm2, ", end="")
+    print(f"{int(shot.truth.visible.sum())} of {len(shot.truth.visible)} caps in sight")
+    for path in written:
+        print(f"wrote {path}")

@@ -1,0 +1,75 @@
+"""The files of one rendered contact: frame, truth, skin, panel."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scenes.object import ObjectSpec
+from twin.geometry.export import pins_surface, skin_surface
+from twin.mechanics.path import ContactPose
+from twin.preprocess.pipeline import Pipeline
+from twin.simulator import Shot, Simulator
+from twin.stimulus import build_stimulus
+from twin.types import ContactState
+from twin.views.panel import Look, contact_panel
+from twin.views.skin3d import draw_skin, stimulus_surface
+
+SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)
+
+
+def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> list[Path]:
+    """Write everything about one contact into a folder.
+
+    Returns
+    -------
+    list of Path
+        What was written.
+    """
+    from twin.optics.files import write_exr
+
+    spec = simulator.spec
+    image = shot.frame.image
+    cv2.imwrite(str(out / "frame.png"), image if image.ndim == 2 else image[..., ::-1])
+    write_exr(out / "frame.exr", shot.linear)
+    truth = {key: value for key, value in asdict(shot.truth).items()}
+    np.savez_compressed(out / "truth.npz", **truth)
+    (out / "truth.json").write_text(json.dumps(contact_record(simulator, stimulus, pose, state, shot), indent=1) + "\n")
+
+    skin = skin_surface(simulator.solver.mesh, state.nodes_mm)
+    skin.save(out / "skin.vtp")
+    surface = stimulus_surface(build_stimulus(stimulus).distance, state.T_sensor_object, bounds_mm=SCENE_BOUNDS_MM)
+    draw_skin(skin, pins_surface(spec.pins, state.base_mm, state.axis), surface, out / "skin.png")
+    look = look_at(simulator, shot)
+    title = f"{spec.name} against {stimulus.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
+    contact_panel(out / "skin.png", look, title).savefig(out / "panel.png", dpi=110)
+    names = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
+    return [out / name for name in names]
+
+
+def look_at(simulator: Simulator, shot: Shot) -> Look:
+    """Run the pipeline on a shot and on the same sensor's no-contact frame."""
+    form = shot.frame.form
+    pipeline = Pipeline(simulator.spec, form)
+    rest = simulator.shoot(simulator.rest, form=form)
+    return Look(shot.frame, pipeline(shot.frame), pipeline(rest.frame))
+
+
+def contact_record(simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> dict:
+    """What ``truth.json`` holds: forces on the object in the sensor frame, pose, everything resolved."""
+    return {
+        "force_n": state.force_n.tolist(),
+        "torque_nmm": state.torque_nmm.tolist(),
+        "area_mm2": state.area_mm2,
+        "pose": asdict(pose),
+        "T_sensor_object": state.T_sensor_object.tolist(),
+        "form": str(shot.frame.form),
+        "residual": state.residual,
+        "seconds": {"render": shot.seconds},
+        "renderer": simulator.renderer.describe(),
+        "solver": simulator.solver.describe(),
+        "sensor": simulator.spec.model_dump(mode="json"),
+        "object": stimulus.model_dump(mode="json"),
+    }

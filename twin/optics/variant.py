@@ -1,0 +1,249 @@
+"""The one owner of Mitsuba variants and of the LLVM library behind them.
+
+Dr.Jit loads whichever libLLVM it finds first. LLVM 15 and older abort the whole process at
+the first kernel (no instruction for IEEE fminimum), so a library is chosen and proved here,
+before Dr.Jit looks for one. Nothing is imported or set until `use_variant` is called.
+"""
+
+import ctypes.util
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from twin.errors import RenderError
+from twin.optics.probes import probe
+
+OLDEST_LLVM = 16  # 14 and 15 abort at the first kernel
+BACKENDS = ("cuda", "llvm", "scalar")
+REMEDY = "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19), or point DRJIT_LIBLLVM_PATH to its library"
+_LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
+_VARIANT_VARIABLE = "TACTIP_VARIANT"
+
+
+@dataclass(frozen=True)
+class LlvmLibrary:
+    """One libLLVM found on this machine; ``reason`` says why it is not used ("" where it is)."""
+
+    path: str
+    version: str
+    ok: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class LlvmSearch:
+    """The result of `find_llvm`: the proved library or None, and all that were looked at."""
+
+    library: LlvmLibrary | None
+    candidates: tuple[LlvmLibrary, ...]
+
+
+@dataclass(frozen=True)
+class VariantChoice:
+    """A Mitsuba variant that works here, why it was taken, and the LLVM it needs (None: none)."""
+
+    variant: str
+    reason: str
+    llvm_path: str | None = None
+
+    @property
+    def backend(self) -> str:
+        """"cuda", "llvm" or "scalar"."""
+        return self.variant.split("_")[0]
+
+    @property
+    def mono(self) -> bool:
+        """Whether the variant carries one channel instead of three."""
+        return self.variant.endswith("mono")
+
+
+def find_llvm(search: Sequence[Path] | None = None) -> LlvmSearch:
+    """The newest working LLVM library, the user's DRJIT_LIBLLVM_PATH first.
+
+    Parameters
+    ----------
+    search : sequence of Path, optional
+        Library files to consider instead of the usual places.
+    """
+    looked_at = []
+    wish = os.environ.get(_LLVM_VARIABLE)
+    if wish:
+        looked_at.append(_judge(Path(wish), asked_for=True))
+        if looked_at[0].ok:
+            return LlvmSearch(looked_at[0], tuple(looked_at))
+    for path in _newest_first(_usual_places() if search is None else search):
+        looked_at.append(_judge(path))
+        if looked_at[-1].ok:
+            return LlvmSearch(looked_at[-1], tuple(looked_at))
+    return LlvmSearch(None, tuple(looked_at))
+
+
+def find_cuda() -> tuple[bool, str]:
+    """Whether a GPU works here, and the reason."""
+    library = _libcuda()
+    if library is None:
+        return False, "no NVIDIA driver (libcuda) found"
+    verdict = probe("cuda", library, remember_failure=False)
+    return verdict.ok, "a tiny kernel runs on the GPU" if verdict.ok else verdict.reason
+
+
+def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_search: Sequence[Path] | None = None) -> VariantChoice:
+    """The fastest Mitsuba variant that is proved to work on this machine.
+
+    Parameters
+    ----------
+    channels : {"color", "mono"}
+        What the camera delivers.
+    prefer : {"cuda", "llvm", "scalar", "auto"} or a full variant name, optional
+        Insist on a backend; the environment variable TACTIP_VARIANT overrides it.
+    llvm_search : sequence of Path, optional
+        As for `find_llvm`.
+
+    Raises
+    ------
+    RenderError
+        For an unknown name, or where the backend insisted on does not work.
+    """
+    wish, source = os.environ.get(_VARIANT_VARIABLE) or prefer or "auto", "TACTIP_VARIANT" if os.environ.get(_VARIANT_VARIABLE) else "prefer"
+    exact = wish if wish in available_variants() else None
+    backend = wish.split("_")[0] if exact else wish
+    if backend not in (*BACKENDS, "auto"):
+        names = ", ".join(v for v in available_variants() if v.endswith(("_rgb", "_mono")))
+        raise RenderError(f"{source}={wish!r} is no variant: use auto, {', '.join(BACKENDS)}, or one of {names}")
+    failed = []
+    for kind in BACKENDS if backend == "auto" else (backend,):
+        choice, reason = _try(kind, exact or _name(kind, channels), llvm_search)
+        if choice is not None:
+            reasons = [choice.reason, *failed] if backend == "auto" else [f"asked for by {source}", choice.reason]
+            return VariantChoice(choice.variant, "; ".join(reasons), choice.llvm_path)
+        failed.append(f"{kind}: {reason}")
+    raise RenderError(f"{source}={wish!r} does not work here: {failed[0]}; {REMEDY if backend == 'llvm' else 'use TACTIP_VARIANT=auto'}")
+
+
+def use_variant(choice: VariantChoice):
+    """Make ``choice`` Mitsuba's current variant and return the ``mitsuba`` module."""
+    if choice.llvm_path:
+        os.environ[_LLVM_VARIABLE] = choice.llvm_path
+    import mitsuba as mi
+
+    if mi.variant() != choice.variant:
+        mi.set_variant(choice.variant)
+    return mi
+
+
+def available_variants() -> tuple[str, ...]:
+    """Names of the variants compiled into the installed Mitsuba, without importing it."""
+    spec = importlib.util.find_spec("mitsuba")
+    if spec is None or spec.origin is None:
+        raise RenderError("Mitsuba is not installed: pip install 'mitsuba>=3.9'")
+    pattern = re.compile(r"((?:scalar|llvm_ad|cuda_ad)_\w+?)\.[\w.-]*(?:so|pyd)$")
+    found = (pattern.match(p.name) for p in Path(spec.origin).parent.iterdir())
+    return tuple(sorted(m.group(1) for m in found if m))
+
+
+def report() -> dict:
+    """What a diagnosis prints: every variant, the one used for each kind of camera and why, LLVM, GPU."""
+    llvm = find_llvm()
+    gpu, gpu_reason = find_cuda()
+    used = {}
+    for channels in ("color", "mono"):
+        try:
+            used[channels] = asdict(choose_variant(channels))
+        except RenderError as error:
+            used[channels] = {"variant": None, "reason": str(error), "llvm_path": None}
+    return {
+        "variants": list(available_variants()),
+        "used": used,
+        "llvm": asdict(llvm.library) if llvm.library else None,
+        "llvm_rejected": [asdict(c) for c in llvm.candidates if not c.ok],
+        "gpu": gpu,
+        "gpu_reason": gpu_reason,
+        "override": os.environ.get(_VARIANT_VARIABLE),
+        "remedy": None if llvm.library or gpu else REMEDY,
+    }
+
+
+def _name(backend: str, channels: str) -> str:
+    """The compiled variant for a camera; a wheel without scalar_mono renders colour, reduced to luminance later."""
+    prefix = backend if backend == "scalar" else f"{backend}_ad"
+    mono = f"{prefix}_mono"
+    return mono if channels == "mono" and mono in available_variants() else f"{prefix}_rgb"
+
+
+def _try(backend: str, variant: str, llvm_search) -> tuple[VariantChoice | None, str]:
+    if variant not in available_variants():
+        return None, f"{variant} is not compiled into the installed Mitsuba"
+    if backend == "scalar":
+        return VariantChoice(variant, "the scalar variant needs nothing, and is slow"), ""
+    if backend == "cuda":
+        works, reason = find_cuda()
+        return (VariantChoice(variant, reason), "") if works else (None, reason)
+    found = find_llvm(llvm_search)
+    if found.library is None:
+        rejected = "; ".join(f"{c.path}: {c.reason}" for c in found.candidates) or "no libLLVM found"
+        return None, f"{rejected}; {REMEDY}"
+    return VariantChoice(variant, f"LLVM {found.library.version} at {found.library.path}", found.library.path), ""
+
+
+def _judge(path: Path, *, asked_for: bool = False) -> LlvmLibrary:
+    version = _version(path)
+    if not path.exists():
+        return LlvmLibrary(str(path), version, False, f"does not exist{' (DRJIT_LIBLLVM_PATH)' if asked_for else ''}")
+    if version and int(version.split(".")[0]) < OLDEST_LLVM and not asked_for:
+        return LlvmLibrary(str(path), version, False, f"older than LLVM {OLDEST_LLVM}: would abort the process at the first kernel")
+    verdict = probe("llvm", path)
+    return LlvmLibrary(str(path), verdict.version or version, verdict.ok, verdict.reason)
+
+
+def _version(path: Path) -> str:
+    """Version told by a library's resolved name or folder ("" where neither tells)."""
+    for text in (path.resolve().name, path.name, str(path.resolve().parent)):
+        match = re.search(r"(?:libLLVM[-.](?:so\.)?|llvm[-@]?)(\d+(?:\.\d+)*)", text)
+        if match:
+            return match.group(1)
+    return ""
+
+
+def _newest_first(paths: Sequence[Path]) -> list[Path]:
+    distinct = {Path(p).resolve(): Path(p) for p in reversed(list(paths))}
+    return sorted(distinct.values(), key=lambda p: [int(n) for n in (_version(p) or "0").split(".")], reverse=True)
+
+
+def _usual_places() -> list[Path]:
+    found = []
+    if sys.platform.startswith("linux"):
+        for tool in ("/sbin/ldconfig", "/usr/sbin/ldconfig"):
+            if Path(tool).exists():
+                listing = subprocess.run([tool, "-p"], capture_output=True, text=True).stdout
+                found += [Path(p) for p in re.findall(r"=> (\S*libLLVM[^\s]*)", listing)]
+                break
+        roots, patterns = ["/usr/lib", "/usr/lib64", "/usr/local/lib"], ["libLLVM*.so*", "*-linux-gnu/libLLVM*.so*", "llvm*/lib/libLLVM*.so*"]
+    elif sys.platform == "darwin":
+        roots, patterns = ["/opt/homebrew/opt", "/usr/local/opt", "/opt/local/libexec"], ["llvm*/lib/libLLVM*.dylib"]
+    else:
+        roots, patterns = [os.environ.get("PROGRAMFILES", "C:/Program Files")], ["LLVM/bin/LLVM-C.dll"]
+    roots.append(str(Path(sys.prefix) / "lib"))
+    for root in roots:
+        for pattern in patterns:
+            found += sorted(Path(root).glob(pattern))
+    return [p for p in found if p.exists()]
+
+
+def _libcuda() -> Path | None:
+    if sys.platform == "win32":
+        library = Path(os.environ.get("SYSTEMROOT", "C:/Windows")) / "System32" / "nvcuda.dll"
+        return library if library.exists() else None
+    name = ctypes.util.find_library("cuda")
+    if name is None:
+        return None
+    places = ["/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/lib/wsl/lib", "/usr/local/cuda/compat"]
+    places += os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
+    for place in filter(None, places):
+        if (Path(place) / name).exists():
+            return Path(place) / name
+    return None

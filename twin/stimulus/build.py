@@ -1,0 +1,48 @@
+"""From an object's specification to its signed-distance field."""
+
+from typing import Protocol
+
+import numpy as np
+
+from scenes.object import CylinderShape, EdgeShape, MeshShape, ObjectSpec, PlaneShape, PrismShape, SphereShape
+from twin.stimulus.analytic import Cylinder, Edge, Plane, Prism, Sphere
+from twin.stimulus.mesh_field import load_mesh_field
+from twin.stimulus.texture import WireMesh
+
+
+class Stimulus(Protocol):
+    """A solid in the object frame.
+
+    ``distance(points (k, 3)) -> (k,)`` in mm, positive outside; ``gradient(points) -> (k, 3)`` unit, outwards.
+    """
+
+    def distance(self, points_mm: np.ndarray) -> np.ndarray: ...
+
+    def gradient(self, points_mm: np.ndarray) -> np.ndarray: ...
+
+
+def build_stimulus(spec: ObjectSpec) -> Stimulus:
+    """The signed-distance field of an object, with its texture.
+
+    Raises
+    ------
+    MeshError
+        If a mesh file is not closed, in the wrong unit, empty or unreadable.
+    """
+    shape = spec.shape
+    match shape:
+        case PlaneShape():
+            base = Plane()
+        case SphereShape():
+            base = Sphere(shape.radius_mm)
+        case CylinderShape():
+            base = Cylinder(shape.radius_mm)
+        case EdgeShape():
+            base = Edge(shape.fillet_mm)
+        case PrismShape():
+            base = Prism(shape.sides, shape.inradius_mm, shape.fillet_mm, np.radians(shape.taper_deg))
+        case MeshShape():
+            base = load_mesh_field(shape)
+    if spec.texture is not None:
+        return WireMesh(base, spec.texture.pitch_mm, spec.texture.wire_diameter_mm)
+    return base

@@ -84,7 +84,11 @@ class CameraSpec(Section):
 
 
 class LedRingSpec(Section):
-    """LEDs behind the lens, as apparent emitters: azimuths in the sensor frame."""
+    """LEDs as apparent emitters on the gel's side (refraction absorbed): azimuths in the sensor frame.
+
+    Each is a square of ``size_mm`` at ``radius_mm`` from the axis in the plane ``z_mm``, turned towards
+    the middle of the dome. ``off`` lists indices of dead ones.
+    """
 
     azimuth_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=64)]
     radius_mm: Positive
@@ -96,22 +100,46 @@ class LedRingSpec(Section):
 
 
 class HousingSpec(Section):
-    """The bright ring and wall around the disc the camera sees."""
+    """The bright ring and wall around the disc the camera sees, at its apparent place.
+
+    ``ambient`` light falls off outwards over ``ambient_falloff_mm``; each LED adds a ``glow`` at
+    ``glow_radius_mm``, as wide as a source ``glow_height_mm`` above the surface makes it. Outside
+    a lip of ``lip_width_mm`` the wall shows only ``wall_fraction`` of this light.
+    """
 
     aperture_radius_mm: Positive
     outer_radius_mm: Positive
     z_mm: float
     albedo: Rgb
+    ambient: NonNegative = 0.3
+    ambient_falloff_mm: Positive = 20.0
+    glow: NonNegative = 1.0
+    glow_radius_mm: Positive
+    glow_height_mm: Positive = 1.5
+    lip_width_mm: NonNegative = 1.0
+    wall_fraction: Fraction = 1.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.outer_radius_mm <= self.aperture_radius_mm:
+            raise ValueError("outer_radius_mm must be larger than aperture_radius_mm")
+        return self
 
 
 class AppearanceSpec(Section):
-    """Reflectances (linear, 0 to 1) of what the camera sees."""
+    """Reflectances (linear, 0 to 1) of what the camera sees, and the LEDs' reflections in the lens.
+
+    A glint is a square of ``glint_size_mm`` at ``glint_radius_mm`` in the housing's plane; its strength is
+    relative to the LEDs' power, 0 for none.
+    """
 
     skin_albedo: Rgb
     skin_gloss: Fraction
     pin_albedo: Rgb
     cap_albedo: Rgb
     glint_strength: Fraction = 0.5
+    glint_radius_mm: Positive = 16.5
+    glint_size_mm: Positive = 1.0
 
 
 class ResponseSpec(Section):

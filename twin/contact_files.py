@@ -8,16 +8,13 @@ import cv2
 import numpy as np
 
 from scenes.object import ObjectSpec
-from twin.geometry.export import pins_surface, skin_surface
 from twin.mechanics.path import ContactPose
 from twin.preprocess.pipeline import Pipeline
 from twin.simulator import Shot, Simulator
 from twin.stimulus import build_stimulus
 from twin.types import ContactState
 from twin.views.panel import Look, contact_panel
-from twin.views.skin3d import draw_skin, stimulus_surface
-
-SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)
+from twin.views.skin3d import displaced_skin, draw_contact_skin
 
 
 def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> list[Path]:
@@ -38,10 +35,9 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     np.savez_compressed(out / "truth.npz", **truth)
     (out / "truth.json").write_text(json.dumps(contact_record(simulator, stimulus, pose, state, shot), indent=1) + "\n")
 
-    skin = skin_surface(simulator.solver.mesh, state.nodes_mm)
-    skin.save(out / "skin.vtp")
-    surface = stimulus_surface(build_stimulus(stimulus).distance, state.T_sensor_object, bounds_mm=SCENE_BOUNDS_MM)
-    draw_skin(skin, pins_surface(spec.pins, state.base_mm, state.axis), surface, out / "skin.png")
+    mesh = simulator.solver.mesh
+    displaced_skin(mesh, state).save(out / "skin.vtp")
+    draw_contact_skin(mesh, spec.pins, state, build_stimulus(stimulus), out / "skin.png")
     look = look_at(simulator, shot)
     title = f"{spec.name} against {stimulus.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
     contact_panel(out / "skin.png", look, title).savefig(out / "panel.png", dpi=110)

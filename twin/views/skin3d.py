@@ -12,9 +12,43 @@ from pathlib import Path
 import numpy as np
 import pyvista as pv
 
+from scenes.sensor import PinsSpec
+from twin.geometry.export import skin_surface
+from twin.geometry.mesh import SensorMesh
+from twin.stimulus import Stimulus
+from twin.types import ContactState
+
+SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)
 WINDOW_PX = (1100, 900)
 CHILD_TIMEOUT_S = 120
 REMEDY = "install libegl1 and libgl1 (apt-get install libegl1 libgl1) for shaded 3D pictures"
+
+
+def displaced_skin(mesh: SensorMesh, state: ContactState) -> pv.PolyData:
+    """The deformed skin with point data ``displacement_mm`` (n,) and ``displacement_xyz_mm`` (n, 3)."""
+    moved = state.nodes_mm - mesh.nodes_mm
+    data = {"displacement_mm": np.linalg.norm(moved, axis=1), "displacement_xyz_mm": moved}
+    return skin_surface(mesh, nodes_mm=state.nodes_mm, point_data=data)
+
+
+def pins_surface(pins: PinsSpec, state: ContactState) -> pv.PolyData:
+    """Stems and caps of all pins as tubes."""
+    parts = []
+    stem_end = state.caps_mm - state.axis * pins.cap_height_mm / 2
+    for start, end, diameter_mm in (
+        (state.base_mm, stem_end, pins.diameter_mm),
+        (stem_end, state.caps_mm + state.axis * pins.cap_height_mm / 2, pins.cap_diameter_mm),
+    ):
+        count = len(start)
+        lines = np.column_stack([np.full(count, 2), np.arange(count), np.arange(count) + count])
+        parts.append(pv.PolyData(np.vstack([start, end]), lines=lines.ravel()).tube(radius=diameter_mm / 2, n_sides=16, capping=True))
+    return pv.merge(parts)
+
+
+def draw_contact_skin(mesh: SensorMesh, pins: PinsSpec, state: ContactState, stimulus: Stimulus, path: Path) -> str:
+    """Draw a contact: skin, pins and the object's surface near it (see ``draw_skin``)."""
+    surface = stimulus_surface(stimulus.distance, state.T_sensor_object, bounds_mm=SCENE_BOUNDS_MM)
+    return draw_skin(displaced_skin(mesh, state), pins_surface(pins, state), surface, path)
 
 
 def draw_skin(skin: pv.PolyData, pins: pv.PolyData, stimulus: pv.PolyData, path: Path) -> str:

@@ -1,0 +1,112 @@
+"""The demo's order of work."""
+
+import os
+import platform
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from scenes import load_object, load_sensor
+from twin.demo.page import contact_figures, contact_pictures, embed, motion_figure, render_page, write_figure
+from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, depth_table, run_contact
+from twin.projection import project
+from twin.preprocess.forms import raw_to_form
+from twin.simulator import Simulator
+from twin.stimulus import build_stimulus
+from twin.types import Form
+from twin.views.skin3d import draw_contact_skin
+
+
+def run_demo(out: Path, bar) -> list[Path]:
+    """Run the whole demo into a folder.
+
+    Parameters
+    ----------
+    out : Path
+    bar : callable
+        ``bar(title)`` is a context manager that yields ``progress(fraction)``.
+
+    Returns
+    -------
+    list of Path
+        What was written, the page first.
+    """
+    pictures = out / "pictures"
+    pictures.mkdir(exist_ok=True)
+    simulators: dict[str, Simulator] = {}
+    contacts, seconds, notes = [], {}, set()
+    for sensor, stimulus, pose, form in CONTACTS:
+        start = perf_counter()
+        with bar(f"{sensor}: press the {stimulus}, render, detect") as progress:
+            simulator = simulators.setdefault(sensor, Simulator(load_sensor(sensor)))
+            result = run_contact(simulator, stimulus, pose, form, progress=progress)
+        seconds[f"{sensor} against {stimulus}"] = perf_counter() - start
+        with bar(f"{sensor}: pictures"):
+            skin = pictures / f"{sensor}-{stimulus}-skin.png"
+            notes.add(draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_stimulus(load_object(stimulus)), skin))
+            contacts.append(_contact_content(simulator, result, skin, pictures))
+
+    motion_sensor = CONTACTS[0][0]
+    start = perf_counter()
+    looks = []
+    with bar(f"{motion_sensor}: motions along Z, X and Y") as progress:
+        for number, (title, pose) in enumerate(MOTIONS):
+            looks.append((title, run_contact(simulators[motion_sensor], "plane", pose, Form.RAW).look))
+            progress((number + 1) / len(MOTIONS))
+        motions = write_figure(pictures / "motions.png", motion_figure(looks))
+    seconds["motions"] = perf_counter() - start
+
+    tables = {}
+    start = perf_counter()
+    for sensor in MEASURED_DISPLACEMENT_PX:
+        with bar(f"{sensor}: displacement by depth") as progress:
+            tables[sensor] = depth_table(sensor, progress=progress)
+    seconds["displacement tables"] = perf_counter() - start
+
+    renderer = simulators[motion_sensor].renderer.describe()
+    machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(sorted(notes))
+    page = out / "index.html"
+    page.write_text(
+        render_page(
+            machine=machine,
+            contacts=contacts,
+            motions=embed(motions),
+            motion_sensor=motion_sensor,
+            tables=tables,
+            seconds=[*seconds.items(), ("all", sum(seconds.values()))],
+        ),
+        encoding="utf-8",
+    )
+    _print_tables(tables)
+    return [page, *sorted(pictures.iterdir())]
+
+
+def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pictures: Path) -> dict:
+    spec = simulator.spec
+    written = contact_pictures(pictures, result)
+    touched = result.state.contact_nodes
+    contact_mm = result.state.nodes_mm[touched].mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
+    contact_px = raw_to_form(spec, result.look.frame.form, project(spec.camera, contact_mm[None]))[0]
+    height, width = result.raw.frame.image.shape[:2]
+    return {
+        "title": f"{spec.name} against {result.stimulus}",
+        "description": f"{spec.description}. {load_object(result.stimulus).description}, pressed in by {result.pose.indent_mm:g} mm.",
+        "skin": embed(skin),
+        "raw": embed(written["raw"]),
+        "raw_size": f"{width} x {height} px",
+        "recorded": embed(written["recorded"]) if result.look.frame.form is Form.RECORDING else "",
+        "pins": embed(written["pins"]),
+        "areas": embed(written["areas"]),
+        "surfaces": embed(written["surfaces"]),
+        "figures": contact_figures(result, contact_px),
+    }
+
+
+def _print_tables(tables: dict) -> None:
+    for sensor, rows in tables.items():
+        print(f"{sensor}: mean pin displacement, px (measured on the Tac-VGNN recordings / simulated)")
+        print("  indentation, mm  " + "".join(f"{row.indent_mm:8.1f}" for row in rows))
+        print("  measured, px     " + "".join(f"{row.measured_px:8.1f}" for row in rows))
+        print("  simulated, px    " + "".join(f"{row.simulated_px:8.1f}" for row in rows))
+        print("  area at contact %" + "".join(f"{row.contact_area_change_percent:+8.1f}" for row in rows))

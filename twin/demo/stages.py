@@ -1,0 +1,104 @@
+"""What the demo computes: contacts through the whole chain, the three motions, the depth table."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+
+from scenes import load_object, load_sensor
+from twin.mechanics.path import ContactPose
+from twin.preprocess.pipeline import Pipeline
+from twin.projection import project
+from twin.simulator import Shot, Simulator
+from twin.types import ContactState, Form
+from twin.views.panel import Look
+
+CONTACTS = (
+    ("ur5-331", "edge", ContactPose(indent_mm=3.5), Form.RAW),
+    ("mg400-331", "plane", ContactPose(indent_mm=4.0, tilt_deg=(0.0, 8.0)), Form.RECORDING),
+    ("mg400-127", "sphere", ContactPose(indent_mm=4.0, offset_mm=(3.0, -2.0)), Form.RECORDING),
+)
+MOTIONS = (
+    ("Z: pressed 4 mm", ContactPose(indent_mm=4.0)),
+    ("X: then dragged 3 mm along x", ContactPose(indent_mm=4.0, shear_mm=(3.0, 0.0))),
+    ("Y: then dragged 3 mm along y", ContactPose(indent_mm=4.0, shear_mm=(0.0, 3.0))),
+)
+# Mean pin displacement of pure presses in the Tac-VGNN release's recordings (Apache-2.0), px of the uncropped camera frame,
+# for pose_2 in four 1 mm bins from -4 to 0; the indentation is about pose_2 + 5 mm.
+MEASURED_DISPLACEMENT_PX = {"mg400-331": (1.9, 3.4, 5.0, 7.5), "mg400-127": (2.2, 3.8, 6.0, 8.9)}
+TABLE_INDENTS_MM = (1.5, 2.5, 3.5, 4.5)
+
+
+@dataclass(frozen=True)
+class Timed:
+    """Seconds spent, by stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def run(self, stage: str, work: Callable):
+        """Call ``work()`` and add its time to the stage."""
+        start = perf_counter()
+        result = work()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + perf_counter() - start
+        return result
+
+
+@dataclass(frozen=True)
+class ContactResult:
+    """One contact through the whole chain."""
+
+    sensor: str
+    stimulus: str
+    pose: ContactPose
+    state: ContactState
+    raw: Shot
+    look: Look
+    seconds: dict[str, float]
+
+
+def run_contact(simulator: Simulator, stimulus: str, pose: ContactPose, form: Form, *, progress=None) -> ContactResult:
+    """Press, render, capture, detect, build the graph: one contact beside no contact."""
+    timed = Timed()
+    spec = simulator.spec
+    state = timed.run("press", lambda: simulator.press(load_object(stimulus), pose, progress=progress))
+    raw = timed.run("render", lambda: simulator.shoot(state))
+    shot = raw if form is Form.RAW else timed.run("capture", lambda: simulator.recapture(raw, form))
+    rest = simulator.shoot(simulator.rest, form=form)
+    pipeline = Pipeline(spec, form)
+    pipeline(rest.frame)  # compiled once, so that the time below is a frame's
+    observation = timed.run("pins and graph", lambda: pipeline(shot.frame))
+    return ContactResult(spec.name, stimulus, pose, state, raw, Look(shot.frame, observation, pipeline(rest.frame)), timed.seconds)
+
+
+@dataclass(frozen=True)
+class DepthRow:
+    """One depth of the table: mean displacement of all pins and growth of the cells at the contact."""
+
+    indent_mm: float
+    simulated_px: float
+    measured_px: float
+    contact_area_change_percent: float
+    force_n: float
+
+
+def depth_table(sensor: str, *, progress=None) -> list[DepthRow]:
+    """Press a plane to the four depths of the recordings' table (true caps, no rendering)."""
+    from twin.preprocess.graph import build_graph
+
+    spec = load_sensor(sensor)
+    simulator = Simulator(spec)
+    rest_px = project(spec.camera, simulator.rest.caps_mm)
+    rest_graph = build_graph("voronoi", rest_px, spec)
+    middle = np.argsort(np.hypot(*(rest_px - rest_px[0]).T))[: spec.pins.count // 8]
+    rows = []
+    for number, (indent_mm, measured_px) in enumerate(zip(TABLE_INDENTS_MM, MEASURED_DISPLACEMENT_PX[sensor], strict=True)):
+        state = simulator.press(load_object("plane"), ContactPose(indent_mm=indent_mm))
+        caps_px = project(spec.camera, state.caps_mm)
+        areas = build_graph("voronoi", caps_px, spec).area_px2
+        change = 100 * float(np.mean(areas[middle] / rest_graph.area_px2[middle]) - 1)
+        moved = float(np.hypot(*(caps_px - rest_px).T).mean())
+        rows.append(DepthRow(indent_mm, moved, measured_px, change, float(state.force_n[2])))
+        if progress:
+            progress((number + 1) / len(TABLE_INDENTS_MM))
+    return rows

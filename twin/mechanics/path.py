@@ -1,0 +1,148 @@
+"""Where the object goes: from first touch through the press to the end of the shear."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import ContactError
+
+_LARGEST_TILT_DEG = 60.0
+_LARGEST_TWIST_DEG = 90.0
+_TOUCH_TOLERANCE_MM = 1e-6
+_DOME_POINTS = 20_000
+_START_MM = 60.0
+
+
+@dataclass(frozen=True)
+class ContactPose:
+    """One contact, as the object's motion relative to the sensor.
+
+    The object, its origin on the apex and its axes parallel to the sensor's, is turned by
+    R = Ry(tilt_y) Rx(tilt_x) about the apex (right-handed, sensor axes), moved sideways by
+    ``offset_mm``, brought down the sensor's z to first touch, pressed ``indent_mm`` further,
+    then moved by ``shear_mm`` along x, y while it twists about the sensor's z axis.
+
+    Attributes
+    ----------
+    indent_mm : float
+        Beyond first touch; zero or less: no contact.
+    tilt_deg, shear_mm, offset_mm : (2,) float
+        About / along the sensor's x and y.
+    twist_deg : float
+        About the sensor's z.
+    """
+
+    indent_mm: float
+    tilt_deg: tuple[float, float] = (0.0, 0.0)
+    shear_mm: tuple[float, float] = (0.0, 0.0)
+    twist_deg: float = 0.0
+    offset_mm: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ContactPath:
+    """Object poses along a contact: progress 0 is first touch, 1 fully pressed, 2 fully sheared.
+
+    Attributes
+    ----------
+    pose : ContactPose
+    T_touch : (4, 4) float
+        ``T_sensor_object`` at first touch.
+    """
+
+    pose: ContactPose
+    T_touch: np.ndarray
+
+    @property
+    def end(self) -> float:
+        """Progress at the end of the path."""
+        return 2.0 if any(self.pose.shear_mm) or self.pose.twist_deg else 1.0
+
+    def at(self, progress: float) -> np.ndarray:
+        """``T_sensor_object`` (4, 4) at a progress from 0 to 2."""
+        pressed, sheared = min(progress, 1.0), max(progress - 1.0, 0.0)
+        T = self.T_touch.copy()
+        T[2, 3] -= pressed * self.pose.indent_mm
+        move = np.eye(4)
+        angle = np.radians(self.pose.twist_deg) * sheared
+        move[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        move[:2, 3] = np.multiply(self.pose.shear_mm, sheared)
+        return move @ T
+
+
+def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
+    """Check a pose and find its first touch with the undeformed skin.
+
+    The object comes down along z by its smallest distance to the dome, again and again, which never
+    passes the first touch (sphere tracing, Hart 1996). The dome is sampled evenly, then finely
+    around the nearest point.
+
+    Raises
+    ------
+    ContactError
+        If a value is out of range, or the object misses the dome or starts inside it.
+    """
+    _check(spec, pose)
+    rx, ry = np.radians(pose.tilt_deg)
+    turn_x = np.array([[1, 0, 0], [0, np.cos(rx), -np.sin(rx)], [0, np.sin(rx), np.cos(rx)]])
+    turn_y = np.array([[np.cos(ry), 0, np.sin(ry)], [0, 1, 0], [-np.sin(ry), 0, np.cos(ry)]])
+    radius = spec.skin.outer_radius_mm
+    T = np.eye(4)
+    T[:3, :3] = turn_y @ turn_x
+    T[:3, 3] = [*pose.offset_mm, radius]
+    lowest_z = spec.skin.rim_z_mm / radius
+    directions = _sphere_points(_DOME_POINTS)
+    directions = directions[directions[:, 2] >= lowest_z]
+    height, nearest = _bring_down(stimulus, T, radius * directions, _START_MM, radius - spec.skin.rim_z_mm)
+    # around the nearest point the sampling is refined 30 times
+    spread = 3 / np.sqrt(_DOME_POINTS)
+    near = directions[nearest] + spread * _sphere_points(2000)
+    near /= np.linalg.norm(near, axis=1, keepdims=True)
+    near = near[near[:, 2] >= lowest_z]
+    height, _ = _bring_down(stimulus, T, radius * near, height + spread * radius, radius - spec.skin.rim_z_mm)
+    T[2, 3] += height
+    return ContactPath(pose, T)
+
+
+def _check(spec: SensorSpec, pose: ContactPose) -> None:
+    values = np.concatenate([[pose.indent_mm, pose.twist_deg], pose.tilt_deg, pose.shear_mm, pose.offset_mm])
+    if values.shape != (8,) or not np.isfinite(values).all():
+        raise ContactError(f"a contact pose needs finite numbers, got {pose}")
+    radius = spec.skin.outer_radius_mm
+    deepest = 0.5 * (radius - spec.skin.thickness_mm - spec.lens.z_mm)
+    limits = [
+        ("indent_mm", pose.indent_mm, deepest, "half the gel's depth"),
+        ("tilt_deg", max(map(abs, pose.tilt_deg)), _LARGEST_TILT_DEG, "the dome's reach"),
+        ("shear_mm", float(np.hypot(*pose.shear_mm)), radius / 2, "half the dome's radius"),
+        ("twist_deg", abs(pose.twist_deg), _LARGEST_TWIST_DEG, "a quarter turn"),
+        ("offset_mm", max(map(abs, pose.offset_mm)), 50 * radius, "fifty radii"),
+    ]
+    for name, value, limit, reason in limits:
+        if value > limit:
+            raise ContactError(f"{name}: {value:g} is more than {limit:g} ({reason}); give a smaller value")
+
+
+def _bring_down(stimulus, T, points_mm, height_mm, depth_mm):
+    """Height above ``T`` (mm) where the object just touches the points, and the index of the touched one."""
+    turn, shift = T[:3, :3], T[:3, 3]
+    for _ in range(400):
+        distance = stimulus.distance((points_mm - shift - [0, 0, height_mm]) @ turn)
+        nearest = int(distance.argmin())
+        if distance[nearest] < -_TOUCH_TOLERANCE_MM and height_mm >= _START_MM:
+            raise ContactError("the object is in the skin's way before it comes down; use a smaller tilt or another offset")
+        if distance[nearest] < _TOUCH_TOLERANCE_MM:
+            return height_mm, nearest
+        height_mm -= distance[nearest]
+        if height_mm < -depth_mm:
+            break
+    raise ContactError("the object misses the dome; use a smaller offset or tilt")
+
+
+def _sphere_points(count: int) -> np.ndarray:
+    """(count, 3) nearly even unit vectors (Fibonacci sphere)."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - z * z)
+    return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])

@@ -86,8 +86,8 @@ class CameraSpec(Section):
 class LedRingSpec(Section):
     """LEDs as apparent emitters on the gel's side (refraction absorbed): azimuths in the sensor frame.
 
-    Each is a square of ``size_mm`` at ``radius_mm`` from the axis in the plane ``z_mm``, turned towards
-    the middle of the dome. ``off`` lists indices of dead ones.
+    Each is a square of ``size_mm`` at ``radius_mm`` from the axis in the plane ``z_mm``, shining along +z.
+    ``off`` lists indices of dead ones.
     """
 
     azimuth_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=64)]
@@ -102,20 +102,24 @@ class LedRingSpec(Section):
 class HousingSpec(Section):
     """The bright ring and wall around the disc the camera sees, at its apparent place.
 
-    ``ambient`` light falls off outwards over ``ambient_falloff_mm``; each LED adds a ``glow`` at
-    ``glow_radius_mm``, as wide as a source ``glow_height_mm`` above the surface makes it. Outside
-    a lip of ``lip_width_mm`` the wall shows only ``wall_fraction`` of this light.
+    A flat annulus about (``center_mm``, ``z_mm``). Its light is relative to the LEDs' power: ``ambient``
+    falls off outwards over ``ambient_falloff_mm``; each LED adds ``glow * (1 + d^2 / h^2)^-n`` at a distance
+    d from its place at ``glow_radius_mm``, with h the ``glow_height_mm`` and n the ``glow_exponent`` (1.5: a
+    small source at height h above matt material; higher: a glossy one). Outside a lip of ``lip_width_mm``
+    the wall shows only ``wall_fraction`` of this light.
     """
 
     aperture_radius_mm: Positive
     outer_radius_mm: Positive
     z_mm: float
+    center_mm: tuple[float, float] = (0.0, 0.0)
     albedo: Rgb
-    ambient: NonNegative = 0.3
+    ambient: NonNegative = 1.5
     ambient_falloff_mm: Positive = 20.0
-    glow: NonNegative = 1.0
+    glow: NonNegative = 6.0
     glow_radius_mm: Positive
     glow_height_mm: Positive = 1.5
+    glow_exponent: Positive = 1.5
     lip_width_mm: NonNegative = 1.0
     wall_fraction: Fraction = 1.0
 

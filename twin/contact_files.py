@@ -9,6 +9,7 @@ import numpy as np
 
 from scenes.object import ObjectSpec
 from twin.mechanics.path import ContactPose
+from twin.optics.files import write_exr
 from twin.preprocess.pipeline import Pipeline
 from twin.simulator import Shot, Simulator
 from twin.stimulus import build_stimulus
@@ -25,12 +26,10 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     list of Path
         What was written.
     """
-    from twin.optics.files import write_exr
-
     spec = simulator.spec
     image = shot.frame.image
     cv2.imwrite(str(out / "frame.png"), image if image.ndim == 2 else image[..., ::-1])
-    write_exr(out / "frame.exr", shot.linear)
+    write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
     truth = {key: value for key, value in asdict(shot.truth).items()}
     np.savez_compressed(out / "truth.npz", **truth)
     (out / "truth.json").write_text(json.dumps(contact_record(simulator, stimulus, pose, state, shot), indent=1) + "\n")
@@ -64,8 +63,7 @@ def contact_record(simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose
         "form": str(shot.frame.form),
         "residual": state.residual,
         "seconds": {"render": shot.seconds},
-        "renderer": simulator.renderer.describe(),
-        "solver": simulator.solver.describe(),
+        **simulator.describe(),
         "sensor": simulator.spec.model_dump(mode="json"),
         "object": stimulus.model_dump(mode="json"),
     }

@@ -1,6 +1,6 @@
 """The twin of one sensor: press it, look through its camera, get frames with ground truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -10,9 +10,9 @@ from scenes.sensor import SensorSpec
 from twin.camera import expose, record
 from twin.errors import RenderError
 from twin.mechanics.path import ContactPose
+from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Renderer
-from twin.stimulus import build_stimulus
 from twin.truth import CapTruth, cap_truth
 from twin.types import ContactState, Form, Frame
 
@@ -59,7 +59,7 @@ class Simulator:
     def renderer(self) -> Renderer:
         """The renderer, built when it is first needed (pressing alone needs no Mitsuba)."""
         if self._renderer is None:
-            self._renderer = Renderer(self.spec, quality=self._quality)
+            self._renderer = Renderer(self.spec, quality=self._quality, mesh=self.solver.mesh)
         return self._renderer
 
     def press(self, stimulus: ObjectSpec, pose: ContactPose, *, progress=None) -> ContactState:
@@ -70,7 +70,7 @@ class Simulator:
         ContactError
             If the pose is out of reach or the solver does not converge.
         """
-        return self.solver.press(build_stimulus(stimulus), pose, friction=stimulus.friction, progress=progress)
+        return self.solver.press(stimulus, pose, progress=progress and (lambda fraction, _: progress(fraction)))
 
     def shoot(self, state: ContactState, *, form: Form = Form.RAW, seed: int = 0, name: str = "frame.png") -> Shot:
         """Render what the camera sees, and capture it in the given form.
@@ -80,12 +80,33 @@ class Simulator:
         RenderError
             If the sensor has no recording form, or nothing can be rendered here.
         """
-        if form is Form.RECORDING and self.spec.recording is None:
-            raise RenderError(f"sensor '{self.spec.name}' has no recording form: its recordings are raw frames; use the raw form")
+        self._check_form(form)
         start = perf_counter()
         linear = self.renderer.render(state, seed=seed)
         image = expose(linear, self.spec.response, np.random.default_rng(seed))
-        if form is Form.RECORDING:
-            image = record(image, self.spec.recording)
         seconds = perf_counter() - start
-        return Shot(Frame(image, form, name), linear, cap_truth(self.spec, self.rest, state, form), seconds)
+        raw = Shot(Frame(image, Form.RAW, name), linear, cap_truth(self.spec, self.rest, state, Form.RAW), seconds)
+        return raw if form is Form.RAW else self.as_recorded(raw, state)
+
+    def as_recorded(self, raw: Shot, state: ContactState) -> Shot:
+        """The shot of a raw frame in the form of the sensor's recordings."""
+        self._check_form(Form.RECORDING)
+        image = record(raw.frame.image, self.spec.recording)
+        frame = replace(raw.frame, image=image, form=Form.RECORDING)
+        return replace(raw, frame=frame, truth=cap_truth(self.spec, self.rest, state, Form.RECORDING))
+
+    def describe(self) -> dict:
+        """What a result depends on besides sensor and object: variant and samples, mesh and tolerances."""
+        return {
+            "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},
+            "solver": {
+                "nodes": len(self.solver.mesh.nodes_mm),
+                "hexes": len(self.solver.mesh.hexes),
+                "gap_bound_mm": GAP_BOUND_MM,
+                "residual_tolerance": RESIDUAL_TOLERANCE,
+            },
+        }
+
+    def _check_form(self, form: Form) -> None:
+        if form is Form.RECORDING and self.spec.recording is None:
+            raise RenderError(f"sensor '{self.spec.name}' has no recording form: its recordings are raw frames; use the raw form")

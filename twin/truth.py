@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.preprocess.forms import raw_to_form
+from twin.preprocess.forms import frame_size, from_raw
 from twin.projection import project
 from twin.types import ContactState, Form
 
@@ -32,12 +32,9 @@ class CapTruth:
 
 def cap_truth(spec: SensorSpec, rest: ContactState, state: ContactState, form: Form) -> CapTruth:
     """Ground truth of a contact for frames of the given form."""
-    caps_px = raw_to_form(spec, form, project(spec.camera, state.caps_mm))
-    rest_px = raw_to_form(spec, form, project(spec.camera, rest.caps_mm))
-    size = (spec.camera.width_px, spec.camera.height_px)
-    if form is Form.RECORDING:
-        size = (spec.recording.width_px, spec.recording.height_px)
-    inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(size) - 0.5), axis=1)
+    caps_px = from_raw(spec, form, project(spec.camera, state.caps_mm))
+    rest_px = from_raw(spec, form, project(spec.camera, rest.caps_mm))
+    inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
     return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec, state))
 
 

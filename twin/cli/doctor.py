@@ -30,13 +30,26 @@ def doctor() -> None:
 
 
 def _rendering() -> bool:
+    from twin.errors import RenderError
     from twin.optics.variant import report
 
-    found = report()
     print("\nRendering (Mitsuba)")
-    for line in found.lines():
-        print(f"  {line}")
-    return found.usable
+    try:
+        found = report()
+    except RenderError as error:
+        print(f"  NOT POSSIBLE: {error}")
+        return False
+    print(f"  variants installed: {', '.join(found['variants'])}")
+    for channels, used in found["used"].items():
+        print(f"  for {channels} cameras: {used['variant'] or 'NONE'} ({used['reason']})")
+    llvm = found["llvm"]
+    print(f"  LLVM: {llvm['version']} at {llvm['path']}" if llvm else f"  LLVM: none that works; {found['remedy']}")
+    for rejected in found["llvm_rejected"]:
+        print(f"    not used: {rejected['path']}: {rejected['reason']}")
+    print(f"  GPU: {'yes' if found['gpu'] else 'none used'} ({found['gpu_reason']})")
+    if found["override"]:
+        print(f"  TACTIP_VARIANT={found['override']} is set")
+    return any(used["variant"] for used in found["used"].values())
 
 
 def _pictures() -> None:

@@ -11,7 +11,7 @@ from scenes import load_object, load_sensor
 from twin.demo.page import contact_figures, contact_pictures, embed, motion_figure, render_page, write_figure
 from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, depth_table, run_contact
 from twin.projection import project
-from twin.preprocess.forms import raw_to_form
+from twin.preprocess.forms import from_raw
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
 from twin.types import Form
@@ -64,7 +64,7 @@ def run_demo(out: Path, bar) -> list[Path]:
             tables[sensor] = depth_table(sensor, progress=progress)
     seconds["displacement tables"] = perf_counter() - start
 
-    renderer = simulators[motion_sensor].renderer.describe()
+    renderer = simulators[motion_sensor].describe()["renderer"]
     machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(sorted(notes))
     page = out / "index.html"
     page.write_text(
@@ -87,7 +87,7 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
     written = contact_pictures(pictures, result)
     touched = result.state.contact_nodes
     contact_mm = result.state.nodes_mm[touched].mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
-    contact_px = raw_to_form(spec, result.look.frame.form, project(spec.camera, contact_mm[None]))[0]
+    contact_px = from_raw(spec, result.look.frame.form, project(spec.camera, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
     return {
         "title": f"{spec.name} against {result.stimulus}",

@@ -63,7 +63,7 @@ def run_contact(simulator: Simulator, stimulus: str, pose: ContactPose, form: Fo
     spec = simulator.spec
     state = timed.run("press", lambda: simulator.press(load_object(stimulus), pose, progress=progress))
     raw = timed.run("render", lambda: simulator.shoot(state))
-    shot = raw if form is Form.RAW else timed.run("capture", lambda: simulator.recapture(raw, form))
+    shot = raw if form is Form.RAW else timed.run("capture", lambda: simulator.as_recorded(raw, state))
     rest = simulator.shoot(simulator.rest, form=form)
     pipeline = Pipeline(spec, form)
     pipeline(rest.frame)  # compiled once, so that the time below is a frame's

@@ -75,7 +75,7 @@ def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
     """Check a pose and find its first touch with the undeformed skin.
 
     The object comes down along z by its smallest distance to the dome, again and again, which never
-    passes the first touch (sphere tracing, Hart 1996). The dome is sampled evenly, then finely
+    passes the first touch where distances are exact (sphere tracing, Hart 1996). The dome is sampled evenly, then finely
     around the nearest point.
 
     Raises
@@ -126,14 +126,19 @@ def _check(spec: SensorSpec, pose: ContactPose) -> None:
 def _bring_down(stimulus, T, points_mm, height_mm, depth_mm):
     """Height above ``T`` (mm) where the object just touches the points, and the index of the touched one."""
     turn, shift = T[:3, :3], T[:3, 3]
+    free_mm = None
     for _ in range(400):
         distance = stimulus.distance((points_mm - shift - [0, 0, height_mm]) @ turn)
         nearest = int(distance.argmin())
-        if distance[nearest] < -_TOUCH_TOLERANCE_MM and height_mm >= _START_MM:
-            raise ContactError("the object is in the skin's way before it comes down; use a smaller tilt or another offset")
-        if distance[nearest] < _TOUCH_TOLERANCE_MM:
+        if abs(distance[nearest]) <= _TOUCH_TOLERANCE_MM:
             return height_mm, nearest
-        height_mm -= distance[nearest]
+        if distance[nearest] > 0:
+            free_mm = height_mm
+            height_mm -= distance[nearest]
+        elif free_mm is None:
+            raise ContactError("the object is in the skin's way before it comes down; use a smaller tilt or another offset")
+        else:  # a distance was too large (wires, far from a mesh): back half way
+            height_mm = (height_mm + free_mm) / 2
         if height_mm < -depth_mm:
             break
     raise ContactError("the object misses the dome; use a smaller offset or tilt")

@@ -10,7 +10,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.optics import sensor as camera_plugin
-from twin.optics.surfaces import Surface, glints, housing, led_corners
+from twin.optics.surfaces import Surface, glints, housing, led_frames
 from twin.projection import sensor_to_camera
 
 GEL_INDEX, SKIN_INDEX = 1.41, 1.52  # silicone gel; acrylate rubber
@@ -39,7 +39,7 @@ def build_scene(mi, spec: SensorSpec, *, skin: Surface, stems: Surface, caps: Su
     if reflections is not None:
         description["glints"] = _painted(mi, "glints", reflections)
     color = [LED_RADIANCE * spec.leds.power * c for c in spec.leds.color]
-    for k, frame in enumerate(led_corners(spec)):
+    for k, frame in enumerate(led_frames(spec)):
         description[f"led_{k}"] = {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f(frame),
@@ -58,7 +58,7 @@ def build_table_camera(mi, spec: SensorSpec, table: np.ndarray, *, spp: int):
             "type": camera_plugin.PLUGIN,
             "to_world": mi.ScalarTransform4f(np.linalg.inv(sensor_to_camera(spec.camera))),
             "table": mi.TensorXf(table.astype(np.float32)),
-            "film": _film(width, height),
+            "film": _film(mi, width, height),
             "sampler": _sampler(spp),
         }
     )
@@ -70,7 +70,8 @@ def build_pinhole_camera(mi, spec: SensorSpec, half_field: float, size_px: int, 
     Its image has x right and y down as the spec's camera has: pixel (i, j) sees
     ``((i + 0.5) / size_px * 2 - 1) * half_field`` in each.
     """
-    to_world = np.linalg.inv(sensor_to_camera(spec.camera)) @ np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's image x and y run against its camera's
+    # Mitsuba's image x and y run against its camera's.
+    to_world = np.linalg.inv(sensor_to_camera(spec.camera)) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return mi.load_dict(
         {
             "type": "perspective",
@@ -78,14 +79,16 @@ def build_pinhole_camera(mi, spec: SensorSpec, half_field: float, size_px: int, 
             "near_clip": 0.01,
             "far_clip": 1e4,
             "to_world": mi.ScalarTransform4f(to_world),
-            "film": _film(size_px, size_px),
+            "film": _film(mi, size_px, size_px),
             "sampler": _sampler(spp),
         }
     )
 
 
-def _film(width: int, height: int) -> dict:
-    return {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}, "pixel_format": "rgb", "component_format": "float32"}
+def _film(mi, width: int, height: int) -> dict:
+    pixel = "luminance" if mi.variant().endswith("mono") else "rgb"
+    form = {"pixel_format": pixel, "component_format": "float32"}
+    return {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}, **form}
 
 
 def _sampler(spp: int) -> dict:

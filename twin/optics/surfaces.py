@@ -15,6 +15,7 @@ SKIN_POLAR_STEPS = 64
 SKIN_AZIMUTH_STEPS = 128
 STEM_SIDES = 12
 CAP_SIDES = 24
+HOUSING_AZIMUTH_STEPS = 360
 CAP_BEVEL = 0.25  # of the cap's height: printed edges are never sharp
 STEM_ROOT_MM = 0.3  # stems start inside the skin, so that no gap opens where it bends
 MOST_CONTROL_POINTS = 1200  # displacement interpolation solves a dense system of this size once
@@ -55,9 +56,8 @@ class SkinSurface:
         self.faces = _fan_grid(SKIN_POLAR_STEPS, SKIN_AZIMUTH_STEPS)
         # The rim is clamped: fixed points there keep the spline still where no control point is.
         self._keep = np.unique(np.linspace(0, len(control_mm) - 1, min(len(control_mm), MOST_CONTROL_POINTS)).astype(int))
-        rim = inner_mm * np.stack([np.sin(rim_rad) * np.cos(azimuth), np.sin(rim_rad) * np.sin(azimuth), np.full_like(azimuth, np.cos(rim_rad))], axis=1)
         chart = _chart(control_mm[self._keep])
-        rim_chart = _chart(rim[::4])
+        rim_chart = _chart(self.rest_mm[-SKIN_AZIMUTH_STEPS::4])
         apart = np.min(np.linalg.norm(rim_chart[:, None] - chart[None], axis=2), axis=1) > 0.02
         sites = np.concatenate([chart, rim_chart[apart]])
         unit = np.eye(len(sites))[:, : len(chart)]
@@ -81,31 +81,31 @@ def caps(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> Surface:
     """All caps, one surface: bevelled discs about their centres."""
     radius, half = 0.5 * spec.pins.cap_diameter_mm, 0.5 * spec.pins.cap_height_mm
     bevel = min(CAP_BEVEL * spec.pins.cap_height_mm, 0.5 * radius)
-    profile = np.array([[0, -half], [radius, -half], [radius, half - bevel], [radius - 0.3 * bevel, half - 0.3 * bevel], [radius - bevel, half], [0, half]])
-    return _lathe(profile, caps_mm, axis, CAP_SIDES)
+    edge = [[radius, half - bevel], [radius - 0.3 * bevel, half - 0.3 * bevel], [radius - bevel, half]]
+    return _lathe(np.array([[0, -half], [radius, -half], *edge, [0, half]]), caps_mm, axis, CAP_SIDES)
 
 
 def housing(spec: SensorSpec) -> Surface:
     """The ring and wall around the disc, painted with the light it sends to the camera.
 
-    Radiance at p: albedo * (ambient * exp(-(rho - aperture) / falloff) + glow * sum over LEDs of
-    power / (1 + |p - led|^2 / h^2)^(3/2)), the irradiance of a small source at height h above a plane.
+    Radiance at p, at a distance rho from the ring's axis: ``albedo * power * (ambient * lit share of LEDs *
+    exp(-(rho - aperture) / falloff) + glow * sum over lit LEDs of (1 + |p - led|^2 / h^2)^-n)``.
     """
-    part, leds = spec.housing, spec.leds
+    part, lit = spec.housing, _lit_leds(spec)
     band = part.outer_radius_mm - part.aperture_radius_mm
-    steps = np.concatenate([np.linspace(0, 1, 33) ** 2 * band, [part.lip_width_mm, part.lip_width_mm * 1.001 + 1e-3]])
+    steps = np.concatenate([np.linspace(0, 1, 49) ** 2 * band, part.lip_width_mm + np.array([0.0, 0.01])])
     rho = part.aperture_radius_mm + np.unique(np.clip(steps, 0, band))
-    phi = np.arange(360) * np.pi / 180
-    r, a = (g.ravel() for g in np.meshgrid(rho, phi, indexing="ij"))
-    xy = np.stack([r * np.cos(a), r * np.sin(a)], axis=1)
+    turn = np.arange(HOUSING_AZIMUTH_STEPS) * 2 * np.pi / HOUSING_AZIMUTH_STEPS
+    r, phi = (g.ravel() for g in np.meshgrid(rho, turn, indexing="ij"))
+    xy = np.stack([r * np.cos(phi), r * np.sin(phi)], axis=1)
     out = r - part.aperture_radius_mm
-    light = part.ambient * np.exp(-out / part.ambient_falloff_mm)
-    for led in _lit_leds(spec):
+    light = part.ambient * len(lit) / len(spec.leds.azimuth_deg) * np.exp(-out / part.ambient_falloff_mm)
+    for led in lit:
         away = np.linalg.norm(xy - part.glow_radius_mm * led, axis=1) / part.glow_height_mm
-        light = light + part.glow * leds.power * (1 + away**2) ** -1.5
-    light = light * np.where(out <= part.lip_width_mm * 1.0005, 1.0, part.wall_fraction)
-    vertices = np.concatenate([xy, np.full((len(xy), 1), part.z_mm)], axis=1)
-    return Surface(vertices, _facing_camera(vertices, _ring_grid(len(rho) - 1, len(phi))), light[:, None] * np.array(part.albedo))
+        light = light + part.glow * (1 + away**2) ** -part.glow_exponent
+    light = spec.leds.power * light * np.where(out < part.lip_width_mm + 0.005, 1.0, part.wall_fraction)
+    vertices = np.concatenate([xy + part.center_mm, np.full((len(xy), 1), part.z_mm)], axis=1)
+    return Surface(vertices, _facing_camera(vertices, _ring_grid(len(rho) - 1, len(turn))), light[:, None] * np.array(part.albedo))
 
 
 def glints(spec: SensorSpec) -> Surface | None:
@@ -115,30 +115,25 @@ def glints(spec: SensorSpec) -> Surface | None:
         return None
     n = 9
     u, v = (g.ravel() for g in np.meshgrid(np.linspace(-0.5, 0.5, n), np.linspace(-0.5, 0.5, n), indexing="ij"))
-    heart = 0.25 + 4.0 * np.exp(-((u - 0.12) ** 2 + v**2) / (2 * 0.13**2))
+    heart = 0.8 + 6.0 * np.exp(-((u - 0.15) ** 2 + v**2) / (2 * 0.16**2))
     vertices, faces, light = [], [], []
     for k, led in enumerate(lit):
         side = np.array([-led[1], led[0]])
-        xy = look.glint_radius_mm * led + look.glint_size_mm * (u[:, None] * led + v[:, None] * side)
-        vertices.append(np.concatenate([xy, np.full((len(xy), 1), spec.housing.z_mm)], axis=1))
+        xy = spec.housing.center_mm + look.glint_radius_mm * led + look.glint_size_mm * (u[:, None] * led + v[:, None] * side)
+        vertices.append(np.concatenate([xy, np.full((len(xy), 1), spec.housing.z_mm + 0.01)], axis=1))
         faces.append(_sheet(n) + k * n * n)
         light.append(look.glint_strength * spec.leds.power * heart[:, None] * np.array(spec.leds.color))
     vertices = np.concatenate(vertices)
     return Surface(vertices, _facing_camera(vertices, np.concatenate(faces)), np.concatenate(light))
 
 
-def led_corners(spec: SensorSpec) -> list[np.ndarray]:
-    """For each lit LED: its frame (4, 4), z towards the middle of the dome, a unit being half its size."""
+def led_frames(spec: SensorSpec) -> list[np.ndarray]:
+    """For each lit LED the frame (4, 4) of its square [-1, 1]^2, which shines along +z: away from the camera."""
     frames = []
-    target = np.array([0, 0, 0.5 * spec.skin.outer_radius_mm])
     for led in _lit_leds(spec):
-        place = np.array([*(spec.leds.radius_mm * led), spec.leds.z_mm])
-        z = (target - place) / np.linalg.norm(target - place)
-        x = np.cross(z, [-led[1], led[0], 0])
-        x /= np.linalg.norm(x)
         frame = np.eye(4)
-        frame[:3, :3] = 0.5 * spec.leds.size_mm * np.stack([x, np.cross(z, x), z], axis=1)
-        frame[:3, 3] = place
+        frame[:3, :3] *= 0.5 * spec.leds.size_mm
+        frame[:3, 3] = [*(spec.leds.radius_mm * led), spec.leds.z_mm]
         frames.append(frame)
     return frames
 

@@ -109,7 +109,8 @@ def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_s
     RenderError
         For an unknown name, or where the backend insisted on does not work.
     """
-    wish, source = os.environ.get(_VARIANT_VARIABLE) or prefer or "auto", "TACTIP_VARIANT" if os.environ.get(_VARIANT_VARIABLE) else "prefer"
+    override = os.environ.get(_VARIANT_VARIABLE)
+    wish, source = override or prefer or "auto", _VARIANT_VARIABLE if override else "variant"
     exact = wish if wish in available_variants() else None
     backend = wish.split("_")[0] if exact else wish
     if backend not in (*BACKENDS, "auto"):
@@ -147,7 +148,15 @@ def available_variants() -> tuple[str, ...]:
 
 
 def report() -> dict:
-    """What a diagnosis prints: every variant, the one used for each kind of camera and why, LLVM, GPU."""
+    """What a diagnosis prints about rendering on this machine.
+
+    Returns
+    -------
+    dict
+        ``variants`` (compiled in), ``used`` ("color" and "mono" to variant, reason, llvm_path; variant None where
+        nothing works), ``llvm`` and ``llvm_rejected`` (path, version, ok, reason), ``gpu``, ``gpu_reason``,
+        ``override`` (TACTIP_VARIANT or None) and ``remedy`` (None where nothing is slow).
+    """
     llvm = find_llvm()
     gpu, gpu_reason = find_cuda()
     used = {}
@@ -222,7 +231,8 @@ def _usual_places() -> list[Path]:
                 listing = subprocess.run([tool, "-p"], capture_output=True, text=True).stdout
                 found += [Path(p) for p in re.findall(r"=> (\S*libLLVM[^\s]*)", listing)]
                 break
-        roots, patterns = ["/usr/lib", "/usr/lib64", "/usr/local/lib"], ["libLLVM*.so*", "*-linux-gnu/libLLVM*.so*", "llvm*/lib/libLLVM*.so*"]
+        roots = ["/usr/lib", "/usr/lib64", "/usr/local/lib"]
+        patterns = ["libLLVM*.so*", "*-linux-gnu/libLLVM*.so*", "llvm*/lib/libLLVM*.so*"]
     elif sys.platform == "darwin":
         roots, patterns = ["/opt/homebrew/opt", "/usr/local/opt", "/opt/local/libexec"], ["llvm*/lib/libLLVM*.dylib"]
     else:
@@ -241,7 +251,7 @@ def _libcuda() -> Path | None:
     name = ctypes.util.find_library("cuda")
     if name is None:
         return None
-    places = ["/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/lib/wsl/lib", "/usr/local/cuda/compat"]
+    places = ["/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/lib/wsl/lib"]
     places += os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
     for place in filter(None, places):
         if (Path(place) / name).exists():

@@ -16,7 +16,7 @@ from twin.stimulus.analytic import project_on_xy
 
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _SMALLEST_MM, _LARGEST_MM = 1.0, 2000.0
-_REACH_MM = 32.0  # half width of the sampled region around the origin: the dome and its shear
+_REACH_MM = 40.0  # half width of the sampled region around the origin: the dome and its shear
 _MARGIN_MM = 4.0
 _NODES = 250_000  # of the sampled grid: about 4 s, 2 MB
 _FINEST_MM = 0.25
@@ -26,7 +26,7 @@ _FINEST_MM = 0.25
 class MeshField:
     """Signed distance on a regular grid, interpolated by the tricubic B-spline through its nodes (C2).
 
-    Outside the grid the distance to the grid is added, so that it stays positive.
+    Outside the grid the distance to the grid is added: positive, and never too small.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class MeshField:
         values = _tricubic(self.coefficients, (inside - self.corner_mm) / self.spacing_mm)
         away = points_mm - inside
         gap = np.linalg.norm(away, axis=1)
-        slope = np.where(gap[:, None] > 0, away / np.maximum(gap, 1e-12)[:, None], values[:, 1:] / self.spacing_mm)
+        slope = np.where(away == 0, values[:, 1:] / self.spacing_mm, 0.0) + away / np.maximum(gap, 1e-12)[:, None]
         return values[:, 0] + gap, slope
 
 

@@ -1,0 +1,146 @@
+"""Laws of the renderer, on small films: projection, symmetry, light, noise, updates."""
+
+import numpy as np
+import pytest
+
+from scenes import load_sensor
+from scenes.sensor import SensorSpec
+from twin.errors import RenderError
+from twin.geometry.pins import PinRest, rest_pins
+from twin.optics.render import Renderer
+from twin.projection import project
+
+
+def changed(spec: SensorSpec, **sections) -> SensorSpec:
+    """A copy of the specification with values changed, section by section."""
+    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
+
+
+@pytest.fixture(scope="module")
+def small() -> SensorSpec:
+    """19 wide flat caps on a 120 x 100 px film, a strongly distorting tilted mono camera, no glints."""
+    return changed(
+        load_sensor("ur5-331"),
+        pins={"rings": 2, "cap_diameter_mm": 4.0, "cap_height_mm": 0.02, "max_polar_deg": 40.0},
+        camera={
+            "channels": "mono", "width_px": 120, "height_px": 100, "fx_px": 160.0, "fy_px": 170.0, "cx_px": 61.3, "cy_px": 47.8,
+            "tilt_x_deg": 2.0, "tilt_y_deg": -3.0, "k1": 0.7, "k2": 0.3, "p1": 0.02, "p2": -0.015,
+        },
+        appearance={"glint_strength": 0.0, "skin_gloss": 0.0, "skin_albedo": (0.0, 0.0, 0.0), "pin_albedo": (0.0, 0.0, 0.0)},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def straight(small) -> SensorSpec:
+    """The same with an ideal camera on the axis, where the scene's six-fold symmetry is the image's."""
+    leds = {"azimuth_deg": tuple(60.0 * k for k in range(6))}
+    lens = {"tilt_x_deg": 0.0, "tilt_y_deg": 0.0, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "fx_px": 170.0}
+    return changed(small, camera=lens, leds=leds, pins={"phase_deg": 0.0}, housing={"center_mm": (0.0, 0.0)})
+
+
+def centroids(image: np.ndarray, near_px: np.ndarray) -> np.ndarray:
+    """Light-weighted centroids (N, 2) of the spots within 6 px of the given places."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    weights = [np.where(np.hypot(x - u, y - v) < 6.0, image, 0.0) for u, v in near_px]
+    return np.array([[(w * x).sum() / w.sum(), (w * y).sum() / w.sum()] for w in weights])
+
+
+def cap_light(image: np.ndarray, spec: SensorSpec, rest: PinRest) -> np.ndarray:
+    """Mean light of each cap (N,), over 5 x 5 px at its projection."""
+    places = np.rint(project(spec.camera, rest.cap_mm)).astype(int)
+    return np.array([image[v - 2 : v + 3, u - 2 : u + 3].mean() for u, v in places])
+
+
+@pytest.mark.parametrize(("variant", "tolerance_px"), [(None, 0.03), ("scalar", 0.06)])
+def test_a_rendered_cap_is_where_the_projection_says(small, variant, tolerance_px):
+    """Mean over caps; flat caps, because the lit and the unlit side of a tall one are both part of its solid."""
+    expected = project(small.camera, rest_pins(small).cap_mm)
+    found = centroids(Renderer(small, variant, spp=64).render(), expected)
+    assert np.sqrt(((found - expected) ** 2).sum(axis=1).mean()) < tolerance_px
+    assert np.abs((found - expected).mean(axis=0)).max() < tolerance_px / 2, "a systematic shift"
+
+
+def test_a_window_is_a_part_of_the_whole_frame(small):
+    whole = Renderer(small, spp=64).render()
+    part = Renderer(small, spp=64, window_px=(30, 20, 91, 77)).render()
+    assert part.shape == (57, 61)
+    noise_mean = 0.01
+    assert np.abs(part - whole[20:77, 30:91]).mean() < noise_mean * whole.max()
+
+
+def test_a_dead_led_darkens_its_side_and_turns_with_the_sensor(straight):
+    """Switching off LED k + 1 instead of LED k turns the picture by 60 deg: outer cap j takes the place of cap j - 2."""
+    rest = rest_pins(straight)
+    lit = cap_light(Renderer(straight, spp=64).render(), straight, rest)[7:]
+    dark = []
+    for led in (0, 1):
+        spec = changed(straight, leds={"off": (led,)})
+        dark.append(cap_light(Renderer(spec, spp=64).render(), spec, rest)[7:] / lit)
+    assert (dark[0] < 1).all()
+    assert dark[0][0] != pytest.approx(dark[0][6], rel=0.02), "the side of the dead LED looks like the far side"
+    noise_relative = 0.02
+    np.testing.assert_allclose(np.roll(dark[0], 2), dark[1], rtol=noise_relative)
+
+
+def test_the_picture_of_a_symmetric_sensor_is_symmetric(straight):
+    light = cap_light(Renderer(straight, spp=64).render(), straight, rest_pins(straight))
+    noise_relative = 0.02
+    np.testing.assert_allclose(light[7:].reshape(6, 2), np.tile(light[7:].reshape(6, 2).mean(axis=0), (6, 1)), rtol=noise_relative)
+
+
+def test_light_is_proportional_to_the_leds(small):
+    one = Renderer(small, spp=16).render(seed=3)
+    two = Renderer(changed(small, leds={"power": 2 * small.leds.power}), spp=16).render(seed=3)
+    rounding = 1e-4
+    np.testing.assert_allclose(two, 2 * one, rtol=rounding, atol=rounding * one.max())
+
+
+def test_the_same_seed_gives_the_same_image(small):
+    renderer = Renderer(small, spp=4)
+    first, again, other = renderer.render(seed=1), renderer.render(seed=1), renderer.render(seed=2)
+    accumulation = 1e-5  # parallel sums of floats come in any order
+    np.testing.assert_allclose(again, first, rtol=accumulation, atol=accumulation)
+    assert np.abs(other - first).max() > 100 * accumulation
+
+
+def test_variance_falls_at_least_as_one_over_samples(small):
+    def variance(spp):
+        renderer = Renderer(small, spp=spp)
+        return np.var([renderer.render(seed=k) for k in range(8)], axis=0, ddof=1).mean()
+
+    sampling = 0.7  # eight images estimate a mean variance over 12000 px well; stratified samples do better than 1/spp
+    assert variance(16) * 4 * sampling < variance(4)
+
+
+def test_moving_the_vertices_equals_building_anew(small):
+    rest = rest_pins(small)
+    shift = np.array([0.4, -0.3, -0.8]) * (rest.base_mm[:, 2:] / 19.0) ** 4
+    pressed = PinRest(rest.base_mm + shift, rest.axis, rest.cap_mm + shift)
+    moved = Renderer(small, spp=4)
+    at_rest = moved.render(seed=4)
+    after, built, back = moved.render(pressed, seed=4), Renderer(small, spp=4).render(pressed, seed=4), moved.render(seed=4)
+    accumulation = 1e-4
+    edge_samples = 1e-3  # of pixels: samples that hit a triangle's edge may fall to either side
+    assert (np.abs(after - built) > accumulation).mean() < edge_samples
+    assert (np.abs(back - at_rest) > accumulation).mean() < edge_samples
+    assert np.abs(after - at_rest).max() > 0.1
+
+
+def test_a_color_camera_sees_three_channels_and_a_mono_one_their_luminance(small):
+    color = Renderer(changed(small, camera={"channels": "color"}), spp=64).render()
+    mono = Renderer(small, spp=64).render()
+    assert color.shape == (100, 120, 3) and mono.shape == (100, 120) and color.dtype == mono.dtype == np.float32
+    rest = rest_pins(small)
+    luminance = cap_light(color @ np.float32([0.212671, 0.715160, 0.072169]), small, rest)
+    interreflection = 0.02  # relative: products of spectra are not products of luminances
+    np.testing.assert_allclose(cap_light(mono, small, rest).mean(), luminance.mean(), rtol=interreflection)
+
+
+def test_what_cannot_be_rendered_is_refused(small):
+    with pytest.raises(RenderError, match="quality"):
+        Renderer(small, quality="best")
+    with pytest.raises(RenderError, match="window_px"):
+        Renderer(small, window_px=(0, 0, 121, 100))
+    rest = rest_pins(small)
+    with pytest.raises(RenderError, match="19"):
+        Renderer(small, spp=1).render(PinRest(rest.base_mm[:5], rest.axis[:5], rest.cap_mm[:5]))

@@ -1,0 +1,62 @@
+"""``twin graph``: graphs of frames or of found pins, as arrays and pictures."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.cli import app
+from twin.cli.options import FormOrAuto, Out, Sensor, writable_folder
+
+HELP = """Build the graph of a frame, a folder of frames, or of a pins.npz.
+
+\b
+knn       edges from each pin to its 6 nearest (directed)
+delaunay  both directions of every side of the Delaunay triangles
+voronoi   the same edges, and the area of each pin's Voronoi cell inside the enlarged
+          boundary around the outermost pins
+
+\b
+Writes graph.npz: image_name (M,), nodes_px (M, N, 2), area_px2 (M, N), edges (E, 2) of all
+graphs one after the other (graph k has edges[edge_start[k]:edge_start[k+1]]), and pictures of
+the first: graph.png, and surface.png (cell area as a surface: no contact, contact, difference).
+"""
+
+
+class Kind(StrEnum):
+    """Kinds of graphs."""
+
+    KNN = "knn"
+    DELAUNAY = "delaunay"
+    VORONOI = "voronoi"
+
+
+@app.command("graph", help=HELP)
+def graph(
+    path: Annotated[Path, typer.Argument(help="frame, folder of frames, or pins.npz")],
+    sensor: Sensor,
+    kind: Annotated[Kind, typer.Option("--kind", help="kind of graph")] = Kind.VORONOI,
+    out: Out = Path("out/graph"),
+    form: FormOrAuto = None,
+) -> None:
+    from scenes import load_sensor
+    from twin.graph_files import draw_graph_pictures, form_of_pins, graphs_of_nodes, read_pins, write_graphs
+    from twin.preprocess.batch import observe_recording
+    from twin.preprocess.reference import nominal_reference
+
+    spec = load_sensor(sensor)
+    image = None
+    if path.suffix == ".npz":
+        names, nodes_px = read_pins(path, spec)
+        form = form or form_of_pins(spec, nodes_px)
+        reference = nominal_reference(spec, form)
+        graphs = graphs_of_nodes(kind.value, nodes_px, reference)
+    else:
+        seen = observe_recording(path, spec, form=form, graph=kind.value)
+        names, graphs = seen.names, seen.graphs
+        form, reference, image = seen.form, seen.reference, seen.first_image
+    writable_folder(out)
+    print(f"{len(graphs)} graphs; the first has {len(graphs[0].nodes_px)} nodes and {len(graphs[0].edges)} directed edges")
+    for written in [write_graphs(out, names, graphs), *draw_graph_pictures(out, spec, form, graphs[0], reference, image)]:
+        print(f"wrote {written}")

@@ -1,0 +1,84 @@
+"""Graphs of many frames as one set of arrays, and their pictures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.preprocess.forms import frame_size
+from twin.preprocess.graph import GraphKind, make_graph
+from twin.preprocess.reference import Reference, nominal_reference
+from twin.types import Form, PinGraph
+from twin.views.plots import area_surface_figure, draw_frame, draw_graph, new_figure
+
+
+def read_pins(path: Path, spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Names (M,) and node positions (M, N, 2) of the valid frames of a ``pins.npz``; lost pins take their predicted place.
+
+    Raises
+    ------
+    FrameError
+        If the file is no ``pins.npz``, belongs to a sensor with another number of pins, or has no valid frame.
+    """
+    try:
+        with np.load(path) as data:
+            names, pins, predicted, valid = (data[key] for key in ("image_name", "pins_px", "predicted_px", "valid"))
+    except (OSError, KeyError, ValueError) as error:
+        raise FrameError(f"{path}: not a pins.npz as 'twin preprocess' writes it ({error})") from error
+    if pins.shape[1] != spec.pins.count:
+        raise FrameError(f"{path}: holds {pins.shape[1]} pins a frame, sensor '{spec.name}' has {spec.pins.count}; give the right --sensor")
+    if not valid.any():
+        raise FrameError(f"{path}: no valid frame in it; look at summary.json beside it for the reasons")
+    return names[valid], np.where(np.isnan(pins), predicted, pins)[valid]
+
+
+def form_of_pins(spec: SensorSpec, nodes_px: np.ndarray) -> Form:
+    """The form whose rest layout lies nearer to the pins (their file holds pixels only)."""
+    if spec.recording is None:
+        return Form.RAW
+    center = np.median(nodes_px.reshape(-1, 2), axis=0)
+    away = {form: np.linalg.norm(center - np.median(nominal_reference(spec, form).pins_px, axis=0)) for form in Form}
+    return min(away, key=away.get)
+
+
+def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) -> Path:
+    """Write M graphs to ``graph.npz``.
+
+    Arrays: ``image_name (M,)``, ``nodes_px (M, N, 2)``, ``area_px2 (M, N)``, and the directed edges of all graphs one after
+    the other, ``edges (E, 2)``, those of graph k being ``edges[edge_start[k]:edge_start[k + 1]]``.
+    """
+    path = out / "graph.npz"
+    np.savez_compressed(
+        path,
+        image_name=np.asarray(names, dtype=np.str_),
+        nodes_px=np.stack([graph.nodes_px for graph in graphs]),
+        area_px2=np.stack([graph.area_px2 for graph in graphs]),
+        edges=np.concatenate([graph.edges for graph in graphs]),
+        edge_start=np.concatenate([[0], np.cumsum([len(graph.edges) for graph in graphs])]),
+    )
+    return path
+
+
+def draw_graph_pictures(out: Path, spec: SensorSpec, form: Form, graph: PinGraph, reference: Reference, image: np.ndarray | None) -> list[Path]:
+    """``graph.png`` over the frame (or on black), and for a Voronoi graph ``surface.png`` against the reference."""
+    if image is None:
+        width, height = frame_size(spec, form)
+        image = np.zeros((height, width), np.uint8)
+    figure, (ax,) = new_figure(1, panel_inch=8)
+    draw_frame(ax, image, f"{spec.name}: {graph.kind}, {len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
+    draw_graph(ax, graph)
+    ax.plot(*graph.nodes_px.T, ".", color="#19d3a2", markersize=4)
+    written = [out / "graph.png"]
+    figure.savefig(written[0], dpi=120)
+    if graph.kind == "voronoi":
+        rest = make_graph("voronoi", reference.pins_px, outmost=reference.outmost)
+        written.append(out / "surface.png")
+        area_surface_figure(rest, graph).savefig(written[1], dpi=120)
+    return written
+
+
+def graphs_of_nodes(kind: GraphKind, nodes_px: np.ndarray, reference: Reference) -> list[PinGraph]:
+    """A graph for each of M node sets (M, N, 2)."""
+    return [make_graph(kind, nodes, outmost=reference.outmost) for nodes in nodes_px]

@@ -1,0 +1,114 @@
+"""Bright blobs of a masked gray image: threshold, erosion, connected components, sub-pixel centroids."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+
+from scenes.sensor import BlobSpec
+from twin.preprocess.mask import Mask
+
+NOISE_SIGMA_PX = 0.7  # smoothing before an adaptive threshold: halves white noise, leaves a cap of 6 px its edge
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """Connected bright components in one frame.
+
+    Attributes
+    ----------
+    px : (K, 2) float
+        Centroids, px of the frame.
+    area_px2 : (K,) float
+        Pixels of each component, as thresholded (before erosion).
+    label : (K,) int
+        Each blob's value in ``labels``.
+    label_area_px2 : (L,) float
+        Area of every component, the rejected ones too.
+    labels : (h, w) uint16
+        Components grown over what belongs to them, in the mask's window.
+    gray : (h, w) uint8
+        The window's gray levels.
+    corner_px : (2,) float
+        (x, y) of the window's first pixel in the frame.
+    """
+
+    px: np.ndarray
+    area_px2: np.ndarray
+    label: np.ndarray
+    label_area_px2: np.ndarray
+    labels: np.ndarray
+    gray: np.ndarray
+    corner_px: np.ndarray
+
+
+def threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> np.ndarray:
+    """(h, w) uint8 of 0 and 255: bright pixels inside the disc.
+
+    Before an adaptive threshold all that lies outside the disc (housing, LEDs) is set to the disc's
+    median, so that light from there doesn't raise the local mean near the rim.
+    """
+    if not blob.threshold_block_px:
+        _, binary = cv2.threshold(gray, blob.threshold, 255, cv2.THRESH_BINARY)
+        return cv2.bitwise_and(binary, disc)
+    histogram = cv2.calcHist([gray], [0], disc, [256], [0, 256]).ravel()
+    median = int(np.searchsorted(np.cumsum(histogram), histogram.sum() / 2))
+    smooth = cv2.GaussianBlur(gray, (3, 3), NOISE_SIGMA_PX)
+    smooth[disc == 0] = min(median, 255)
+    binary = cv2.adaptiveThreshold(
+        smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, blob.threshold_block_px | 1, blob.threshold
+    )
+    return cv2.bitwise_and(binary, disc)
+
+
+@njit(cache=True)
+def _centroids(gray, labels, grown, ringed, bright, count):
+    """Background (mean of the ring around), then intensity-weighted centroid and area of each label."""
+    height, width = gray.shape
+    ring_sum, ring_n = np.zeros(count), np.zeros(count)
+    for y in range(height):
+        for x in range(width):
+            if grown[y, x] == 0 and ringed[y, x] > 0:
+                ring_sum[ringed[y, x]] += gray[y, x]
+                ring_n[ringed[y, x]] += 1
+    sums = np.zeros((count, 4))
+    for y in range(height):
+        for x in range(width):
+            k = labels[y, x]
+            if k == 0:
+                k = grown[y, x]
+            if k > 0:
+                grown[y, x] = k
+                sums[k, 3] += bright[y, x] > 0
+                weight = gray[y, x] - ring_sum[k] / max(ring_n[k], 1.0)
+                if weight > 0:
+                    sums[k, 0] += weight
+                    sums[k, 1] += weight * x
+                    sums[k, 2] += weight * y
+    return sums
+
+
+def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: float) -> Blobs:
+    """Blobs of the window ``gray`` (h, w) uint8 between ``blob.min_area_px2`` and ``max_area_px2``.
+
+    Components are those of the eroded bright image. A centroid weighs the pixels of the component, grown back over
+    the erosion and one pixel more, by their level above the mean of the ring around; for a two-level
+    image it is the plain centroid of the bright pixels.
+    """
+    bright = threshold(gray, mask.disc, blob)
+    eroded = bright
+    if blob.erosion_px > 1:
+        eroded = cv2.erode(bright, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(eroded, connectivity=4, ltype=cv2.CV_16U)
+    grow = 2 * blob.erosion_px + 1
+    grown = cv2.dilate(labels, np.ones((grow, grow), np.uint8))
+    ringed = cv2.dilate(labels, np.ones((grow + 4, grow + 4), np.uint8))
+    sums = _centroids(gray, labels, grown, ringed, bright, count)
+    area = sums[:, 3]
+    keep = np.flatnonzero((area >= blob.min_area_px2) & (area <= max_area_px2) & (sums[:, 0] > 0) & (np.arange(count) > 0))
+    # compact: a cap is never thinner than a quarter of its bounding box (arcs of the housing are)
+    box = stats[keep, cv2.CC_STAT_WIDTH] * stats[keep, cv2.CC_STAT_HEIGHT].astype(float)
+    keep = keep[stats[keep, cv2.CC_STAT_AREA] >= 0.25 * box]
+    px = sums[keep, 1:3] / sums[keep, :1] + mask.corner_px
+    return Blobs(px, area[keep], keep, area, grown, gray, mask.corner_px)

@@ -1,0 +1,277 @@
+"""Which blob is which pin: grow a consistent labelling over the rest layout from a seed, keep the best of several.
+
+The displacement of a pin may exceed the pitch, so the nearest blob proves nothing. But neighbours
+move alike: from one right pair the next pin's place is predicted by the local affine motion of those already
+paired, and the labelling grows over the layout. Growth from a wrong seed runs out of blobs or into large
+residuals; the seed that explains most blobs wins.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.optimize import linear_sum_assignment
+
+from twin.preprocess.motion import predict, predict_all
+from twin.preprocess.reference import Reference
+
+GROW_GATES = (0.30, 0.45)  # prediction to blob, in local spacings, while growing: strict first
+FINAL_GATE = 0.40  # prediction to blob, in local spacings, in the final assignment
+SOFT_RESIDUAL = 0.15  # residual, in local spacings, at which a pair's weight is halved
+AREA_LOG_WEIGHT = 0.02  # cost of a log-area ratio of 1 against a squared residual in spacings
+MIN_AREA_RATIO = 0.2  # a blob smaller than this part of its neighbours' mean area is a speck, not a pin
+SETTLED_FRACTION = 0.97  # of the pins paired ...
+SETTLED_RESIDUAL2 = 0.1  # ... at this mean squared residual relative to the gate: no further seed is tried
+SEED_PINS = 16
+
+
+@dataclass(frozen=True)
+class Match:
+    """A labelling of the blobs.
+
+    Attributes
+    ----------
+    blob : (N,) int
+        Blob of each pin, -1 for none.
+    predicted_px : (N, 2) float
+        Each pin's place as its neighbours' motion predicts it.
+    score : float
+        Pins paired, less their squared residuals relative to the gate.
+    settled : bool
+        Nearly all pins are paired at small residuals: no other labelling can be much better.
+    """
+
+    blob: np.ndarray
+    predicted_px: np.ndarray
+    score: float
+    settled: bool
+
+
+@njit(cache=True)
+def _buckets(px, cell):
+    """Blobs by square cell: (first blob of each cell, next blob in the same cell, x0, y0, columns, rows)."""
+    x0, y0 = px[:, 0].min(), px[:, 1].min()
+    columns = int((px[:, 0].max() - x0) / cell) + 1
+    rows = int((px[:, 1].max() - y0) / cell) + 1
+    head = np.full(columns * rows, -1)
+    following = np.full(len(px), -1)
+    for k in range(len(px)):
+        c = int((px[k, 1] - y0) / cell) * columns + int((px[k, 0] - x0) / cell)
+        following[k] = head[c]
+        head[c] = k
+    return head, following, x0, y0, columns, rows
+
+
+@njit(cache=True)
+def _nearest(x, y, reach, px, taken, buckets, cell):
+    """Nearest free blob within ``reach`` of (x, y): (index or -1, squared distance)."""
+    head, following, x0, y0, columns, rows = buckets
+    best, best_d2 = -1, reach * reach
+    for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), rows - 1) + 1):
+        for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), columns - 1) + 1):
+            k = head[cy * columns + cx]
+            while k >= 0:
+                if not taken[k]:
+                    d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
+                    if d2 < best_d2:
+                        best, best_d2 = k, d2
+                k = following[k]
+    return best, best_d2
+
+
+@njit(cache=True)
+def _grow(rest, neighbours, spacing, px, seed_pin, seed_blob, buckets, cell):
+    """Grow a labelling (N,) from one pair, round by round over the pins next to labelled ones."""
+    n = len(rest)
+    blob = np.full(n, -1)
+    moved = np.zeros((n, 2))
+    weight = np.zeros(n)
+    taken = np.zeros(len(px), np.bool_)
+    near = min(6, neighbours.shape[1])
+    blob[seed_pin] = seed_blob
+    moved[seed_pin] = px[seed_blob]
+    weight[seed_pin] = 1.0
+    taken[seed_blob] = True
+    labelled = 1
+    claim = np.full(len(px), -1)
+    claim_cost = np.zeros(len(px))
+    tried = np.full(n, -1)  # neighbours that had spoken when a pin was last tried
+    for level in range(len(GROW_GATES)):
+        tried[:] = -1
+        least = 3 if level == 0 else 2
+        growing = True
+        while growing:
+            growing = False
+            claim[:] = -1
+            for i in range(n):
+                if blob[i] >= 0:
+                    continue
+                touching = 0
+                for k in range(near):
+                    touching += blob[neighbours[i, k]] >= 0
+                if touching == 0:
+                    continue
+                ux, uy, count = predict(i, rest, neighbours, spacing, moved, weight)
+                if count == tried[i] or count < min(least, labelled):
+                    continue
+                tried[i] = count
+                x, y = rest[i, 0] + ux, rest[i, 1] + uy
+                k, d2 = _nearest(x, y, GROW_GATES[level] * spacing[i], px, taken, buckets, cell)
+                if k >= 0:
+                    cost = d2 / (spacing[i] * spacing[i])
+                    if claim[k] < 0 or cost < claim_cost[k]:
+                        claim[k] = i
+                        claim_cost[k] = cost
+            for k in range(len(px)):
+                i = claim[k]
+                if i >= 0:
+                    blob[i] = k
+                    moved[i] = px[k]
+                    weight[i] = 1.0
+                    taken[k] = True
+                    labelled += 1
+                    growing = True
+    return blob
+
+
+@njit(cache=True)
+def _trust(rest, neighbours, spacing, px, blob):
+    """Weights (N,) of the pairs by their residual to the neighbours' motion; positions (N, 2)."""
+    n = len(rest)
+    moved, weight = np.zeros((n, 2)), np.zeros(n)
+    for i in range(n):
+        if blob[i] >= 0:
+            moved[i] = px[blob[i]]
+            weight[i] = 1.0
+    predicted = predict_all(rest, neighbours, spacing, moved, weight)
+    for i in range(n):
+        if weight[i] > 0:
+            r2 = (predicted[i, 0] - moved[i, 0]) ** 2 + (predicted[i, 1] - moved[i, 1]) ** 2
+            weight[i] = 1.0 / (1.0 + r2 / (SOFT_RESIDUAL * spacing[i]) ** 2)
+            if not np.isfinite(weight[i]):
+                weight[i] = 0.0
+    return moved, weight
+
+
+@njit(cache=True)
+def _candidates(predicted, neighbours, spacing, px, area, blob, buckets, cell):
+    """Gated pairs: arrays of pin, blob, cost; and whether some pin or blob is in more than one."""
+    n = len(predicted)
+    pins, blobs, costs = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)], [0.0 for _ in range(0)]
+    head, following, x0, y0, columns, rows = buckets
+    uses = np.zeros(len(px), np.int64)
+    contested = False
+    for i in range(n):
+        x, y = predicted[i, 0], predicted[i, 1]
+        if not np.isfinite(x + y):
+            continue
+        total, count = 0.0, 0
+        for k in range(neighbours.shape[1]):
+            j = blob[neighbours[i, k]]
+            if j >= 0:
+                total += area[j]
+                count += 1
+        expected = total / max(count, 1)
+        reach = FINAL_GATE * spacing[i]
+        mine = 0
+        for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), rows - 1) + 1):
+            for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), columns - 1) + 1):
+                k = head[cy * columns + cx]
+                while k >= 0:
+                    d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
+                    if d2 < reach * reach and area[k] >= MIN_AREA_RATIO * expected:
+                        pins.append(i)
+                        blobs.append(k)
+                        costs.append(d2 / (spacing[i] * spacing[i]) + AREA_LOG_WEIGHT * np.log(area[k] / expected) ** 2)
+                        mine += 1
+                        uses[k] += 1
+                        contested = contested or mine > 1 or uses[k] > 1
+                    k = following[k]
+    return pins, blobs, costs, contested
+
+
+def _assign(n: int, blob_count: int, pins: list, blobs: list, costs: list, contested: bool) -> np.ndarray:
+    """One-to-one assignment (N,) over the gated pairs: most pairs, then least cost."""
+    blob = np.full(n, -1)
+    pins, blobs, costs = np.array(pins, int), np.array(blobs, int), np.array(costs, float)
+    if not contested:
+        blob[pins] = blobs
+        return blob
+    open_pair = (np.bincount(pins, minlength=n)[pins] > 1) | (np.bincount(blobs, minlength=blob_count)[blobs] > 1)
+    blob[pins[~open_pair]] = blobs[~open_pair]
+    row_pin, row = np.unique(pins[open_pair], return_inverse=True)
+    column_blob, column = np.unique(blobs[open_pair], return_inverse=True)
+    table = np.full((len(row_pin), len(column_blob)), 10.0)  # far above any gated cost: pairing more pins always pays
+    table[row, column] = costs[open_pair]
+    for r, c in zip(*linear_sum_assignment(table), strict=True):
+        if table[r, c] < 10.0:
+            blob[row_pin[r]] = column_blob[c]
+    return blob
+
+
+def _refine(reference: Reference, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: tuple, cell: float) -> Match:
+    """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
+    rest, neighbours, spacing = reference.pins_px, reference.neighbours, reference.spacing_px
+    for _ in range(4):
+        moved, weight = _trust(rest, neighbours, spacing, px, blob)
+        predicted = predict_all(rest, neighbours, spacing, moved, weight)
+        before = blob
+        blob = _assign(len(rest), len(px), *_candidates(predicted, neighbours, spacing, px, area, blob, buckets, cell))
+        if np.array_equal(blob, before):
+            break
+    found = blob >= 0
+    residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * spacing[found]) ** 2
+    settled = found.sum() >= SETTLED_FRACTION * len(rest) and residual2.mean() < SETTLED_RESIDUAL2
+    return Match(blob, predicted, float(found.sum() - residual2.sum()), bool(settled))
+
+
+def _seed_pins(reference: Reference) -> np.ndarray:
+    """Pins to start from: around the rim, where motion is least, then inwards."""
+    rim = reference.outmost
+    rim = rim[np.linspace(0, len(rim), SEED_PINS // 2, endpoint=False).astype(int)]
+    inner = np.linspace(0, len(reference.pins_px) - len(reference.outmost) - 1, SEED_PINS // 2).astype(int)[::-1]
+    return np.concatenate([rim, inner])
+
+
+def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
+    """Label blobs by the pins of a reference.
+
+    Parameters
+    ----------
+    reference : Reference
+    px : (K, 2) float
+        Blob centroids, px, in any order.
+    area_px2 : (K,) float
+        Blob areas.
+
+    Returns
+    -------
+    Match
+        The best labelling found; it may be poor: see its score.
+    """
+    n = len(reference.pins_px)
+    if len(px) < 3:
+        return Match(np.full(n, -1), np.full((n, 2), np.nan), 0.0, False)
+    px = np.ascontiguousarray(px)
+    cell = float(np.median(reference.spacing_px))
+    buckets = _buckets(px, cell)
+    best = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0, False)
+    seen = set()
+    shift = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
+    for offset in (shift, np.zeros(2)):
+        for rank in range(3):
+            for pin in _seed_pins(reference):
+                distance2 = ((px - reference.pins_px[pin] - offset) ** 2).sum(axis=1)
+                blob = int(np.argpartition(distance2, rank)[rank])
+                if (pin, blob) in seen:
+                    continue
+                seen.add((pin, blob))
+                grown = _grow(reference.pins_px, reference.neighbours, reference.spacing_px, px, pin, blob, buckets, cell)
+                if (grown >= 0).sum() < max(best.score, 0.3 * n):
+                    continue
+                candidate = _refine(reference, px, area_px2, grown, buckets, cell)
+                if candidate.score > best.score:
+                    best = candidate
+                if best.settled:
+                    return best
+    return best

@@ -1,0 +1,171 @@
+"""From a frame to an observation: the one way, for rendered, recorded and live frames alike."""
+
+from time import perf_counter
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.preprocess.blobs import Blobs, find_blobs
+from twin.preprocess.forms import blob_spec, frame_size, gray_levels
+from twin.preprocess.graph import GraphKind, make_graph
+from twin.preprocess.mask import Mask, circular_mask
+from twin.preprocess.matching import Match, match
+from twin.preprocess.motion import predict_all
+from twin.preprocess.reference import Reference, folded_fraction, make_reference, nominal_reference
+from twin.preprocess.split import split_merged
+from twin.types import Form, Frame, Observation
+
+MIN_FOUND = 0.8  # of the pins: fewer is not an observation
+MAX_EXTRA = 0.35  # further blobs among the pins, as a part of N: more is another sensor's layout, or clutter
+MAX_FOLDED = 0.02  # of the rest triangles turned over: more is a wrong labelling
+MAX_SHIFT = 0.3  # of the layout's radius: a frame displaced further isn't this sensor's view
+MAX_BLOB_PITCHES2 = 3.0  # area of a component, in squared pitches: larger is housing or glare
+REMASK_PX = 2.0  # a frame displaced by more gets its mask displaced likewise when pins are missing
+
+
+class Pipeline:
+    """Finds, labels and connects the pins of one sensor's frames.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    form : Form
+        Form of the frames it will be given.
+    reference : Reference, optional
+        No-contact layout; by default the specification's own.
+    graph : {"voronoi", "delaunay", "knn"}
+    """
+
+    def __init__(self, spec: SensorSpec, form: Form, reference: Reference | None = None, *, graph: GraphKind = "voronoi") -> None:
+        self.spec, self.form, self.graph = spec, Form(form), graph
+        self.size_px = frame_size(spec, self.form)
+        self.blob_spec = blob_spec(spec, self.form)
+        self.reference = nominal_reference(spec, self.form) if reference is None else reference
+        self._mask = circular_mask(self.size_px, self.blob_spec.mask_center_px, self.blob_spec.mask_radius_px)
+        pitch = float(np.mean(self.reference.spacing_px))
+        self._max_area_px2 = MAX_BLOB_PITCHES2 * pitch**2
+        self._center_px = np.median(self.reference.pins_px, axis=0)
+        self._radius_px = float(np.linalg.norm(self.reference.pins_px - self._center_px, axis=1).max())
+
+    def __call__(self, frame: Frame) -> Observation:
+        """Observe one frame; a frame without (enough) pins gives ``valid=False`` and why.
+
+        Raises
+        ------
+        FrameError
+            The image isn't one of this sensor's frames: wrong size, type or form.
+        """
+        self._check(frame)
+        started = perf_counter()
+        ms: dict[str, float] = {}
+        blobs = self._detect(frame, self._mask)
+        ms["detect"], now = _since(started)
+        found = match(self.reference, blobs.px, blobs.area_px2)
+        ms["match"], now = _since(now)
+        if (found.blob < 0).any() and self._plausible(found):
+            blobs, found = self._with_displaced_mask(frame, blobs, found)
+        pins_px, split = split_merged(self.reference, blobs, found.blob, found.predicted_px)
+        nodes_px = self._complete(pins_px)
+        lost = ~np.isfinite(pins_px[:, 0])
+        predicted_px = np.where(lost[:, None], nodes_px, np.nan)
+        owned = np.zeros(len(blobs.px), bool)
+        owned[found.blob[(found.blob >= 0) & ~lost]] = True
+        extra_px = blobs.px[~owned & ~np.isin(blobs.label, list(split))] if len(blobs.px) else blobs.px
+        ms["complete"], now = _since(now)
+        reason = self._reason(blobs, int((~lost).sum()), nodes_px, extra_px)
+        graph = None
+        if not reason:
+            graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost)
+        ms["graph"], now = _since(now)
+        ms["total"], _ = _since(started)
+        return Observation(pins_px, predicted_px, int((~lost).sum()), not reason, reason, graph, extra_px, ms)
+
+    def _check(self, frame: Frame) -> None:
+        image, (width, height) = frame.image, self.size_px
+        where = frame.name or "frame"
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+            raise FrameError(f"{where}: expected 8-bit levels, got {getattr(image, 'dtype', type(image).__name__)}; convert it to uint8")
+        if image.ndim not in (2, 3) or image.shape[:2] != (height, width) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
+            raise FrameError(
+                f"{where}: expected {width}x{height} gray or RGB ({self.form} form of {self.spec.name}), got an array of shape {image.shape};"
+                " give the right --sensor or --form, or the unresized frame"
+            )
+        if frame.form != self.form:
+            raise FrameError(f"{where}: expected a {self.form} frame, got a {frame.form} one; make a Pipeline of that form for it")
+
+    def _detect(self, frame: Frame, mask: Mask) -> Blobs:
+        window = gray_levels(np.ascontiguousarray(frame.image[mask.window]))
+        return find_blobs(window, mask, self.blob_spec, max_area_px2=self._max_area_px2)
+
+    def _plausible(self, found: Match) -> bool:
+        return (found.blob >= 0).sum() > 0.5 * len(found.blob)
+
+    def _with_displaced_mask(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
+        """Look again where the whole view is displaced, so that its mask cuts pins off."""
+        paired = found.blob >= 0
+        rim = self.reference.outmost[paired[self.reference.outmost]]
+        if not len(rim):
+            return blobs, found
+        shift = np.median(blobs.px[found.blob[rim]] - self.reference.pins_px[rim], axis=0)
+        if np.linalg.norm(shift) < REMASK_PX:
+            return blobs, found
+        center = np.asarray(self.blob_spec.mask_center_px) + shift
+        displaced = self._detect(frame, circular_mask(self.size_px, tuple(center), self.blob_spec.mask_radius_px))
+        again = match(self.reference, displaced.px, displaced.area_px2)
+        return (displaced, again) if again.score > found.score else (blobs, found)
+
+    def _complete(self, pins_px: np.ndarray) -> np.ndarray:
+        """Pins (N, 2) with the lost ones where their neighbours' motion puts them."""
+        reference = self.reference
+        found = np.isfinite(pins_px[:, 0])
+        if found.all():
+            return pins_px
+        nodes_px = np.where(found[:, None], pins_px, reference.pins_px)
+        known = found.astype(float)
+        while known.any() and not known.all():  # from the edge of a gap inwards
+            predicted = predict_all(reference.pins_px, reference.neighbours, reference.spacing_px, nodes_px, known)
+            new = (known == 0) & np.isfinite(predicted[:, 0])
+            if not new.any():
+                break
+            nodes_px[new] = predicted[new]
+            known[new] = 0.1
+        return nodes_px
+
+    def _reason(self, blobs: Blobs, found: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
+        n = len(nodes_px)
+        if len(blobs.px) < MIN_FOUND * n / 2:
+            return f"no pins: {len(blobs.px)} blobs seen, {n} pins expected"
+        if found < MIN_FOUND * n:
+            return f"too few pins: {found} of {n} found among {len(blobs.px)} blobs, {MIN_FOUND:.0%} needed"
+        folded = folded_fraction(self.reference, nodes_px)
+        if folded > MAX_FOLDED:
+            return f"inconsistent pins: the labelling turns {folded:.1%} of the layout over"
+        shift = np.linalg.norm(np.median(nodes_px, axis=0) - self._center_px)
+        if shift > MAX_SHIFT * self._radius_px:
+            return f"inconsistent pins: the layout is displaced by {shift:.0f} px"
+        center = nodes_px.mean(axis=0)
+        radius = np.linalg.norm(nodes_px - center, axis=1).max()
+        extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
+        if extra > MAX_EXTRA * n:
+            return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
+        return ""
+
+
+def _since(start: float) -> tuple[float, float]:
+    now = perf_counter()
+    return 1e3 * (now - start), now
+
+
+def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
+    """The reference as a no-contact frame shows it; lost pins are filled in from their neighbours.
+
+    Raises
+    ------
+    FrameError
+        The layout can't be found in the frame.
+    """
+    observation = Pipeline(spec, form, graph="delaunay")(frame)
+    if not observation.valid:
+        raise FrameError(f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout")
+    return make_reference(observation.graph.nodes_px, spec.pins.rings)

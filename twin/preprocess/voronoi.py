@@ -1,0 +1,204 @@
+"""Voronoi areas of the pins, clipped to an enlarged outline of the outmost ones.
+
+The boundary. The release adds the convex hull's pins, scaled by 1.1 about the centre, as further sites, so its outer
+cells end half way, at 1.05; its hexagon, which isn't convex, needs virtual sites for that. Here the cells are clipped
+to the polygon through the outmost pins (in the layout's order, so it follows the hexagon's inward-bowed sides),
+scaled by 1.05 about its centroid: the same place without virtual sites, and it doesn't jump when
+a pin joins or leaves the convex hull. Without a usable outline, the convex hull takes its place.
+
+A cell is what is left of the region after cutting it at the bisectors to the pin's Delaunay neighbours. Cutting is
+additive, so the cells tile the region to rounding, whatever its shape.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.spatial import ConvexHull, Delaunay, QhullError
+
+BOUNDARY_SCALE = 1.05
+
+
+@dataclass(frozen=True)
+class Tessellation:
+    """Cells of N nodes.
+
+    Attributes
+    ----------
+    area_px2 : (N,) float
+    cells : list of (k, 2) float
+        Cell polygons (nodes at one place share one cell: each lists it, and counts an equal part of its area).
+    region_px : (m, 2) float
+        The polygon the cells tile.
+    """
+
+    area_px2: np.ndarray
+    cells: list
+    region_px: np.ndarray
+
+
+def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
+    """Delaunay triangles (t, 3) of the nodes (N, 2); None where they have none (collinear, coincident, fewer than 3)."""
+    if len(nodes_px) < 3:
+        return None
+    try:
+        mesh = Delaunay(nodes_px)
+    except QhullError:
+        return None
+    return None if len(mesh.coplanar) else mesh.simplices
+
+
+def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
+    """(E, 2) both directions of each triangle side, sorted."""
+    i = triangles[:, [0, 1, 2, 1, 2, 0]].astype(np.int64).ravel()
+    j = triangles[:, [1, 2, 0, 0, 1, 2]].astype(np.int64).ravel()
+    # a side of two triangles occurs once in each direction per triangle
+    code = np.unique(i * n + j)
+    return np.stack([code // n, code % n], axis=1)
+
+
+@njit(cache=True)
+def polygon_area(polygon, count):
+    """Signed area (shoelace) of the first ``count`` vertices, about the first one against cancellation."""
+    total = 0.0
+    x0, y0 = polygon[0, 0], polygon[0, 1]
+    for k in range(1, count - 1):
+        total += (polygon[k, 0] - x0) * (polygon[k + 1, 1] - y0) - (polygon[k + 1, 0] - x0) * (polygon[k, 1] - y0)
+    return 0.5 * total
+
+
+@njit(cache=True)
+def _cut(polygon, count, a, b, c, out):
+    """The part of a polygon with a x + b y <= c (Sutherland and Hodgman 1974); returns its vertex count."""
+    kept = 0
+    px, py = polygon[count - 1, 0], polygon[count - 1, 1]
+    previous = a * px + b * py - c
+    for k in range(count):
+        x, y = polygon[k, 0], polygon[k, 1]
+        here = a * x + b * y - c
+        if (here <= 0) != (previous <= 0):
+            t = previous / (previous - here)
+            out[kept, 0] = px + t * (x - px)
+            out[kept, 1] = py + t * (y - py)
+            kept += 1
+        if here <= 0:
+            out[kept, 0] = x
+            out[kept, 1] = y
+            kept += 1
+        px, py, previous = x, y, here
+    return kept
+
+
+@njit(cache=True)
+def _cells(nodes, start, neighbours, region):
+    """Area of every cell and its vertices, end to end."""
+    n = len(nodes)
+    area = np.zeros(n)
+    first = np.zeros(n + 1, np.int64)
+    store = np.empty((16 * n + 4 * len(region), 2))
+    here = np.empty((2 * len(region) + 2 * n + 8, 2))
+    there = np.empty_like(here)
+    for i in range(n):
+        count = len(region)
+        here[:count] = region
+        for e in range(start[i], start[i + 1]):
+            j = neighbours[e]
+            a, b = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]
+            c = 0.5 * (nodes[j, 0] ** 2 + nodes[j, 1] ** 2 - nodes[i, 0] ** 2 - nodes[i, 1] ** 2)
+            count = _cut(here, count, a, b, c, there)
+            here, there = there, here
+            if count == 0:
+                break
+        if count > 2:
+            area[i] = polygon_area(here, count)
+        while first[i] + count > len(store):
+            store = np.concatenate((store, np.empty_like(store)))
+        store[first[i] : first[i] + count] = here[:count]
+        first[i + 1] = first[i] + count
+    return area, store, first
+
+
+def _star_shaped(polygon: np.ndarray) -> bool:
+    """Whether a closed polygon about the origin winds once and always forwards (or always backwards)."""
+    ahead = np.roll(polygon, -1, axis=0)
+    cross = polygon[:, 0] * ahead[:, 1] - polygon[:, 1] * ahead[:, 0]
+    turn = np.arctan2(cross, (polygon * ahead).sum(axis=1))
+    return bool((np.all(cross > 0) or np.all(cross < 0)) and abs(abs(turn.sum()) - 2 * np.pi) < 1e-6)
+
+
+def _outline_region(nodes: np.ndarray, outmost: np.ndarray | None) -> np.ndarray | None:
+    """The outmost nodes' polygon, enlarged and counter-clockwise (y up); None where it isn't usable."""
+    if outmost is None or len(outmost) < 3:
+        return None
+    polygon = nodes[outmost]
+    center = polygon.mean(axis=0)
+    if not _star_shaped(polygon - center):
+        return None
+    region = center + BOUNDARY_SCALE * (polygon - center)
+    return region if polygon_area(region, len(region)) > 0 else np.ascontiguousarray(region[::-1])
+
+
+def _hull_region(nodes: np.ndarray) -> np.ndarray:
+    """The enlarged convex hull; for nodes on a line, a strip about them as wide as a twentieth of its length (1 px at least)."""
+    center = nodes.mean(axis=0)
+    spread = nodes - center
+    _, size, axes = np.linalg.svd(spread, full_matrices=True)
+    if len(nodes) >= 3 and size[-1] > 1e-9 * max(size[0], 1.0):
+        hull = nodes[ConvexHull(nodes).vertices]
+        middle = hull.mean(axis=0)
+        return np.ascontiguousarray(middle + BOUNDARY_SCALE * (hull - middle))
+    along = spread @ axes[0]
+    margin = max(0.05 * np.ptp(along), 1.0) / 2
+    low, high = along.min() - margin, along.max() + margin
+    corners = np.array([[low, -margin], [high, -margin], [high, margin], [low, margin]])
+    region = center + corners @ axes
+    return region if polygon_area(region, 4) > 0 else np.ascontiguousarray(region[::-1])
+
+
+def _with_all_pairs(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    n = len(nodes)
+    other = np.broadcast_to(np.arange(n), (n, n))[~np.eye(n, dtype=bool)]
+    return np.arange(n + 1) * (n - 1), np.ascontiguousarray(other)
+
+
+def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, triangles: np.ndarray | None = None) -> Tessellation:
+    """Voronoi cells of nodes, clipped to the enlarged outline (see the module).
+
+    Parameters
+    ----------
+    nodes_px : (N, 2) float
+        Finite positions, N >= 1; coincident or collinear ones are allowed.
+    outmost : (m,) int, optional
+        The outmost nodes, in order around the layout; their polygon is used if it is star-shaped.
+    triangles : (t, 3) int, optional
+        The nodes' Delaunay triangles, where the caller has them.
+    """
+    nodes_px = np.ascontiguousarray(nodes_px, float)
+    if nodes_px.ndim != 2 or not len(nodes_px) or not np.isfinite(nodes_px).all():
+        raise ValueError("nodes_px must be (N, 2), N >= 1, all finite")
+    origin = nodes_px.mean(axis=0)
+    nodes = nodes_px - origin
+    share, back = None, None
+    if triangles is None:
+        triangles = triangulate(nodes)
+    if triangles is None:
+        unique, back, share = np.unique(nodes, axis=0, return_inverse=True, return_counts=True)
+        start, neighbours = _with_all_pairs(unique)
+        sites = np.ascontiguousarray(unique)
+    else:
+        edges = directed_edges(triangles, len(nodes))
+        start = np.searchsorted(edges[:, 0], np.arange(len(nodes) + 1))
+        neighbours, sites = np.ascontiguousarray(edges[:, 1]), nodes
+
+    region = _outline_region(nodes, outmost)
+    if region is not None:
+        area, store, first = _cells(sites, start, neighbours, region)
+    if region is None or not (area > 0).all():
+        region = _hull_region(nodes)
+        area, store, first = _cells(sites, start, neighbours, region)
+    store = store[: first[-1]] + origin
+    ends = first.tolist()
+    cells = [store[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    if back is not None:
+        area, cells = (area / share)[back], [cells[k] for k in back]
+    return Tessellation(area, cells, region + origin)

@@ -134,13 +134,16 @@ class AppearanceSpec(Section):
     """Reflectances (linear, 0 to 1) of what the camera sees, and the LEDs' reflections in the lens.
 
     A glint is a square of ``glint_size_mm`` at ``glint_radius_mm`` in the housing's plane; its strength is
-    relative to the LEDs' power, 0 for none.
+    relative to the LEDs' power, 0 for none. ``cap_variation`` is the relative sd of the caps' reflectance
+    from pin to pin, a fixed pattern of ``cap_pattern`` (another number: another print of the same sensor).
     """
 
     skin_albedo: Rgb
     skin_gloss: Fraction
     pin_albedo: Rgb
     cap_albedo: Rgb
+    cap_variation: Fraction = 0.0
+    cap_pattern: Annotated[int, Field(ge=0)] = 0
     glint_strength: Fraction = 0.5
     glint_radius_mm: Positive = 16.5
     glint_size_mm: Positive = 1.0

@@ -52,7 +52,7 @@ def test_without_any_llvm_the_scalar_variant_renders_and_says_what_to_install():
 def test_an_llvm_that_aborts_is_refused_and_another_way_is_found(tmp_path):
     """The probe, not the file name, decides about a library the user names."""
     path = old_llvm()
-    code = "from twin.optics.variant import *; import json; f = find_llvm(()); print(json.dumps([f.candidates[0].ok, f.candidates[0].reason]))"
+    code = "import json; from twin.optics.variant import find_llvm; c = find_llvm(()).candidates[0]; print(json.dumps([c.ok, c.reason]))"
     ok, reason = json.loads(in_child(code, DRJIT_LIBLLVM_PATH=str(path), TACTIP_CACHE=str(tmp_path)))
     assert not ok and "signal" in reason
     out = in_child(RENDER_TINY.format(search="None"), DRJIT_LIBLLVM_PATH=str(path), TACTIP_VARIANT="", TACTIP_CACHE=str(tmp_path))

@@ -8,7 +8,9 @@ import numpy as np
 
 from scenes import load_object, load_sensor
 from twin.mechanics.path import ContactPose
+from twin.preprocess.graph import make_graph
 from twin.preprocess.pipeline import Pipeline
+from twin.preprocess.reference import nominal_reference
 from twin.projection import project
 from twin.simulator import Shot, Simulator
 from twin.types import ContactState, Form
@@ -84,19 +86,18 @@ class DepthRow:
 
 def depth_table(sensor: str, *, progress=None) -> list[DepthRow]:
     """Press a plane to the four depths of the recordings' table (true caps, no rendering)."""
-    from twin.preprocess.graph import build_graph
-
     spec = load_sensor(sensor)
     simulator = Simulator(spec)
     rest_px = project(spec.camera, simulator.rest.caps_mm)
-    rest_graph = build_graph("voronoi", rest_px, spec)
+    outmost = nominal_reference(spec, Form.RAW).outmost
+    rest_area_px2 = make_graph("voronoi", rest_px, outmost=outmost).area_px2
     middle = np.argsort(np.hypot(*(rest_px - rest_px[0]).T))[: spec.pins.count // 8]
     rows = []
     for number, (indent_mm, measured_px) in enumerate(zip(TABLE_INDENTS_MM, MEASURED_DISPLACEMENT_PX[sensor], strict=True)):
         state = simulator.press(load_object("plane"), ContactPose(indent_mm=indent_mm))
         caps_px = project(spec.camera, state.caps_mm)
-        areas = build_graph("voronoi", caps_px, spec).area_px2
-        change = 100 * float(np.mean(areas[middle] / rest_graph.area_px2[middle]) - 1)
+        areas = make_graph("voronoi", caps_px, outmost=outmost).area_px2
+        change = 100 * float(np.mean(areas[middle] / rest_area_px2[middle]) - 1)
         moved = float(np.hypot(*(caps_px - rest_px).T).mean())
         rows.append(DepthRow(indent_mm, moved, measured_px, change, float(state.force_n[2])))
         if progress:

@@ -170,8 +170,9 @@ def contact_forces(
         bend = _surface_curvature(stimulus, at, n)
         k = (stiff * inside)[:, None, None] * (n[:, :, None] * n[:, None, :] - depth[:, None, None] * bend)
 
-    travel = (at - anchors.position_mm[active]) * anchors.held[active][:, None]
-    travel -= np.einsum("pi,pi->p", travel, n)[:, None] * n
+    path = (at - anchors.position_mm[active]) * anchors.held[active][:, None]
+    along_n = np.einsum("pi,pi->p", path, n)
+    travel = path - along_n[:, None] * n
     length = np.linalg.norm(travel, axis=1)
     limit = frozen_limit_mm[active] if frozen else friction * depth
     slip = length > limit
@@ -185,6 +186,10 @@ def contact_forces(
         k += (stiff * stick)[:, None, None] * plane
         k += (stiff * slip * limit / np.maximum(length, 1e-300))[:, None, None] * turning
         if not frozen:
+            # as the point moves, the normal turns: d s = (I - n n) dx - (n . path) dn - n (path . dn), dn = bend dx
+            turning = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+            bent = along_n[:, None, None] * bend + n[:, :, None] * np.einsum("pi,pij->pj", path, bend)[:, None, :]
+            k -= (stiff * slip * limit / np.maximum(length, 1e-300))[:, None, None] * (turning @ bent)
             k -= (stiff * slip * friction)[:, None, None] * direction[:, :, None] * n[:, None, :]
 
     def scattered(values, shape=()):

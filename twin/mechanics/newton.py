@@ -17,9 +17,10 @@ from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite
 GAP_BOUND_MM = 0.01  # no contact point ends deeper inside the object
 RESIDUAL_TOLERANCE = 1e-7  # of the sum of the contact forces
 _FORCE_FLOOR_N = 1e-3  # the residual's scale is never less
-_CLOSE = 1e-2  # relative residual at which the minimiser hands over
+_CLOSE = 1e-2  # relative residual at which the minimiser hands over at first, then
+_CLOSER = 0.1  # times that in each round
 _PENALTY_GROWTH, _PENALTY_RAISES = 4.0, 5
-_ROUNDS = 4
+_ROUNDS = 8
 _MINIMISER_ITERATIONS, _NEWTON_ITERATIONS = 25, 12
 _LARGEST_MOVE_MM = 1.0  # of a node in one iteration
 _SMALLEST_SHIFT_N_MM = 1e-3
@@ -128,7 +129,7 @@ class LoadStepper:
         """
         nodes, yielded = self._predict(state, T)
         penalty, normal = state.penalty_mpa_mm, state.normal_n
-        anchors = self._anchors_at_touch(state, T)
+        anchors = self._anchors_at_touch(state, T, nodes, yielded)
         for _ in range(_PENALTY_RAISES):
             problem = _Problem(self, anchors, penalty, T)
             nodes, yielded, balance = self._solve(problem, nodes, yielded, normal)
@@ -138,23 +139,30 @@ class LoadStepper:
             penalty *= _PENALTY_GROWTH
         raise NoConvergence(balance.relative)
 
-    def _anchors_at_touch(self, state: LoadState, T: np.ndarray) -> Anchors:
-        """Anchors with those of the points that the object is about to run into: where they touch it if the skin waits."""
-        positions = self._body.points.positions(state.nodes_mm) - [0, 0, state.yield_mm]
-        before = (positions - state.T[:3, 3]) @ state.T[:3, :3]
-        after = (positions - T[:3, 3]) @ T[:3, :3]
+    def _anchors_at_touch(self, state: LoadState, T: np.ndarray, nodes, yielded) -> Anchors:
+        """Anchors with guesses for the points that may touch in this step.
+
+        A point that the predicted step drives into the object is anchored where it meets the surface on
+        the way. Any other starts from where it is: when it takes over from a neighbour that slides, it slides.
+        """
+        if self._friction == 0:
+            return state.anchors
+        points = self._body.points
+        before = (points.positions(state.nodes_mm) - state.T[:3, 3] - [0, 0, state.yield_mm]) @ state.T[:3, :3]
+        after = (points.positions(nodes) - T[:3, 3] - [0, 0, yielded]) @ T[:3, :3]
         gap_before, gap_after = self._stimulus.distance(before), self._stimulus.distance(after)
-        new = ~state.anchors.held & (gap_before >= 0) & (gap_after < 0)
-        share = np.where(new, gap_before / np.where(new, gap_before - gap_after, 1.0), 0.0)[:, None]
-        touch = (1 - share) * before + share * after
-        return Anchors(np.where(new[:, None], touch, state.anchors.position_mm), state.anchors.held | new)
+        driven = (gap_before > 0) & (gap_after < 0)
+        share = np.where(driven, gap_before / np.where(driven, gap_before - gap_after, 1.0), 0.0)[:, None]
+        guess = (1 - share) * before + share * after
+        held = state.anchors.held[:, None]
+        return Anchors(np.where(held, state.anchors.position_mm, guess), np.ones(len(guess), bool))
 
     def _solve(self, problem: "_Problem", nodes, yielded, normal):
-        if not (self._friction > 0 and problem.anchors.held.any()):
+        if self._friction == 0:
             return self._minimise(problem, nodes, yielded, None, RESIDUAL_TOLERANCE)
-        for _ in range(_ROUNDS):
+        for close in np.maximum(_CLOSE * _CLOSER ** np.arange(_ROUNDS), RESIDUAL_TOLERANCE):
             limit = self._friction * normal / (problem.penalty * self._body.points.area_mm2)
-            nodes, yielded, balance = self._minimise(problem, nodes, yielded, limit, _CLOSE)
+            nodes, yielded, balance = self._minimise(problem, nodes, yielded, limit, close)
             normal = balance.contact.normal_n
             try:
                 return self._coulomb(problem, nodes, yielded)
@@ -208,7 +216,7 @@ class LoadStepper:
             else:
                 raise NoConvergence(balance.relative)
             (nodes, yielded), balance, energy = new, new_balance, new_energy
-        if balance.relative <= tolerance or tolerance >= _CLOSE:
+        if balance.relative <= tolerance or limit is not None:
             return nodes, yielded, balance
         raise NoConvergence(balance.relative)
 

@@ -3,14 +3,16 @@
 import numpy as np
 
 from scenes.sensor import CameraSpec
-from twin.projection import distort, undistort
+from twin.projection import distort
 
 FIELD_MARGIN = 0.97  # of the fold's radius: past it the table goes on straight, where a distortion model means nothing
+WIDEST_FIELD = 6.0  # ideal normalised radius (80 deg off the axis): a pinhole image ends somewhere
+NEWTON_STEPS = 8  # from the radial solution; each doubles the digits
 
 
 def valid_radius(camera: CameraSpec) -> float:
     """Ideal normalised radius up to which the radial distortion grows without folding back (inf: everywhere)."""
-    radius = np.linspace(0, 6, 6001)
+    radius = np.linspace(0, WIDEST_FIELD, 6001)
     slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4
     folded = np.flatnonzero(slope <= 0.05)
     return float(radius[folded[0]]) if len(folded) else float("inf")
@@ -25,11 +27,26 @@ def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.nd
     x0, y0, x1, y1 = window_px
     x, y = np.meshgrid(np.arange(x0, x1 + 1) - 0.5, np.arange(y0, y1 + 1) - 0.5)
     seen = np.stack([(x - camera.cx_px) / camera.fx_px, (y - camera.cy_px) / camera.fy_px], axis=-1)
-    limit = FIELD_MARGIN * valid_radius(camera)
-    if not np.isfinite(limit):
-        return undistort(camera, seen, iterations=60)
-    edge = np.linalg.norm(distort(camera, np.array([limit, 0.0])))
-    radius = np.linalg.norm(seen, axis=-1, keepdims=True)
-    inside = np.minimum(1.0, edge / np.maximum(radius, 1e-12))
-    ideal = undistort(camera, seen * inside, iterations=200)
-    return ideal * np.maximum(1.0, radius / edge)
+    radius = np.linspace(0, min(FIELD_MARGIN * valid_radius(camera), WIDEST_FIELD), 6001)
+    distorted = radius * (1 + camera.k1 * radius**2 + camera.k2 * radius**4)
+    seen_radius = np.linalg.norm(seen, axis=-1, keepdims=True)
+    beyond = np.maximum(1.0, seen_radius / distorted[-1])
+    inside = seen / beyond
+    guess = inside * np.interp(seen_radius / beyond, distorted, radius) / np.maximum(seen_radius / beyond, 1e-12)
+    return beyond * _invert(camera, inside, guess)
+
+
+def _invert(camera: CameraSpec, seen: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Newton's method on ``distort(ideal) = seen``, with central differences for the Jacobian."""
+    ideal, step = guess, 1e-6
+    for _ in range(NEWTON_STEPS):
+        along_x, along_y = ((distort(camera, ideal + d) - distort(camera, ideal - d)) / (2 * step) for d in ([step, 0.0], [0.0, step]))
+        miss = seen - distort(camera, ideal)
+        area = _cross(along_x, along_y)
+        move = np.stack([_cross(miss, along_y), _cross(along_x, miss)], axis=-1)
+        ideal = ideal + np.clip(move / np.where(np.abs(area) > 1e-6, area, 1e-6)[..., None], -0.1, 0.1)
+    return ideal
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -10,12 +10,14 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.optics import sensor as camera_plugin
-from twin.optics.surfaces import Surface, glints, housing, led_frames
+from twin.optics.surfaces import Surface, glints, housing, led_ring
 from twin.projection import sensor_to_camera
 
 GEL_INDEX, SKIN_INDEX = 1.41, 1.52  # silicone gel; acrylate rubber
 SKIN_ROUGHNESS = 0.25
 LED_RADIANCE = 250.0  # of an LED of power 1: a white cap then sends about 1, the unit of the linear image
+
+PAINT = {"type": "mesh_attribute", "name": "vertex_paint"}
 
 
 def build_scene(mi, spec: SensorSpec, *, skin: Surface, stems: Surface, caps: Surface, max_depth: int):
@@ -32,20 +34,13 @@ def build_scene(mi, spec: SensorSpec, *, skin: Surface, stems: Surface, caps: Su
         "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": 100},
         "skin": _mesh(mi, "skin", skin, _skin_bsdf(mi, look), smooth=True),
         "stems": _mesh(mi, "stems", stems, _diffuse(mi, look.pin_albedo), smooth=True),
-        "caps": _mesh(mi, "caps", caps, _diffuse(mi, look.cap_albedo), smooth=False),
+        "caps": _mesh(mi, "caps", caps, _by_vertex(mi), smooth=False),
+        "leds": _leds(mi, spec),
         "housing": _painted(mi, "housing", housing(spec)),
     }
     reflections = glints(spec)
     if reflections is not None:
         description["glints"] = _painted(mi, "glints", reflections)
-    color = [LED_RADIANCE * spec.leds.power * c for c in spec.leds.color]
-    for k, frame in enumerate(led_frames(spec)):
-        description[f"led_{k}"] = {
-            "type": "rectangle",
-            "to_world": mi.ScalarTransform4f(frame),
-            "bsdf": {"type": "null"},
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": color}},
-        }
     return mi.load_dict(description, parallel=False)
 
 
@@ -99,6 +94,10 @@ def _diffuse(mi, albedo) -> object:
     return mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": list(albedo)}})
 
 
+def _by_vertex(mi) -> object:
+    return mi.load_dict({"type": "diffuse", "reflectance": PAINT})
+
+
 def _skin_bsdf(mi, look) -> object:
     """Matt rubber with a faint gloss where it meets the gel."""
     if look.skin_gloss == 0:
@@ -115,20 +114,17 @@ def _skin_bsdf(mi, look) -> object:
     )
 
 
+def _leds(mi, spec: SensorSpec):
+    """All LEDs as one emitter, so that which one a sample picks does not depend on the order of loading."""
+    color = {"type": "rgb", "value": [LED_RADIANCE * spec.leds.power * c for c in spec.leds.color]}
+    unseen = mi.load_dict({"type": "null"})
+    return _mesh(mi, "leds", led_ring(spec), unseen, smooth=False, emitter={"type": "area", "radiance": color})
+
+
 def _painted(mi, name: str, surface: Surface):
     """A black surface that sends out its painted radiance; never sampled as a light."""
-    mono = mi.variant().endswith("mono")
-    radiance = luminance(surface.radiance)[:, None] if mono else surface.radiance
-    # The emitter reads a mesh attribute, which must be there before it is attached: hence a two-step build.
-    return _mesh(
-        mi,
-        name,
-        surface,
-        _diffuse(mi, (0.0, 0.0, 0.0)),
-        smooth=False,
-        attribute=("vertex_radiance", radiance),
-        emitter={"type": "area", "sampling_weight": 0.0, "radiance": {"type": "mesh_attribute", "name": "vertex_radiance"}},
-    )
+    emitter = {"type": "area", "sampling_weight": 0.0, "radiance": PAINT}
+    return _mesh(mi, name, surface, _diffuse(mi, (0.0, 0.0, 0.0)), smooth=False, emitter=emitter)
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:
@@ -136,15 +132,16 @@ def luminance(rgb: np.ndarray) -> np.ndarray:
     return np.asarray(rgb) @ [0.212671, 0.715160, 0.072169]
 
 
-def _mesh(mi, name: str, surface: Surface, bsdf, *, smooth: bool, attribute=None, emitter=None):
+def _mesh(mi, name: str, surface: Surface, bsdf, *, smooth: bool, emitter=None):
     props = mi.Properties()
     props["bsdf"] = bsdf
     props["face_normals"] = not smooth
     if emitter is not None:
         props["emitter"] = mi.load_dict(emitter)
     mesh = mi.Mesh(name, len(surface.vertices_mm), len(surface.faces), props=props, has_vertex_normals=smooth)
-    if attribute is not None:
-        mesh.add_attribute(attribute[0], attribute[1].shape[1], np.ascontiguousarray(attribute[1], np.float32).ravel())
+    if surface.paint is not None:
+        paint = luminance(surface.paint)[:, None] if mi.variant().endswith("mono") else surface.paint
+        mesh.add_attribute(PAINT["name"], paint.shape[1], np.ascontiguousarray(paint, np.float32).ravel())
     params = mi.traverse(mesh)
     params["faces"] = np.ascontiguousarray(surface.faces, np.uint32).ravel()
     params["vertex_positions"] = np.ascontiguousarray(surface.vertices_mm, np.float32).ravel()

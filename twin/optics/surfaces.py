@@ -10,6 +10,7 @@ import numpy as np
 from scipy.interpolate import RBFInterpolator
 
 from scenes.sensor import SensorSpec
+from twin.errors import RenderError
 
 SKIN_POLAR_STEPS = 64
 SKIN_AZIMUTH_STEPS = 128
@@ -23,11 +24,11 @@ MOST_CONTROL_POINTS = 1200  # displacement interpolation solves a dense system o
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles ``faces (m, 3)`` over ``vertices_mm (n, 3)``; colour per vertex where it is painted."""
+    """Triangles ``faces (m, 3)`` over ``vertices_mm (n, 3)``; ``paint (n, 3)`` per vertex: radiance of what shines, reflectance of caps."""
 
     vertices_mm: np.ndarray
     faces: np.ndarray
-    radiance: np.ndarray | None = None
+    paint: np.ndarray | None = None
 
 
 class SkinSurface:
@@ -82,7 +83,11 @@ def caps(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> Surface:
     radius, half = 0.5 * spec.pins.cap_diameter_mm, 0.5 * spec.pins.cap_height_mm
     bevel = min(CAP_BEVEL * spec.pins.cap_height_mm, 0.5 * radius)
     edge = [[radius, half - bevel], [radius - 0.3 * bevel, half - 0.3 * bevel], [radius - bevel, half]]
-    return _lathe(np.array([[0, -half], [radius, -half], *edge, [0, half]]), caps_mm, axis, CAP_SIDES)
+    body = _lathe(np.array([[0, -half], [radius, -half], *edge, [0, half]]), caps_mm, axis, CAP_SIDES)
+    look, count = spec.appearance, len(caps_mm)
+    each = 1 + look.cap_variation * np.random.default_rng(look.cap_pattern).standard_normal((count, 1))
+    paint = np.clip(each * np.array(look.cap_albedo), 0, 1)
+    return Surface(body.vertices_mm, body.faces, np.repeat(paint, len(body.vertices_mm) // count, axis=0))
 
 
 def housing(spec: SensorSpec) -> Surface:
@@ -111,7 +116,7 @@ def housing(spec: SensorSpec) -> Surface:
 def glints(spec: SensorSpec) -> Surface | None:
     """Reflections of the lit LEDs in the lens: pale squares with a bright heart, or None if there are none to show."""
     look, lit = spec.appearance, _lit_leds(spec)
-    if look.glint_strength == 0 or not len(lit):
+    if look.glint_strength == 0:
         return None
     n = 9
     u, v = (g.ravel() for g in np.meshgrid(np.linspace(-0.5, 0.5, n), np.linspace(-0.5, 0.5, n), indexing="ij"))
@@ -127,20 +132,21 @@ def glints(spec: SensorSpec) -> Surface | None:
     return Surface(vertices, _facing_camera(vertices, np.concatenate(faces)), np.concatenate(light))
 
 
-def led_frames(spec: SensorSpec) -> list[np.ndarray]:
-    """For each lit LED the frame (4, 4) of its square [-1, 1]^2, which shines along +z: away from the camera."""
-    frames = []
-    for led in _lit_leds(spec):
-        frame = np.eye(4)
-        frame[:3, :3] *= 0.5 * spec.leds.size_mm
-        frame[:3, 3] = [*(spec.leds.radius_mm * led), spec.leds.z_mm]
-        frames.append(frame)
-    return frames
+def led_ring(spec: SensorSpec) -> Surface:
+    """The lit LEDs, one surface: squares whose normals look along +z, away from the camera."""
+    half = 0.5 * spec.leds.size_mm
+    square = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])
+    lit = _lit_leds(spec)
+    places = np.concatenate([spec.leds.radius_mm * lit, np.full((len(lit), 1), spec.leds.z_mm)], axis=1)
+    two = np.array([[0, 1, 2], [0, 2, 3]])
+    return Surface((places[:, None] + square).reshape(-1, 3), (4 * np.arange(len(lit))[:, None, None] + two).reshape(-1, 3))
 
 
 def _lit_leds(spec: SensorSpec) -> np.ndarray:
     """Unit vectors (k, 2) towards the LEDs that work."""
     lit = np.radians([a for k, a in enumerate(spec.leds.azimuth_deg) if k not in spec.leds.off])
+    if not len(lit):
+        raise RenderError(f"all {len(spec.leds.azimuth_deg)} LEDs of {spec.name} are off: shorten leds.off")
     return np.stack([np.cos(lit), np.sin(lit)], axis=1)
 
 

@@ -22,6 +22,8 @@ class Blobs:
         Centroids, px of the frame.
     area_px2 : (K,) float
         Pixels of each component, as thresholded (before erosion).
+    elongation : (K,) float
+        Ratio of the larger to the smaller variance along the component's axes (1 for a disc).
     label : (K,) int
         Each blob's value in ``labels``.
     label_area_px2 : (L,) float
@@ -36,6 +38,7 @@ class Blobs:
 
     px: np.ndarray
     area_px2: np.ndarray
+    elongation: np.ndarray
     label: np.ndarray
     label_area_px2: np.ndarray
     labels: np.ndarray
@@ -64,7 +67,7 @@ def threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> np.ndarray:
 
 @njit(cache=True)
 def _centroids(gray, labels, grown, ringed, bright, count):
-    """Background (mean of the ring around), then intensity-weighted centroid and area of each label."""
+    """Background (mean of the ring around), then of each label the weight, its moments x and y, area, moments xx, xy, yy."""
     height, width = gray.shape
     ring_sum, ring_n = np.zeros(count), np.zeros(count)
     for y in range(height):
@@ -72,7 +75,7 @@ def _centroids(gray, labels, grown, ringed, bright, count):
             if grown[y, x] == 0 and ringed[y, x] > 0:
                 ring_sum[ringed[y, x]] += gray[y, x]
                 ring_n[ringed[y, x]] += 1
-    sums = np.zeros((count, 4))
+    sums = np.zeros((count, 7))
     for y in range(height):
         for x in range(width):
             k = labels[y, x]
@@ -86,6 +89,9 @@ def _centroids(gray, labels, grown, ringed, bright, count):
                     sums[k, 0] += weight
                     sums[k, 1] += weight * x
                     sums[k, 2] += weight * y
+                    sums[k, 4] += weight * x * x
+                    sums[k, 5] += weight * x * y
+                    sums[k, 6] += weight * y * y
     return sums
 
 
@@ -100,7 +106,7 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     eroded = bright
     if blob.erosion_px > 1:
         eroded = cv2.erode(bright, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(eroded, connectivity=4, ltype=cv2.CV_16U)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=cv2.CV_16U)
     grow = 2 * blob.erosion_px + 1
     grown = cv2.dilate(labels, np.ones((grow, grow), np.uint8))
     ringed = cv2.dilate(labels, np.ones((grow + 4, grow + 4), np.uint8))
@@ -110,5 +116,8 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     # compact: a cap is never thinner than a quarter of its bounding box (arcs of the housing are)
     box = stats[keep, cv2.CC_STAT_WIDTH] * stats[keep, cv2.CC_STAT_HEIGHT].astype(float)
     keep = keep[stats[keep, cv2.CC_STAT_AREA] >= 0.25 * box]
-    px = sums[keep, 1:3] / sums[keep, :1] + mask.corner_px
-    return Blobs(px, area[keep], keep, area, grown, gray, mask.corner_px)
+    mean = sums[keep, 1:3] / sums[keep, :1]
+    xx, xy, yy = (sums[keep, 4:] / sums[keep, :1] - np.stack([mean[:, 0] ** 2, mean[:, 0] * mean[:, 1], mean[:, 1] ** 2], axis=1)).T
+    root = np.hypot(xx - yy, 2 * xy)
+    elongation = (xx + yy + root) / np.maximum(xx + yy - root, 1e-3)
+    return Blobs(mean + mask.corner_px, area[keep], elongation, keep, area, grown, gray, mask.corner_px)

@@ -6,6 +6,7 @@ paired, and the labelling grows over the layout. Growth from a wrong seed runs o
 residuals; the seed that explains most blobs wins.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +18,15 @@ from twin.preprocess.reference import Reference
 
 GROW_GATES = (0.30, 0.45)  # prediction to blob, in local spacings, while growing: strict first
 FINAL_GATE = 0.40  # prediction to blob, in local spacings, in the final assignment
+ADOPT_GATE = 0.7  # the same for a lost pin and a free blob that are each other's nearest ...
+ADOPT_AREA_RATIO = 2.0  # ... if the blob's area is within this ratio of its neighbours'
 SOFT_RESIDUAL = 0.15  # residual, in local spacings, at which a pair's weight is halved
 AREA_LOG_WEIGHT = 0.02  # cost of a log-area ratio of 1 against a squared residual in spacings
 MIN_AREA_RATIO = 0.2  # a blob smaller than this part of its neighbours' mean area is a speck, not a pin
-SETTLED_FRACTION = 0.97  # of the pins paired ...
-SETTLED_RESIDUAL2 = 0.1  # ... at this mean squared residual relative to the gate: no further seed is tried
-SEED_PINS = 16
+NEARLY_ALL = 0.985  # of the pins, or blobs, labelled by one growth ...
+SETTLED = 0.9  # ... at a score of this part of their number: no further seed is tried
+RIM_SEEDS = 12
+REFINED = 4  # growths that are refined when none settles
 
 
 @dataclass(frozen=True)
@@ -37,14 +41,11 @@ class Match:
         Each pin's place as its neighbours' motion predicts it.
     score : float
         Pins paired, less their squared residuals relative to the gate.
-    settled : bool
-        Nearly all pins are paired at small residuals: no other labelling can be much better.
     """
 
     blob: np.ndarray
     predicted_px: np.ndarray
     score: float
-    settled: bool
 
 
 @njit(cache=True)
@@ -80,19 +81,21 @@ def _nearest(x, y, reach, px, taken, buckets, cell):
 
 
 @njit(cache=True)
-def _grow(rest, neighbours, spacing, px, seed_pin, seed_blob, buckets, cell):
-    """Grow a labelling (N,) from one pair, round by round over the pins next to labelled ones."""
+def _grow(rest, neighbours, spacing, px, start, buckets, cell):
+    """Grow a labelling (N,), from ``start`` (N,) with at least one pair, round by round over the pins next to labelled ones."""
     n = len(rest)
-    blob = np.full(n, -1)
+    blob = start.copy()
     moved = np.zeros((n, 2))
     weight = np.zeros(n)
     taken = np.zeros(len(px), np.bool_)
     near = min(6, neighbours.shape[1])
-    blob[seed_pin] = seed_blob
-    moved[seed_pin] = px[seed_blob]
-    weight[seed_pin] = 1.0
-    taken[seed_blob] = True
-    labelled = 1
+    labelled = 0
+    for i in range(n):
+        if blob[i] >= 0:
+            moved[i] = px[blob[i]]
+            weight[i] = 1.0
+            taken[blob[i]] = True
+            labelled += 1
     claim = np.full(len(px), -1)
     claim_cost = np.zeros(len(px))
     tried = np.full(n, -1)  # neighbours that had spoken when a pin was last tried
@@ -209,9 +212,9 @@ def _assign(n: int, blob_count: int, pins: list, blobs: list, costs: list, conte
     return blob
 
 
-def _refine(reference: Reference, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: tuple, cell: float) -> Match:
+def _refine(layout: tuple, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: tuple, cell: float) -> Match:
     """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
-    rest, neighbours, spacing = reference.pins_px, reference.neighbours, reference.spacing_px
+    rest, neighbours, spacing = layout
     for _ in range(4):
         moved, weight = _trust(rest, neighbours, spacing, px, blob)
         predicted = predict_all(rest, neighbours, spacing, moved, weight)
@@ -219,18 +222,65 @@ def _refine(reference: Reference, px: np.ndarray, area: np.ndarray, blob: np.nda
         blob = _assign(len(rest), len(px), *_candidates(predicted, neighbours, spacing, px, area, blob, buckets, cell))
         if np.array_equal(blob, before):
             break
+    blob = _adopt(layout, px, area, blob, predicted)
     found = blob >= 0
     residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * spacing[found]) ** 2
-    settled = found.sum() >= SETTLED_FRACTION * len(rest) and residual2.mean() < SETTLED_RESIDUAL2
-    return Match(blob, predicted, float(found.sum() - residual2.sum()), bool(settled))
+    return Match(blob, predicted, float(found.sum() - residual2.sum()))
 
 
-def _seed_pins(reference: Reference) -> np.ndarray:
-    """Pins to start from: around the rim, where motion is least, then inwards."""
-    rim = reference.outmost
-    rim = rim[np.linspace(0, len(rim), SEED_PINS // 2, endpoint=False).astype(int)]
-    inner = np.linspace(0, len(reference.pins_px) - len(reference.outmost) - 1, SEED_PINS // 2).astype(int)[::-1]
-    return np.concatenate([rim, inner])
+def _adopt(layout: tuple, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Give lost pins the free blobs of a cap's size a little outside the gate: at the rim the prediction is an extrapolation."""
+    _, neighbours, spacing = layout
+    lost = np.flatnonzero((blob < 0) & np.isfinite(predicted[:, 0]))
+    free = np.setdiff1d(np.arange(len(px)), blob)
+    if not len(lost) or not len(free) or len(lost) > 0.2 * len(blob):
+        return blob
+    distance = np.linalg.norm(px[free] - predicted[lost][:, None], axis=2) / spacing[lost][:, None]
+    around = np.where(blob[neighbours[lost]] >= 0, area[blob[neighbours[lost]]], np.nan)
+    spoken = np.isfinite(around).any(axis=1)
+    expected = np.full(len(lost), np.nan)
+    expected[spoken] = np.nanmedian(around[spoken], axis=1)
+    ratio = area[free] / expected[:, None]
+    distance[~((ratio > 1 / ADOPT_AREA_RATIO) & (ratio < ADOPT_AREA_RATIO))] = np.inf
+    blob = blob.copy()
+    for row, column in zip(*np.nonzero(distance < ADOPT_GATE), strict=True):
+        if distance[row, column] == distance[row].min() == distance[:, column].min():
+            blob[lost[row]] = free[column]
+    return blob
+
+
+def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Pairs to start from: pins around the rim, where motion is least, then inside, with their 1st, 2nd, 3rd nearest blobs."""
+    rim, inside = reference.outmost, len(reference.pins_px) - len(reference.outmost)
+    pins = np.concatenate([rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], [*range(0, inside, max(inside // 6, 1))]])
+    shift = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
+    seen = set()
+    for rank in range(3):
+        for offset in (np.zeros(2), shift):
+            for pin in pins.tolist():
+                distance2 = ((px - (reference.pins_px[pin] + offset)) ** 2).sum(axis=1)
+                pair = pin, int(np.argpartition(distance2, rank)[rank])
+                if pair not in seen:
+                    seen.add(pair)
+                    yield pair
+
+
+def _regrown(layout: tuple, px: np.ndarray, area: np.ndarray, found: Match, buckets: tuple, cell: float) -> Match:
+    """Forget the labels around the lost pins and grow them anew from the others."""
+    rest, neighbours, spacing = layout
+    for reach in (6, neighbours.shape[1]):
+        doubtful = np.zeros(len(rest), bool)
+        lost = found.blob < 0
+        doubtful[neighbours[lost, :reach].ravel()] = True
+        start = np.where(doubtful, -1, found.blob)
+        if (start >= 0).sum() < 0.5 * len(rest):
+            break
+        again = _refine(layout, px, area, _grow(*layout, px, start, buckets, cell), buckets, cell)
+        if again.score > found.score:
+            found = again
+        if (found.blob >= 0).all():
+            break
+    return found
 
 
 def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
@@ -250,28 +300,39 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         The best labelling found; it may be poor: see its score.
     """
     n = len(reference.pins_px)
+    nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
     if len(px) < 3:
-        return Match(np.full(n, -1), np.full((n, 2), np.nan), 0.0, False)
+        return nothing
     px = np.ascontiguousarray(px)
+    layout = (reference.pins_px, reference.neighbours, reference.spacing_px)
     cell = float(np.median(reference.spacing_px))
     buckets = _buckets(px, cell)
-    best = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0, False)
-    seen = set()
-    shift = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
-    for offset in (shift, np.zeros(2)):
-        for rank in range(3):
-            for pin in _seed_pins(reference):
-                distance2 = ((px - reference.pins_px[pin] - offset) ** 2).sum(axis=1)
-                blob = int(np.argpartition(distance2, rank)[rank])
-                if (pin, blob) in seen:
-                    continue
-                seen.add((pin, blob))
-                grown = _grow(reference.pins_px, reference.neighbours, reference.spacing_px, px, pin, blob, buckets, cell)
-                if (grown >= 0).sum() < max(best.score, 0.3 * n):
-                    continue
-                candidate = _refine(reference, px, area_px2, grown, buckets, cell)
-                if candidate.score > best.score:
-                    best = candidate
-                if best.settled:
-                    return best
+    grown = []
+    for pin, blob in _seeds(reference, px):
+        start = np.full(n, -1)
+        start[pin] = blob
+        labels = _grow(*layout, px, start, buckets, cell)
+        count = int((labels >= 0).sum())
+        if count >= NEARLY_ALL * min(n, len(px)) and count >= NEARLY_ALL**2 * n:
+            found = _refine(layout, px, area_px2, labels, buckets, cell)
+            if found.score >= SETTLED * count:
+                grown = [(found.score, labels, found)]
+                break
+        grown.append((count, labels, None))
+    grown.sort(key=lambda entry: -entry[0])
+    best = nothing
+    for _, labels, found in grown[:REFINED]:
+        found = found or _refine(layout, px, area_px2, labels, buckets, cell)
+        best = max(best, found, key=lambda entry: entry.score)
+    lost = int((best.blob < 0).sum())
+    if 0 < lost < 0.3 * n and len(px) > n - lost:
+        best = _regrown(layout, px, area_px2, best, buckets, cell)
     return best
+
+
+def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray) -> Match:
+    """Settle a labelling ``blob`` (N,) of nearly all pins on a slightly different set of blobs, as ``match`` would."""
+    px = np.ascontiguousarray(px)
+    cell = float(np.median(reference.spacing_px))
+    layout = (reference.pins_px, reference.neighbours, reference.spacing_px)
+    return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)

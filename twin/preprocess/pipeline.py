@@ -10,10 +10,10 @@ from twin.preprocess.blobs import Blobs, find_blobs
 from twin.preprocess.forms import blob_spec, frame_size, gray_levels
 from twin.preprocess.graph import GraphKind, make_graph
 from twin.preprocess.mask import Mask, circular_mask
-from twin.preprocess.matching import Match, match
+from twin.preprocess.matching import Match, match, rematch
 from twin.preprocess.motion import predict_all
 from twin.preprocess.reference import Reference, folded_fraction, make_reference, nominal_reference
-from twin.preprocess.split import split_merged
+from twin.preprocess.split import split_chains, split_merged
 from twin.types import Form, Frame, Observation
 
 MIN_FOUND = 0.8  # of the pins: fewer is not an observation
@@ -21,6 +21,7 @@ MAX_EXTRA = 0.35  # further blobs among the pins, as a part of N: more is anothe
 MAX_FOLDED = 0.02  # of the rest triangles turned over: more is a wrong labelling
 MAX_SHIFT = 0.3  # of the layout's radius: a frame displaced further isn't this sensor's view
 MAX_BLOB_PITCHES2 = 3.0  # area of a component, in squared pitches: larger is housing or glare
+SPLIT_ROUNDS = 3
 REMASK_PX = 2.0  # a frame displaced by more gets its mask displaced likewise when pins are missing
 
 
@@ -65,21 +66,22 @@ class Pipeline:
         ms["match"], now = _since(now)
         if (found.blob < 0).any() and self._plausible(found):
             blobs, found = self._with_displaced_mask(frame, blobs, found)
-        pins_px, split = split_merged(self.reference, blobs, found.blob, found.predicted_px)
+        if (found.blob < 0).any() and self._plausible(found):
+            blobs, found = self._with_split_caps(blobs, found)
+        paired = found.blob >= 0
+        pins_px = np.full_like(self.reference.pins_px, np.nan)
+        pins_px[paired] = blobs.px[found.blob[paired]]
         nodes_px = self._complete(pins_px)
-        lost = ~np.isfinite(pins_px[:, 0])
-        predicted_px = np.where(lost[:, None], nodes_px, np.nan)
-        owned = np.zeros(len(blobs.px), bool)
-        owned[found.blob[(found.blob >= 0) & ~lost]] = True
-        extra_px = blobs.px[~owned & ~np.isin(blobs.label, list(split))] if len(blobs.px) else blobs.px
+        predicted_px = np.where(paired[:, None], np.nan, nodes_px)
+        extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
         ms["complete"], now = _since(now)
-        reason = self._reason(blobs, int((~lost).sum()), nodes_px, extra_px)
+        reason = self._reason(blobs, int(paired.sum()), nodes_px, extra_px)
         graph = None
         if not reason:
             graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost)
         ms["graph"], now = _since(now)
         ms["total"], _ = _since(started)
-        return Observation(pins_px, predicted_px, int((~lost).sum()), not reason, reason, graph, extra_px, ms)
+        return Observation(pins_px, predicted_px, int(paired.sum()), not reason, reason, graph, extra_px, ms)
 
     def _check(self, frame: Frame) -> None:
         image, (width, height) = frame.image, self.size_px
@@ -88,7 +90,7 @@ class Pipeline:
             raise FrameError(f"{where}: expected 8-bit levels, got {getattr(image, 'dtype', type(image).__name__)}; convert it to uint8")
         if image.ndim not in (2, 3) or image.shape[:2] != (height, width) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
             raise FrameError(
-                f"{where}: expected {width}x{height} gray or RGB ({self.form} form of {self.spec.name}), got an array of shape {image.shape};"
+                f"{where}: expected {width}x{height} gray or RGB ({self.form} form of {self.spec.name}), got shape {image.shape};"
                 " give the right --sensor or --form, or the unresized frame"
             )
         if frame.form != self.form:
@@ -96,7 +98,7 @@ class Pipeline:
 
     def _detect(self, frame: Frame, mask: Mask) -> Blobs:
         window = gray_levels(np.ascontiguousarray(frame.image[mask.window]))
-        return find_blobs(window, mask, self.blob_spec, max_area_px2=self._max_area_px2)
+        return split_chains(find_blobs(window, mask, self.blob_spec, max_area_px2=self._max_area_px2))
 
     def _plausible(self, found: Match) -> bool:
         return (found.blob >= 0).sum() > 0.5 * len(found.blob)
@@ -105,7 +107,8 @@ class Pipeline:
         """Look again where the whole view is displaced, so that its mask cuts pins off."""
         paired = found.blob >= 0
         rim = self.reference.outmost[paired[self.reference.outmost]]
-        if not len(rim):
+        away = np.linalg.norm(found.predicted_px[~paired] - self.blob_spec.mask_center_px, axis=1)
+        if not len(rim) or not (away > self.blob_spec.mask_radius_px - self.reference.spacing_px[~paired]).any():
             return blobs, found
         shift = np.median(blobs.px[found.blob[rim]] - self.reference.pins_px[rim], axis=0)
         if np.linalg.norm(shift) < REMASK_PX:
@@ -114,6 +117,20 @@ class Pipeline:
         displaced = self._detect(frame, circular_mask(self.size_px, tuple(center), self.blob_spec.mask_radius_px))
         again = match(self.reference, displaced.px, displaced.area_px2)
         return (displaced, again) if again.score > found.score else (blobs, found)
+
+    def _with_split_caps(self, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
+        """Split merged caps; each split corrects the predictions that the next is made by."""
+        for _ in range(SPLIT_ROUNDS):
+            parts = split_merged(self.reference, blobs, found)
+            if parts is blobs:
+                break
+            kept = {tuple(px): k for k, px in enumerate(parts.px)}
+            before = np.array([kept.get(tuple(blobs.px[k]), -1) if k >= 0 else -1 for k in found.blob])
+            again = rematch(self.reference, parts.px, parts.area_px2, before)
+            if again.score <= found.score:
+                break
+            blobs, found = parts, again
+        return blobs, found
 
     def _complete(self, pins_px: np.ndarray) -> np.ndarray:
         """Pins (N, 2) with the lost ones where their neighbours' motion puts them."""
@@ -167,5 +184,7 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
     """
     observation = Pipeline(spec, form, graph="delaunay")(frame)
     if not observation.valid:
-        raise FrameError(f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout")
+        raise FrameError(
+            f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout"
+        )
     return make_reference(observation.graph.nodes_px, spec.pins.rings)

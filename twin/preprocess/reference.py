@@ -27,7 +27,7 @@ class Reference:
     spacing_px : (N,) float
         Distance to the nearest other pin.
     triangles : (t, 3) int
-        Delaunay triangles, all of the same orientation.
+        Delaunay triangles, all of the same orientation; none of outmost pins alone.
     outmost : (m,) int
         The outmost pins, in order around the layout.
     area_px2 : (N,) float
@@ -49,9 +49,9 @@ def make_reference(pins_px: np.ndarray, rings: int) -> Reference:
     distance, index = cKDTree(pins_px).query(pins_px, k=min(NEIGHBOURS + 1, n))
     triangles = Delaunay(pins_px).simplices.astype(np.int64)
     area = _double_areas(pins_px, triangles)
-    flat = np.abs(area) < 0.2 * np.median(np.abs(area))  # slivers along the rim turn over without meaning
-    triangles, area = triangles[~flat], area[~flat]
     triangles[area < 0] = triangles[area < 0][:, ::-1]
+    inner = (triangles < n - 6 * rings).any(axis=1)  # slivers between outmost pins turn over without meaning
+    triangles = triangles[inner]
     outmost = np.arange(n - 6 * rings, n)
     area_px2 = voronoi(pins_px, outmost=outmost).area_px2
     return Reference(pins_px, np.ascontiguousarray(index[:, 1:]), distance[:, 1], triangles, outmost, area_px2)

@@ -1,25 +1,32 @@
 """Caps that touch and merged into one component: one disc each, where the pixels allow."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from twin.preprocess.blobs import Blobs
-from twin.preprocess.matching import FINAL_GATE
+from twin.preprocess.matching import Match
 from twin.preprocess.reference import Reference
 
-REACH_PX = 2  # how far from a pin's predicted place a component may lie to be claimed
+REACH = 0.4  # how far from a pin's predicted place a component may lie to be claimed, in spacings
 MIN_AREA_SHARE = 0.65  # of the areas expected of all claimants: less is one cap, not several
 MIN_SEPARATION = 0.6  # of two parts, in cap diameters
+MIN_PART = 0.5  # of the weight of the smallest part, to an equal share
 ROUNDS = 12
+MIN_ELONGATION = 2.4  # of a chain: two touching discs have 5, the most foreshortened cap about 2.5
+MIN_CAPS, MAX_CAPS = 1.35, 5.0  # area of a chain, in median areas of its neighbours
+AROUND = 13  # blobs that median is taken over
 
 
-def _label_at(blobs: Blobs, x: float, y: float) -> int:
-    """Label of the component at a place in the frame, or of the nearest within reach; 0 for none."""
-    column, row = np.round(np.array([x, y]) - blobs.corner_px).astype(int)
+def _label_near(blobs: Blobs, px: np.ndarray, reach_px: float) -> int:
+    """Label of the component at a place (2,) in the frame, or of the nearest within reach; 0 for none."""
+    column, row = np.round(px - blobs.corner_px).astype(int)
+    reach = int(np.ceil(reach_px))
     height, width = blobs.labels.shape
     if not (0 <= column < width and 0 <= row < height):
         return 0
-    top, left = max(row - REACH_PX, 0), max(column - REACH_PX, 0)
-    patch = blobs.labels[top : row + REACH_PX + 1, left : column + REACH_PX + 1]
+    top, left = max(row - reach, 0), max(column - reach, 0)
+    patch = blobs.labels[top : row + reach + 1, left : column + reach + 1]
     rows, columns = np.nonzero(patch)
     if not len(rows):
         return 0
@@ -47,53 +54,81 @@ def _parts(blobs: Blobs, label: int, seeds_px: np.ndarray) -> tuple[np.ndarray, 
     return centers, share / weight.sum()
 
 
-def split_merged(reference: Reference, blobs: Blobs, blob: np.ndarray, predicted_px: np.ndarray) -> tuple[np.ndarray, set]:
-    """Pins (N, 2) px, with components that several pins claim split among them.
+def _with_parts(blobs: Blobs, split: list[int], px: list, area_px2: list, label: list) -> Blobs:
+    rest = ~np.isin(blobs.label, split)
+    return replace(
+        blobs,
+        px=np.concatenate([blobs.px[rest], px]),
+        area_px2=np.concatenate([blobs.area_px2[rest], area_px2]),
+        elongation=np.concatenate([blobs.elongation[rest], np.ones(len(px))]),
+        label=np.concatenate([blobs.label[rest], label]),
+    )
 
-    A component is claimed by the pin it was matched to and by lost pins predicted on it. Where it is large enough for
-    all and falls into as many parts near the predictions, each pin gets its own part; otherwise a component too large for one cap
-    is given to nobody.
 
-    Parameters
-    ----------
-    blob : (N,) int
-        Blob of each pin, -1 for none.
-    predicted_px : (N, 2) float
+def split_chains(blobs: Blobs) -> Blobs:
+    """The blobs, with each that is as long and large as two (or more) of its neighbours replaced by that many parts."""
+    long = np.flatnonzero(blobs.elongation > MIN_ELONGATION)
+    if not len(long) or len(blobs.px) < AROUND:
+        return blobs
+    split, px, part_area, part_label = [], [], [], []
+    for k in long:
+        nearest = np.argpartition(((blobs.px - blobs.px[k]) ** 2).sum(axis=1), AROUND - 1)[:AROUND]
+        caps = blobs.area_px2[k] / np.median(blobs.area_px2[nearest])
+        if not MIN_CAPS < caps < MAX_CAPS:
+            continue
+        rows, columns = np.nonzero(blobs.labels == blobs.label[k])
+        pixels = np.stack([columns, rows], axis=1) + blobs.corner_px
+        spread = pixels - pixels.mean(axis=0)
+        _, _, axes = np.linalg.svd(spread, full_matrices=False)
+        along = spread @ axes[0]
+        count = max(int(np.round(caps)), 2)
+        seeds = pixels.mean(axis=0) + np.outer(np.quantile(along, (np.arange(count) + 0.5) / count), axes[0])
+        centers, share = _parts(blobs, int(blobs.label[k]), seeds)
+        if share.min() > MIN_PART / count:
+            split.append(int(blobs.label[k]))
+            px += list(centers)
+            part_area += list(share * blobs.area_px2[k])
+            part_label += [int(blobs.label[k])] * count
+    return _with_parts(blobs, split, px, part_area, part_label) if split else blobs
 
-    Returns
-    -------
-    pins_px : (N, 2) float
-        NaN where a pin has none.
-    used : set of int
-        Labels of components that were split.
+
+def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
+    """The blobs, with each component that several pins claim replaced by as many parts.
+
+    A component is claimed by the pin it was matched to and by lost pins predicted on it. It is split if it is large
+    enough for all claimants and falls into as many parts of a cap's size.
     """
-    found = blob >= 0
-    pins_px = np.full((len(blob), 2), np.nan)
-    pins_px[found] = blobs.px[blob[found]]
-    used: set[int] = set()
+    labelled = found.blob >= 0
+    whole_labels, uses = np.unique(blobs.label, return_counts=True)
+    already = set(whole_labels[uses > 1].tolist())
     claims: dict[int, list[int]] = {}
-    for pin in np.flatnonzero(~found & np.isfinite(predicted_px).all(axis=1)):
-        label = _label_at(blobs, *predicted_px[pin])
-        if label:
+    for pin in np.flatnonzero(~labelled & np.isfinite(found.predicted_px).all(axis=1)):
+        label = _label_near(blobs, found.predicted_px[pin], REACH * reference.spacing_px[pin])
+        if label and label not in already:
             claims.setdefault(label, []).append(int(pin))
     if not claims:
-        return pins_px, used
-    owner = {int(blobs.label[blob[pin]]): int(pin) for pin in np.flatnonzero(found)}
-    area = np.full(len(blob), np.nan)
-    area[found] = blobs.area_px2[blob[found]]
+        return blobs
+    owner = {int(blobs.label[found.blob[pin]]): int(pin) for pin in np.flatnonzero(labelled)}
+    area = np.full(len(found.blob), np.nan)
+    area[labelled] = blobs.area_px2[found.blob[labelled]]
+    px, part_area, part_label, split = [], [], [], []
     for label, pins in claims.items():
         if label in owner:
             pins.append(owner[label])
-        if len(pins) < 2:
+        around = area[reference.neighbours[pins]]
+        if len(pins) < 2 or not np.isfinite(around).any():
             continue
-        expected = np.array([np.nanmedian(area[reference.neighbours[p]]) if found[reference.neighbours[p]].any() else np.inf for p in pins])
-        if blobs.label_area_px2[label] < MIN_AREA_SHARE * expected.sum():
+        expected = float(np.nanmedian(around))
+        whole = blobs.label_area_px2[label]
+        if whole < MIN_AREA_SHARE * expected * len(pins):
             continue
-        centers, share = _parts(blobs, label, predicted_px[pins])
-        apart = np.linalg.norm(centers[:, None] - centers, axis=2) + 1e9 * np.eye(len(pins))
-        diameter = 2 * np.sqrt(expected.mean() / np.pi)
-        off = np.linalg.norm(centers - predicted_px[pins], axis=1) / reference.spacing_px[pins]
-        good = apart.min() > MIN_SEPARATION * diameter and off.max() < FINAL_GATE and share.min() > 0.5 / len(pins)
-        pins_px[pins] = centers if good else np.nan
-        used.add(label)
-    return pins_px, used
+        centers, share = _parts(blobs, label, found.predicted_px[pins])
+        apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(pins), np.inf))
+        if apart.min() > MIN_SEPARATION * 2 * np.sqrt(expected / np.pi) and share.min() > MIN_PART / len(pins):
+            split.append(label)
+            px += list(centers)
+            part_area += list(share * whole)
+            part_label += [label] * len(pins)
+    if not split:
+        return blobs
+    return _with_parts(blobs, split, px, part_area, part_label)

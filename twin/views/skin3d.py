@@ -36,7 +36,7 @@ def pins_surface(pins: PinsSpec, state: ContactState) -> pv.PolyData:
     parts = []
     stem_end = state.caps_mm - state.axis * pins.cap_height_mm / 2
     for start, end, diameter_mm in (
-        (state.base_mm, stem_end, pins.diameter_mm),
+        (state.base_mm + 0.1 * (stem_end - state.base_mm), stem_end, pins.diameter_mm),  # just off the flat facets of the skin
         (stem_end, state.caps_mm + state.axis * pins.cap_height_mm / 2, pins.cap_diameter_mm),
     ):
         count = len(start)
@@ -111,15 +111,23 @@ def _draw_with_pyvista(folder: Path, path: str) -> None:
     plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))
     plotter.set_background("#0d1117", top="#27313f")
     scalars = "displacement_mm" if "displacement_mm" in skin.point_data else None
-    half_skin, half_pins = (part.clip(normal=(0, -1, 0), origin=(0, -0.01, 0)) for part in (skin, pins))
-    bar = {"title": "skin displacement, mm", "color": "white", "vertical": False, "position_x": 0.25, "position_y": 0.03}
-    plotter.add_mesh(half_skin, scalars=scalars, cmap="inferno", smooth_shading=True, scalar_bar_args=bar)
-    plotter.add_mesh(half_pins, color="#e9f3ff", smooth_shading=True)
+    front = {"normal": (0, -1, 0), "origin": (0, -0.01, 0)}
+    bar = {"title": "skin displacement, mm", "color": "white", "fmt": "%.1f", "n_labels": 4, "position_x": 0.25, "position_y": 0.04}
+    plotter.add_mesh(skin.clip(**front), scalars=scalars, cmap=_glow(), ambient=0.2, smooth_shading=True, scalar_bar_args=bar)
+    plotter.add_mesh(pins.clip(**front), color="#f2f7ff", smooth_shading=True, split_sharp_edges=True, specular=0.3)
     if stimulus.n_points:
-        plotter.add_mesh(stimulus, color="#7aa7d9", opacity=0.45, smooth_shading=True)
-    plotter.camera_position = [(38.0, -78.0, 42.0), (0.0, 0.0, 11.0), (0.0, 0.0, 1.0)]
+        plotter.add_mesh(stimulus.clip(**front), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
+    plotter.camera_position = [(22.0, -84.0, 30.0), (0.0, 0.0, 12.5), (0.0, 0.0, 1.0)]
     plotter.enable_anti_aliasing("ssaa")
     plotter.screenshot(path)
+
+
+def _glow():
+    """Inferno without its black end, which would vanish in the background."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colormaps["inferno"](np.linspace(0.22, 0.97, 256)))
 
 
 def _draw_plain(skin: pv.PolyData, stimulus: pv.PolyData, path: Path) -> None:

@@ -28,7 +28,7 @@ def rotation(axis, angle_rad):
     return np.eye(3) - np.sin(angle_rad) * cross + (1 - np.cos(angle_rad)) * cross @ cross
 
 
-@pytest.mark.parametrize("across, skin_layers", [(5, 1), (12, 2), (21, 1)])
+@pytest.mark.parametrize("across, skin_layers", [(5, 1), (12, 2), (21, 1), (33, 2)])
 def test_every_element_has_positive_volume_at_its_gauss_points(sensor, across, skin_layers):
     mesh = build_mesh(sensor, resolution=Resolution(across=across, skin_layers=skin_layers))
     ones = np.ones(len(mesh.hexes))

@@ -119,14 +119,6 @@ def test_caps_vary_as_specified_in_a_pattern_of_their_own(straight):
     assert np.abs(patterns[2] - patterns[0]).max() > 0.05
 
 
-def test_denoising_brings_few_samples_closer_to_many(small):
-    pytest.importorskip("pyoidn")
-    truth = Renderer(small, spp=256).render(seed=9)
-    noisy, clean = Renderer(small, spp=2).render(), Renderer(small, spp=2, denoised=True).render()
-    assert clean.shape == noisy.shape and clean.dtype == np.float32
-    assert np.square(clean - truth).mean() < 0.7 * np.square(noisy - truth).mean()
-
-
 def test_light_is_proportional_to_the_leds(small):
     one = Renderer(small, spp=16).render(seed=3)
     two = Renderer(changed(small, leds={"power": 2 * small.leds.power}), spp=16).render(seed=3)

@@ -122,7 +122,10 @@ def build_mesh(spec: SensorSpec, *, resolution: Resolution | None = None) -> Sen
         layers.append(_dome(square, outer_mm + depth * (inner_mm - outer_mm), spec.skin.rim_z_mm))
     inner = layers[-1]
     wall_mm = np.hypot(inner[0, 0], inner[0, 1])
-    lens = np.column_stack([wall_mm * _squared_disc(square), np.full(len(square), spec.lens.z_mm)])
+    disc = _squared_disc(square)
+    # graded as the dome, which also keeps the flat corner columns the right way round
+    disc *= (_polar_fraction(radius := np.linalg.norm(disc, axis=1)) / np.maximum(radius, 1e-300))[:, None]
+    lens = np.column_stack([wall_mm * disc, np.full(len(square), spec.lens.z_mm)])
     for depth in np.linspace(0, 1, resolution.gel_layers + 1)[1:]:
         layers.append((1 - depth) * inner + depth * lens)
     grid = (len(layers), side, side)

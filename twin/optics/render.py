@@ -9,7 +9,6 @@ from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.optics import scene as scene_module
-from twin.optics.denoise import denoise
 from twin.optics.lens import ray_table
 from twin.optics.surfaces import SkinSurface, Surface, caps, stems
 from twin.optics.variant import VariantChoice, choose_variant, use_variant
@@ -40,8 +39,6 @@ class Renderer:
         Samples per pixel instead of the quality's.
     max_depth : int
         Longest light path, in segments.
-    denoised : bool
-        Remove the sampling noise afterwards; needs the optional package pyoidn.
     """
 
     def __init__(
@@ -54,7 +51,6 @@ class Renderer:
         window_px: tuple[int, int, int, int] | None = None,
         spp: int | None = None,
         max_depth: int = MAX_DEPTH,
-        denoised: bool = False,
     ):
         if quality not in SAMPLES:
             raise RenderError(f"quality={quality!r} is unknown: use {', '.join(SAMPLES)}")
@@ -72,7 +68,6 @@ class Renderer:
         self._inner = None if mesh is None else np.unique(mesh.inner_quads)
         self._skin = SkinSurface(spec, self._rest.base_mm if mesh is None else mesh.nodes_mm[self._inner])
         self._max_depth = max_depth
-        self._denoised = denoised
         self._scene = None
 
     def render(self, state=None, seed: int = 0) -> np.ndarray:
@@ -101,9 +96,9 @@ class Renderer:
         if self._remap is not None:
             image = cv2.remap(image, *self._remap, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         image = np.maximum(image, 0)
-        if self.spec.camera.channels == "mono":
-            image = np.ascontiguousarray(image[..., 0] if self.choice.mono else scene_module.luminance(image).astype(np.float32))
-        return denoise(image) if self._denoised else image
+        if self.spec.camera.channels == "color":
+            return image
+        return np.ascontiguousarray(image[..., 0] if self.choice.mono else scene_module.luminance(image).astype(np.float32))
 
     def _surfaces(self, state) -> dict[str, Surface]:
         cap_mm = state.caps_mm if hasattr(state, "caps_mm") else state.cap_mm
@@ -140,10 +135,11 @@ class Renderer:
 
     def _render_passes(self, mi, seed: int) -> np.ndarray:
         width, height = self._camera.film().size()
-        passes = 1 if self._scalar else -(-self.spp * width * height // MOST_SAMPLES_AT_ONCE)
-        each = -(-self.spp // passes)
+        passes, each = 1, self.spp
+        while not self._scalar and each > 1 and each * width * height > MOST_SAMPLES_AT_ONCE:
+            passes, each = 2 * passes, -(-each // 2)  # halves: the sampler stratifies powers of two well
         total = 0.0
         for k in range(passes):
-            image = mi.render(self._scene, sensor=self._camera, spp=each, seed=seed * 1009 + k)
+            image = mi.render(self._scene, sensor=self._camera, spp=each, seed=(seed * 1009 + k) % 2**32)
             total = total + np.array(image, dtype=np.float32)
         return total / passes

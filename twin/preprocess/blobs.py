@@ -9,6 +9,7 @@ from numba import njit
 from scenes.sensor import BlobSpec
 from twin.preprocess.mask import Mask
 
+GROWTH_PX = 4  # at most, of a component over its box
 NOISE_SIGMA_PX = 0.7  # smoothing before an adaptive threshold: halves white noise, leaves a cap of 6 px its edge
 
 
@@ -28,6 +29,8 @@ class Blobs:
         Each blob's value in ``labels``.
     label_area_px2 : (L,) float
         Area of every component, the rejected ones too.
+    label_box : (L, 4) int
+        Every component's left, top, width, height in the window, before it is grown.
     labels : (h, w) uint16
         Components grown over what belongs to them, in the mask's window.
     gray : (h, w) uint8
@@ -41,9 +44,18 @@ class Blobs:
     elongation: np.ndarray
     label: np.ndarray
     label_area_px2: np.ndarray
+    label_box: np.ndarray
     labels: np.ndarray
     gray: np.ndarray
     corner_px: np.ndarray
+
+    def pixels(self, label: int) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (p, 2), px of the frame, and gray levels (p,) of the pixels of a component."""
+        left, top, width, height = self.label_box[label]
+        left, top, right, bottom = max(left - GROWTH_PX, 0), max(top - GROWTH_PX, 0), left + width + GROWTH_PX, top + height + GROWTH_PX
+        rows, columns = np.nonzero(self.labels[top:bottom, left:right] == label)
+        rows, columns = rows + top, columns + left
+        return np.stack([columns, rows], axis=1) + self.corner_px, self.gray[rows, columns]
 
 
 def threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> np.ndarray:
@@ -120,4 +132,4 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     xx, xy, yy = (sums[keep, 4:] / sums[keep, :1] - np.stack([mean[:, 0] ** 2, mean[:, 0] * mean[:, 1], mean[:, 1] ** 2], axis=1)).T
     root = np.hypot(xx - yy, 2 * xy)
     elongation = (xx + yy + root) / np.maximum(xx + yy - root, 1e-3)
-    return Blobs(mean + mask.corner_px, area[keep], elongation, keep, area, grown, gray, mask.corner_px)
+    return Blobs(mean + mask.corner_px, area[keep], elongation, keep, area, stats[:, :4], grown, gray, mask.corner_px)

@@ -34,13 +34,13 @@ def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | N
     if kind == "knn":
         return PinGraph(kind, nodes_px, knn_edges(nodes_px), none)
     triangles = triangulate(nodes_px)
-    edges = knn_edges(nodes_px) if triangles is None else directed_edges(triangles, len(nodes_px))
+    edges = None if triangles is None else directed_edges(triangles, len(nodes_px))
+    if kind == "voronoi":
+        tessellation = voronoi(nodes_px, outmost=outmost, edges=edges)
+        return PinGraph(kind, nodes_px, knn_edges(nodes_px) if edges is None else edges, tessellation.area_px2, tessellation.cells)
     if kind == "delaunay":
-        return PinGraph(kind, nodes_px, edges, none)
-    if kind != "voronoi":
-        raise ValueError(f"kind must be knn, delaunay or voronoi, not {kind!r}")
-    tessellation = voronoi(nodes_px, outmost=outmost, triangles=triangles)
-    return PinGraph(kind, nodes_px, edges, tessellation.area_px2, tessellation.cells)
+        return PinGraph(kind, nodes_px, knn_edges(nodes_px) if edges is None else edges, none)
+    raise ValueError(f"kind must be knn, delaunay or voronoi, not {kind!r}")
 
 
 def features(graph: PinGraph, reference: Reference, kind: Literal["relative", "pixels"] = "relative") -> np.ndarray:

@@ -11,10 +11,13 @@ from twin.preprocess.reference import Reference
 REACH = 0.4  # how far from a pin's predicted place a component may lie to be claimed, in spacings
 MIN_AREA_SHARE = 0.65  # of the areas expected of all claimants: less is one cap, not several
 MIN_SEPARATION = 0.6  # of two parts, in cap diameters
-MIN_PART = 0.5  # of the weight of the smallest part, to an equal share
+MIN_PART = 0.4  # of the weight of the smallest part, to an equal share
 ROUNDS = 12
-MIN_ELONGATION = 2.4  # of a chain: two touching discs have 5, the most foreshortened cap about 2.5
+MIN_ELONGATION = 2.0  # of a chain: two touching discs have 5
+ODD_ELONGATION = 1.5  # of a chain, to the median of the blobs around: all caps near the rim are long
 MIN_CAPS, MAX_CAPS = 1.35, 5.0  # area of a chain, in median areas of its neighbours
+NECK = 0.7  # width of a neck to that of the narrower part beside it
+MIN_CAPS_NECKED = 1.0  # area of a necked chain, likewise
 AROUND = 13  # blobs that median is taken over
 
 
@@ -34,12 +37,28 @@ def _label_near(blobs: Blobs, px: np.ndarray, reach_px: float) -> int:
     return int(patch[rows[nearest], columns[nearest]])
 
 
+def _weight(level: np.ndarray) -> np.ndarray:
+    return level - float(level.min()) if np.ptp(level) else np.ones(len(level))
+
+
+def _neck(along: np.ndarray, weight: np.ndarray) -> float | None:
+    """Where along its axis a component is narrow between two wide parts, from its pixels' places (p,) along it; else None."""
+    low = np.floor(along.min())
+    width = np.bincount((along - low).astype(int), weight)
+    width = np.convolve(width, [0.25, 0.5, 0.25])[1:-1]
+    inner = np.arange(2, len(width) - 2)
+    if not len(inner):
+        return None
+    left, right = np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1]
+    ratio = width[inner] / np.minimum(left[inner], right[inner])
+    narrowest = ratio.argmin()
+    return float(low + inner[narrowest] + 0.5) if ratio[narrowest] < NECK else None
+
+
 def _parts(blobs: Blobs, label: int, seeds_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weighted k-means of a component's pixels from seeds: centres (n, 2) px of the frame, shares of the weight (n,)."""
-    rows, columns = np.nonzero(blobs.labels == label)
-    level = blobs.gray[rows, columns].astype(float)
-    weight = np.maximum(level - level.min(), 0) if np.ptp(level) else np.ones_like(level)
-    pixels = np.stack([columns, rows], axis=1) + blobs.corner_px
+    pixels, level = blobs.pixels(label)
+    weight = _weight(level)
     centers = seeds_px + (np.average(pixels, axis=0, weights=weight) - seeds_px.mean(axis=0))
     share = np.zeros(len(centers))
     for _ in range(ROUNDS):
@@ -70,20 +89,28 @@ def split_chains(blobs: Blobs) -> Blobs:
     long = np.flatnonzero(blobs.elongation > MIN_ELONGATION)
     if not len(long) or len(blobs.px) < AROUND:
         return blobs
+    distance2 = ((blobs.px - blobs.px[long, None]) ** 2).sum(axis=2)
+    around = np.argpartition(distance2, AROUND - 1, axis=1)[:, :AROUND]
+    odd = blobs.elongation[long] > ODD_ELONGATION * np.median(blobs.elongation[around], axis=1)
+    caps_in = blobs.area_px2[long] / np.median(blobs.area_px2[around], axis=1)
     split, px, part_area, part_label = [], [], [], []
-    for k in long:
-        nearest = np.argpartition(((blobs.px - blobs.px[k]) ** 2).sum(axis=1), AROUND - 1)[:AROUND]
-        caps = blobs.area_px2[k] / np.median(blobs.area_px2[nearest])
-        if not MIN_CAPS < caps < MAX_CAPS:
+    for k, caps in zip(long[odd], caps_in[odd], strict=True):
+        pixels, level = blobs.pixels(int(blobs.label[k]))
+        weight = _weight(level)
+        middle = np.average(pixels, axis=0, weights=weight)
+        axis = np.linalg.eigh(np.cov(pixels.T, aweights=weight))[1][:, 1]
+        along = (pixels - middle) @ axis
+        neck = _neck(along, weight)
+        if not (MIN_CAPS_NECKED if neck is not None else MIN_CAPS) < caps < MAX_CAPS:
             continue
-        rows, columns = np.nonzero(blobs.labels == blobs.label[k])
-        pixels = np.stack([columns, rows], axis=1) + blobs.corner_px
-        spread = pixels - pixels.mean(axis=0)
-        _, _, axes = np.linalg.svd(spread, full_matrices=False)
-        along = spread @ axes[0]
         count = max(int(np.round(caps)), 2)
-        seeds = pixels.mean(axis=0) + np.outer(np.quantile(along, (np.arange(count) + 0.5) / count), axes[0])
-        centers, share = _parts(blobs, int(blobs.label[k]), seeds)
+        if neck is not None and count == 2:
+            owner = along > neck
+            share = np.array([weight[~owner].sum(), weight[owner].sum()]) / weight.sum()
+            centers = [np.average(pixels[part], axis=0, weights=weight[part]) for part in (~owner, owner)]
+        else:
+            seeds = middle + np.outer(np.quantile(along, (np.arange(count) + 0.5) / count), axis)
+            centers, share = _parts(blobs, int(blobs.label[k]), seeds)
         if share.min() > MIN_PART / count:
             split.append(int(blobs.label[k]))
             px += list(centers)
@@ -95,26 +122,23 @@ def split_chains(blobs: Blobs) -> Blobs:
 def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
     """The blobs, with each component that several pins claim replaced by as many parts.
 
-    A component is claimed by the pin it was matched to and by lost pins predicted on it. It is split if it is large
+    A component is claimed by the pins it, or part of it, was matched to and by lost pins predicted on it. It is split if it is large
     enough for all claimants and falls into as many parts of a cap's size.
     """
     labelled = found.blob >= 0
-    whole_labels, uses = np.unique(blobs.label, return_counts=True)
-    already = set(whole_labels[uses > 1].tolist())
     claims: dict[int, list[int]] = {}
     for pin in np.flatnonzero(~labelled & np.isfinite(found.predicted_px).all(axis=1)):
         label = _label_near(blobs, found.predicted_px[pin], REACH * reference.spacing_px[pin])
-        if label and label not in already:
+        if label:
             claims.setdefault(label, []).append(int(pin))
     if not claims:
         return blobs
-    owner = {int(blobs.label[found.blob[pin]]): int(pin) for pin in np.flatnonzero(labelled)}
+    owned_label = np.where(labelled, blobs.label[found.blob], 0)
     area = np.full(len(found.blob), np.nan)
     area[labelled] = blobs.area_px2[found.blob[labelled]]
     px, part_area, part_label, split = [], [], [], []
     for label, pins in claims.items():
-        if label in owner:
-            pins.append(owner[label])
+        pins += np.flatnonzero(owned_label == label).tolist()
         around = area[reference.neighbours[pins]]
         if len(pins) < 2 or not np.isfinite(around).any():
             continue

@@ -48,13 +48,33 @@ def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
     return None if len(mesh.coplanar) else mesh.simplices
 
 
-def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
-    """(E, 2) both directions of each triangle side, sorted."""
-    i = triangles[:, [0, 1, 2, 1, 2, 0]].astype(np.int64).ravel()
-    j = triangles[:, [1, 2, 0, 0, 1, 2]].astype(np.int64).ravel()
-    # a side of two triangles occurs once in each direction per triangle
-    code = np.unique(i * n + j)
-    return np.stack([code // n, code % n], axis=1)
+@njit(cache=True)
+def directed_edges(triangles, n):
+    """(E, 2) both directions of each triangle side of a triangulation of ``n`` nodes, sorted."""
+    start = np.zeros(n + 1, np.int64)
+    for t in range(len(triangles)):
+        for k in range(3):
+            start[triangles[t, k] + 1] += 2
+    start = np.cumsum(start)
+    fill = start[:-1].copy()
+    ends = np.empty(start[-1], np.int64)
+    for t in range(len(triangles)):
+        for k in range(3):
+            i = triangles[t, k]
+            ends[fill[i]] = triangles[t, (k + 1) % 3]
+            ends[fill[i] + 1] = triangles[t, (k + 2) % 3]
+            fill[i] += 2
+    edges = np.empty((len(ends), 2), np.int64)
+    count = 0
+    for i in range(n):
+        last = -1
+        for j in np.sort(ends[start[i] : start[i + 1]]):
+            if j != last:  # a side of two triangles comes twice
+                edges[count, 0] = i
+                edges[count, 1] = j
+                count += 1
+                last = j
+    return edges[:count]
 
 
 @njit(cache=True)
@@ -90,25 +110,58 @@ def _cut(polygon, count, a, b, c, out):
 
 
 @njit(cache=True)
+def _cell(i, nodes, start, neighbours, count, here, there):
+    """Cut the ``count`` vertices in ``here`` down to node i's cell; returns (count, the array they are in, the other)."""
+    for e in range(start[i], start[i + 1]):
+        j = neighbours[e]
+        a, b = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]
+        c = 0.5 * (nodes[j, 0] ** 2 + nodes[j, 1] ** 2 - nodes[i, 0] ** 2 - nodes[i, 1] ** 2)
+        count = _cut(here, count, a, b, c, there)
+        here, there = there, here
+        if count == 0:
+            break
+    return count, here, there
+
+
+@njit(cache=True)
+def _inner_radius2(region, x0, y0):
+    """Squared distance of a point from the nearest of a polygon's sides."""
+    least = np.inf
+    for k in range(len(region)):
+        ax, ay = region[k - 1, 0] - x0, region[k - 1, 1] - y0
+        dx, dy = region[k, 0] - region[k - 1, 0], region[k, 1] - region[k - 1, 1]
+        length2 = dx * dx + dy * dy
+        t = min(max(-(ax * dx + ay * dy) / length2, 0.0), 1.0) if length2 > 0 else 0.0
+        least = min(least, (ax + t * dx) ** 2 + (ay + t * dy) ** 2)
+    return least
+
+
+@njit(cache=True)
 def _cells(nodes, start, neighbours, region):
-    """Area of every cell and its vertices, end to end."""
-    n = len(nodes)
+    """Area of every cell and its vertices, end to end.
+
+    Cutting starts from the region's bounding box; a cell that leaves the disc the region is known
+    to hold is cut again from the region itself.
+    """
+    n, m = len(nodes), len(region)
+    x0, y0 = region[:, 0].mean(), region[:, 1].mean()
+    radius2 = _inner_radius2(region, x0, y0)
     area = np.zeros(n)
     first = np.zeros(n + 1, np.int64)
-    store = np.empty((16 * n + 4 * len(region), 2))
-    here = np.empty((2 * len(region) + 2 * n + 8, 2))
+    store = np.empty((16 * n + 4 * m, 2))
+    here = np.empty((2 * m + 2 * n + 8, 2))
     there = np.empty_like(here)
+    left, right, top, bottom = region[:, 0].min(), region[:, 0].max(), region[:, 1].min(), region[:, 1].max()
     for i in range(n):
-        count = len(region)
-        here[:count] = region
-        for e in range(start[i], start[i + 1]):
-            j = neighbours[e]
-            a, b = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]
-            c = 0.5 * (nodes[j, 0] ** 2 + nodes[j, 1] ** 2 - nodes[i, 0] ** 2 - nodes[i, 1] ** 2)
-            count = _cut(here, count, a, b, c, there)
-            here, there = there, here
-            if count == 0:
-                break
+        here[0, 0], here[0, 1], here[1, 0], here[1, 1] = left, top, right, top
+        here[2, 0], here[2, 1], here[3, 0], here[3, 1] = right, bottom, left, bottom
+        count, here, there = _cell(i, nodes, start, neighbours, 4, here, there)
+        inside = count > 2
+        for k in range(count):
+            inside = inside and (here[k, 0] - x0) ** 2 + (here[k, 1] - y0) ** 2 < radius2
+        if not inside:
+            here[:m] = region
+            count, here, there = _cell(i, nodes, start, neighbours, m, here, there)
         if count > 2:
             area[i] = polygon_area(here, count)
         while first[i] + count > len(store):
@@ -161,7 +214,7 @@ def _with_all_pairs(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(n + 1) * (n - 1), np.ascontiguousarray(other)
 
 
-def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, triangles: np.ndarray | None = None) -> Tessellation:
+def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, edges: np.ndarray | None = None) -> Tessellation:
     """Voronoi cells of nodes, clipped to the enlarged outline (see the module).
 
     Parameters
@@ -170,8 +223,8 @@ def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, triangle
         Finite positions, N >= 1; coincident or collinear ones are allowed.
     outmost : (m,) int, optional
         The outmost nodes, in order around the layout; their polygon is used if it is star-shaped.
-    triangles : (t, 3) int, optional
-        The nodes' Delaunay triangles, where the caller has them.
+    edges : (E, 2) int, optional
+        The nodes' Delaunay edges as ``directed_edges`` gives them, where the caller has them.
     """
     nodes_px = np.ascontiguousarray(nodes_px, float)
     if nodes_px.ndim != 2 or not len(nodes_px) or not np.isfinite(nodes_px).all():
@@ -179,14 +232,13 @@ def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, triangle
     origin = nodes_px.mean(axis=0)
     nodes = nodes_px - origin
     share, back = None, None
-    if triangles is None:
-        triangles = triangulate(nodes)
-    if triangles is None:
+    if edges is None and (triangles := triangulate(nodes)) is not None:
+        edges = directed_edges(triangles, len(nodes))
+    if edges is None:
         unique, back, share = np.unique(nodes, axis=0, return_inverse=True, return_counts=True)
         start, neighbours = _with_all_pairs(unique)
         sites = np.ascontiguousarray(unique)
     else:
-        edges = directed_edges(triangles, len(nodes))
         start = np.searchsorted(edges[:, 0], np.arange(len(nodes) + 1))
         neighbours, sites = np.ascontiguousarray(edges[:, 1]), nodes
 

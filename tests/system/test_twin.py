@@ -1,0 +1,85 @@
+"""The whole way on rendered frames: press, render, detect, graph, against exact truth."""
+
+import numpy as np
+import pytest
+
+from scenes import load_object, load_sensor
+from twin.mechanics.path import ContactPose
+from twin.preprocess.graph import make_graph
+from twin.preprocess.pipeline import Pipeline
+from twin.preprocess.reference import nominal_reference
+from twin.simulator import Simulator
+from twin.types import Form
+
+CENTROID_RMS_PX = 0.3  # detected against projected caps, no contact
+SLOPE_SHARE = 0.5  # a drag along one axis moves the pins at least this much more along it than across it
+FORMS = [("mg400-331", Form.RAW), ("mg400-331", Form.RECORDING), ("mg400-127", Form.RAW), ("mg400-127", Form.RECORDING), ("ur5-331", Form.RAW)]
+
+
+@pytest.fixture(scope="module")
+def simulators():
+    return {name: Simulator(load_sensor(name)) for name in ("mg400-331", "mg400-127", "ur5-331")}
+
+
+@pytest.mark.parametrize(("name", "form"), FORMS)
+def test_rendered_caps_are_found_where_they_project(simulators, name, form):
+    simulator = simulators[name]
+    shot = simulator.shoot(simulator.rest, form=form)
+    observation = Pipeline(simulator.spec, form)(shot.frame)
+    assert observation.found == simulator.spec.pins.count and shot.truth.visible.all()
+    error = observation.pins_px - shot.truth.caps_px
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < CENTROID_RMS_PX
+
+
+@pytest.mark.parametrize(("name", "delaunay"), [("mg400-331", 1860), ("ur5-331", 1860), ("mg400-127", 744)])
+def test_edges_without_contact(simulators, name, delaunay):
+    simulator = simulators[name]
+    observation = Pipeline(simulator.spec, Form.RAW)(simulator.shoot(simulator.rest).frame)
+    assert len(observation.graph.edges) == delaunay
+    assert len(make_graph("knn", observation.pins_px).edges) == 6 * simulator.spec.pins.count
+
+
+def test_cells_at_the_contact_grow_with_depth(simulators):
+    simulator = simulators["mg400-331"]
+    outmost = nominal_reference(simulator.spec, Form.RAW).outmost
+    truth = [simulator.rest] + [simulator.press(load_object("plane"), ContactPose(indent_mm=d)) for d in (1.5, 3.0, 4.5)]
+    from twin.projection import project
+
+    graphs = [make_graph("voronoi", project(simulator.spec.camera, state.caps_mm), outmost=outmost) for state in truth]
+    middle = np.arange(37)  # the inner three rings and the centre
+    means = [graph.area_px2[middle].mean() for graph in graphs]
+    assert means == sorted(means) and means[-1] > 1.1 * means[0]
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_drag_carries_the_pins_along(simulators, axis, sign):
+    simulator = simulators["mg400-127"]
+    shear = [0.0, 0.0]
+    shear[axis] = 2.0 * sign
+    pressed = simulator.shoot(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0)))
+    dragged = simulator.shoot(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0, shear_mm=tuple(shear))))
+    pipeline = Pipeline(simulator.spec, Form.RAW)
+    moved = np.nanmean(pipeline(dragged.frame).pins_px - pipeline(pressed.frame).pins_px, axis=0)
+    assert sign * moved[axis] > 1.0
+    assert abs(moved[1 - axis]) < SLOPE_SHARE * abs(moved[axis])
+
+
+def test_a_tilt_moves_the_contact_to_the_side_that_is_touched(simulators):
+    simulator = simulators["mg400-331"]
+    for tilt_deg, axis, sign in (((0.0, 12.0), 0, 1), ((0.0, -12.0), 0, -1), ((12.0, 0.0), 1, -1), ((-12.0, 0.0), 1, 1)):
+        state = simulator.press(load_object("plane"), ContactPose(indent_mm=2.5, tilt_deg=tilt_deg))
+        weight = -state.traction_n @ state.T_sensor_object[:3, 2] if len(state.traction_n) else np.zeros(0)
+        center = np.average(state.nodes_mm[state.contact_nodes], axis=0, weights=np.abs(weight))
+        assert sign * center[axis] > 1.0
+        moved = np.linalg.norm(state.caps_mm - simulator.rest.caps_mm, axis=1)
+        assert sign * np.average(simulator.rest.caps_mm[:, axis], weights=moved) > 0.3
+
+
+def test_the_same_contact_gives_the_same_frame(simulators):
+    simulator = simulators["mg400-127"]
+    pose = ContactPose(indent_mm=2.0, twist_deg=5.0)
+    states = [simulator.press(load_object("sphere"), pose) for _ in range(2)]
+    assert np.array_equal(states[0].nodes_mm, states[1].nodes_mm)
+    shots = [simulator.shoot(state, seed=3) for state in states]
+    assert np.array_equal(shots[0].frame.image, shots[1].frame.image)

@@ -32,7 +32,7 @@ class CylinderShape(Section):
 
 
 class EdgeShape(Section):
-    """Quarter space x >= 0, z >= 0 with a rounded edge along y through the origin."""
+    """Quarter space x >= 0, z >= 0. Its edge along y through the origin is rounded, which sets it back from there."""
 
     kind: Literal["edge"]
     fillet_mm: NonNegative = 0.0
@@ -54,8 +54,8 @@ class PrismShape(Section):
 class MeshShape(Section):
     """Closed triangle mesh (STL, OBJ, PLY). ``file`` is relative to the specification.
 
-    The mesh is turned by ``rotation_deg`` (intrinsic x, y, z), then moved so that its lowest z over the x = y = 0
-    line of its bounding box centre is the origin.
+    The mesh is turned by ``rotation_deg`` (intrinsic x, y, z), then moved so that the line through its bounding box's
+    centre along z first meets it at the origin (where the mesh has a hole there: its lowest vertex has z = 0).
     """
 
     kind: Literal["mesh"]
@@ -71,7 +71,7 @@ Shape = Annotated[
 
 
 class TextureSpec(Section):
-    """A raised wire mesh wrapped on the surface: round wires crossing at a pitch."""
+    """A wire mesh lying on the surface, raised by one wire diameter: round wires crossing at a pitch."""
 
     kind: Literal["wire-mesh"]
     pitch_mm: Positive

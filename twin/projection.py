@@ -9,6 +9,9 @@ import numpy as np
 
 from scenes.sensor import CameraSpec
 
+NEWTON_STEPS = 12  # quadratic: the last ones only polish
+MOST_NEWTON_MOVE = 0.1  # per step, normalised: keeps far starts from jumping past the fold
+
 
 def sensor_to_camera(camera: CameraSpec) -> np.ndarray:
     """``T_camera_sensor`` (4, 4): camera looks along +z with x right and y down.
@@ -39,15 +42,23 @@ def distort(camera: CameraSpec, xy: np.ndarray) -> np.ndarray:
     )
 
 
-def undistort(camera: CameraSpec, xy: np.ndarray, *, iterations: int = 30) -> np.ndarray:
-    """Distorted normalised coordinates (..., 2) to ideal ones, by fixed-point iteration.
+def undistort(camera: CameraSpec, seen: np.ndarray, *, guess: np.ndarray | None = None) -> np.ndarray:
+    """Distorted normalised coordinates (..., 2) to ideal ones: Newton's method on ``distort(ideal) = seen``.
 
-    Where the distortion folds back (outside its valid field) the last iterate is returned, bounded.
+    Starts at ``guess`` (default: ``seen``). Meaningless where the distortion folds back, outside its valid field.
     """
-    ideal = np.array(xy, dtype=float)
-    for _ in range(iterations):
-        ideal = np.clip(ideal + 0.7 * (xy - distort(camera, ideal)), -20, 20)
+    ideal, step = np.array(seen if guess is None else guess, float), 1e-6
+    for _ in range(NEWTON_STEPS):
+        along_x, along_y = ((distort(camera, ideal + d) - distort(camera, ideal - d)) / (2 * step) for d in ([step, 0.0], [0.0, step]))
+        miss = seen - distort(camera, ideal)
+        area = _cross(along_x, along_y)
+        move = np.stack([_cross(miss, along_y), _cross(along_x, miss)], axis=-1)
+        ideal = ideal + np.clip(move / np.where(np.abs(area) > 1e-6, area, 1e-6)[..., None], -MOST_NEWTON_MOVE, MOST_NEWTON_MOVE)
     return ideal
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def project(camera: CameraSpec, points_mm: np.ndarray) -> np.ndarray:

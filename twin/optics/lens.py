@@ -3,11 +3,10 @@
 import numpy as np
 
 from scenes.sensor import CameraSpec
-from twin.projection import distort
+from twin.projection import undistort
 
 FIELD_MARGIN = 0.97  # of the fold's radius: past it the table goes on straight, where a distortion model means nothing
 WIDEST_FIELD = 6.0  # ideal normalised radius (80 deg off the axis): a pinhole image ends somewhere
-NEWTON_STEPS = 8  # from the radial solution; each doubles the digits
 
 
 def valid_radius(camera: CameraSpec) -> float:
@@ -33,20 +32,4 @@ def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.nd
     beyond = np.maximum(1.0, seen_radius / distorted[-1])
     inside = seen / beyond
     guess = inside * np.interp(seen_radius / beyond, distorted, radius) / np.maximum(seen_radius / beyond, 1e-12)
-    return beyond * _invert(camera, inside, guess)
-
-
-def _invert(camera: CameraSpec, seen: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Newton's method on ``distort(ideal) = seen``, with central differences for the Jacobian."""
-    ideal, step = guess, 1e-6
-    for _ in range(NEWTON_STEPS):
-        along_x, along_y = ((distort(camera, ideal + d) - distort(camera, ideal - d)) / (2 * step) for d in ([step, 0.0], [0.0, step]))
-        miss = seen - distort(camera, ideal)
-        area = _cross(along_x, along_y)
-        move = np.stack([_cross(miss, along_y), _cross(along_x, miss)], axis=-1)
-        ideal = ideal + np.clip(move / np.where(np.abs(area) > 1e-6, area, 1e-6)[..., None], -0.1, 0.1)
-    return ideal
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return beyond * undistort(camera, inside, guess=guess)

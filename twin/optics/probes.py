@@ -14,6 +14,8 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from twin.optics.native import PRIVATE_FOLDER
+
 PROBE_TIMEOUT_S = 60.0
 
 # The empty home keeps Dr.Jit from answering with a kernel it compiled (with another LLVM) before.
@@ -75,6 +77,7 @@ def probe(backend: str, library: Path, *, remember_failure: bool = True) -> Verd
 def _run(backend: str, library: Path) -> Verdict:
     with tempfile.TemporaryDirectory() as home:
         env = dict(os.environ, HOME=home, APPDATA=home, LOCALAPPDATA=home, PYTHONPATH=os.pathsep.join(p for p in sys.path if p))
+        env["LD_LIBRARY_PATH"] = os.pathsep.join(filter(None, [str(PRIVATE_FOLDER), os.environ.get("LD_LIBRARY_PATH")]))
         if backend == "llvm":
             env["DRJIT_LIBLLVM_PATH"] = str(library)
         command = [sys.executable, "-c", _NO_CORE_DUMP + _PROBE.format(backend=backend)]

@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from twin.errors import RenderError
+from twin.optics.native import load_needed_libraries
 from twin.optics.probes import probe
 
 OLDEST_LLVM = 16  # 14 and 15 abort at the first kernel
@@ -130,6 +131,8 @@ def use_variant(choice: VariantChoice):
     """Make ``choice`` Mitsuba's current variant and return the ``mitsuba`` module."""
     if choice.llvm_path:
         os.environ[_LLVM_VARIABLE] = choice.llvm_path
+    if missing := load_needed_libraries():
+        raise RenderError(missing)
     import mitsuba as mi
 
     if mi.variant() != choice.variant:
@@ -187,8 +190,10 @@ def _name(backend: str, channels: str) -> str:
 def _try(backend: str, variant: str, llvm_search) -> tuple[VariantChoice | None, str]:
     if variant not in available_variants():
         return None, f"{variant} is not compiled into the installed Mitsuba"
+    if missing := load_needed_libraries():
+        return None, missing
     if backend == "scalar":
-        return VariantChoice(variant, "the scalar variant needs nothing, and is slow"), ""
+        return VariantChoice(variant, "the scalar variant works everywhere, and is slow"), ""
     if backend == "cuda":
         works, reason = find_cuda()
         return (VariantChoice(variant, reason), "") if works else (None, reason)

@@ -80,24 +80,27 @@ def legacy_detector(parameters: LegacyParameters) -> cv2.SimpleBlobDetector:
     return cv2.SimpleBlobDetector_create(settings)
 
 
-def virtual_nodes(nodes: np.ndarray, parameters: LegacyParameters) -> np.ndarray:
-    """Turned and scaled copies of the hull's vertices, which make the bowed sides of a hexagon convex; (0, 2) for a round layout."""
-    hull = nodes[ConvexHull(nodes).vertices]
-    copies = [np.empty((0, 2))]
+def boundary_nodes(nodes: np.ndarray, parameters: LegacyParameters) -> np.ndarray:
+    """The hull's vertices, enlarged, and for a hexagon turned and scaled copies of them, which fill its inward-bowed sides."""
+    bound = HULL_SCALE * nodes[ConvexHull(nodes).vertices]
+    nodes_around = [bound]
     for degrees, scale in zip(parameters.virtual_rotations_deg, parameters.virtual_scales, strict=True):
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-        copies.append(scale * hull @ [[c, s], [-s, c]])
-    return np.concatenate(copies)
+        nodes_around.append(scale * bound @ [[c, s], [-s, c]])
+    return np.concatenate(nodes_around)
 
 
 def legacy_graph(nodes: np.ndarray, parameters: LegacyParameters) -> PinGraph:
-    """Delaunay edges and Voronoi areas of centred nodes (N, 2), as published (Algorithm 1 of the paper)."""
+    """Delaunay edges and Voronoi areas of centred nodes (N, 2), as published (Algorithm 1 of the paper).
+
+    A convex layout's edges are its own; a hexagon's are those among its nodes in the triangulation with the boundary nodes.
+    """
     n = len(nodes)
-    outer = np.concatenate([nodes, virtual_nodes(nodes, parameters)])
-    edges = directed_edges(Delaunay(outer).simplices, len(outer))
+    extended = np.concatenate([nodes, boundary_nodes(nodes, parameters)])
+    triangulated = extended if parameters.virtual_scales else nodes
+    edges = directed_edges(Delaunay(triangulated).simplices, len(triangulated))
     edges = edges[(edges < n).all(axis=1)]
-    bound = HULL_SCALE * outer[ConvexHull(outer).vertices]
-    diagram = Voronoi(np.concatenate([outer, bound]))
+    diagram = Voronoi(extended)
     area, cells = np.full(n, np.nan), []
     for i in range(n):
         region = diagram.regions[diagram.point_region[i]]

@@ -1,0 +1,134 @@
+"""The pipeline over a whole recording, written to a folder."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.preprocess.forms import blob_spec
+from twin.preprocess.overlay import draw_overlay
+from twin.preprocess.pipeline import Pipeline, measure_reference
+from twin.recordings import Recording, open_recording
+from twin.types import Form, Observation
+
+
+def _reference(spec: SensorSpec, recording: Recording, problems: list):
+    """The recording's own no-contact layout, and its name; the specification's where there is none or it is no use."""
+    if recording.reference is not None:
+        try:
+            return measure_reference(spec, recording.form, recording.reference), recording.reference.name
+        except FrameError as error:
+            problems.append(str(error))
+    return None, "specification"
+
+
+def _write(path: Path, write: Callable) -> None:
+    """Write a file so that it is there whole or not at all."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            write(file)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise FrameError(f"{path}: can't be written ({error.strerror}); give another folder or free some space") from error
+
+
+def _timing(observations: list[Observation]) -> dict:
+    warm = observations[1:] or observations  # the first frame also loads the compiled code
+    stages = {stage: [o.ms[stage] for o in warm] for stage in observations[0].ms}
+    return {s: dict(zip(("p50", "p95", "p99"), np.percentile(ms, (50, 95, 99)).round(4).tolist(), strict=True)) for s, ms in stages.items()}
+
+
+def preprocess_recording(
+    path: str | Path,
+    spec: SensorSpec,
+    out_dir: str | Path,
+    form: Form | None = None,
+    overlay: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict:
+    """Observe every frame of a recording and write ``pins.npz``, ``summary.json`` and, if asked, ``overlay/``.
+
+    Parameters
+    ----------
+    path : path
+        Anything ``open_recording`` takes.
+    form : Form, optional
+        Told by size and content if not given.
+    progress : callable, optional
+        Called with (done, total).
+
+    Returns
+    -------
+    dict
+        The summary. ``pins.npz`` has one row per readable frame, in the recording's order: ``image_name``, ``pins_px``
+        and ``predicted_px`` (M, N, 2), ``area_px2`` (M, N), ``found`` and ``valid`` (M,).
+
+    Raises
+    ------
+    FrameError
+        No frame was readable, or the folder can't be written to.
+    """
+    recording = open_recording(path, spec, form)
+    out_dir = Path(out_dir)
+    try:
+        (out_dir / "overlay" if overlay else out_dir).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FrameError(f"{out_dir}: can't be made ({error.strerror}); give another folder") from error
+    notes: list[str] = []
+    reference, reference_name = _reference(spec, recording, notes)
+    pipeline = Pipeline(spec, recording.form, reference)
+    names, observations, failed = [], [], []
+    for frame in recording:
+        try:
+            observation = pipeline(frame)
+        except FrameError as error:
+            failed.append({"image_name": frame.name, "reason": str(error).removeprefix(f"{frame.name}: ")})
+            continue
+        names.append(frame.name)
+        observations.append(observation)
+        if overlay:
+            picture = cv2.cvtColor(draw_overlay(frame, observation), cv2.COLOR_RGB2BGR)
+            _write(out_dir / "overlay" / f"{Path(frame.name).stem}.png", cv2.imencode(".png", picture)[1].tofile)
+        if progress:
+            progress(frame.sequence + 1, len(recording))
+    failed = recording.failed + failed
+    if not observations:
+        raise FrameError(f"{path}: none of {len(recording)} frames could be used; the first: {failed[0]['reason']}")
+
+    n = spec.pins.count
+    none = np.full(n, np.nan)
+    arrays = {
+        "image_name": np.array(names, str),
+        "pins_px": np.stack([o.pins_px for o in observations]),
+        "predicted_px": np.stack([o.predicted_px for o in observations]),
+        "area_px2": np.stack([none if o.graph is None else o.graph.area_px2 for o in observations]),
+        "found": np.array([o.found for o in observations]),
+        "valid": np.array([o.valid for o in observations]),
+    }
+    summary = {
+        "sensor": spec.name,
+        "frames": len(observations),
+        "exact_fraction": float(np.mean(arrays["valid"] & (arrays["found"] == n))),
+        "valid_fraction": float(arrays["valid"].mean()),
+        "ms": _timing(observations),
+        "parameters": {
+            "form": str(recording.form),
+            "size_px": list(recording.size_px),
+            "reference": reference_name,
+            "graph": pipeline.graph,
+            "detection": blob_spec(spec, recording.form).model_dump(mode="json"),
+        },
+        "invalid": [{"image_name": name, "reason": o.reason} for name, o in zip(names, observations, strict=True) if not o.valid],
+        "failed": failed,
+        "problems": recording.problems + notes,
+    }
+    _write(out_dir / "pins.npz", lambda file: np.savez_compressed(file, **arrays))
+    _write(out_dir / "summary.json", lambda file: file.write((json.dumps(summary, indent=1) + "\n").encode()))
+    return summary

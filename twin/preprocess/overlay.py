@@ -1,0 +1,34 @@
+"""A picture of what the pipeline saw."""
+
+import cv2
+import numpy as np
+
+from twin.preprocess.forms import gray_levels
+from twin.types import Frame, Observation
+
+EDGE_RGB, FOUND_RGB, LOST_RGB, EXTRA_RGB = (90, 110, 160), (60, 220, 60), (255, 60, 60), (255, 210, 0)
+
+
+def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
+    """(H, W, 3) uint8 RGB: the frame, its graph, found pins (green), predicted places of lost ones (red), rejected blobs (yellow)."""
+    gray = cv2.resize(gray_levels(frame.image), None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    canvas = cv2.cvtColor(gray // 2, cv2.COLOR_GRAY2RGB)
+
+    def place(px: np.ndarray) -> list:
+        px = px[np.isfinite(px).all(axis=1)]
+        return np.round((np.clip(px, -1e4, 1e4) + 0.5) * scale - 0.5).astype(int).tolist()
+
+    if observation.graph is not None:
+        nodes = place(observation.graph.nodes_px)
+        for i, j in observation.graph.edges:
+            if i < j:
+                cv2.line(canvas, nodes[i], nodes[j], EDGE_RGB, 1, cv2.LINE_AA)
+    for px in place(observation.pins_px):
+        cv2.circle(canvas, px, 2, FOUND_RGB, -1, cv2.LINE_AA)
+    for px in place(observation.predicted_px):
+        cv2.circle(canvas, px, 5, LOST_RGB, 1, cv2.LINE_AA)
+    for px in place(observation.extra_px):
+        cv2.circle(canvas, px, 6, EXTRA_RGB, 1, cv2.LINE_AA)
+    text = f"{frame.name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
+    cv2.putText(canvas, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
+    return canvas

@@ -48,7 +48,9 @@ def read_surface_labels(folder: Path) -> SurfaceLabels:
     executed_file = folder / "move_executed.csv"
     executed_of = {}
     if executed_file.is_file():
-        executed_of = {row["image_name"]: float(row["executed_estimate"]) for row in _read_rows(executed_file, ("image_name", "executed_estimate"))}
+        executed_of = {
+            row["image_name"]: float(row["executed_estimate"]) for row in _read_rows(executed_file, ("image_name", "executed_estimate"))
+        }
     executed = np.array([executed_of.get(row["image_name"], 1.0) for row in rows])
     column = {key: np.array([float(row[key]) for row in rows]) for key in ("pose_2", "pose_6", "move_1", "move_6")}
     return SurfaceLabels(

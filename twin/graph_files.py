@@ -61,7 +61,9 @@ def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) ->
     return path
 
 
-def draw_graph_pictures(out: Path, spec: SensorSpec, form: Form, graph: PinGraph, reference: Reference, image: np.ndarray | None) -> list[Path]:
+def draw_graph_pictures(
+    out: Path, spec: SensorSpec, form: Form, graph: PinGraph, reference: Reference, image: np.ndarray | None
+) -> list[Path]:
     """``graph.png`` over the frame (or on black), and for a Voronoi graph ``surface.png`` against the reference."""
     if image is None:
         width, height = frame_size(spec, form)

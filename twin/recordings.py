@@ -398,7 +398,9 @@ def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form 
             problems.append(f"no-contact frame {error}")
             continue
         if (image.shape[1], image.shape[0]) != size:
-            problems.append(f"no-contact frame {candidate.name}: {image.shape[1]}x{image.shape[0]}, the frames are {size[0]}x{size[1]}; ignored")
+            problems.append(
+                f"no-contact frame {candidate.name}: {image.shape[1]}x{image.shape[0]}, the frames are {size[0]}x{size[1]}; ignored"
+            )
             continue
         recording.reference = Frame(image, form, candidate.name)
         break

@@ -9,8 +9,8 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.camera import expose, record
 from twin.errors import RenderError
-from twin.mechanics.path import ContactPose
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
+from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Renderer
 from twin.truth import CapTruth, cap_truth

@@ -101,7 +101,9 @@ def test_bad_input_is_one_line_with_the_remedy(tmp_path):
     (tmp_path / "torn.avi").write_bytes(b"RIFF....AVI ")
     one_line_error(twin("preprocess", tmp_path / "torn.avi", *sensor), "torn.avi")
     one_line_error(twin("graph", tmp_path / "nowhere.npz", "--sensor", "mg400-127"), "nowhere.npz")
-    one_line_error(twin("render", "--sensor", "mg400-172", "--object", "plane", "--indent-mm", 1, "--out", tmp_path), "did you mean 'mg400-127'")
+    one_line_error(
+        twin("render", "--sensor", "mg400-172", "--object", "plane", "--indent-mm", 1, "--out", tmp_path), "did you mean 'mg400-127'"
+    )
     typo = tmp_path / "mine.toml"
     typo.write_text((SHIPPED / "sensors" / "mg400-127.toml").read_text().replace("thickness_mm", "thicknes_mm", 1))
     one_line_error(twin("render", "--sensor", typo, "--object", "plane", "--indent-mm", 1, "--out", tmp_path), "mine.toml", "did you mean")

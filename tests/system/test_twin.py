@@ -13,7 +13,7 @@ from twin.types import Form
 
 CENTROID_RMS_PX = 0.3  # detected against projected caps, no contact
 SLOPE_SHARE = 0.5  # a drag along one axis moves the pins at least this much more along it than across it
-FORMS = [("mg400-331", Form.RAW), ("mg400-331", Form.RECORDING), ("mg400-127", Form.RAW), ("mg400-127", Form.RECORDING), ("ur5-331", Form.RAW)]
+FORMS = [(name, form) for name in ("mg400-331", "mg400-127") for form in Form] + [("ur5-331", Form.RAW)]
 
 
 @pytest.fixture(scope="module")

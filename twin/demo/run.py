@@ -10,8 +10,8 @@ import numpy as np
 from scenes import load_object, load_sensor
 from twin.demo.page import contact_figures, contact_pictures, embed, motion_figure, render_page, write_figure
 from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, depth_table, run_contact
-from twin.projection import project
 from twin.preprocess.forms import from_raw
+from twin.projection import project
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
 from twin.types import Form
@@ -44,7 +44,9 @@ def run_demo(out: Path, bar) -> list[Path]:
         seconds[f"{sensor} against {stimulus}"] = perf_counter() - start
         with bar(f"{sensor}: pictures"):
             skin = pictures / f"{sensor}-{stimulus}-skin.png"
-            notes.add(draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_stimulus(load_object(stimulus)), skin))
+            notes.add(
+                draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_stimulus(load_object(stimulus)), skin)
+            )
             contacts.append(_contact_content(simulator, result, skin, pictures))
 
     motion_sensor = CONTACTS[0][0]
@@ -65,7 +67,9 @@ def run_demo(out: Path, bar) -> list[Path]:
     seconds["displacement tables"] = perf_counter() - start
 
     renderer = simulators[motion_sensor].describe()["renderer"]
-    machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(sorted(notes))
+    machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(
+        sorted(notes)
+    )
     page = out / "index.html"
     page.write_text(
         render_page(

@@ -8,6 +8,7 @@ residuals; the seed that explains most blobs wins.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -23,10 +24,22 @@ ADOPT_AREA_RATIO = 2.0  # ... if the blob's area is within this ratio of its nei
 SOFT_RESIDUAL = 0.15  # residual, in local spacings, at which a pair's weight is halved
 AREA_LOG_WEIGHT = 0.02  # cost of a log-area ratio of 1 against a squared residual in spacings
 MIN_AREA_RATIO = 0.2  # a blob smaller than this part of its neighbours' mean area is a speck, not a pin
-NEARLY_ALL = 0.985  # of the pins, or blobs, labelled by one growth ...
+NEARLY_ALL = 0.985  # of the pins (or nearly so of the blobs, and this part of the pins) labelled by one growth ...
+MIN_SETTLED = 0.7
 SETTLED = 0.9  # ... at a score of this part of their number: no further seed is tried
+RIM_WEIGHT = 0.1  # of the rim's mean square motion (in spacings) in the score, per pin
+EXTENT = (0.02, 0.98)  # quantiles whose middle tells how far the whole view is displaced, whatever moves inside
 RIM_SEEDS = 12
 REFINED = 4  # growths that are refined when none settles
+
+
+class Layout(NamedTuple):
+    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, outmost (m,)."""
+
+    rest: np.ndarray
+    neighbours: np.ndarray
+    spacing: np.ndarray
+    outmost: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -40,7 +53,7 @@ class Match:
     predicted_px : (N, 2) float
         Each pin's place as its neighbours' motion predicts it.
     score : float
-        Pins paired, less their squared residuals relative to the gate.
+        Pins paired, less their squared residuals relative to the gate, less what the rim moves.
     """
 
     blob: np.ndarray
@@ -212,9 +225,9 @@ def _assign(n: int, blob_count: int, pins: list, blobs: list, costs: list, conte
     return blob
 
 
-def _refine(layout: tuple, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: tuple, cell: float) -> Match:
+def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: tuple, cell: float) -> Match:
     """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
-    rest, neighbours, spacing = layout
+    rest, neighbours, spacing, _ = layout
     for _ in range(4):
         moved, weight = _trust(rest, neighbours, spacing, px, blob)
         predicted = predict_all(rest, neighbours, spacing, moved, weight)
@@ -225,12 +238,26 @@ def _refine(layout: tuple, px: np.ndarray, area: np.ndarray, blob: np.ndarray, b
     blob = _adopt(layout, px, area, blob, predicted)
     found = blob >= 0
     residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * spacing[found]) ** 2
-    return Match(blob, predicted, float(found.sum() - residual2.sum()))
+    return Match(blob, predicted, float(found.sum() - residual2.sum() - RIM_WEIGHT * len(rest) * _rim_motion2(layout, px, blob)))
 
 
-def _adopt(layout: tuple, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+def _rim_motion2(layout: Layout, px: np.ndarray, blob: np.ndarray) -> float:
+    """Mean square motion of the outmost pins against each other, in spacings, 1 at most.
+
+    The rim is clamped, so it hardly turns. That tells the true labelling of a round layout from the one in
+    which every ring is turned on by one pin, which is nearly as smooth.
+    """
+    rim = layout.outmost[blob[layout.outmost] >= 0]
+    if not len(rim):
+        return 1.0
+    motion = px[blob[rim]] - layout.rest[rim]
+    motion = motion - np.median(motion, axis=0)
+    return float(min(1.0, np.mean((motion**2).sum(axis=1) / layout.spacing[rim] ** 2)))
+
+
+def _adopt(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """Give lost pins the free blobs of a cap's size a little outside the gate: at the rim the prediction is an extrapolation."""
-    _, neighbours, spacing = layout
+    neighbours, spacing = layout.neighbours, layout.spacing
     lost = np.flatnonzero((blob < 0) & np.isfinite(predicted[:, 0]))
     free = np.setdiff1d(np.arange(len(px)), blob)
     if not len(lost) or not len(free) or len(lost) > 0.2 * len(blob):
@@ -253,10 +280,11 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
     """Pairs to start from: pins around the rim, where motion is least, then inside, with their 1st, 2nd, 3rd nearest blobs."""
     rim, inside = reference.outmost, len(reference.pins_px) - len(reference.outmost)
     pins = np.concatenate([rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], [*range(0, inside, max(inside // 6, 1))]])
-    shift = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
+    extent = np.quantile(px, EXTENT, axis=0).mean(axis=0) - np.quantile(reference.pins_px, EXTENT, axis=0).mean(axis=0)
+    median = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
     seen = set()
     for rank in range(3):
-        for offset in (np.zeros(2), shift):
+        for offset in (extent, np.zeros(2), median):
             for pin in pins.tolist():
                 distance2 = ((px - (reference.pins_px[pin] + offset)) ** 2).sum(axis=1)
                 pair = pin, int(np.argpartition(distance2, rank)[rank])
@@ -265,9 +293,9 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
                     yield pair
 
 
-def _regrown(layout: tuple, px: np.ndarray, area: np.ndarray, found: Match, buckets: tuple, cell: float) -> Match:
+def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buckets: tuple, cell: float) -> Match:
     """Forget the labels around the lost pins and grow them anew from the others."""
-    rest, neighbours, spacing = layout
+    rest, neighbours = layout.rest, layout.neighbours
     for reach in (6, neighbours.shape[1]):
         doubtful = np.zeros(len(rest), bool)
         lost = found.blob < 0
@@ -275,7 +303,7 @@ def _regrown(layout: tuple, px: np.ndarray, area: np.ndarray, found: Match, buck
         start = np.where(doubtful, -1, found.blob)
         if (start >= 0).sum() < 0.5 * len(rest):
             break
-        again = _refine(layout, px, area, _grow(*layout, px, start, buckets, cell), buckets, cell)
+        again = _refine(layout, px, area, _grow(*layout[:3], px, start, buckets, cell), buckets, cell)
         if again.score > found.score:
             found = again
         if (found.blob >= 0).all():
@@ -304,16 +332,16 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
     if len(px) < 3:
         return nothing
     px = np.ascontiguousarray(px)
-    layout = (reference.pins_px, reference.neighbours, reference.spacing_px)
+    layout = Layout(reference.pins_px, reference.neighbours, reference.spacing_px, reference.outmost)
     cell = float(np.median(reference.spacing_px))
     buckets = _buckets(px, cell)
     grown = []
     for pin, blob in _seeds(reference, px):
         start = np.full(n, -1)
         start[pin] = blob
-        labels = _grow(*layout, px, start, buckets, cell)
+        labels = _grow(*layout[:3], px, start, buckets, cell)
         count = int((labels >= 0).sum())
-        if count >= NEARLY_ALL * min(n, len(px)) and count >= NEARLY_ALL**2 * n:
+        if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
             found = _refine(layout, px, area_px2, labels, buckets, cell)
             if found.score >= SETTLED * count:
                 grown = [(found.score, labels, found)]
@@ -334,5 +362,5 @@ def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np
     """Settle a labelling ``blob`` (N,) of nearly all pins on a slightly different set of blobs, as ``match`` would."""
     px = np.ascontiguousarray(px)
     cell = float(np.median(reference.spacing_px))
-    layout = (reference.pins_px, reference.neighbours, reference.spacing_px)
+    layout = Layout(reference.pins_px, reference.neighbours, reference.spacing_px, reference.outmost)
     return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)

@@ -40,12 +40,14 @@ class PinsSpec(Section):
     """Pins on the skin's inside, normal to it.
 
     ``rings``: ring i has 6 i pins. ``hexagon``: hexagonal rings of 6 i pins. Both have
-    1 + 3 r (r + 1) pins for r rings, at polar angles proportional to the ring's (flat
-    hexagon's) radius, ``max_polar_deg`` for the outermost (corner) pin. ``phase_deg``
-    is the azimuth of the first pin of each ring, from x towards y.
+    1 + 3 r (r + 1) pins for r rings, ``max_polar_deg`` being the outermost (corner) pin's
+    polar angle. ``spacing``: the ring's (flat hexagon's) radius is proportional to the polar
+    angle (``polar``), or to its sine, so that the pins are even in plan (``plan``).
+    ``phase_deg`` is the azimuth of the first pin of each ring, from x towards y.
     """
 
     layout: Literal["rings", "hexagon"]
+    spacing: Literal["polar", "plan"] = "polar"
     rings: Annotated[int, Field(ge=1, le=40)]
     max_polar_deg: Annotated[float, Field(gt=0, lt=90)]
     phase_deg: float = 0.0

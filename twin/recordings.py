@@ -166,10 +166,8 @@ class Recording:
     def _frame(self, image: np.ndarray, index: int, time_s: float = 0.0) -> Frame:
         name = self.names[index]
         if (image.shape[1], image.shape[0]) != tuple(self.size_px):
-            raise FrameError(
-                f"{name}: expected {self.size_px[0]}x{self.size_px[1]} as the recording's other frames, got {image.shape[1]}x{image.shape[0]};"
-                " leave it out or record it again"
-            )
+            expected, got = _times(self.size_px), _times(image.shape[1::-1])
+            raise FrameError(f"{name}: expected {expected} as the recording's other frames, got {got}; leave it out or record it again")
         return Frame(image, self.form, name, time_s, index)
 
     def _video_frames(self) -> Iterator[Frame]:
@@ -183,6 +181,10 @@ class Recording:
                 yield self._frame(_video_image(image), index, time_s)
         finally:
             capture.release()
+
+
+def _times(size_px: tuple) -> str:
+    return f"{size_px[0]}x{size_px[1]}"
 
 
 def _video_image(image: np.ndarray) -> np.ndarray:

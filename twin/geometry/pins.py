@@ -47,10 +47,11 @@ def pin_lattice(layout: str, rings: int) -> np.ndarray:
 
 
 def rest_pins(spec: SensorSpec) -> PinRest:
-    """Pins at rest of a sensor: polar angle proportional to the lattice radius (equal polar steps)."""
+    """Pins at rest of a sensor: the lattice wrapped onto the inside of the dome (``spec.pins.spacing``)."""
     pins, skin = spec.pins, spec.skin
     lattice = pin_lattice(pins.layout, pins.rings)
-    polar = np.radians(pins.max_polar_deg) * lattice[:, 0]
+    largest = np.radians(pins.max_polar_deg)
+    polar = largest * lattice[:, 0] if pins.spacing == "polar" else np.arcsin(np.sin(largest) * lattice[:, 0])
     azimuth = lattice[:, 1] + np.radians(pins.phase_deg)
     outward = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=1)
     base = (skin.outer_radius_mm - skin.thickness_mm) * outward

@@ -71,9 +71,7 @@ def threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> np.ndarray:
     median = int(np.searchsorted(np.cumsum(histogram), histogram.sum() / 2))
     smooth = cv2.GaussianBlur(gray, (3, 3), NOISE_SIGMA_PX)
     smooth[disc == 0] = min(median, 255)
-    binary = cv2.adaptiveThreshold(
-        smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, blob.threshold_block_px | 1, blob.threshold
-    )
+    binary = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, blob.threshold_block_px | 1, blob.threshold)
     return cv2.bitwise_and(binary, disc)
 
 

@@ -28,7 +28,7 @@ NEARLY_ALL = 0.985  # of the pins (or nearly so of the blobs, and this part of t
 MIN_SETTLED = 0.7
 SETTLED = 0.9  # ... at a score of this part of their number: no further seed is tried
 RIM_WEIGHT = 0.1  # of the rim's mean square motion (in spacings) in the score, per pin
-EXTENT = (0.02, 0.98)  # quantiles whose middle tells how far the whole view is displaced, whatever moves inside
+EXTENT_MARGIN = 0.02  # of the points on each side; the rest's middle tells how far the whole view is displaced
 RIM_SEEDS = 12
 REFINED = 4  # growths that are refined when none settles
 
@@ -276,11 +276,18 @@ def _adopt(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, p
     return blob
 
 
+def _middle(px: np.ndarray) -> np.ndarray:
+    """Middle (2,) of the extent of points (K, 2), but for the outermost few."""
+    ordered = np.sort(px, axis=0)
+    margin = int(EXTENT_MARGIN * len(px))
+    return (ordered[margin] + ordered[-1 - margin]) / 2
+
+
 def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
     """Pairs to start from: pins around the rim, where motion is least, then inside, with their 1st, 2nd, 3rd nearest blobs."""
     rim, inside = reference.outmost, len(reference.pins_px) - len(reference.outmost)
     pins = np.concatenate([rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], [*range(0, inside, max(inside // 6, 1))]])
-    extent = np.quantile(px, EXTENT, axis=0).mean(axis=0) - np.quantile(reference.pins_px, EXTENT, axis=0).mean(axis=0)
+    extent = _middle(px) - _middle(reference.pins_px)
     median = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
     seen = set()
     for rank in range(3):

@@ -17,9 +17,10 @@ from twin.preprocess.split import split_chains, split_merged
 from twin.types import Form, Frame, Observation
 
 MIN_FOUND = 0.8  # of the pins: fewer is not an observation
-MAX_EXTRA = 0.35  # further blobs among the pins, as a part of N: more is another sensor's layout, or clutter
+MAX_EXTRA = 0.35  # further blobs among the pins, as a part of N, where pins are missing: more is another sensor's layout, or clutter
+NEARLY_ALL = 0.97
 MAX_FOLDED = 0.02  # of the rest triangles turned over: more is a wrong labelling
-MAX_SHIFT = 0.3  # of the layout's radius: a frame displaced further isn't this sensor's view
+MAX_SHIFT = 0.5  # of the layout's radius: a frame displaced further isn't this sensor's view
 MAX_BLOB_PITCHES2 = 3.0  # area of a component, in squared pitches: larger is housing or glare
 SPLIT_ROUNDS = 3
 REMASK_PX = 2.0  # a frame displaced by more gets its mask displaced likewise when pins are missing
@@ -164,7 +165,7 @@ class Pipeline:
         center = nodes_px.mean(axis=0)
         radius = np.linalg.norm(nodes_px - center, axis=1).max()
         extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
-        if extra > MAX_EXTRA * n:
+        if extra > MAX_EXTRA * n and found < NEARLY_ALL * n:
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         return ""
 

@@ -1,0 +1,82 @@
+"""Time the pipeline against the published method, frame by frame in the same run and thread.
+
+Run: python tests/bench/bench_pipeline.py [--sensor mg400-331] [--frames 200]. It takes the recordings named by
+TACTIP_REAL (default ../shared/real) where they are, else drawn frames.
+"""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from time import perf_counter
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "unit"), str(ROOT / "tests" / "bench")]
+
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+from baseline_release import Baseline  # noqa: E402
+from drawn_frames import drawn_frame, smooth_warp  # noqa: E402
+
+from scenes import load_sensor  # noqa: E402
+from twin.preprocess import Pipeline, features, nominal_reference  # noqa: E402
+from twin.recordings import open_recording  # noqa: E402
+from twin.types import Form  # noqa: E402
+
+FOLDERS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
+WARM_UP = 5
+
+
+def take_frames(spec, count):
+    """Up to ``count`` frames spread over the recording, or drawn ones; and what they are."""
+    folder = Path(os.environ.get("TACTIP_REAL", ROOT / "../shared/real")) / FOLDERS[spec.name]
+    if folder.is_dir():
+        recording = open_recording(folder, spec)
+        picked = np.linspace(0, len(recording) - 1, min(count, len(recording))).astype(int)
+        return [recording.read(k) for k in picked], f"recorded frames ({folder.name})"
+    rng = np.random.default_rng(0)
+    rest = nominal_reference(spec, Form.RECORDING)
+    pitch = rest.spacing_px.mean()
+    frames = [drawn_frame(spec, Form.RECORDING, smooth_warp(rest.pins_px, rng.uniform(0, pitch), rng)) for _ in range(count)]
+    return frames, "drawn frames (no recordings found; set TACTIP_REAL)"
+
+
+def timed(call, *arguments):
+    """Result of a call, and its time in ms."""
+    start = perf_counter()
+    result = call(*arguments)
+    return result, 1e3 * (perf_counter() - start)
+
+
+def main():
+    """Print p50, p95, p99 of every stage and the ratio of the medians."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sensor", choices=FOLDERS, default="mg400-331")
+    parser.add_argument("--frames", type=int, default=200)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    spec = load_sensor(options.sensor)
+    frames, what = take_frames(spec, options.frames)
+    pipeline, baseline = Pipeline(spec, Form.RECORDING), Baseline(spec)
+    ours, theirs = {}, {}
+    for k, frame in enumerate(frames[:1] * WARM_UP + frames):
+        observation, total = timed(pipeline, frame)
+        node_features, feature_ms = timed(features, observation.graph, pipeline.reference) if observation.valid else (None, 0.0)
+        nodes, detect_ms = timed(baseline.detect, frame.image)
+        _, graph_ms = timed(baseline.graph, nodes)
+        if k >= WARM_UP:
+            for stage, ms in {**observation.ms, "features": feature_ms, "total": total + feature_ms}.items():
+                ours.setdefault(stage, []).append(ms)
+            for stage, ms in {"detect": detect_ms, "graph": graph_ms, "total": detect_ms + graph_ms}.items():
+                theirs.setdefault(stage, []).append(ms)
+    print(f"{len(frames)} {what}, {spec.name}, one thread, ms per frame")
+    print(f"{'':24s}{'p50':>9s}{'p95':>9s}{'p99':>9s}")
+    for title, stages in (("pipeline", ours), ("published method", theirs)):
+        for stage, ms in stages.items():
+            print(f"{title + ' ' + stage:24s}" + "".join(f"{value:9.3f}" for value in np.percentile(ms, (50, 95, 99))))
+    print(f"ratio of the median totals: {np.median(theirs['total']) / np.median(ours['total']):.1f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -17,9 +17,10 @@ from twin.preprocess.split import split_chains, split_merged
 from twin.types import Form, Frame, Observation
 
 MIN_FOUND = 0.8  # of the pins: fewer is not an observation
-MAX_EXTRA = 0.35  # further blobs among the pins, as a part of N, where pins are missing: more is another sensor's layout, or clutter
+MAX_EXTRA = 0.35  # further blobs among the pins, as a part of N, where pins are missing (N itself where none is)
 NEARLY_ALL = 0.97
 MAX_FOLDED = 0.02  # of the rest triangles turned over: more is a wrong labelling
+MAX_RIM_SCALE = 1.2  # of the clamped rim, to its size at rest; contact changes it by some percent
 MAX_SHIFT = 0.5  # of the layout's radius: a frame displaced further isn't this sensor's view
 MAX_BLOB_PITCHES2 = 3.0  # area of a component, in squared pitches: larger is housing or glare
 SPLIT_ROUNDS = 3
@@ -162,12 +163,20 @@ class Pipeline:
         shift = np.linalg.norm(np.median(nodes_px, axis=0) - self._center_px)
         if shift > MAX_SHIFT * self._radius_px:
             return f"inconsistent pins: the layout is displaced by {shift:.0f} px"
+        rim = self.reference.outmost
+        scale = _mean_radius(nodes_px[rim]) / _mean_radius(self.reference.pins_px[rim])
+        if not 1 / MAX_RIM_SCALE < scale < MAX_RIM_SCALE:
+            return f"inconsistent pins: the rim is {scale:.2f} times its size at rest; another sensor's frame"
         center = nodes_px.mean(axis=0)
         radius = np.linalg.norm(nodes_px - center, axis=1).max()
         extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
-        if extra > MAX_EXTRA * n and found < NEARLY_ALL * n:
+        if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         return ""
+
+
+def _mean_radius(px: np.ndarray) -> float:
+    return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
 
 
 def _since(start: float) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
@@ -40,6 +41,7 @@ class SkinSolver:
         )
         points = contact_points(self.mesh, spec.skin.outer_radius_mm)
         self.body = Body(table, points, FrontalSolver(self.mesh.hexes, self.mesh.fixed, self.mesh.grid), ~self.mesh.fixed)
+        self._blas = ThreadpoolController()  # the fronts are small: more BLAS threads only wait for each other
 
     def rest(self, *, T_sensor_object: np.ndarray | None = None) -> ContactState:
         """The undeformed sensor."""
@@ -114,7 +116,8 @@ class SkinSolver:
                 at = stops[number - 1] + (done + stride) * (stops[number] - stops[number - 1])
                 T = plan.at(min(at, 2 * plan.end - at))
                 try:
-                    state, balance = stepper.step(state, T)
+                    with self._blas.limit(limits=1, user_api="blas"):
+                        state, balance = stepper.step(state, T)
                 except NoConvergence as failure:
                     stride /= 2
                     if stride >= _SMALLEST_STRIDE:

@@ -24,7 +24,8 @@ MAX_RIM_SCALE = 1.2  # of the clamped rim, to its size at rest; contact changes 
 MAX_SHIFT = 0.5  # of the layout's radius: a frame displaced further isn't this sensor's view
 MAX_BLOB_PITCHES2 = 3.0  # area of a component, in squared pitches: larger is housing or glare
 SPLIT_ROUNDS = 3
-REMASK_PX = 2.0  # a frame displaced by more gets its mask displaced likewise when pins are missing
+REMASK_PX = 2.0  # a frame displaced by more gets its mask displaced likewise ...
+MASK_MARGIN = 0.5  # ... when a pin is this close to the mask's edge, in spacings
 
 
 class Pipeline:
@@ -66,7 +67,7 @@ class Pipeline:
         ms["detect"], now = _since(started)
         found = match(self.reference, blobs.px, blobs.area_px2)
         ms["match"], now = _since(now)
-        if (found.blob < 0).any() and self._plausible(found):
+        if self._plausible(found):
             blobs, found = self._with_displaced_mask(frame, blobs, found)
         if (found.blob < 0).any() and self._plausible(found):
             blobs, found = self._with_split_caps(blobs, found)
@@ -106,11 +107,11 @@ class Pipeline:
         return (found.blob >= 0).sum() > 0.5 * len(found.blob)
 
     def _with_displaced_mask(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
-        """Look again where the whole view is displaced, so that its mask cuts pins off."""
+        """Look again where the whole view is displaced and its mask cuts into pins, or near them."""
         paired = found.blob >= 0
         rim = self.reference.outmost[paired[self.reference.outmost]]
-        away = np.linalg.norm(found.predicted_px[~paired] - self.blob_spec.mask_center_px, axis=1)
-        if not len(rim) or not (away > self.blob_spec.mask_radius_px - self.reference.spacing_px[~paired]).any():
+        away = np.linalg.norm(found.predicted_px - self.blob_spec.mask_center_px, axis=1)
+        if not len(rim) or not (away > self.blob_spec.mask_radius_px - MASK_MARGIN * self.reference.spacing_px).any():
             return blobs, found
         shift = np.median(blobs.px[found.blob[rim]] - self.reference.pins_px[rim], axis=0)
         if np.linalg.norm(shift) < REMASK_PX:

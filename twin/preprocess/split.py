@@ -103,8 +103,8 @@ def split_chains(blobs: Blobs) -> Blobs:
         neck = _neck(along, weight)
         if not (MIN_CAPS_NECKED if neck is not None else MIN_CAPS) < caps < MAX_CAPS:
             continue
-        count = max(int(np.round(caps)), 2)
-        if neck is not None and count == 2:
+        count = 2 if neck is not None else max(int(np.round(caps)), 2)
+        if neck is not None:
             owner = along > neck
             share = np.array([weight[~owner].sum(), weight[owner].sum()]) / weight.sum()
             centers = [np.average(pixels[part], axis=0, weights=weight[part]) for part in (~owner, owner)]

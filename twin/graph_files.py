@@ -1,15 +1,19 @@
 """Graphs of many frames as one set of arrays, and their pictures."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
+from twin.preprocess.batch import recording_reference
 from twin.preprocess.forms import frame_size
 from twin.preprocess.graph import GraphKind, make_graph
+from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import Reference, nominal_reference
+from twin.recordings import open_recording
 from twin.types import Form, PinGraph
 from twin.views.plots import area_surface_figure, draw_frame, draw_graph, new_figure
 
@@ -84,3 +88,42 @@ def draw_graph_pictures(
 def graphs_of_nodes(kind: GraphKind, nodes_px: np.ndarray, reference: Reference) -> list[PinGraph]:
     """A graph for each of M node sets (M, N, 2)."""
     return [make_graph(kind, nodes, outmost=reference.outmost) for nodes in nodes_px]
+
+
+@dataclass(frozen=True)
+class RecordingGraphs:
+    """Graphs of the good frames of a recording, what they were measured against, and what was left out and why."""
+
+    names: list[str]
+    graphs: list[PinGraph]
+    form: Form
+    reference: Reference
+    first_image: np.ndarray
+    left_out: list[str]
+
+
+def graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None) -> RecordingGraphs:
+    """Run the pipeline on everything ``open_recording`` takes and keep the graphs.
+
+    Raises
+    ------
+    FrameError
+        If no frame has a graph.
+    """
+    recording = open_recording(path, spec, form)
+    left_out: list[str] = []
+    reference, _ = recording_reference(spec, recording, left_out)
+    pipeline = Pipeline(spec, recording.form, reference, graph=kind)
+    names, graphs, first_image = [], [], None
+    for frame in recording:
+        observation = pipeline(frame)
+        if observation.graph is None:
+            left_out.append(f"{frame.name}: {observation.reason}")
+            continue
+        names.append(frame.name)
+        graphs.append(observation.graph)
+        first_image = frame.image if first_image is None else first_image
+    left_out += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
+    if not graphs:
+        raise FrameError(f"{path}: no frame has a graph; the first: {left_out[0] if left_out else 'no frame in it'}")
+    return RecordingGraphs(names, graphs, recording.form, reference, first_image, left_out)

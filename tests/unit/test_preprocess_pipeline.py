@@ -6,8 +6,9 @@ import pytest
 from drawn_frames import cap_radii_px, draw_discs, drawn_frame, smooth_warp
 
 from scenes import load_sensor
+from twin.camera import record
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, as_recording, measure_reference, nominal_reference, raw_to_recording
+from twin.preprocess import Pipeline, measure_reference, nominal_reference, raw_to_recording
 from twin.preprocess.blobs import find_blobs
 from twin.preprocess.legacy import LegacyPipeline
 from twin.preprocess.mask import circular_mask
@@ -215,7 +216,7 @@ def test_a_raw_frame_and_its_recording_show_the_same_pins():
     rest = nominal_reference(spec, Form.RAW).pins_px
     truth = smooth_warp(rest, 8.0, np.random.default_rng(0))
     raw = drawn_frame(spec, Form.RAW, truth, noise_sd=1.0, rng=np.random.default_rng(1))
-    observation = Pipeline(spec, Form.RECORDING)(as_recording(spec, raw))
+    observation = Pipeline(spec, Form.RECORDING)(Frame(record(raw.image, spec.recording), Form.RECORDING))
     assert observation.found == len(truth)
     assert rms(errors_px(observation, raw_to_recording(spec, truth))) < CENTROID_BINARY_PX
 

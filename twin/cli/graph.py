@@ -41,8 +41,7 @@ def graph(
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_sensor
-    from twin.graph_files import draw_graph_pictures, form_of_pins, graphs_of_nodes, read_pins, write_graphs
-    from twin.preprocess.batch import observe_recording
+    from twin.graph_files import draw_graph_pictures, form_of_pins, graphs_of_nodes, graphs_of_recording, read_pins, write_graphs
     from twin.preprocess.reference import nominal_reference
 
     spec = load_sensor(sensor)
@@ -53,9 +52,11 @@ def graph(
         reference = nominal_reference(spec, form)
         graphs = graphs_of_nodes(kind.value, nodes_px, reference)
     else:
-        seen = observe_recording(path, spec, form=form, graph=kind.value)
+        seen = graphs_of_recording(path, spec, kind.value, form)
         names, graphs = seen.names, seen.graphs
         form, reference, image = seen.form, seen.reference, seen.first_image
+        for reason in seen.left_out:
+            print(f"skipped {reason}")
     writable_folder(out)
     print(f"{len(graphs)} graphs; the first has {len(graphs[0].nodes_px)} nodes and {len(graphs[0].edges)} directed edges")
     for written in [write_graphs(out, names, graphs), *draw_graph_pictures(out, spec, form, graphs[0], reference, image)]:

@@ -48,14 +48,17 @@ def element_table(nodes_mm: np.ndarray, hexes: np.ndarray, mu_mpa: np.ndarray, l
     """Gradients and volumes at rest; ValueError if an element is inside out."""
     at = _CORNERS / np.sqrt(3)
     factors = 1 + at[:, None, :] * _CORNERS[None, :, :]
-    local = np.stack(
-        [
-            _CORNERS[:, 0] * factors[:, :, 1] * factors[:, :, 2],
-            _CORNERS[:, 1] * factors[:, :, 0] * factors[:, :, 2],
-            _CORNERS[:, 2] * factors[:, :, 0] * factors[:, :, 1],
-        ],
-        axis=2,
-    ) / 8
+    local = (
+        np.stack(
+            [
+                _CORNERS[:, 0] * factors[:, :, 1] * factors[:, :, 2],
+                _CORNERS[:, 1] * factors[:, :, 0] * factors[:, :, 2],
+                _CORNERS[:, 2] * factors[:, :, 0] * factors[:, :, 1],
+            ],
+            axis=2,
+        )
+        / 8
+    )
     jacobian = np.einsum("mai,qaj->mqij", nodes_mm[hexes], local)
     weights = np.linalg.det(jacobian)
     if weights.min() <= 0:

@@ -198,9 +198,7 @@ class LoadStepper:
             if balance.relative <= tolerance:
                 return nodes, yielded, balance
             stiffness = problem.stiffness(nodes, yielded, limit)
-            move, yield_move, shift = self._direction(
-                stiffness, balance.residual, balance.yield_residual_n, symmetric=True, shift=shift
-            )
+            move, yield_move, shift = self._direction(stiffness, balance.residual, balance.yield_residual_n, symmetric=True, shift=shift)
             slope = balance.work(move, yield_move)
             size = min(1.0, _LARGEST_MOVE_MM / max(np.abs(move).max(), 1e-300))
             for _ in range(12):
@@ -228,9 +226,7 @@ class LoadStepper:
                 return nodes, yielded, balance
             stiffness = problem.stiffness(nodes, yielded)
             symmetric = not balance.contact.slipping.any()
-            move, yield_move, _ = self._direction(
-                stiffness, balance.residual, balance.yield_residual_n, symmetric=symmetric, shift=0.0
-            )
+            move, yield_move, _ = self._direction(stiffness, balance.residual, balance.yield_residual_n, symmetric=symmetric, shift=0.0)
             slope = balance.work(move, yield_move)
             if slope >= 0:
                 raise NoConvergence(balance.relative)

@@ -36,9 +36,7 @@ class SkinSolver:
         self.mesh = build_mesh(spec, resolution=resolution)
         skin, gel = (lame_constants(m.young_modulus_mpa, m.poisson_ratio) for m in (spec.skin, spec.gel))
         is_skin = self.mesh.material == SKIN
-        table = element_table(
-            self.mesh.nodes_mm, self.mesh.hexes, np.where(is_skin, skin[0], gel[0]), np.where(is_skin, skin[1], gel[1])
-        )
+        table = element_table(self.mesh.nodes_mm, self.mesh.hexes, np.where(is_skin, skin[0], gel[0]), np.where(is_skin, skin[1], gel[1]))
         points = contact_points(self.mesh, spec.skin.outer_radius_mm)
         self.body = Body(table, points, FrontalSolver(self.mesh.hexes, self.mesh.fixed, self.mesh.grid), ~self.mesh.fixed)
         self._blas = ThreadpoolController()  # the fronts are small: more BLAS threads only wait for each other

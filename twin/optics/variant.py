@@ -54,7 +54,7 @@ class VariantChoice:
 
     @property
     def backend(self) -> str:
-        """"cuda", "llvm" or "scalar"."""
+        """ "cuda", "llvm" or "scalar"."""
         return self.variant.split("_")[0]
 
     @property

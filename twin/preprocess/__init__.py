@@ -1,6 +1,6 @@
 """From frames to labelled pins and their graphs."""
 
-from twin.preprocess.forms import as_recording, raw_to_recording, recording_to_raw
+from twin.preprocess.forms import raw_to_recording, recording_to_raw
 from twin.preprocess.graph import features, make_graph
 from twin.preprocess.pipeline import Pipeline, measure_reference
 from twin.preprocess.reference import Reference, make_reference, nominal_reference
@@ -8,7 +8,6 @@ from twin.preprocess.reference import Reference, make_reference, nominal_referen
 __all__ = [
     "Pipeline",
     "Reference",
-    "as_recording",
     "features",
     "make_graph",
     "make_reference",

@@ -13,18 +13,22 @@ from twin.errors import FrameError
 from twin.preprocess.forms import blob_spec
 from twin.preprocess.overlay import draw_overlay
 from twin.preprocess.pipeline import Pipeline, measure_reference
+from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import Recording, open_recording
 from twin.types import Form, Observation
 
 
-def _reference(spec: SensorSpec, recording: Recording, problems: list):
-    """The recording's own no-contact layout, and its name; the specification's where there is none or it is no use."""
+def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
+    """The recording's own no-contact layout and its frame's name; where there is none or it is no use, the specification's.
+
+    Why a no-contact frame was no use is appended to ``problems``.
+    """
     if recording.reference is not None:
         try:
             return measure_reference(spec, recording.form, recording.reference), recording.reference.name
         except FrameError as error:
             problems.append(str(error))
-    return None, "specification"
+    return nominal_reference(spec, recording.form), "specification"
 
 
 def _write(path: Path, write: Callable) -> None:
@@ -82,7 +86,7 @@ def preprocess_recording(
     except OSError as error:
         raise FrameError(f"{out_dir}: can't be made ({error.strerror}); give another folder") from error
     notes: list[str] = []
-    reference, reference_name = _reference(spec, recording, notes)
+    reference, reference_name = recording_reference(spec, recording, notes)
     pipeline = Pipeline(spec, recording.form, reference)
     names, observations, failed = [], [], []
     for frame in recording:

@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
-from twin.types import Form, Frame
+from twin.types import Form
 
 
 def _crop_scale(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
@@ -56,16 +56,3 @@ def gray_levels(image: np.ndarray) -> np.ndarray:
     if image.ndim == 2:
         return image
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.shape[2] == 3 else image[..., 0]
-
-
-def as_recording(spec: SensorSpec, frame: Frame) -> Frame:
-    """A raw frame as the sensor's capture would have recorded it: crop, adaptive mean threshold, resize."""
-    width, height = frame_size(spec, Form.RECORDING)
-    x0, y0, x1, y1 = spec.recording.crop_px
-    gray = gray_levels(np.ascontiguousarray(frame.image[y0:y1, x0:x1]))
-    binary = cv2.adaptiveThreshold(
-        gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, spec.recording.threshold_block_px, spec.recording.threshold_offset
-    )
-    if (width, height) != (x1 - x0, y1 - y0):
-        binary = cv2.resize(binary, (width, height), interpolation=cv2.INTER_LINEAR)
-    return Frame(binary, Form.RECORDING, frame.name, frame.time_s, frame.sequence)

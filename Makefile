@@ -25,7 +25,8 @@ test: setup      ## run the tests
 	@$(BIN)/python -m pytest -n auto
 
 bench: setup     ## speed, as ratios to named baselines in the same run
-	@$(BIN)/python tests/bench/bench_pipeline.py
+	@$(BIN)/python tests/bench/bench_pipeline.py --sensor mg400-331
+	@$(BIN)/python tests/bench/bench_pipeline.py --sensor mg400-127
 
 validate: setup  ## heavier proofs, on the recordings named by TACTIP_REAL
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests

@@ -9,6 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from twin.demo.stages import ContactResult
+from twin.types import Form
 from twin.views.panel import Look, area_change_at
 from twin.views.plots import area_surface_figure, draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins, new_figure
 
@@ -36,13 +37,15 @@ def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
     draw_pins(ax, look.observation)
     areas, (ax,) = new_figure(1, panel_inch=6)
     draw_area_change(ax, look.observation.graph, look.rest.graph.area_px2, "")
-    return {
+    written = {
         "raw": write_image(folder / f"{stem}-frame.png", result.raw.frame.image),
-        "recorded": write_image(folder / f"{stem}-recorded.png", look.frame.image),
         "pins": write_figure(folder / f"{stem}-graph.png", pins),
         "areas": write_figure(folder / f"{stem}-areas.png", areas),
         "surfaces": write_figure(folder / f"{stem}-surfaces.png", area_surface_figure(look.rest.graph, look.observation.graph)),
     }
+    if look.frame.form is Form.RECORDING:
+        written["recorded"] = write_image(folder / f"{stem}-recorded.png", look.frame.image)
+    return written
 
 
 def motion_figure(motions: list[tuple[str, Look]]) -> Figure:

@@ -99,7 +99,7 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
         "skin": embed(skin),
         "raw": embed(written["raw"]),
         "raw_size": f"{width} x {height} px",
-        "recorded": embed(written["recorded"]) if result.look.frame.form is Form.RECORDING else "",
+        "recorded": embed(written["recorded"]) if "recorded" in written else "",
         "pins": embed(written["pins"]),
         "areas": embed(written["areas"]),
         "surfaces": embed(written["surfaces"]),

@@ -21,6 +21,7 @@ from twin.types import ContactState
 SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)
 WINDOW_PX = (1100, 900)
 CHILD_TIMEOUT_S = 120
+FRONT = {"normal": (0, -1, 0), "origin": (0, -0.01, 0)}  # cut away, so that one sees the pins
 REMEDY = "install libegl1 and libgl1 (apt-get install libegl1 libgl1) for shaded 3D pictures"
 
 
@@ -111,12 +112,11 @@ def _draw_with_pyvista(folder: Path, path: str) -> None:
     plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))
     plotter.set_background("#0d1117", top="#27313f")
     scalars = "displacement_mm" if "displacement_mm" in skin.point_data else None
-    front = {"normal": (0, -1, 0), "origin": (0, -0.01, 0)}
     bar = {"title": "skin displacement, mm", "color": "white", "fmt": "%.1f", "n_labels": 4, "position_x": 0.25, "position_y": 0.04}
-    plotter.add_mesh(skin.clip(**front), scalars=scalars, cmap=_glow(), ambient=0.2, smooth_shading=True, scalar_bar_args=bar)
-    plotter.add_mesh(pins.clip(**front), color="#f2f7ff", smooth_shading=True, split_sharp_edges=True, specular=0.3)
+    plotter.add_mesh(skin.clip(**FRONT), scalars=scalars, cmap=_glow(), ambient=0.2, smooth_shading=True, scalar_bar_args=bar)
+    plotter.add_mesh(pins.clip(**FRONT), color="#f2f7ff", smooth_shading=True, split_sharp_edges=True, specular=0.3)
     if stimulus.n_points:
-        plotter.add_mesh(stimulus.clip(**front), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
+        plotter.add_mesh(stimulus.clip(**FRONT), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
     plotter.camera_position = [(22.0, -84.0, 30.0), (0.0, 0.0, 12.5), (0.0, 0.0, 1.0)]
     plotter.enable_anti_aliasing("ssaa")
     plotter.screenshot(path)
@@ -135,11 +135,17 @@ def _draw_plain(skin: pv.PolyData, stimulus: pv.PolyData, path: Path) -> None:
 
     figure = Figure(figsize=(WINDOW_PX[0] / 100, WINDOW_PX[1] / 100), layout="constrained")
     axes = figure.add_subplot(projection="3d")
-    for surface, color, alpha in ((skin, "#b3541e", 0.9), (stimulus, "#7aa7d9", 0.3)):
-        if surface.n_points:
-            triangles = surface.triangulate().faces.reshape(-1, 4)[:, 1:]
-            axes.plot_trisurf(*surface.points.T, triangles=triangles, color=color, alpha=alpha)
-    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", box_aspect=(1, 1, 0.7))
+    half = skin.clip(**FRONT).triangulate()
+    triangles = half.regular_faces
+    shell = axes.plot_trisurf(*half.points.T, triangles=triangles, cmap=_glow())
+    if "displacement_mm" in half.point_data:
+        shell.set_array(half["displacement_mm"][triangles].mean(axis=1))
+        shell.set_clim(0, half["displacement_mm"].max())
+        figure.colorbar(shell, ax=axes, shrink=0.6, label="skin displacement, mm")
+    if stimulus.n_points:
+        axes.plot_trisurf(*stimulus.points.T, triangles=stimulus.triangulate().regular_faces, color="#7aa7d9", alpha=0.3)
+    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", aspect="equal")
+    axes.view_init(elev=15, azim=-75)
     figure.savefig(path, dpi=100)
 
 

@@ -81,6 +81,9 @@ def _list(kind: str) -> dict[str, Path]:
 
 def _find(name_or_path: str | Path, kind: str) -> Path:
     path = Path(name_or_path)
+    if path.suffix != ".toml" and path.is_file():
+        known = ", ".join((".toml", *MESH_SUFFIXES) if kind == "objects" else (".toml",))
+        raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {known}")
     if path.suffix == ".toml":
         if not path.is_file():
             raise SpecError(f"{path}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'")

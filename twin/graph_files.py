@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -27,15 +28,23 @@ def read_pins(path: Path, spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
         If the file is no ``pins.npz``, belongs to a sensor with another number of pins, or has no valid frame.
     """
     try:
-        with np.load(path) as data:
+        with np.load(path, allow_pickle=False) as data:
             names, pins, predicted, valid = (data[key] for key in ("image_name", "pins_px", "predicted_px", "valid"))
-    except (OSError, KeyError, ValueError) as error:
-        raise FrameError(f"{path}: not a pins.npz as 'twin preprocess' writes it ({error})") from error
+    except FileNotFoundError as error:
+        raise FrameError(f"{path}: no such file; 'twin preprocess' writes it") from error
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile) as error:
+        raise FrameError(f"{path}: not a pins.npz, or a damaged one; write it anew with 'twin preprocess'") from error
+    frames = names.shape[0] if names.ndim else 0
+    if pins.ndim != 3 or pins.shape[2] != 2 or predicted.shape != pins.shape or valid.shape != (frames,) or len(pins) != frames:
+        raise FrameError(f"{path}: its arrays do not fit each other; write it anew with 'twin preprocess'")
     if pins.shape[1] != spec.pins.count:
         raise FrameError(f"{path}: holds {pins.shape[1]} pins a frame, sensor '{spec.name}' has {spec.pins.count}; give the right --sensor")
     if not valid.any():
         raise FrameError(f"{path}: no valid frame in it; look at summary.json beside it for the reasons")
-    return names[valid], np.where(np.isnan(pins), predicted, pins)[valid]
+    nodes_px = np.where(np.isnan(pins), predicted, pins)[valid]
+    if not np.isfinite(nodes_px).all():
+        raise FrameError(f"{path}: a valid frame lacks a pin and its prediction; write it anew with 'twin preprocess'")
+    return names[valid], nodes_px
 
 
 def form_of_pins(spec: SensorSpec, nodes_px: np.ndarray) -> Form:

@@ -80,7 +80,7 @@ class Simulator:
         RenderError
             If the sensor has no recording form, or nothing can be rendered here.
         """
-        self._check_form(form)
+        self.check_form(form)
         start = perf_counter()
         linear = self.renderer.render(state, seed=seed)
         image = expose(linear, self.spec.response, np.random.default_rng(seed))
@@ -90,7 +90,7 @@ class Simulator:
 
     def as_recorded(self, raw: Shot, state: ContactState) -> Shot:
         """The shot of a raw frame in the form of the sensor's recordings."""
-        self._check_form(Form.RECORDING)
+        self.check_form(Form.RECORDING)
         image = record(raw.frame.image, self.spec.recording)
         frame = replace(raw.frame, image=image, form=Form.RECORDING)
         return replace(raw, frame=frame, truth=cap_truth(self.spec, self.rest, state, Form.RECORDING))
@@ -107,6 +107,7 @@ class Simulator:
             },
         }
 
-    def _check_form(self, form: Form) -> None:
+    def check_form(self, form: Form) -> None:
+        """Raise RenderError if the sensor has no such form."""
         if form is Form.RECORDING and self.spec.recording is None:
             raise RenderError(f"sensor '{self.spec.name}' has no recording form: its recordings are raw frames; use the raw form")

@@ -109,6 +109,36 @@ def test_bad_input_is_one_line_with_the_remedy(tmp_path):
     one_line_error(twin("render", "--sensor", typo, "--object", "plane", "--indent-mm", 1, "--out", tmp_path), "mine.toml", "did you mean")
 
 
+def test_a_damaged_pins_file_is_named(rendered, tmp_path):
+    out, _ = rendered
+    assert twin("preprocess", out / "frame.png", "--sensor", "mg400-127", "--out", tmp_path).returncode == 0
+    whole = (tmp_path / "pins.npz").read_bytes()
+    for name, content in (("cut.npz", whole[: len(whole) // 2]), ("empty.npz", b""), ("text.npz", b"pins")):
+        (tmp_path / name).write_bytes(content)
+        one_line_error(twin("graph", tmp_path / name, "--sensor", "mg400-127", "--out", tmp_path / "g"), name, "twin preprocess")
+    with np.load(tmp_path / "pins.npz") as data:
+        arrays = {key: data[key] for key in data}
+    np.savez(tmp_path / "holes.npz", **(arrays | {"pins_px": np.full_like(arrays["pins_px"], np.nan)}))
+    one_line_error(twin("graph", tmp_path / "holes.npz", "--sensor", "mg400-127", "--out", tmp_path / "g"), "holes.npz", "prediction")
+    one_line_error(twin("graph", tmp_path / "pins.npz", "--sensor", "mg400-331", "--out", tmp_path / "g"), "127", "331")
+
+
+def test_no_good_frame_is_a_failure_that_still_leaves_its_summary(tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    cv2.imwrite(str(frames / "black.png"), np.zeros((256, 256), np.uint8))
+    done = twin("preprocess", frames, "--sensor", "mg400-127", "--form", "recording", "--out", tmp_path / "out")
+    one_line_error(done, "frames")
+    with np.load(tmp_path / "out" / "pins.npz") as pins:
+        assert pins["found"].tolist() == [0] and not pins["valid"].any()
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["invalid"][0]["image_name"] == "black.png"
+
+
+def test_a_sensor_without_recording_form_says_so_before_it_presses(tmp_path):
+    asked = ("--sensor", "ur5-331", "--object", "plane", "--indent-mm", 2, "--form", "recording", "--out", tmp_path)
+    one_line_error(twin("render", *asked), "ur5-331", "raw form")
+
+
 def test_unusable_meshes_are_named(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=8.0)
     holed = trimesh.Trimesh(ball.vertices, ball.faces[:-5])

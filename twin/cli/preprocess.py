@@ -46,6 +46,8 @@ def preprocess(
         f"{summary['frames']} frames, all {spec.pins.count} pins found in {100 * summary['exact_fraction']:.2f} %, "
         f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
     )
+    for invalid in summary["invalid"]:
+        print(f"not valid {invalid['image_name']}: {invalid['reason']}")
     for problem in summary["problems"]:
         print(f"note: {problem}")
     for failed in summary["failed"]:

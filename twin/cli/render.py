@@ -1,5 +1,6 @@
 """``twin render``: one contact, rendered, with its exact ground truth."""
 
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -14,7 +15,7 @@ The pose is the OBJECT's, relative to the sensor. The image shows the sensor's x
 the tip at the object. Angles turn right-handed about those axes.
 
 \b
-        image                        side view (y away from you)
+        image                        side view (y towards you)
       +----------> x                        camera
       |   . . .                       ___ (       ) ___  lens
       |  . . . .                     |     gel         |
@@ -35,12 +36,23 @@ the tip at the object. Angles turn right-handed about those axes.
                   before it approaches
 
 \b
-Writes: frame.png, frame.exr (linear), truth.npz (caps_mm, caps_px, rest_px, visible: one
-row a pin, specification's order), truth.json (force_n, torque_nmm, area_mm2, pose,
-everything resolved), skin.vtp, panel.png.
+Writes: frame.png, frame.exr (linear light on the whole raw frame), truth.npz (caps_mm,
+caps_px, rest_px, visible: one row a pin, specification's order), truth.json (force_n of the
+skin on the object in the sensor's axes, so z > 0 when pressed; torque_nmm about the
+sensor's origin, area_mm2, pose, everything resolved), skin.vtp, skin.png, panel.png.
 
-Example: twin render --sensor ur5-331 --object edge --indent-mm 3 --out out/edge
+\b
+Example:
+  twin render --sensor ur5-331 --object edge --indent-mm 3 --out out/edge
 """
+
+
+class Quality(StrEnum):
+    """Presets of the renderer."""
+
+    PREVIEW = "preview"
+    STANDARD = "standard"
+    HIGH = "high"
 
 
 @app.command("render", help=HELP)
@@ -49,12 +61,15 @@ def render(
     object_: Object,
     indent_mm: Annotated[float, typer.Option("--indent-mm", metavar="D", help="indentation from first touch; 0: no contact")],
     out: Out,
-    tilt_deg: Annotated[Pair, typer.Option("--tilt-deg", metavar="RX RY")] = (0.0, 0.0),
-    shear_mm: Annotated[Pair, typer.Option("--shear-mm", metavar="X Y")] = (0.0, 0.0),
-    twist_deg: Annotated[float, typer.Option("--twist-deg", metavar="RZ")] = 0.0,
-    offset_mm: Annotated[Pair, typer.Option("--offset-mm", metavar="X Y")] = (0.0, 0.0),
+    tilt_deg: Annotated[Pair, typer.Option("--tilt-deg", metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
+    shear_mm: Annotated[Pair, typer.Option("--shear-mm", metavar="X Y", help="drag after the press")] = (0.0, 0.0),
+    twist_deg: Annotated[float, typer.Option("--twist-deg", metavar="RZ", help="turn about z during the drag")] = 0.0,
+    offset_mm: Annotated[Pair, typer.Option("--offset-mm", metavar="X Y", help="sideways place of the object before it approaches")] = (
+        0.0,
+        0.0,
+    ),
     form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
-    quality: Annotated[str, typer.Option(help="samples per pixel: preview, standard or high")] = "standard",
+    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = Quality.STANDARD,
     seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
 ) -> None:
     from scenes import load_object, load_sensor
@@ -66,14 +81,15 @@ def render(
     spec, stimulus = load_sensor(sensor), load_object(object_)
     pose = ContactPose(indent_mm=indent_mm, tilt_deg=tilt_deg, shear_mm=shear_mm, twist_deg=twist_deg, offset_mm=offset_mm)
     writable_folder(out)
-    simulator = Simulator(spec, quality=quality)
+    simulator = Simulator(spec, quality=quality.value)
+    simulator.check_form(form)
     with step_bar(f"press {stimulus.name}") as progress:
         state = simulator.press(stimulus, pose, progress=progress)
     with step_bar("render"):
         shot = simulator.shoot(state, form=form, seed=seed)
     with step_bar("pictures"):
         written = write_contact(out, simulator, stimulus, pose, state, shot)
-    force = state.force_n
+    force = state.force_n.round(2) + 0.0  # no negative zeros
     print(f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {state.area_mm2:.1f} mm2, ", end="")
     print(f"{int(shot.truth.visible.sum())} of {len(shot.truth.visible)} caps in sight")
     for path in written:

@@ -108,7 +108,7 @@ def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
 def _check(spec: SensorSpec, pose: ContactPose) -> None:
     values = np.concatenate([[pose.indent_mm, pose.twist_deg], pose.tilt_deg, pose.shear_mm, pose.offset_mm])
     if values.shape != (8,) or not np.isfinite(values).all():
-        raise ContactError(f"a contact pose needs finite numbers, got {pose}")
+        raise ContactError(f"a contact pose needs finite numbers, got {values}; give numbers in mm and deg")
     radius = spec.skin.outer_radius_mm
     deepest = 0.5 * (radius - spec.skin.thickness_mm - spec.lens.z_mm)
     limits = [

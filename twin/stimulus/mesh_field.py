@@ -14,6 +14,7 @@ from scenes.object import MeshShape
 from twin.errors import MeshError
 from twin.stimulus.analytic import project_on_xy
 
+_UNIT_REMEDY = "scale the file to mm, or name its unit in an object's TOML: shape = { kind = 'mesh', file = ..., unit = 'm' }"
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _SMALLEST_MM, _LARGEST_MM = 1.0, 2000.0
 _REACH_MM = 40.0  # half width of the sampled region around the origin: the dome and its shear
@@ -91,9 +92,9 @@ def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:
     mesh.apply_scale(_MM[unit])
     size_mm = float(mesh.extents.max())
     if not np.isfinite(size_mm) or size_mm < _SMALLEST_MM:
-        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too small; set shape.unit (perhaps 'm' or 'inch')")
+        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too small; {_UNIT_REMEDY}")
     if size_mm > _LARGEST_MM:
-        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too large; set shape.unit (perhaps 'mm')")
+        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too large; {_UNIT_REMEDY}")
     if not mesh.is_watertight:
         _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
         raise MeshError(

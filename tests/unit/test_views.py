@@ -1,0 +1,67 @@
+"""Pictures: drawn with or without VTK's offscreen rendering, never ending the program."""
+
+import os
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pyvista as pv
+
+from scenes import load_sensor
+from twin.mechanics.path import ContactPose
+from twin.mechanics.solver import SkinSolver
+from twin.stimulus import build_stimulus
+from twin.views import skin3d
+from twin.views.plots import area_surface_figure, draw_area_change, new_figure
+
+
+def test_a_dying_vtk_leaves_a_plain_picture_and_a_reason(tmp_path, monkeypatch):
+    dying = tmp_path / "python"
+    dying.write_text("#!/bin/sh\nkill -SEGV $$\n")
+    dying.chmod(0o755)
+    monkeypatch.setattr(skin3d.sys, "executable", str(dying))
+    skin = pv.Sphere()
+    skin["displacement_mm"] = np.linspace(0, 1, skin.n_points)
+    reason = skin3d.draw_skin(skin, pv.Sphere(), pv.Sphere(center=(0, 0, 1)), tmp_path / "skin.png")
+    assert "libegl1" in reason
+    assert cv2.imread(str(tmp_path / "skin.png")) is not None
+
+
+def test_pictures_need_no_display(tmp_path):
+    code = "from twin.views.skin3d import probe_offscreen; print('reason:', probe_offscreen())"
+    env = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert done.returncode == 0 and "reason:" in done.stdout
+
+
+def test_the_object_is_drawn_where_its_pose_puts_it():
+    from scenes import load_object
+
+    T = np.eye(4)
+    T[:3, 3] = [1, 2, 15]
+    surface = skin3d.stimulus_surface(build_stimulus(load_object("sphere")).distance, T, bounds_mm=skin3d.SCENE_BOUNDS_MM)
+    radius = np.linalg.norm(surface.points - [1, 2, 25], axis=1)
+    assert np.abs(radius - 10).max() < 0.1
+
+
+def test_the_skin_file_carries_displacement():
+    from scenes import load_object
+
+    solver = SkinSolver(load_sensor("mg400-127"))
+    state = solver.press(load_object("plane"), ContactPose(indent_mm=1.0))
+    skin = skin3d.displaced_skin(solver.mesh, state)
+    assert 0.8 < skin["displacement_mm"].max() < 1.3 and skin["displacement_xyz_mm"].shape == (skin.n_points, 3)
+    assert skin3d.pins_surface(load_sensor("mg400-127").pins, state).n_points > 127
+
+
+def test_area_pictures_take_any_graph():
+    from twin.preprocess import make_graph
+
+    rng = np.random.default_rng(0)
+    rest = make_graph("voronoi", rng.uniform(0, 100, (40, 2)))
+    moved = make_graph("voronoi", rest.nodes_px + rng.normal(0, 1, (40, 2)))
+    figure, (ax,) = new_figure(1)
+    draw_area_change(ax, moved, rest.area_px2, "change")
+    assert len(ax.collections[0].get_paths()) == 40
+    assert len(area_surface_figure(rest, moved).axes) == 3

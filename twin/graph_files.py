@@ -12,6 +12,7 @@ from twin.errors import FrameError
 from twin.preprocess.batch import recording_reference
 from twin.preprocess.forms import frame_size
 from twin.preprocess.graph import GraphKind, make_graph
+from twin.preprocess.legacy import LegacyPipeline
 from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import open_recording
@@ -111,8 +112,21 @@ class RecordingGraphs:
     left_out: list[str]
 
 
-def graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None) -> RecordingGraphs:
-    """Run the pipeline on everything ``open_recording`` takes and keep the graphs.
+def draw_bare_graph(out: Path, graph: PinGraph) -> list[Path]:
+    """``graph.png`` without a frame, for nodes that are not in a frame's pixels."""
+    figure, (ax,) = new_figure(1, panel_inch=8)
+    ax.set_facecolor("#101418")
+    draw_graph(ax, graph)
+    ax.plot(*graph.nodes_px.T, ".", color="#19d3a2", markersize=4)
+    ax.set(aspect="equal", title=f"{len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
+    ax.invert_yaxis()
+    path = out / "graph.png"
+    figure.savefig(path, dpi=120)
+    return [path]
+
+
+def graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None, *, legacy: bool = False) -> RecordingGraphs:
+    """Run the pipeline, or the published release's, on everything ``open_recording`` takes and keep the graphs.
 
     Raises
     ------
@@ -122,7 +136,7 @@ def graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: For
     recording = open_recording(path, spec, form)
     left_out: list[str] = []
     reference, _ = recording_reference(spec, recording, left_out)
-    pipeline = Pipeline(spec, recording.form, reference, graph=kind)
+    pipeline = LegacyPipeline(spec) if legacy else Pipeline(spec, recording.form, reference, graph=kind)
     names, graphs, first_image = [], [], None
     for frame in recording:
         observation = pipeline(frame)

@@ -75,6 +75,18 @@ def test_graph_of_a_frame_and_of_its_pins(rendered, tmp_path, kind, edges):
     assert np.isfinite(graphs[0]["area_px2"]).all() == (kind == "voronoi")
 
 
+def test_the_releases_method_on_a_frame_in_the_recordings_form(tmp_path):
+    done = twin("render", "--sensor", "mg400-127", "--object", "plane", "--indent-mm", 0, "--form", "recording", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert cv2.imread(str(tmp_path / "frame.png"), cv2.IMREAD_UNCHANGED).shape == (256, 256)
+    assert json.loads((tmp_path / "truth.json").read_text())["force_n"] == [0, 0, 0]
+    done = twin("graph", tmp_path / "frame.png", "--sensor", "mg400-127", "--legacy", "--out", tmp_path / "graph")
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "graph" / "graph.npz") as data:
+        assert len(data["edges"]) == 684
+    one_line_error(twin("graph", tmp_path / "frame.png", "--sensor", "mg400-127", "--legacy", "--kind", "knn"), "--legacy")
+
+
 def test_good_frames_are_processed_and_bad_ones_listed(rendered, tmp_path):
     out, _ = rendered
     frames = tmp_path / "frames"

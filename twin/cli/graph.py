@@ -21,6 +21,9 @@ voronoi   the same edges, and the area of each pin's Voronoi cell inside the enl
 Writes graph.npz: image_name (M,), nodes_px (M, N, 2), area_px2 (M, N), edges (E, 2) of all
 graphs one after the other (graph k has edges[edge_start[k]:edge_start[k+1]]), and pictures of
 the first: graph.png, and surface.png (cell area as a surface: no contact, contact, difference).
+
+With --legacy (frames in the recordings' form only) pins, edges and areas are those of the published release: nodes in its
+detector's order, px of its resized image about its scalar median; a frame without exactly all pins is left out.
 """
 
 
@@ -39,25 +42,38 @@ def graph(
     kind: Annotated[Kind, typer.Option("--kind", help="kind of graph")] = Kind.VORONOI,
     out: Out = Path("out/graph"),
     form: FormOrAuto = None,
+    legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
 ) -> None:
     from scenes import load_sensor
-    from twin.graph_files import draw_graph_pictures, form_of_pins, graphs_of_nodes, graphs_of_recording, read_pins, write_graphs
+    from twin.errors import TwinError
+    from twin.graph_files import (
+        draw_bare_graph,
+        draw_graph_pictures,
+        form_of_pins,
+        graphs_of_nodes,
+        graphs_of_recording,
+        read_pins,
+        write_graphs,
+    )
     from twin.preprocess.reference import nominal_reference
 
     spec = load_sensor(sensor)
     image = None
+    if legacy and (kind is not Kind.VORONOI or path.suffix == ".npz"):
+        raise TwinError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
     if path.suffix == ".npz":
         names, nodes_px = read_pins(path, spec)
         form = form or form_of_pins(spec, nodes_px)
         reference = nominal_reference(spec, form)
         graphs = graphs_of_nodes(kind.value, nodes_px, reference)
     else:
-        seen = graphs_of_recording(path, spec, kind.value, form)
+        seen = graphs_of_recording(path, spec, kind.value, form, legacy=legacy)
         names, graphs = seen.names, seen.graphs
         form, reference, image = seen.form, seen.reference, seen.first_image
         for reason in seen.left_out:
             print(f"skipped {reason}")
     writable_folder(out)
     print(f"{len(graphs)} graphs; the first has {len(graphs[0].nodes_px)} nodes and {len(graphs[0].edges)} directed edges")
-    for written in [write_graphs(out, names, graphs), *draw_graph_pictures(out, spec, form, graphs[0], reference, image)]:
+    pictures = draw_bare_graph(out, graphs[0]) if legacy else draw_graph_pictures(out, spec, form, graphs[0], reference, image)
+    for written in [write_graphs(out, names, graphs), *pictures]:
         print(f"wrote {written}")

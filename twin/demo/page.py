@@ -32,7 +32,7 @@ def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
     """Write the pictures of one contact; the skin's own picture is drawn elsewhere."""
     look, stem = result.look, f"{result.sensor}-{result.stimulus}"
     pins, (ax,) = new_figure(1, panel_inch=6)
-    draw_frame(ax, look.frame.image)
+    draw_frame(ax, look.frame.image, around_px=look.rest.graph.nodes_px)
     draw_graph(ax, look.observation.graph)
     draw_pins(ax, look.observation)
     areas, (ax,) = new_figure(1, panel_inch=6)

@@ -30,7 +30,8 @@ def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
     axes[0].imshow(imread(skin_picture))
     axes[0].set(title="deformed skin, cut open", xticks=[], yticks=[])
     draw_frame(axes[1], look.frame.image, "what the camera sees")
-    draw_frame(axes[2], look.frame.image, f"{look.observation.found} pins found")
+    around_px = None if look.rest.graph is None else look.rest.graph.nodes_px
+    draw_frame(axes[2], look.frame.image, f"{look.observation.found} pins found", around_px=around_px)
     draw_pins(axes[2], look.observation)
     graph = look.observation.graph
     if graph is None or look.rest.graph is None:
@@ -38,7 +39,7 @@ def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
             ax.text(0.5, 0.5, look.observation.reason or look.rest.reason, ha="center", wrap=True)
             ax.set_axis_off()
         return figure
-    draw_frame(axes[3], look.frame.image, f"Voronoi graph: {len(graph.edges)} directed edges")
+    draw_frame(axes[3], look.frame.image, f"Voronoi graph: {len(graph.edges)} directed edges", around_px=around_px)
     draw_graph(axes[3], graph)
     draw_area_change(axes[4], graph, look.rest.graph.area_px2, "Voronoi areas against no contact")
     draw_displacement(axes[5], look.rest.graph.nodes_px, graph.nodes_px, "pin displacement")

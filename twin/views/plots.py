@@ -9,6 +9,7 @@ from scipy.interpolate import CloughTocher2DInterpolator
 from twin.types import Observation, PinGraph
 
 FOUND, LOST, EXTRA, EDGE = "#19d3a2", "#ff5c5c", "#ffb000", "#5ec8ff"
+FRAME_REACH = 0.6  # of the pins' extent, to each side of their middle: pins and the ring around them
 SURFACE_GRID = 80  # samples across an interpolated surface
 
 
@@ -19,9 +20,14 @@ def new_figure(columns: int, rows: int = 1, *, panel_inch: float = 4.0, projecti
     return figure, axes.ravel()
 
 
-def draw_frame(ax: Axes, image: np.ndarray, title: str = "") -> None:
-    """The frame itself, in pixels with y down."""
+def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.ndarray | None = None) -> None:
+    """The frame itself, in pixels with y down; with points (N, 2) only the part around them."""
     ax.imshow(image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    if around_px is not None:
+        height, width = image.shape[:2]
+        center, reach = around_px.mean(axis=0), FRAME_REACH * np.ptp(around_px, axis=0).max()
+        ax.set_xlim(max(center[0] - reach, -0.5), min(center[0] + reach, width - 0.5))
+        ax.set_ylim(min(center[1] + reach, height - 0.5), max(center[1] - reach, -0.5))
     ax.set(title=title, xticks=[], yticks=[])
 
 

@@ -77,7 +77,7 @@ def probe_offscreen() -> str:
         return _run_child(folder, str(Path(folder) / "probe.png"))
 
 
-def stimulus_surface(distance, T_sensor_object: np.ndarray, *, bounds_mm, samples: int = 60) -> pv.PolyData:
+def stimulus_surface(distance, T_sensor_object: np.ndarray, *, bounds_mm, samples: int = 100) -> pv.PolyData:
     """The zero level of an object's signed distance inside a box of the sensor frame.
 
     Parameters

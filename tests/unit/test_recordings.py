@@ -1,6 +1,9 @@
 """Recordings in the formats found in the wild, whole and broken."""
 
+import contextlib
 import json
+import os
+import zlib
 
 import cv2
 import numpy as np
@@ -11,7 +14,8 @@ from scenes import load_sensor
 from twin.errors import FrameError
 from twin.preprocess import nominal_reference
 from twin.preprocess.batch import preprocess_recording
-from twin.recordings import natural_key, open_recording
+from twin.preprocess.overlay import overlay_name
+from twin.recordings import natural_key, open_recording, read_image
 from twin.types import Form
 
 
@@ -80,8 +84,9 @@ def test_rows_and_pictures_that_don_t_pair_are_reported(tmp_path, spec, pictures
     names = write_set(tmp_path, "frames_bw", "frame_{}_0.png", pictures, (1, 2, 3))
     (tmp_path / "frames_bw" / names[0]).rename(tmp_path / "frames_bw" / "frame_77_0.png")
     recording = open_recording(tmp_path, spec)
-    assert recording.names == names[1:]
-    np.testing.assert_array_equal(recording.labels["pose_2"], [0.5, 1.0])
+    assert recording.names == [*names[1:], "frame_77_0.png"]
+    assert recording.labels["image_name"].tolist() == [*names[1:], ""]
+    np.testing.assert_array_equal(recording.labels["pose_2"], [0.5, 1.0, np.nan])
     assert any("frame_1_0.png" in p and "without a picture" in p for p in recording.problems)
     assert any("frame_77_0.png" in p and "without a row" in p for p in recording.problems)
 
@@ -212,3 +217,205 @@ def test_batch_writes_what_it_promises(tmp_path, spec, pictures):
     assert sorted(p.name for p in (tmp_path / "out" / "overlay").iterdir()) == sorted(names)
     assert seen[-1] == (3, 3)
     assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_json_nested_without_end_is_reported(tmp_path, spec, pictures):
+    cv2.imwrite(str(tmp_path / "a.png"), pictures[1])
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    recording = open_recording(tmp_path, spec)
+    assert recording.names == ["a.png"] and "deep.json" not in recording.metadata
+    assert any("deep.json" in p and "nested" in p for p in recording.problems)
+
+
+def write_pictures(folder, images):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in images.items():
+        assert cv2.imwrite(str(folder / name), image)
+
+
+@pytest.mark.parametrize("given", [None, Form.RECORDING])
+def test_most_frames_decide_on_the_form(tmp_path, spec, pictures, given):
+    raw = np.zeros((480, 640), np.uint8)
+    write_pictures(tmp_path, {"a.png": raw, **{f"b{k}.png": pictures[1] for k in range(4)}})
+    recording = open_recording(tmp_path, spec, given)
+    assert recording.form == Form.RECORDING and recording.size_px == (256, 256)
+    assert len(list(recording)) == 4 and [f["image_name"] for f in recording.failed] == ["a.png"]
+
+
+def test_the_first_frame_decides_between_equal_numbers(tmp_path, spec, pictures):
+    raw = np.zeros((480, 640), np.uint8)
+    write_pictures(tmp_path, {"a.png": raw, "b.png": pictures[1]})
+    assert open_recording(tmp_path, spec).form == Form.RAW
+    assert open_recording(tmp_path, spec, Form.RECORDING).size_px == (256, 256)
+
+
+def test_a_form_that_no_frame_has_is_an_error(tmp_path, spec, pictures):
+    write_pictures(tmp_path, {"a.png": pictures[1]})
+    with pytest.raises(FrameError, match="a.png: expected 640x480 .raw.*got 256x256.*--form"):
+        open_recording(tmp_path, spec, Form.RAW)
+
+
+def test_a_long_recording_opens_where_few_frames_are_usable(tmp_path, spec, pictures):
+    write_pictures(tmp_path, {f"f_{k}.png": np.zeros((9, 9), np.uint8) for k in range(80)})
+    write_pictures(tmp_path, {"f_41.png": pictures[1]})
+    assert [f.name for f in open_recording(tmp_path, spec)] == ["f_41.png"]
+
+
+def test_the_next_folder_is_read_where_the_first_is_unusable(tmp_path, spec, pictures):
+    write_pictures(tmp_path / "sensor_images", {"image_1.png": np.zeros((50, 60), np.uint8)})
+    write_pictures(tmp_path / "processed_images", {"image_1.png": pictures[1]})
+    recording = open_recording(tmp_path, spec)
+    np.testing.assert_array_equal(recording.read(0).image, pictures[1])
+    assert any("sensor_images" in p and "got 60x50" in p for p in recording.problems)
+    (tmp_path / "processed_images" / "image_1.png").write_bytes(b"")
+    with pytest.raises(FrameError, match="sensor_images: no usable frame.*got 60x50"):
+        open_recording(tmp_path, spec)
+
+
+PLAIN = "image_name,pose_2\nb.png,0.5\na.png,1.5\n"
+TABLES = {
+    "no suffix": PLAIN.replace(".png", "").encode(),
+    "another suffix": PLAIN.replace(".png", ".jpg").encode(),
+    "another case": PLAIN.replace(".png", ".PNG").replace("image_name", "Image_Name").encode(),
+    "single quotes": PLAIN.replace("b.png", "'b.png'").replace("a.png", "'a.png'").encode(),
+    "spaces and quotes": PLAIN.replace("b.png", ' "b.png" ').replace("a.png", "  a.png ").encode(),
+    "an open quote": PLAIN.replace("b.png", '"b.png').encode(),
+    "UTF-16": PLAIN.encode("utf-16"),
+    "UTF-16 without a mark": PLAIN.encode("utf-16-le"),
+    "semicolons": PLAIN.replace(",", ";").replace(".5", ",5").encode(),
+    "the name column twice": PLAIN.replace(",pose_2", ",pose_2,image_name").replace(".5\n", ".5,x\n").encode(),
+    "names in the other column": PLAIN.replace("image_name,", "image_name,sensor_image,")
+    .replace("b.", ",b.")
+    .replace("a.", ",a.")
+    .encode(),
+    "carriage returns": PLAIN.replace("\n", "\r").encode(),
+}
+
+
+@pytest.mark.parametrize("how", TABLES)
+def test_tables_written_in_other_ways_keep_their_order_and_labels(tmp_path, spec, pictures, how):
+    write_pictures(tmp_path, {"a.png": pictures[1], "b.png": pictures[2]})
+    (tmp_path / "targets.csv").write_bytes(TABLES[how])
+    recording = open_recording(tmp_path, spec)
+    assert recording.names == [f.name for f in recording] == ["b.png", "a.png"]
+    np.testing.assert_array_equal(recording.labels["pose_2"], [0.5, 1.5])
+
+
+def test_pictures_with_capital_suffixes_and_equal_stems(tmp_path, spec, pictures):
+    write_pictures(tmp_path, {"a.PNG": pictures[1], "b.png": pictures[1], "b.bmp": pictures[2]})
+    (tmp_path / "targets.csv").write_text("sensor_image,k\nb.bmp,0\nb.png,1\na.png,2\n")
+    recording = open_recording(tmp_path, spec)
+    assert recording.names == ["b.bmp", "b.png", "a.PNG"] and recording.labels["k"].tolist() == [0, 1, 2]
+    assert len(recording.problems) == 1 and "another suffix or case (a.png)" in recording.problems[0]
+
+
+def test_of_two_rows_for_a_picture_the_first_counts(tmp_path, spec, pictures):
+    write_pictures(tmp_path, {"a.png": pictures[1], "b.png": pictures[2]})
+    (tmp_path / "targets.csv").write_text("image_name,k\nb.png,0\nb.png,1\na.png,2\n")
+    recording = open_recording(tmp_path, spec)
+    assert recording.names == ["b.png", "a.png"] and recording.labels["k"].tolist() == [0, 2]
+    assert any("has one before" in p and "b.png" in p for p in recording.problems)
+
+
+def test_a_table_of_other_pictures_leaves_the_natural_order(tmp_path, spec, pictures):
+    write_pictures(tmp_path, {"a.png": pictures[1], "b.png": pictures[2]})
+    (tmp_path / "targets.csv").write_text("image_name,k\ny.png,0\nx.png,1\n")
+    recording = open_recording(tmp_path, spec)
+    assert recording.names == ["a.png", "b.png"] and not recording.labels
+    assert any("natural order" in p for p in recording.problems)
+
+
+def test_pictures_deeper_down_are_pointed_at(tmp_path, spec, pictures):
+    write_pictures(tmp_path / "a" / "b", {"x.png": pictures[1]})
+    with pytest.raises(FrameError, match=r"deeper down \(a/b\); give"):
+        open_recording(tmp_path, spec)
+    assert len(open_recording(tmp_path / "a", spec)) == 1
+
+
+def test_a_folder_with_one_video_gives_its_frames(video, spec, pictures):
+    cv2.imwrite(str(video.parent / "init_0.png"), np.zeros((480, 640), np.uint8))
+    recording = open_recording(video.parent, spec)
+    assert len(list(recording)) == 12 and recording.reference.name == "init_0.png"
+    (video.parent / "tap_2.avi").write_bytes(video.read_bytes())
+    with pytest.raises(FrameError, match=r"2 videos here \(tap.avi, tap_2.avi\); give one of them"):
+        open_recording(video.parent, spec)
+
+
+def test_bytes_after_a_png_don_t_matter_and_missing_ones_do(tmp_path, spec, pictures):
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), pictures[1])
+    data = path.read_bytes()
+    path.write_bytes(data + bytes(500))
+    np.testing.assert_array_equal(read_image(path)[0], pictures[1])
+    for missing in (1, 12, 60, len(data) - 9):
+        path.write_bytes(data[:-missing] + (b"IEND" if missing == 60 else b""))
+        with pytest.raises(FrameError, match="truncated PNG|damaged PNG"):
+            read_image(path)
+
+
+def broken_files(folder, pictures):
+    """Files that the libraries under OpenCV complain about."""
+    write_pictures(folder, {"sum.png": pictures[1], "flow.png": pictures[1], "cut.jpg": pictures[1], "cut.tif": pictures[1]})
+    data = bytearray((folder / "sum.png").read_bytes())
+    data[len(data) // 2] ^= 0x55
+    (folder / "sum.png").write_bytes(data)
+    start = data.index(b"IDAT")
+    length = int.from_bytes(data[start - 4 : start], "big")
+    data[start + length // 2 + 4] ^= 0xFF  # damaged pixels under a correct checksum
+    data[start + 4 + length : start + 8 + length] = zlib.crc32(data[start : start + 4 + length]).to_bytes(4, "big")
+    (folder / "flow.png").write_bytes(data)
+    for name in ("cut.jpg", "cut.tif"):
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[: len(whole) // 2])
+    (folder / "no_moov.mp4").write_bytes(b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + bytes(4000))
+
+
+def test_broken_files_make_no_noise(tmp_path, video, pictures, capfd):
+    folder = tmp_path / "broken"
+    broken_files(folder, pictures)
+    data = video.read_bytes()
+    (folder / "cut.avi").write_bytes(data[: int(0.55 * len(data))])
+    capfd.readouterr()
+    for file in sorted(folder.iterdir()):
+        with contextlib.suppress(FrameError):
+            list(open_recording(file))
+    assert capfd.readouterr().err == ""
+    os.write(2, b"heard again")
+    assert capfd.readouterr().err == "heard again"
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_sixteen_bit_files_of_any_depth_keep_their_levels(tmp_path, spec, pictures, bits):
+    top = (1 << bits) - 1
+    bright = np.round(pictures[1] * (top / 255)).astype(np.uint16)
+    bright[0, 0] = top
+    write_pictures(tmp_path, {"a.png": bright // 20, "b.png": bright})
+    recording = open_recording(tmp_path, spec, Form.RECORDING)
+    dim, image = (frame.image for frame in recording)
+    assert np.abs(image[1:].astype(int) - pictures[1][1:]).max() <= 1
+    assert np.abs(dim[1:] - pictures[1][1:] / 20).max() <= 2
+    (note,) = recording.problems
+    assert f"{bits}-bit" in note and "a.png" in note
+
+
+def test_overlays_of_pictures_with_equal_stems_are_all_kept(tmp_path, spec, pictures):
+    write_pictures(tmp_path / "set", {"a.png": pictures[1], "a.bmp": pictures[2], "b.png": pictures[3]})
+    preprocess_recording(tmp_path / "set", spec, tmp_path / "out", overlay=True)
+    assert len(list((tmp_path / "out" / "overlay").iterdir())) == 3
+    taken = set()
+    assert [overlay_name(name, taken) for name in ("a.jpg", "A.png", "a.jpg", "b")] == ["a.png", "A.png.png", "a.jpg.png", "b.png"]
+    assert overlay_name("a.jpg", taken) == "a_2.png"
+
+
+def test_frames_without_pins_are_one_error_with_the_files_written(tmp_path, spec, pictures):
+    black = np.zeros_like(pictures[0])
+    write_pictures(tmp_path / "set", {"a.png": black, "b.png": black})
+    with pytest.raises(FrameError, match="in none of 2 frames; the first, a.png: .*--sensor, --form") as error:
+        preprocess_recording(tmp_path / "set", spec, tmp_path / "out")
+    summary_path = tmp_path / "out" / "summary.json"
+    message = str(error.value)
+    assert message.startswith(str(tmp_path / "set")) and str(summary_path) in message and "\n" not in message
+    summary = json.loads(summary_path.read_text())
+    assert [bad["image_name"] for bad in summary["invalid"]] == ["a.png", "b.png"] and summary["exact_fraction"] == 0
+    with np.load(tmp_path / "out" / "pins.npz", allow_pickle=False) as arrays:
+        assert arrays["valid"].tolist() == [False, False]

@@ -11,7 +11,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.preprocess.forms import blob_spec
-from twin.preprocess.overlay import draw_overlay
+from twin.preprocess.overlay import draw_overlay, overlay_name
 from twin.preprocess.pipeline import Pipeline, measure_reference
 from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import Recording, open_recording
@@ -44,9 +44,33 @@ def _write(path: Path, write: Callable) -> None:
 
 
 def _timing(observations: list[Observation]) -> dict:
+    if not observations:
+        return {}
     warm = observations[1:] or observations  # the first frame also loads the compiled code
     stages = {stage: [o.ms[stage] for o in warm] for stage in observations[0].ms}
     return {s: dict(zip(("p50", "p95", "p99"), np.percentile(ms, (50, 95, 99)).round(4).tolist(), strict=True)) for s, ms in stages.items()}
+
+
+def _arrays(names: list[str], observations: list[Observation], n: int) -> dict:
+    """What ``pins.npz`` holds of M frames with ``n`` pins."""
+    none = np.full(n, np.nan)
+    areas = [none if o.graph is None else o.graph.area_px2 for o in observations]
+    return {
+        "image_name": np.array(names, str),
+        "pins_px": np.array([o.pins_px for o in observations], float).reshape(-1, n, 2),
+        "predicted_px": np.array([o.predicted_px for o in observations], float).reshape(-1, n, 2),
+        "area_px2": np.array(areas, float).reshape(-1, n),
+        "found": np.array([o.found for o in observations], int),
+        "valid": np.array([o.valid for o in observations], bool),
+    }
+
+
+def _nothing_found(path: str | Path, summary: dict, summary_path: Path) -> str:
+    bad = summary["invalid"] + summary["failed"]
+    return (
+        f"{path}: the pins were found in none of {len(bad)} frames; the first, {bad[0]['image_name']}: {bad[0]['reason']}; "
+        f"check --sensor, --form and the [pipeline] section of the specification (details in {summary_path})"
+    )
 
 
 def preprocess_recording(
@@ -58,6 +82,8 @@ def preprocess_recording(
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
     """Observe every frame of a recording and write ``pins.npz``, ``summary.json`` and, if asked, ``overlay/``.
+
+    A frame is valid if its pins were found.
 
     Parameters
     ----------
@@ -71,13 +97,14 @@ def preprocess_recording(
     Returns
     -------
     dict
-        The summary. ``pins.npz`` has one row per readable frame, in the recording's order: ``image_name``, ``pins_px``
-        and ``predicted_px`` (M, N, 2), ``area_px2`` (M, N), ``found`` and ``valid`` (M,).
+        The summary; ``invalid`` and ``failed`` list the frames whose pins weren't found and those that couldn't be read.
+        ``pins.npz`` has one row per readable frame, in the recording's order: ``image_name``, ``pins_px`` and
+        ``predicted_px`` (M, N, 2), ``area_px2`` (M, N), ``found`` and ``valid`` (M,).
 
     Raises
     ------
     FrameError
-        No frame was readable, or the folder can't be written to.
+        No frame was readable, none was valid (the files are written all the same), or the folder can't be written to.
     """
     recording = open_recording(path, spec, form)
     out_dir = Path(out_dir)
@@ -88,7 +115,7 @@ def preprocess_recording(
     notes: list[str] = []
     reference, reference_name = recording_reference(spec, recording, notes)
     pipeline = Pipeline(spec, recording.form, reference)
-    names, observations, failed = [], [], []
+    names, observations, failed, pictures = [], [], [], set()
     for frame in recording:
         try:
             observation = pipeline(frame)
@@ -99,28 +126,17 @@ def preprocess_recording(
         observations.append(observation)
         if overlay:
             picture = cv2.cvtColor(draw_overlay(frame, observation), cv2.COLOR_RGB2BGR)
-            _write(out_dir / "overlay" / f"{Path(frame.name).stem}.png", cv2.imencode(".png", picture)[1].tofile)
+            _write(out_dir / "overlay" / overlay_name(frame.name, pictures), cv2.imencode(".png", picture)[1].tofile)
         if progress:
             progress(frame.sequence + 1, len(recording))
     failed = recording.failed + failed
-    if not observations:
-        raise FrameError(f"{path}: none of {len(recording)} frames could be used; the first: {failed[0]['reason']}")
-
-    n = spec.pins.count
-    none = np.full(n, np.nan)
-    arrays = {
-        "image_name": np.array(names, str),
-        "pins_px": np.stack([o.pins_px for o in observations]),
-        "predicted_px": np.stack([o.predicted_px for o in observations]),
-        "area_px2": np.stack([none if o.graph is None else o.graph.area_px2 for o in observations]),
-        "found": np.array([o.found for o in observations]),
-        "valid": np.array([o.valid for o in observations]),
-    }
+    arrays = _arrays(names, observations, spec.pins.count)
+    all_found = arrays["valid"] & (arrays["found"] == spec.pins.count)
     summary = {
         "sensor": spec.name,
         "frames": len(observations),
-        "exact_fraction": float(np.mean(arrays["valid"] & (arrays["found"] == n))),
-        "valid_fraction": float(arrays["valid"].mean()),
+        "exact_fraction": float(all_found.sum() / max(len(names), 1)),
+        "valid_fraction": float(arrays["valid"].sum() / max(len(names), 1)),
         "ms": _timing(observations),
         "parameters": {
             "form": str(recording.form),
@@ -135,4 +151,6 @@ def preprocess_recording(
     }
     _write(out_dir / "pins.npz", lambda file: np.savez_compressed(file, **arrays))
     _write(out_dir / "summary.json", lambda file: file.write((json.dumps(summary, indent=1) + "\n").encode()))
+    if not arrays["valid"].any():
+        raise FrameError(_nothing_found(path, summary, out_dir / "summary.json"))
     return summary

@@ -1,5 +1,8 @@
 """A picture of what the pipeline saw."""
 
+from itertools import chain, count
+from pathlib import Path
+
 import cv2
 import numpy as np
 
@@ -32,3 +35,12 @@ def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> n
     text = f"{frame.name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
     cv2.putText(canvas, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
     return canvas
+
+
+def overlay_name(frame_name: str, taken: set[str]) -> str:
+    """File name for a frame's picture, distinct from those in ``taken`` (in lower case), to which it is added."""
+    stem = Path(frame_name).stem
+    tries = chain((f"{stem}.png", f"{frame_name}.png"), (f"{stem}_{k}.png" for k in count(2)))
+    name = next(name for name in tries if name.casefold() not in taken)
+    taken.add(name.casefold())
+    return name

@@ -1,0 +1,241 @@
+"""A recording, opened from whatever the user gives and read frame by frame."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.recordings.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, references_in, the_video_in
+from twin.recordings.forms import Kind, common_kind, form_of, times
+from twin.recordings.images import read_image
+from twin.recordings.quiet import quiet
+from twin.recordings.tables import TABLES, order_by_table, read_metadata
+from twin.types import Form, Frame
+
+
+@dataclass
+class Recording:
+    """Recorded frames, read one at a time when asked for.
+
+    Iterating gives the readable frames in order; what can't be read is added to ``failed`` and skipped.
+
+    Attributes
+    ----------
+    path : Path
+    form : Form
+    names : list of str
+        Base names of the frames, in the table's order, those without a row last; naturally sorted without a table.
+    size_px : (int, int)
+        Width and height every frame must have.
+    labels : dict of str to (M,) array
+        The table's columns, row by row as ``names``; numbers where a column is all numbers. NaN or "" for frames without
+        a row. Empty without a table.
+    metadata : dict of str to object
+        Content of the JSON files, by file name.
+    reference : Frame or None
+        The no-contact frame (``init_*``).
+    problems : list of str
+        What was odd, one line each.
+    failed : list of dict
+        ``image_name`` and ``reason`` of each frame that couldn't be read so far.
+    """
+
+    path: Path
+    form: Form
+    names: list
+    size_px: tuple
+    labels: dict = field(default_factory=dict)
+    metadata: dict = field(default_factory=dict)
+    reference: Frame | None = None
+    problems: list = field(default_factory=list)
+    failed: list = field(default_factory=list)
+    _files: list = field(default_factory=list, repr=False)
+    _bits: int = field(default=0, repr=False)
+    _noted: set = field(default_factory=set, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[Frame]:
+        self.failed.clear()
+        if not self._files:
+            yield from self._video_frames()
+            return
+        for index, name in enumerate(self.names):
+            try:
+                yield self.read(index)
+            except FrameError as error:
+                self.failed.append({"image_name": name, "reason": str(error).removeprefix(f"{name}: ")})
+
+    def read(self, index: int) -> Frame:
+        """Frame ``index`` of ``names`` (of a video: by seeking through it).
+
+        Raises
+        ------
+        FrameError
+            It can't be read, or has another size than the recording's.
+        """
+        if not self._files:
+            for frame in self._video_frames():
+                if frame.sequence == index:
+                    return frame
+            raise FrameError(f"{self.path.name}: has no frame {index}; it ends after {len(self)}")
+        return self._frame(self._image(self._files[index]), index)
+
+    def _image(self, file: Path) -> np.ndarray:
+        image, note = read_image(file, self._bits)
+        if note and note not in self._noted:
+            self._noted.add(note)
+            self.problems.append(f"{file.name}: {note} (the first such frame)")
+        return image
+
+    def _frame(self, image: np.ndarray, index: int, time_s: float = 0.0) -> Frame:
+        name = self.names[index]
+        if image.shape[1::-1] != tuple(self.size_px):
+            expected, got = times(self.size_px), times(image.shape[1::-1])
+            raise FrameError(f"{name}: expected {expected} as the recording's other frames, got {got}; leave it out or record it again")
+        return Frame(image, self.form, name, time_s, index)
+
+    def _video_frames(self) -> Iterator[Frame]:
+        with quiet():
+            capture = cv2.VideoCapture(str(self.path))
+        try:
+            for index in range(len(self.names)):
+                time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+                image = _next_image(capture)
+                if image is None:
+                    break
+                yield self._frame(image, index, time_s)
+        finally:
+            capture.release()
+
+    def take_reference(self, candidates: list[Path]) -> None:
+        """Take the first readable picture of the frames' size as the no-contact frame."""
+        for candidate in candidates:
+            try:
+                image = self._image(candidate)
+            except FrameError as error:
+                self.problems.append(f"no-contact frame {error}")
+                continue
+            got = image.shape[1::-1]
+            if got == tuple(self.size_px):
+                self.reference = Frame(image, self.form, candidate.name)
+                return
+            self.problems.append(f"no-contact frame {candidate.name}: {times(got)}, the frames are {times(self.size_px)}; ignored")
+
+    def take_metadata(self, homes: list[Path]) -> None:
+        """Read the JSON files of folders."""
+        for file in (file for home in homes for file in sorted(home.glob("*.json"))):
+            if (content := read_metadata(file, self.problems)) is not None:
+                self.metadata[file.name] = content
+
+
+def _video_image(image: np.ndarray) -> np.ndarray:
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _next_image(capture: cv2.VideoCapture) -> np.ndarray | None:
+    with quiet():
+        good, image = capture.read()
+    return _video_image(image) if good else None
+
+
+def _count_frames(path: Path) -> tuple[int, int, np.ndarray]:
+    """Frames that can be decoded, frames that the file promises, and the first (RGB)."""
+    with quiet():
+        capture = cv2.VideoCapture(str(path))
+    try:
+        promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+        first = _next_image(capture)
+        if first is None:
+            raise FrameError(f"{path}: no frame can be decoded; check that it is a video, or record it again")
+        count = 1
+        while _next_image(capture) is not None:
+            count += 1
+    finally:
+        capture.release()
+    return count, promised, first
+
+
+def _open_video(path: Path, spec: SensorSpec | None, form: Form | None) -> Recording:
+    count, promised, first = _count_frames(path)
+    problems = []
+    if promised > count:
+        problems.append(f"{path.name}: ends early, {count} of {promised} frames can be decoded")
+    names = [f"{path.stem}_{k:06d}" for k in range(count)]
+    return Recording(path, form_of(first, path.name, spec, form), names, first.shape[1::-1], problems=problems)
+
+
+def _choose_folder(
+    path: Path, folders: list[Path], spec: SensorSpec | None, form: Form | None, problems: list
+) -> tuple[Path, list[Path], Kind]:
+    """The first folder with a usable frame, its frames and their kind."""
+    reasons = []
+    for folder in folders:
+        files = frames_in(folder)
+        try:
+            kind = common_kind(files, spec, form)
+        except FrameError as error:
+            reasons.append((folder, error))
+            continue
+        others = [f.name + "/" for f in folders if f not in (folder, path)]
+        if others:
+            problems.append(f"{path.name}: read {folder.name}/, not {', '.join(others)}")
+        problems += [f"{unusable.name}: {error}" for unusable, error in reasons]
+        return folder, files, kind
+    unusable, error = reasons[0]
+    raise FrameError(f"{unusable}: {error}")
+
+
+def _open_folder(path: Path, spec: SensorSpec | None, form: Form | None) -> Recording:
+    if not any(path.iterdir()):
+        raise FrameError(f"{path}: the folder is empty; give a folder of frames")
+    problems: list[str] = []
+    folders = image_folders(path, form)
+    if folders:
+        folder, files, kind = _choose_folder(path, folders, spec, form, problems)
+        # given the inner folder of a recording, its table and no-contact frame lie beside it
+        inner = folder == path and path.name in IMAGE_FOLDERS
+        homes = list(dict.fromkeys([path, folder] + ([path.parent] if inner else [])))
+        tables = [home / table for home in homes for table in TABLES if (home / table).is_file()]
+        files, labels = order_by_table(tables, files, problems)
+        names = [p.name for p in files]
+        recording = Recording(path, kind.form, names, kind.size_px, labels, problems=problems, _files=files, _bits=kind.bits)
+    else:
+        homes = [path]
+        recording = _open_video(the_video_in(path), spec, form)
+    recording.take_metadata(homes)
+    recording.take_reference([file for home in homes for file in references_in(home)])
+    return recording
+
+
+def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> Recording:
+    """Open recorded frames.
+
+    Parameters
+    ----------
+    path : path
+        A picture, a folder of pictures, a recording's folder, or a video or a folder with one.
+    spec : SensorSpec, optional
+        The sensor; frames must have the size of one of its forms. The size of most frames is the recording's.
+    form : Form, optional
+        The frames' form; told by size and content if not given.
+
+    Raises
+    ------
+    FrameError
+        Nothing there, or no usable frame.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FrameError(f"{path}: no such file or folder; give a picture, a folder of frames, a recording or a video")
+    if path.is_dir():
+        return _open_folder(path, spec, form)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return _open_video(path, spec, form)
+    kind = common_kind([path], spec, form)
+    return Recording(path, kind.form, [path.name], kind.size_px, _files=[path], _bits=kind.bits)

@@ -132,3 +132,9 @@ def test_forms_are_inverse(sensor):
     x0, y0, x1, y1 = sensor.recording.crop_px
     corners = from_raw(sensor, Form.RECORDING, np.array([[x0 - 0.5, y0 - 0.5], [x1 - 0.5, y1 - 0.5]]))
     np.testing.assert_allclose(corners, [[-0.5, -0.5], [sensor.recording.width_px - 0.5, sensor.recording.height_px - 0.5]], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["knn", "delaunay", "voronoi"])
+def test_a_single_node_has_no_edges(kind):
+    graph = make_graph(kind, np.array([[3.0, 4.0]]))
+    assert graph.edges.shape == (0, 2)

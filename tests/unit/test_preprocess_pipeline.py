@@ -89,6 +89,22 @@ def test_a_displaced_view_keeps_its_pins(pipeline):
     assert observation.found == len(truth) and errors_px(observation, truth).max() < SAME_PIN_PX
 
 
+@pytest.mark.parametrize("lost_share", [0.0, 0.05])
+@pytest.mark.parametrize("degrees", [-10, -6, -5, -3, 3, 5, 6, 10])
+def test_a_turned_view_keeps_every_pin_s_name(pipeline, degrees, lost_share):
+    turn = np.exp(1j * np.radians(degrees))
+    turning = np.array([[turn.real, turn.imag], [-turn.imag, turn.real]])
+    middle, radii = pipeline.reference.pins_px[0], cap_radii_px(pipeline.spec, pipeline.form)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        truth = middle + (smooth_warp(pipeline.reference.pins_px, 0.5 * seed * pitch_px(pipeline), rng) - middle) @ turning
+        lost = rng.choice(len(truth), int(lost_share * len(truth)), replace=False)
+        kept = np.setdiff1d(np.arange(len(truth)), lost)
+        observation = pipeline(draw(pipeline, truth[kept], radius_px=radii[kept]))
+        assert observation.valid and observation.found == len(kept)
+        assert errors_px(observation, truth)[kept].max() < SAME_PIN_PX
+
+
 def test_lost_pins_are_nan_and_predicted(pipeline):
     rng = np.random.default_rng(2)
     truth = smooth_warp(pipeline.reference.pins_px, 0.8 * pitch_px(pipeline), rng)

@@ -17,6 +17,8 @@ def knn_edges(nodes_px: np.ndarray, k: int = KNN) -> np.ndarray:
     """(k N, 2) directed edges from each node to its ``k`` nearest others."""
     n = len(nodes_px)
     k = min(k, n - 1)
+    if k < 1:
+        return np.zeros((0, 2), int)
     _, index = cKDTree(nodes_px).query(nodes_px, k=min(k + 1, n))
     others = index != np.arange(n)[:, None]
     others[others.all(axis=1), -1] = False  # of coincident nodes a node's own entry may be missing

@@ -4,6 +4,10 @@ The displacement of a pin may exceed the pitch, so the nearest blob proves nothi
 move alike: from one right pair the next pin's place is predicted by the local affine motion of those already
 paired, and the labelling grows over the layout. Growth from a wrong seed runs out of blobs or into large
 residuals; the seed that explains most blobs wins.
+
+One wrong labelling is nearly as smooth as the true one: every ring of pins turned on by one pin, a vortex with a still rim
+when the view itself is turned by some degrees. Only its centre gives it away: ring i of 6 i pins is turned by 60/i degrees,
+and the innermost rings fall apart. So every growth is unwound to where its rings turn most alike before it is judged.
 """
 
 from collections.abc import Iterator
@@ -26,20 +30,25 @@ AREA_LOG_WEIGHT = 0.02  # cost of a log-area ratio of 1 against a squared residu
 MIN_AREA_RATIO = 0.2  # a blob smaller than this part of its neighbours' mean area is a speck, not a pin
 NEARLY_ALL = 0.985  # of the pins (or nearly so of the blobs, and this part of the pins) labelled by one growth ...
 MIN_SETTLED = 0.7
-SETTLED = 0.9  # ... at a score of this part of their number: no further seed is tried
-RIM_WEIGHT = 0.1  # of the rim's mean square motion (in spacings) in the score, per pin
+SETTLED = 0.94  # ... at a score of this part of their number: no further seed is tried
+TURN_WEIGHT = 1.5  # of the rings' mean turn (1 - its cosine) in the score, per pin
+MAX_WINDING = 3  # by so many pins either way may a growth's rings be turned on ...
+BROKEN_RINGS = 2  # ... but for the innermost, which don't hold together then
 EXTENT_MARGIN = 0.02  # of the points on each side; the rest's middle tells how far the whole view is displaced
 RIM_SEEDS = 12
 REFINED = 4  # growths that are refined when none settles
 
 
 class Layout(NamedTuple):
-    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, outmost (m,)."""
+    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, ring_ends (R + 1,).
+
+    Ring i's pins are ``ring_ends[i - 1]`` to ``ring_ends[i]``, in order around the layout.
+    """
 
     rest: np.ndarray
     neighbours: np.ndarray
     spacing: np.ndarray
-    outmost: np.ndarray
+    ring_ends: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,7 @@ class Match:
     predicted_px : (N, 2) float
         Each pin's place as its neighbours' motion predicts it.
     score : float
-        Pins paired, less their squared residuals relative to the gate, less what the rim moves.
+        Pins paired, less their squared residuals relative to the gate, less what the rings turn.
     """
 
     blob: np.ndarray
@@ -151,6 +160,50 @@ def _grow(rest, neighbours, spacing, px, start, buckets, cell):
 
 
 @njit(cache=True)
+def _ring_turns(rest, px, blob, ring_ends, winding):
+    """Turn of each ring (R,) as a unit complex number (0: unknown), its labels first put back by ``winding`` pins; number known."""
+    turns = np.zeros(len(ring_ends) - 1, np.complex128)
+    known = 0
+    for ring in range(len(turns)):
+        first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
+        count = 0
+        at, to, product = 0j, 0j, 0j
+        for k in range(size):
+            j = blob[first + (k - winding) % size]
+            if j >= 0:
+                a = complex(rest[first + k, 0], rest[first + k, 1])
+                b = complex(px[j, 0], px[j, 1])
+                at += a
+                to += b
+                product += a.conjugate() * b
+                count += 1
+        if count > 2:
+            turn = product - at.conjugate() * to / count
+            if abs(turn) > 0:
+                turns[ring] = turn / abs(turn)
+                known += 1
+    return turns, known
+
+
+@njit(cache=True)
+def _unwound(rest, px, blob, ring_ends):
+    """A labelling (N,) with each ring's labels put back by as many pins as makes the rings turn most alike, less what breaks by it."""
+    best, most_alike = 0, abs(_ring_turns(rest, px, blob, ring_ends, 0)[0][BROKEN_RINGS:].sum())
+    for winding in range(-MAX_WINDING, MAX_WINDING + 1):
+        alike = abs(_ring_turns(rest, px, blob, ring_ends, winding)[0][BROKEN_RINGS:].sum())
+        if alike > most_alike:
+            best, most_alike = winding, alike
+    if best == 0:
+        return blob
+    out = np.full_like(blob, -1)
+    for ring in range(BROKEN_RINGS, len(ring_ends) - 1):
+        first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
+        for k in range(size):
+            out[first + k] = blob[first + (k - best) % size]
+    return out
+
+
+@njit(cache=True)
 def _trust(rest, neighbours, spacing, px, blob):
     """Weights (N,) of the pairs by their residual to the neighbours' motion; positions (N, 2)."""
     n = len(rest)
@@ -227,7 +280,7 @@ def _assign(n: int, blob_count: int, pins: list, blobs: list, costs: list, conte
 
 def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: tuple, cell: float) -> Match:
     """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
-    rest, neighbours, spacing, _ = layout
+    rest, neighbours, spacing, ring_ends = layout
     for _ in range(4):
         moved, weight = _trust(rest, neighbours, spacing, px, blob)
         predicted = predict_all(rest, neighbours, spacing, moved, weight)
@@ -238,21 +291,9 @@ def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, 
     blob = _adopt(layout, px, area, blob, predicted)
     found = blob >= 0
     residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * spacing[found]) ** 2
-    return Match(blob, predicted, float(found.sum() - residual2.sum() - RIM_WEIGHT * len(rest) * _rim_motion2(layout, px, blob)))
-
-
-def _rim_motion2(layout: Layout, px: np.ndarray, blob: np.ndarray) -> float:
-    """Mean square motion of the outmost pins against each other, in spacings, 1 at most.
-
-    The rim is clamped, so it hardly turns. That tells the true labelling of a round layout from the one in
-    which every ring is turned on by one pin, which is nearly as smooth.
-    """
-    rim = layout.outmost[blob[layout.outmost] >= 0]
-    if not len(rim):
-        return 1.0
-    motion = px[blob[rim]] - layout.rest[rim]
-    motion = motion - np.median(motion, axis=0)
-    return float(min(1.0, np.mean((motion**2).sum(axis=1) / layout.spacing[rim] ** 2)))
+    turns, count = _ring_turns(rest, px, blob, ring_ends, 0)
+    turned = 1.0 - turns.real.sum() / max(count, 1)
+    return Match(blob, predicted, float(found.sum() - residual2.sum() - TURN_WEIGHT * len(rest) * turned))
 
 
 def _adopt(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -318,6 +359,13 @@ def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buc
     return found
 
 
+def _layout(reference: Reference) -> Layout:
+    n, rings = len(reference.pins_px), len(reference.outmost) // 6
+    ring = np.arange(rings + 1)
+    ring_ends = n - 3 * (rings * (rings + 1) - ring * (ring + 1))
+    return Layout(reference.pins_px, reference.neighbours, reference.spacing_px, ring_ends)
+
+
 def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
     """Label blobs by the pins of a reference.
 
@@ -339,7 +387,7 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
     if len(px) < 3:
         return nothing
     px = np.ascontiguousarray(px)
-    layout = Layout(reference.pins_px, reference.neighbours, reference.spacing_px, reference.outmost)
+    layout = _layout(reference)
     cell = float(np.median(reference.spacing_px))
     buckets = _buckets(px, cell)
     grown = []
@@ -347,6 +395,9 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         start = np.full(n, -1)
         start[pin] = blob
         labels = _grow(*layout[:3], px, start, buckets, cell)
+        unwound = _unwound(layout.rest, px, labels, layout.ring_ends)
+        if (unwound >= 0).any() and not np.array_equal(unwound, labels):
+            labels = _grow(*layout[:3], px, unwound, buckets, cell)
         count = int((labels >= 0).sum())
         if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
             found = _refine(layout, px, area_px2, labels, buckets, cell)
@@ -369,5 +420,5 @@ def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np
     """Settle a labelling ``blob`` (N,) of nearly all pins on a slightly different set of blobs, as ``match`` would."""
     px = np.ascontiguousarray(px)
     cell = float(np.median(reference.spacing_px))
-    layout = Layout(reference.pins_px, reference.neighbours, reference.spacing_px, reference.outmost)
+    layout = _layout(reference)
     return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)

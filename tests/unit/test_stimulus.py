@@ -119,7 +119,7 @@ def test_a_bad_mesh_says_what_is_wrong_and_what_to_do(tmp_path, kind):
         path.write_text("solid x\nendsolid x\n")
     elif kind != "missing":
         box.export(path)
-    wanted = {"open": "not watertight: 3 open edges", "metre": "too small; set shape.unit", "huge": "too large; set shape.unit"}
+    wanted = {"open": "not watertight: 3 open edges", "metre": "too small; scale the file to mm", "huge": "too large; scale the file to mm"}
     with pytest.raises(MeshError, match=wanted.get(kind, path.name)) as caught:
         build_stimulus(ObjectSpec(name="x", description="", shape=MeshShape(kind="mesh", file=str(path), unit=unit)))
     assert path.name in str(caught.value)

@@ -14,7 +14,7 @@ from scenes.object import MeshShape
 from twin.errors import MeshError
 from twin.stimulus.analytic import project_on_xy
 
-_UNIT_REMEDY = "scale the file to mm, or name its unit in an object's TOML: shape = { kind = 'mesh', file = ..., unit = ... } (mm, cm, m or inch)"
+_UNIT_REMEDY = "scale the file to mm, or name its unit in a TOML: shape = { kind = 'mesh', file = ..., unit = ... } (mm, cm, m or inch)"
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _SMALLEST_MM, _LARGEST_MM = 1.0, 2000.0
 _REACH_MM = 40.0  # half width of the sampled region around the origin: the dome and its shear

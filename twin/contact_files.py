@@ -30,8 +30,7 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     image = shot.frame.image
     cv2.imwrite(str(out / "frame.png"), image if image.ndim == 2 else image[..., ::-1])
     write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
-    truth = {key: value for key, value in asdict(shot.truth).items()}
-    np.savez_compressed(out / "truth.npz", **truth)
+    np.savez_compressed(out / "truth.npz", **asdict(shot.truth))
     (out / "truth.json").write_text(json.dumps(contact_record(simulator, stimulus, pose, state, shot), indent=1) + "\n")
 
     mesh = simulator.solver.mesh

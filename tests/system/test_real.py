@@ -14,6 +14,9 @@ from twin.preprocess.forms import recording_to_raw
 from twin.preprocess.legacy import LegacyPipeline
 from twin.projection import project
 from twin.recordings import open_recording
+from twin.similarity import frame_similarity
+from twin.simulator import Simulator
+from twin.types import Form
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
@@ -21,6 +24,7 @@ SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw":
 MOST_LOST = 0.001  # of all pins of all frames
 SMOOTH_PX = 1.5  # left of a pin's displacement after the set's own smooth modes; a swapped pin leaves a pitch (11 px or more)
 DEPTH_MIDDLES_MM = (1.5, 2.5, 3.5, 4.5)  # indentation, about pose_2 + 5 mm, in the middle of the four bins
+LEAST_SSIM = 0.6  # of two thresholded frames; caps half a pixel off cost a rim of black and white each
 ORDER_OF_MAGNITUDE = (0.7, 1.3)  # simulated to measured displacement; nothing is fitted to the table
 
 
@@ -86,3 +90,16 @@ def test_the_shipped_layout_alone_is_enough(real_dir):
     pipeline = Pipeline(spec, recording.form, nominal_reference(spec, recording.form))
     found = [pipeline(recording.read(k)).found for k in range(0, len(recording), 25)]
     assert np.mean(np.array(found) == spec.pins.count) > 0.99
+
+
+@pytest.mark.parametrize("folder", ["tac-vgnn-331", "tac-vgnn-127"])
+def test_the_rendered_frame_without_contact_is_like_the_recorded_one(real_dir, folder):
+    """Uncalibrated: the floor keeps the pattern in place (a pattern turned by half a pitch falls far below it)."""
+    spec = load_sensor(SETS[folder])
+    recorded = open_recording(real_dir / folder, spec).reference.image
+    simulator = Simulator(spec)
+    rendered = simulator.shoot(simulator.rest, form=Form.RECORDING).frame.image
+    likeness = frame_similarity(rendered, recorded)
+    turned = frame_similarity(np.ascontiguousarray(rendered[::-1]), recorded)
+    print(f"\n{folder}: SSIM {likeness.ssim:.3f}, PSNR {likeness.psnr_db:.1f} dB; mirrored {turned.ssim:.3f}, {turned.psnr_db:.1f} dB")
+    assert likeness.ssim > LEAST_SSIM and likeness.ssim > turned.ssim + 0.05

@@ -47,8 +47,8 @@ def look_at(simulator: Simulator, shot: Shot) -> Look:
     """Run the pipeline on a shot and on the same sensor's no-contact frame."""
     form = shot.frame.form
     pipeline = Pipeline(simulator.spec, form)
-    rest = simulator.shoot(simulator.rest, form=form)
-    return Look(shot.frame, pipeline(shot.frame), pipeline(rest.frame))
+    rest = pipeline(simulator.shoot_rest(form).frame)  # first: it loads the compiled code, so that the shot's times are a frame's
+    return Look(shot.frame, pipeline(shot.frame), rest)
 
 
 def contact_record(simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> dict:

@@ -17,7 +17,7 @@ from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import open_recording
 from twin.types import Form, PinGraph
-from twin.views.plots import area_surface_figure, draw_frame, draw_graph, new_figure
+from twin.views.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes, new_figure
 
 
 def read_pins(path: Path, spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
@@ -85,7 +85,7 @@ def draw_graph_pictures(
     figure, (ax,) = new_figure(1, panel_inch=8)
     draw_frame(ax, image, f"{spec.name}: {graph.kind}, {len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
     draw_graph(ax, graph)
-    ax.plot(*graph.nodes_px.T, ".", color="#19d3a2", markersize=4)
+    draw_nodes(ax, graph)
     written = [out / "graph.png"]
     figure.savefig(written[0], dpi=120)
     if graph.kind == "voronoi":
@@ -117,7 +117,7 @@ def draw_bare_graph(out: Path, graph: PinGraph) -> list[Path]:
     figure, (ax,) = new_figure(1, panel_inch=8)
     ax.set_facecolor("#101418")
     draw_graph(ax, graph)
-    ax.plot(*graph.nodes_px.T, ".", color="#19d3a2", markersize=4)
+    draw_nodes(ax, graph)
     ax.set(aspect="equal", title=f"{len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
     ax.invert_yaxis()
     path = out / "graph.png"

@@ -8,11 +8,11 @@ import numpy as np
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.camera import expose, record
-from twin.errors import RenderError
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Renderer
+from twin.preprocess.forms import frame_size
 from twin.truth import CapTruth, cap_truth
 from twin.types import ContactState, Form, Frame
 
@@ -54,6 +54,7 @@ class Simulator:
         self.rest = self.solver.rest()
         self._quality = quality
         self._renderer: Renderer | None = None
+        self._rest_shots: dict[Form, Shot] = {}
 
     @property
     def renderer(self) -> Renderer:
@@ -77,8 +78,10 @@ class Simulator:
 
         Raises
         ------
+        FrameError
+            If the sensor has no recording form.
         RenderError
-            If the sensor has no recording form, or nothing can be rendered here.
+            If nothing can be rendered here.
         """
         self.check_form(form)
         start = perf_counter()
@@ -87,6 +90,12 @@ class Simulator:
         seconds = perf_counter() - start
         raw = Shot(Frame(image, Form.RAW, name), linear, cap_truth(self.spec, self.rest, state, Form.RAW), seconds)
         return raw if form is Form.RAW else self.as_recorded(raw, state)
+
+    def shoot_rest(self, form: Form) -> Shot:
+        """The frame without contact in the given form; rendered once, then kept."""
+        if form not in self._rest_shots:
+            self._rest_shots[form] = self.shoot(self.rest, form=form)
+        return self._rest_shots[form]
 
     def as_recorded(self, raw: Shot, state: ContactState) -> Shot:
         """The shot of a raw frame in the form of the sensor's recordings."""
@@ -108,6 +117,5 @@ class Simulator:
         }
 
     def check_form(self, form: Form) -> None:
-        """Raise RenderError if the sensor has no such form."""
-        if form is Form.RECORDING and self.spec.recording is None:
-            raise RenderError(f"sensor '{self.spec.name}' has no recording form: its recordings are raw frames; use the raw form")
+        """Raise FrameError if the sensor has no such form."""
+        frame_size(self.spec, form)

@@ -39,7 +39,7 @@ def run_demo(out: Path, bar) -> list[Path]:
     for sensor, stimulus, pose, form in CONTACTS:
         start = perf_counter()
         with bar(f"{sensor}: press the {stimulus}, render, detect") as progress:
-            simulator = simulators.setdefault(sensor, Simulator(load_sensor(sensor)))
+            simulator = simulators[sensor] = Simulator(load_sensor(sensor))
             result = run_contact(simulator, stimulus, pose, form, progress=progress)
         seconds[f"{sensor} against {stimulus}"] = perf_counter() - start
         with bar(f"{sensor}: pictures"):

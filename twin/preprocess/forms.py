@@ -15,7 +15,7 @@ from twin.types import Form
 def _crop_scale(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
     recording = spec.recording
     if recording is None:
-        raise FrameError(f"sensor {spec.name} has no recording form (no [recording] section); use its raw frames")
+        raise FrameError(f"sensor '{spec.name}' has no recording form: its recordings are raw frames; use the raw form")
     x0, y0, x1, y1 = recording.crop_px
     return np.array([x0, y0], float), np.array([recording.width_px / (x1 - x0), recording.height_px / (y1 - y0)])
 

@@ -39,6 +39,11 @@ def draw_graph(ax: Axes, graph: PinGraph) -> None:
         ax.add_collection(PolyCollection(graph.cells, facecolors="none", edgecolors="#ffffff", linewidths=0.5, alpha=0.6))
 
 
+def draw_nodes(ax: Axes, graph: PinGraph) -> None:
+    """The nodes of a graph."""
+    ax.plot(*graph.nodes_px.T, ".", color=FOUND, markersize=4)
+
+
 def draw_pins(ax: Axes, observation: Observation) -> None:
     """Found pins, the model's guess for the lost ones, and the rejected blobs."""
     ax.plot(*observation.pins_px.T, ".", color=FOUND, markersize=4)

@@ -74,8 +74,8 @@ class ContactForces:
     ----------
     force_n : (p, 3) float
         Force on the skin at each point.
-    normal_n, friction_n : (p,) float
-        Sizes of the normal and tangential parts.
+    normal_n : (p,) float
+        Size of the normal part.
     penetration_mm : (p,) float
     slipping : (p,) bool
     stiffness : (p, 3, 3) float or None
@@ -88,7 +88,6 @@ class ContactForces:
 
     force_n: np.ndarray
     normal_n: np.ndarray
-    friction_n: np.ndarray
     penetration_mm: np.ndarray
     slipping: np.ndarray
     stiffness: np.ndarray | None
@@ -200,7 +199,6 @@ def contact_forces(
     return ContactForces(
         force_n=scattered(f, (3,)),
         normal_n=scattered(stiff * depth),
-        friction_n=scattered(stiff * held_length),
         penetration_mm=scattered(depth),
         slipping=scattered(slip & (limit > 0)) > 0,
         stiffness=scattered(k, (3, 3)) if with_stiffness else None,

@@ -6,7 +6,7 @@ rest the axes are parallel to the sensor's, so the sensor comes from -z.
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from scenes.base import NonNegative, Positive, Section
 
@@ -79,7 +79,11 @@ class TextureSpec(Section):
 
 
 class ObjectSpec(Section):
-    """An object, complete. ``name`` is the file's stem."""
+    """An object, complete. ``name`` is the file's stem.
+
+    ``friction`` is the static coefficient; ``kinetic_friction`` (default: the same) is what it falls to once a
+    point has slid by some ``slip_weakening_mm``.
+    """
 
     name: str
     description: str
@@ -87,4 +91,12 @@ class ObjectSpec(Section):
     shape: Shape
     texture: TextureSpec | None = None
     friction: NonNegative = 0.5
+    kinetic_friction: NonNegative | None = None
+    slip_weakening_mm: Positive = 0.1
     compliance_mm_per_n: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.kinetic_friction is not None and self.kinetic_friction > self.friction:
+            raise ValueError("kinetic_friction must not be larger than friction")
+        return self

@@ -14,11 +14,38 @@ from pydantic import Field, model_validator
 from scenes.base import Fraction, NonNegative, Positive, Rgb, Section
 
 
+class RelaxationTerm(Section):
+    """A part of the shear stiffness that relaxes (one Maxwell element): ``fraction`` of it, with time constant ``time_s``."""
+
+    fraction: Annotated[float, Field(gt=0, lt=1)]
+    time_s: Positive
+
+
 class MaterialSpec(Section):
-    """A nearly incompressible rubber: Young's modulus and Poisson's ratio at rest."""
+    """A nearly incompressible rubber: Young's modulus and Poisson's ratio at rest, and how it stiffens.
+
+    ``law``: ``neo-hookean``; ``mooney-rivlin``, where ``second_invariant_share`` is c01 / (c10 + c01);
+    ``yeoh``, with ``c20_c10`` and ``c30_c10`` relative to c10. ``relaxation``: a Prony series; the moduli
+    above are the fast ones, before anything has relaxed.
+    """
 
     young_modulus_mpa: Positive
     poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)]
+    law: Literal["neo-hookean", "mooney-rivlin", "yeoh"] = "neo-hookean"
+    second_invariant_share: Fraction = 0.0
+    c20_c10: NonNegative = 0.0
+    c30_c10: NonNegative = 0.0
+    relaxation: tuple[RelaxationTerm, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_law(self):
+        if self.law != "mooney-rivlin" and self.second_invariant_share:
+            raise ValueError("second_invariant_share belongs to law = 'mooney-rivlin'")
+        if self.law != "yeoh" and (self.c20_c10 or self.c30_c10):
+            raise ValueError("c20_c10 and c30_c10 belong to law = 'yeoh'")
+        if sum(term.fraction for term in self.relaxation) >= 1:
+            raise ValueError("the fractions of relaxation must sum to less than 1: some stiffness must stay")
+        return self
 
 
 class SkinSpec(MaterialSpec):
@@ -27,6 +54,12 @@ class SkinSpec(MaterialSpec):
     outer_radius_mm: Positive
     thickness_mm: Positive
     rim_z_mm: float = 0.0
+
+
+class GelSpec(MaterialSpec):
+    """Gel between skin and lens. ``sealed``: its volume as a whole stays exactly constant, whatever its Poisson's ratio."""
+
+    sealed: bool = False
 
 
 class LensSpec(Section):
@@ -215,7 +248,7 @@ class SensorSpec(Section):
     description: str
     source: str
     skin: SkinSpec
-    gel: MaterialSpec
+    gel: GelSpec
     lens: LensSpec
     pins: PinsSpec
     camera: CameraSpec

@@ -30,7 +30,7 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     image = shot.frame.image
     cv2.imwrite(str(out / "frame.png"), image if image.ndim == 2 else image[..., ::-1])
     write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
-    np.savez_compressed(out / "truth.npz", **asdict(shot.truth))
+    np.savez_compressed(out / "truth.npz", **asdict(shot.truth), **contact_arrays(state))
     (out / "truth.json").write_text(json.dumps(contact_record(simulator, stimulus, pose, state, shot), indent=1) + "\n")
 
     mesh = simulator.solver.mesh
@@ -41,6 +41,12 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     contact_panel(out / "skin.png", look, title).savefig(out / "panel.png", dpi=110)
     names = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
     return [out / name for name in names]
+
+
+def contact_arrays(state: ContactState) -> dict[str, np.ndarray]:
+    """The contact, place by place (see ``ContactState``)."""
+    names = ("contact_mm", "point_area_mm2", "normal", "normal_n", "tangential_n", "slipping")
+    return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}
 
 
 def look_at(simulator: Simulator, shot: Shot) -> Look:
@@ -60,6 +66,7 @@ def contact_record(simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose
         "pose": asdict(pose),
         "T_sensor_object": state.T_sensor_object.tolist(),
         "form": str(shot.frame.form),
+        "elastic_nmm": state.elastic_nmm,
         "residual": state.residual,
         "seconds": {"render": shot.seconds},
         **simulator.describe(),

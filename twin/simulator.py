@@ -109,8 +109,7 @@ class Simulator:
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},
             "solver": {
-                "nodes": len(self.solver.mesh.nodes_mm),
-                "hexes": len(self.solver.mesh.hexes),
+                "elements_across": self.solver.resolution.across,
                 "gap_bound_mm": GAP_BOUND_MM,
                 "residual_tolerance": RESIDUAL_TOLERANCE,
             },

@@ -49,11 +49,23 @@ class ContactState:
     force_n, torque_nmm : (3,) float
         Total contact force of the *skin on the object* and its torque about the sensor's origin.
     area_mm2 : float
-        Deformed area of the outer skin in contact.
-    contact_nodes : (c,) int
-        Outer-surface nodes in contact, with ``traction_n (c, 3)`` the nodal contact force on the object.
+        Area of the outer skin in contact, at rest.
+    contact_mm : (c, 3) float
+        Places of the outer skin that touch the object, each standing for ``point_area_mm2 (c,)`` of the skin at rest.
+    normal : (c, 3) float
+        The object's outward unit normal there.
+    normal_n : (c,) float
+        Size of the normal force at each place, positive; over ``point_area_mm2`` the pressure in MPa.
+    tangential_n : (c, 3) float
+        Friction force of the skin on the object at each place. ``tangential_n - normal_n normal`` sums to ``force_n``.
+    slipping : (c,) bool
+        Whether the place slides (else it sticks).
     T_sensor_object : (4, 4) float
         The object's pose.
+    elastic_nmm : float
+        Energy stored in skin and gel, N mm.
+    dissipated_nmm : float
+        Energy that friction took in the load step that ends here, N mm.
     residual : float
         Norm of the force residual relative to the contact force (N/N).
     """
@@ -65,9 +77,15 @@ class ContactState:
     force_n: np.ndarray
     torque_nmm: np.ndarray
     area_mm2: float
-    contact_nodes: np.ndarray
-    traction_n: np.ndarray
+    contact_mm: np.ndarray
+    point_area_mm2: np.ndarray
+    normal: np.ndarray
+    normal_n: np.ndarray
+    tangential_n: np.ndarray
+    slipping: np.ndarray
     T_sensor_object: np.ndarray
+    elastic_nmm: float
+    dissipated_nmm: float
     residual: float
 
 

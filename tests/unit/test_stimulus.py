@@ -1,4 +1,4 @@
-"""Signed-distance fields: unit gradients that are the distance's derivative, and meshes that help when they are bad."""
+"""Signed-distance fields: unit gradients and Hessians that are derivatives, and meshes that help when they are bad."""
 
 import numpy as np
 import pytest
@@ -7,11 +7,44 @@ import trimesh
 from scenes.load import list_objects, load_object
 from scenes.object import MeshShape, ObjectSpec, PrismShape, TextureSpec
 from twin.errors import MeshError
-from twin.stimulus import build_stimulus
-from twin.stimulus.analytic import Prism, Sphere
-from twin.stimulus.mesh_field import place_mesh, read_mesh
+from twin.stimulus import build_stimulus, mesh_field
+from twin.stimulus.analytic import Cylinder, Edge, Plane, Prism, Sphere
+from twin.stimulus.mesh_distance import signed_distance
+from twin.stimulus.mesh_field import MeshField, sample_mesh
+from twin.stimulus.mesh_file import place_mesh, read_mesh
+from twin.stimulus.texture import WireMesh
 
 STEP_MM = 1e-5
+EXACT = {
+    "plane": Plane(),
+    "ball": Sphere(10.0),
+    "cylinder": Cylinder(8.0),
+    "edge": Edge(3.0),
+    "sharp edge": Edge(0.0),
+    "prism": Prism(6, 9.0, 2.0, 0.0),
+    "sharp prism": Prism(3, 5.0, 0.0, 0.0),
+    "tapered prism": Prism(5, 9.0, 2.0, np.radians(8)),
+}
+
+
+@pytest.fixture(autouse=True)
+def no_cache(monkeypatch):
+    monkeypatch.setenv("TACTIP_CACHE", "off")
+
+
+@pytest.fixture(scope="module")
+def egg() -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=6.0)
+    mesh.apply_scale([1.0, 1.5, 0.8])
+    return place_mesh(mesh)
+
+
+@pytest.fixture(scope="module")
+def fields(egg) -> dict:
+    """Fields that are no exact distances."""
+    wires = {f"wires on a {name}": WireMesh(field, 4.0, 1.0) for name, field in EXACT.items() if "sharp" not in name}
+    egg = sample_mesh(egg)
+    return {"mesh": egg, "wires on a mesh": WireMesh(egg, 4.0, 1.0), **wires}
 
 
 @pytest.fixture
@@ -19,8 +52,66 @@ def points():
     return np.random.default_rng(4).uniform([-25, -25, -4], [25, 25, 6], (2000, 3))
 
 
-def differences(field, at):
-    return np.stack([(field.distance(at + STEP_MM * e) - field.distance(at - STEP_MM * e)) / (2 * STEP_MM) for e in np.eye(3)], axis=1)
+def differences(field, at, *, of="distance"):
+    """Central differences; the last axis is the direction."""
+    of = getattr(field, of)
+    return np.stack([(of(at + STEP_MM * e) - of(at - STEP_MM * e)) / (2 * STEP_MM) for e in np.eye(3)], axis=-1)
+
+
+def hessian_errors(gradient, hessian, turning):
+    """Largest entries of H - H^T, H n and H - dn/dx."""
+    asymmetry = np.abs(hessian - hessian.transpose(0, 2, 1)).max()
+    along_normal = np.abs(np.einsum("kij,kj->ki", hessian, gradient)).max()
+    return asymmetry, along_normal, np.abs(hessian - turning).max()
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_hessian_of_an_exact_distance_is_the_derivative_of_the_gradient(name, points):
+    field = EXACT[name]
+    distance, gradient, hessian = field.probe(points)
+    assert np.array_equal(distance, field.distance(points))
+    assert np.array_equal(gradient, field.gradient(points))
+    asymmetry, along_normal, error = hessian_errors(gradient, hessian, differences(field, points, of="gradient"))
+    assert asymmetry == 0
+    assert along_normal < 1e-9
+    assert error < 1e-7  # none of the points is next to a crease
+    assert (hessian != 0).any() == (name != "plane")
+
+
+@pytest.mark.parametrize("name", ["mesh", "wires on a mesh", *(f"wires on a {name}" for name in EXACT if "sharp" not in name)])
+def test_hessian_of_any_field_is_how_its_gradient_turns_along_the_surface(name, fields, points):
+    field = fields[name]
+    at = points[np.abs(field.distance(points)) < 3]
+    distance, gradient, hessian = field.probe(at)
+    assert np.allclose(distance, field.distance(at), rtol=0, atol=1e-12)
+    along = np.eye(3) - gradient[:, :, None] * gradient[:, None, :]
+    asymmetry, along_normal, error = hessian_errors(gradient, hessian, differences(field, at, of="gradient") @ along)
+    assert asymmetry == 0
+    assert along_normal < 1e-9
+    # under wires on a mesh the base's unit gradient stands for its slope, which differs by the spline's error
+    assert error < (0.1 if name == "wires on a mesh" else 1e-4)
+    assert np.abs(hessian).max() > 0.01
+
+
+def test_there_is_no_curvature_on_creases():
+    edge, prism, ball = Edge(0.0), Prism(4, 10.0, 0.0, 0.0), Sphere(10.0)
+    for field, at in (
+        (edge, [[0.0, 1.0, 0.0], [2.0, 0.0, 2.0], [-1e-4, 0.0, -1e-4]]),
+        (prism, [[0.0, 3.0, 10.0], [10.0, 0.0, 0.0]]),
+        (ball, [[0.0, 0.0, 10.0]]),
+    ):
+        _, gradient, hessian = field.probe(np.array(at))
+        assert not hessian.any()
+        assert np.allclose(np.linalg.norm(gradient, axis=1), 1)
+
+
+@pytest.mark.parametrize("order", ["fortran", "strided", "single", "none"])
+def test_points_may_come_in_any_layout(order, points, fields):
+    wanted = points[::2]
+    given = {"fortran": np.asfortranarray(wanted), "strided": wanted, "single": wanted.astype("f4"), "none": wanted[:0]}[order]
+    for field in (Sphere(10.0), fields["mesh"], WireMesh(Prism(6, 9.0, 2.0, 0.1), 4.0, 1.0)):
+        for got, full in zip(field.probe(given), field.probe(np.array(given, float, order="C")), strict=True):
+            assert np.array_equal(got, full)
 
 
 @pytest.mark.parametrize("name", list_objects())
@@ -95,6 +186,66 @@ def test_mesh_of_a_ball_is_nearly_the_ball(tmp_path, points):
     assert (field.distance(far) > 60).all()
 
 
+def test_mesh_far_outside_its_grid_still_has_derivatives(fields):
+    field = fields["mesh"]
+    far = np.random.default_rng(2).uniform(-60, 60, (500, 3))
+    far = far[field.distance(far) > 20]
+    turning = differences(field, far, of="gradient")
+    _, gradient, hessian = field.probe(far)
+    along = np.eye(3) - gradient[:, :, None] * gradient[:, None, :]
+    assert np.abs(hessian - turning @ along).max() < 1e-4
+
+
+def distance_by_brute_force(mesh, at):
+    """Nearest point among all triangles, sign by the winding number."""
+    to = mesh.triangles[None] - at[:, None, None]
+    triangles = np.broadcast_to(mesh.triangles, (len(at), *mesh.triangles.shape)).reshape(-1, 3, 3)
+    nearest = trimesh.triangles.closest_point(triangles, np.repeat(at, len(mesh.faces), axis=0)).reshape(len(at), -1, 3)
+    distance = np.linalg.norm(nearest - at[:, None], axis=2).min(axis=1)
+    a, b, c = np.moveaxis(to, 2, 0)
+    la, lb, lc = (np.linalg.norm(side, axis=2) for side in (a, b, c))
+    volume = np.einsum("kfi,kfi->kf", a, np.cross(b, c))
+    dot = {"ab": (a * b).sum(2), "bc": (b * c).sum(2), "ca": (c * a).sum(2)}
+    angle = 2 * np.arctan2(volume, la * lb * lc + dot["ab"] * lc + dot["bc"] * la + dot["ca"] * lb)
+    return np.where(angle.sum(axis=1) > 2 * np.pi, -distance, distance)
+
+
+@pytest.mark.parametrize("kind", ["egg", "box", "ring", "spike", "sliver fan"])
+def test_mesh_distance_is_that_of_all_triangles_and_the_winding_number(kind, egg):
+    mesh = {
+        "egg": egg,
+        "box": trimesh.creation.box((8.0, 8.0, 8.0)),
+        "ring": trimesh.creation.torus(5, 2, major_sections=24, minor_sections=12),
+        "spike": trimesh.creation.cone(0.5, 8.0, sections=5),
+        "sliver fan": trimesh.creation.cylinder(4.0, 0.5, sections=200),
+    }[kind]
+    at = np.random.default_rng(5).uniform(mesh.bounds[0] - 2, mesh.bounds[1] + 2, (300, 3))
+    assert np.abs(signed_distance(mesh, at) - distance_by_brute_force(mesh, at)).max() < 1e-9
+
+
+def test_triangles_without_area_do_not_matter():
+    box = trimesh.creation.box((8.0, 8.0, 8.0))
+    box.invert()  # a hole: where an edge is nearest, the solid is, and a normal of zero would say outside
+    ends = box.edges
+    middles = box.vertices[ends].mean(axis=1)
+    flat = np.column_stack([ends[:, 0], 8 + np.arange(len(ends)), ends[:, 1]])
+    split = trimesh.Trimesh(np.vstack([box.vertices, middles]), np.vstack([flat, box.faces]), process=False)
+    at = np.random.default_rng(6).uniform(-6, 6, (300, 3))
+    assert np.abs(signed_distance(split, at) - signed_distance(box, at)).max() < 1e-12
+
+
+def test_a_mesh_wound_inwards_is_the_same_solid(tmp_path):
+    """Its file's normals look inwards too."""
+    box = trimesh.creation.box((8.0, 8.0, 8.0))
+    box.export(tmp_path / "box.stl")
+    inward = trimesh.Trimesh(box.vertices, box.faces[:, ::-1])
+    assert inward.volume < 0
+    inward.export(tmp_path / "inward.stl")
+    at = np.random.default_rng(7).uniform(-6, 6, (300, 3))
+    found, wanted = (signed_distance(read_mesh(str(tmp_path / f"{name}.stl")), at) for name in ("inward", "box"))
+    assert np.abs(found - wanted).max() < 1e-6  # an STL holds single precision
+
+
 def test_mesh_units_rotation_and_placement(tmp_path):
     trimesh.creation.box((0.02, 0.04, 0.06)).export(tmp_path / "block.ply")
     mesh = place_mesh(read_mesh(str(tmp_path / "block.ply"), unit="m"), rotation_deg=(90.0, 0.0, 0.0))
@@ -126,7 +277,42 @@ def test_a_bad_mesh_says_what_is_wrong_and_what_to_do(tmp_path, kind):
     assert "\n" not in str(caught.value)
 
 
+@pytest.fixture
+def sampled(monkeypatch) -> list:
+    """One entry for each mesh that is really sampled."""
+    calls = []
+    real = sample_mesh
+    monkeypatch.setattr(mesh_field, "sample_mesh", lambda mesh: calls.append(mesh) or real(mesh))
+    return calls
+
+
 def test_the_same_mesh_is_sampled_once(tmp_path):
     trimesh.creation.box((8, 8, 8)).export(tmp_path / "box.stl")
     spec = load_object(tmp_path / "box.stl")
     assert build_stimulus(spec) is build_stimulus(spec)
+
+
+def test_a_sampled_mesh_is_kept_on_disk_by_content_and_placement(tmp_path, monkeypatch, sampled):
+    monkeypatch.setenv("TACTIP_CACHE", str(tmp_path / "cache"))
+    path = tmp_path / "box.stl"
+
+    def load(**changes) -> MeshField:
+        mesh_field._sampled.cache_clear()  # as a new process would start
+        return build_stimulus(ObjectSpec(name="x", description="", shape=MeshShape(kind="mesh", file=str(path), **changes)))
+
+    trimesh.creation.box((7, 8, 9)).export(path)
+    first = load()
+    path.touch()
+    again = load()
+    assert len(sampled) == 1
+    assert again.spacing_mm == first.spacing_mm
+    assert np.array_equal(again.corner_mm, first.corner_mm)
+    assert np.array_equal(again.coefficients, first.coefficients)
+    load(rotation_deg=(90.0, 0.0, 0.0))
+    load(unit="cm")
+    assert len(sampled) == 3
+    monkeypatch.setattr(mesh_field, "_NODES", 30_000)
+    load()
+    trimesh.creation.box((7, 8, 10)).export(path)
+    load()
+    assert len(sampled) == 5

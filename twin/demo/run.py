@@ -89,8 +89,8 @@ def run_demo(out: Path, bar) -> list[Path]:
 def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pictures: Path) -> dict:
     spec = simulator.spec
     written = contact_pictures(pictures, result)
-    touched = result.state.contact_nodes
-    contact_mm = result.state.nodes_mm[touched].mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
+    touched = result.state.contact_mm
+    contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
     contact_px = from_raw(spec, result.look.frame.form, project(spec.camera, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
     return {

@@ -1,6 +1,7 @@
-"""Pressing the sensor: poses, finite elements, contact with friction."""
+"""The skin's mechanics: one sensor pressed against one object."""
 
+from twin.mechanics.newton import Friction
 from twin.mechanics.path import ContactPath, ContactPose
 from twin.mechanics.solver import SkinSolver
 
-__all__ = ["ContactPath", "ContactPose", "SkinSolver"]
+__all__ = ["ContactPath", "ContactPose", "Friction", "SkinSolver"]

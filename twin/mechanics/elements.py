@@ -1,12 +1,22 @@
-"""Eight-node hexahedra of a nearly incompressible Neo-Hookean rubber with mean dilatation.
+"""Elements of skin and gel: energy, forces and stiffness of a nearly incompressible body.
 
-Energy per element of rest volume V (Simo & Taylor 1985 mean dilatation; Bonet & Wood, "Nonlinear
-Continuum Mechanics for Finite Element Analysis", for the compressible Neo-Hookean form):
+Energy of an element, with F, J at 2x2x2 Gauss points of rest volume w and the law of ``material``:
 
-    W = sum_q w_q [mu / 2 (tr F^T F - 3) - mu ln J] + V lambda / 2 (v / V - 1)^2
+    W = sum_q w_q [W_distortion(F_q) + S_q : C_q / 2] + V kappa / 2 mean^2 + V kappa_d / 2 difference^2
 
-with F, J at 2x2x2 Gauss points and the deformed volume v = sum_q w_q J. One volume ratio per
-element frees it from volumetric locking. At small strain mu and lambda are Lame's constants.
+with the volume strains e = v / V - 1 of the two levels through the depth (V = sum w and v = sum w J over
+a level's four points), their mean (over both) and half their difference. One volume ratio per level frees
+the element from volumetric locking (mean dilatation, Simo & Taylor 1985). ``S`` is a given stress, what
+is left of the past in a viscoelastic body, zero in an elastic one.
+
+Gel: quadratic splines in all directions, kappa_d = kappa. Skin: quadratic splines along it, linear
+through it. A bent linear layer can't thin where it is stretched and thicken where it is compressed,
+which would make it too stiff; with that thickness strain eliminated by zero thickness stress (as in a
+plate), its bending energy is the plane-stress one, which fixes the modulus of the difference:
+kappa_d = 2 mu nu / (1 - nu) + 2 mu / 3. A homogeneous state has no difference and is exact.
+
+Two Gauss points per direction under-integrate the quadratic splines just enough to free them from
+membrane and shear locking, and leave no mode without stiffness, since the splines are C1.
 """
 
 from dataclasses import dataclass
@@ -14,198 +24,187 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-_CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], float)
+from twin.geometry.solid import Cells
+from twin.mechanics.material import distortion, distortion_stiffness, invariants
+
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks
+_I = np.array([i for i, _ in PAIRS])
+_K = np.array([k for _, k in PAIRS])
 
 
 @dataclass(frozen=True)
-class ElementTable:
-    """What the assembly needs of each element.
+class Elements:
+    """Elements of one kind and their material: ``cells`` of m elements with b controls, and ``law`` (6,), see ``law_coefficients``."""
 
-    Attributes
-    ----------
-    hexes : (m, 8) int
-    gradients : (m, 8, 8, 3) float
-        Shape function gradients (element, Gauss point, corner) in 1/mm at rest.
-    weights_mm3 : (m, 8) float
-        Rest volume of each Gauss point.
-    mu_mpa, lame_mpa : (m,) float
-    """
+    cells: Cells
+    law: np.ndarray
 
-    hexes: np.ndarray
-    gradients: np.ndarray
-    weights_mm3: np.ndarray
-    mu_mpa: np.ndarray
-    lame_mpa: np.ndarray
+    def add_forces(self, control_mm: np.ndarray, stress: np.ndarray, out: np.ndarray, pressure_mpa: float = 0.0) -> float:
+        """Elastic energy in N mm; adds its gradient by the controls to ``out`` (n, 3) in N.
 
+        ``stress`` (m, 8, 3, 3) is the given stress S in MPa, or (0, 8, 3, 3) for none; ``pressure_mpa`` (positive:
+        tension) adds its work on the change of volume.
+        The energy is infinite (and ``out`` useless) where an element is inside out.
+        """
+        return _forces(*self._arrays, control_mm, stress, pressure_mpa, out)
 
-def lame_constants(young_modulus_mpa: float, poisson_ratio: float) -> tuple[float, float]:
-    """mu = E / 2 (1 + nu) and lambda = E nu / (1 + nu)(1 - 2 nu), in MPa."""
-    mu = young_modulus_mpa / (2 * (1 + poisson_ratio))
-    return mu, 2 * mu * poisson_ratio / (1 - 2 * poisson_ratio)
+    def add_volume(self, control_mm: np.ndarray, out: np.ndarray) -> float:
+        """Growth of the volume in mm^3; adds its gradient by the controls to ``out`` (n, 3) in mm^2."""
+        cells = self.cells
+        return _forces(cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), control_mm, np.zeros((0, 8, 3, 3)), 1.0, out)
 
+    def distortion_stress(self, control_mm: np.ndarray) -> np.ndarray:
+        """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa."""
+        cells = self.cells
+        return _distortion_stress(cells.controls, cells.gradients, cells.weights_mm3, self.law, control_mm)
 
-def element_table(nodes_mm: np.ndarray, hexes: np.ndarray, mu_mpa: np.ndarray, lame_mpa: np.ndarray) -> ElementTable:
-    """Gradients and volumes at rest; ValueError if an element is inside out."""
-    at = _CORNERS / np.sqrt(3)
-    factors = 1 + at[:, None, :] * _CORNERS[None, :, :]
-    local = (
-        np.stack(
-            [
-                _CORNERS[:, 0] * factors[:, :, 1] * factors[:, :, 2],
-                _CORNERS[:, 1] * factors[:, :, 0] * factors[:, :, 2],
-                _CORNERS[:, 2] * factors[:, :, 0] * factors[:, :, 1],
-            ],
-            axis=2,
-        )
-        / 8
-    )
-    jacobian = np.einsum("mai,qaj->mqij", nodes_mm[hexes], local)
-    weights = np.linalg.det(jacobian)
-    if weights.min() <= 0:
-        raise ValueError(f"{np.count_nonzero(weights.min(axis=1) <= 0)} elements are inside out at rest; check the node order")
-    gradients = np.einsum("qaj,mqji->mqai", local, np.linalg.inv(jacobian))
-    return ElementTable(np.ascontiguousarray(hexes), np.ascontiguousarray(gradients), weights, mu_mpa, lame_mpa)
+    def stiffness(self, control_mm: np.ndarray, stress: np.ndarray, pressure_mpa: float, out: np.ndarray) -> None:
+        """Second derivative of each element's energy into ``out`` (m, 6, b, b), N/mm.
+
+        Block p couples direction ``PAIRS[p][0]`` of the first control with ``PAIRS[p][1]`` of the second;
+        the other three are transposes.
+        """
+        _stiffness(*self._arrays, control_mm, stress, pressure_mpa, out)
+
+    @property
+    def _arrays(self):
+        return self.cells.controls, self.cells.gradients, self.cells.weights_mm3, self.law
 
 
-def elastic_energy(table: ElementTable, nodes_mm: np.ndarray) -> float:
-    """Elastic energy in N mm (infinite if an element is inside out)."""
-    return _energy(table.hexes, table.gradients, table.weights_mm3, table.mu_mpa, table.lame_mpa, nodes_mm)
-
-
-def elastic_forces(table: ElementTable, nodes_mm: np.ndarray) -> np.ndarray | None:
-    """Gradient of the energy by the nodes, (n, 3) in N; None if an element is inside out."""
-    out = np.zeros_like(nodes_mm)
-    ok = _forces(table.hexes, table.gradients, table.weights_mm3, table.mu_mpa, table.lame_mpa, nodes_mm, out)
-    return out if ok else None
-
-
-def elastic_stiffness(table: ElementTable, nodes_mm: np.ndarray, out: np.ndarray) -> None:
-    """Second derivative of each element's energy into ``out`` (m, 24, 24), N/mm, corner-major."""
-    _stiffness(table.hexes, table.gradients, table.weights_mm3, table.mu_mpa, table.lame_mpa, nodes_mm, out)
-
-
-@numba.njit(cache=True, inline="always")
-def _kinematics(corners, gradients, current):
-    """Current gradients F^-T grad N into ``current`` (8, 3); returns det F and tr F^T F."""
-    f = np.zeros((3, 3))
-    for a in range(8):
+@numba.njit(cache=True, fastmath=True)
+def _kinematics(x, grad, weights, f, g, det):
+    """F, F^-T and det F at all points; (level volumes at rest, and deformed), or a negative first volume if inside out."""
+    v0, v1, r0, r1 = 0.0, 0.0, 0.0, 0.0
+    for q in range(8):
         for i in range(3):
             for j in range(3):
-                f[i, j] += corners[a, i] * gradients[a, j]
-    c00 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
-    c01 = f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
-    c02 = f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0]
-    c10 = f[2, 1] * f[0, 2] - f[2, 2] * f[0, 1]
-    c11 = f[2, 2] * f[0, 0] - f[2, 0] * f[0, 2]
-    c12 = f[2, 0] * f[0, 1] - f[2, 1] * f[0, 0]
-    c20 = f[0, 1] * f[1, 2] - f[0, 2] * f[1, 1]
-    c21 = f[0, 2] * f[1, 0] - f[0, 0] * f[1, 2]
-    c22 = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
-    det = f[0, 0] * c00 + f[0, 1] * c01 + f[0, 2] * c02
-    trace = 0.0
-    for i in range(3):
-        for j in range(3):
-            trace += f[i, j] * f[i, j]
-    if det > 0:
-        for a in range(8):
-            g0, g1, g2 = gradients[a, 0] / det, gradients[a, 1] / det, gradients[a, 2] / det
-            current[a, 0] = c00 * g0 + c01 * g1 + c02 * g2
-            current[a, 1] = c10 * g0 + c11 * g1 + c12 * g2
-            current[a, 2] = c20 * g0 + c21 * g1 + c22 * g2
-    return det, trace
+                total = 0.0
+                for a in range(x.shape[1]):
+                    total += x[i, a] * grad[q, j, a]
+                f[q, i, j] = total
+        det[q] = invariants(f[q], g[q])
+        if det[q] <= 0:
+            return -1.0, 0.0, 0.0, 0.0
+        if q < 4:
+            r0 += weights[q]
+            v0 += weights[q] * det[q]
+        else:
+            r1 += weights[q]
+            v1 += weights[q] * det[q]
+    return r0, r1, v0, v1
 
 
-@numba.njit(cache=True)
-def _energy(hexes, gradients, weights, mu, lame, nodes):
-    total = 0.0
-    current = np.zeros((8, 3))
-    corners = np.zeros((8, 3))
-    for m in range(len(hexes)):
-        for a in range(8):
-            corners[a] = nodes[hexes[m, a]]
-        rest, volume = 0.0, 0.0
+@numba.njit(cache=True, fastmath=True)
+def _forces(elements, gradients, weights, law, control, given, sealing, out):
+    count = elements.shape[1]
+    x, push = np.zeros((3, count)), np.zeros((3, count))
+    f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
+    det, stress = np.zeros(8), np.zeros((3, 3))
+    energy = 0.0
+    for m in range(len(elements)):
+        for a in range(count):
+            for i in range(3):
+                x[i, a] = control[elements[m, a], i]
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, g, det)
+        if r0 < 0:
+            return np.inf
+        rest = r0 + r1
+        mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
+        energy += rest / 2 * (law[4] * mean**2 + law[5] * half**2) + sealing * rest * mean
+        push[:] = 0.0
         for q in range(8):
-            det, trace = _kinematics(corners, gradients[m, q], current)
-            if det <= 0:
-                return np.inf
-            total += weights[m, q] * mu[m] * ((trace - 3) / 2 - np.log(det))
-            rest += weights[m, q]
-            volume += weights[m, q] * det
-        total += rest * lame[m] / 2 * (volume / rest - 1) ** 2
-    return total
-
-
-@numba.njit(cache=True)
-def _forces(hexes, gradients, weights, mu, lame, nodes, out):
-    current = np.zeros((8, 3))
-    corners = np.zeros((8, 3))
-    swell = np.zeros((8, 3))
-    for m in range(len(hexes)):
-        for a in range(8):
-            corners[a] = nodes[hexes[m, a]]
-        rest, volume = 0.0, 0.0
-        swell[:] = 0.0
-        for q in range(8):
-            det, _ = _kinematics(corners, gradients[m, q], current)
-            if det <= 0:
-                return False
             w = weights[m, q]
-            rest += w
-            volume += w * det
-            # mu F grad N: F's rows applied to the rest gradient, summed corner by corner
-            for i in range(3):
-                f0, f1, f2 = 0.0, 0.0, 0.0
-                for b in range(8):
-                    f0 += corners[b, i] * gradients[m, q, b, 0]
-                    f1 += corners[b, i] * gradients[m, q, b, 1]
-                    f2 += corners[b, i] * gradients[m, q, b, 2]
-                for a in range(8):
-                    stretch = f0 * gradients[m, q, a, 0] + f1 * gradients[m, q, a, 1] + f2 * gradients[m, q, a, 2]
-                    out[hexes[m, a], i] += w * mu[m] * (stretch - current[a, i])
-                    swell[a, i] += w * det * current[a, i]
-        pressure = lame[m] * (volume / rest - 1)
-        for a in range(8):
-            for i in range(3):
-                out[hexes[m, a], i] += pressure * swell[a, i]
-    return True
-
-
-@numba.njit(cache=True)
-def _stiffness(hexes, gradients, weights, mu, lame, nodes, out):
-    current = np.zeros((8, 8, 3))
-    det = np.zeros(8)
-    corners = np.zeros((8, 3))
-    swell = np.zeros(24)
-    for m in range(len(hexes)):
-        for a in range(8):
-            corners[a] = nodes[hexes[m, a]]
-        rest, volume = 0.0, 0.0
-        swell[:] = 0.0
-        for q in range(8):
-            det[q], _ = _kinematics(corners, gradients[m, q], current[q])
-            rest += weights[m, q]
-            volume += weights[m, q] * det[q]
-            for a in range(8):
+            pressure = sealing + law[4] * mean + law[5] * half * (rest / (2 * r0) if q < 4 else -rest / (2 * r1))
+            energy += w * distortion(law, f[q], det[q], g[q], stress)
+            if len(given):
                 for i in range(3):
-                    swell[3 * a + i] += weights[m, q] * det[q] * current[q, a, i]
-        pressure = lame[m] * (volume / rest - 1)
-        k = out[m]
-        for r in range(24):
-            for c in range(r + 1):
-                k[r, c] = lame[m] / rest * swell[r] * swell[c]
+                    for j in range(3):
+                        total = 0.0
+                        for k in range(3):
+                            total += f[q, i, k] * given[m, q, k, j]
+                        stress[i, j] += total
+                        energy += w * total * f[q, i, j] / 2
+            for i in range(3):
+                s0 = w * (stress[i, 0] + pressure * det[q] * g[q, i, 0])
+                s1 = w * (stress[i, 1] + pressure * det[q] * g[q, i, 1])
+                s2 = w * (stress[i, 2] + pressure * det[q] * g[q, i, 2])
+                for a in range(count):
+                    push[i, a] += s0 * gradients[m, q, 0, a] + s1 * gradients[m, q, 1, a] + s2 * gradients[m, q, 2, a]
+        for a in range(count):
+            for i in range(3):
+                out[elements[m, a], i] += push[i, a]
+    return energy
+
+
+@numba.njit(cache=True, fastmath=True)
+def _stiffness(elements, gradients, weights, law, control, given, sealing, out):
+    count = elements.shape[1]
+    x = np.zeros((3, count))
+    f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
+    det = np.zeros(8)
+    tangent = np.zeros((3, 3, 3, 3))
+    left = np.zeros((24, 6 * count))
+    swell = np.zeros((2, 3, count))
+    for m in range(len(elements)):
+        for a in range(count):
+            for i in range(3):
+                x[i, a] = control[elements[m, a], i]
+        grad = gradients[m].reshape(24, count)
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, g, det)
+        rest = r0 + r1
+        mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
+        swell[:] = 0.0
         for q in range(8):
             w = weights[m, q]
-            shear = w * mu[m]
-            push = w * det[q] * pressure
-            grad = gradients[m, q]
-            cur = current[q]
-            for a in range(8):
-                for b in range(a + 1):
-                    diagonal = shear * (grad[a, 0] * grad[b, 0] + grad[a, 1] * grad[b, 1] + grad[a, 2] * grad[b, 2])
-                    for i in range(3):
-                        k[3 * a + i, 3 * b + i] += diagonal
-                        for j in range(3):
-                            k[3 * a + i, 3 * b + j] += (shear - push) * cur[b, i] * cur[a, j] + push * cur[a, i] * cur[b, j]
-        for r in range(24):
-            for c in range(r):
-                k[c, r] = k[r, c]
+            lean = rest / (2 * r0) if q < 4 else -rest / (2 * r1)
+            push = (sealing + law[4] * mean + law[5] * half * lean) * det[q]
+            distortion_stiffness(law, f[q], det[q], g[q], tangent)
+            for p in range(6):
+                i, k = _I[p], _K[p]
+                for n in range(3):
+                    c0 = w * (tangent[i, 0, k, n] + push * (g[q, i, 0] * g[q, k, n] - g[q, i, n] * g[q, k, 0]))
+                    c1 = w * (tangent[i, 1, k, n] + push * (g[q, i, 1] * g[q, k, n] - g[q, i, n] * g[q, k, 1]))
+                    c2 = w * (tangent[i, 2, k, n] + push * (g[q, i, 2] * g[q, k, n] - g[q, i, n] * g[q, k, 2]))
+                    if len(given) and i == k:
+                        c0 += w * given[m, q, 0, n]
+                        c1 += w * given[m, q, 1, n]
+                        c2 += w * given[m, q, 2, n]
+                    row = left[3 * q + n]
+                    for a in range(count):
+                        row[count * p + a] = c0 * grad[3 * q, a] + c1 * grad[3 * q + 1, a] + c2 * grad[3 * q + 2, a]
+            for i in range(3):
+                s0, s1, s2 = w * det[q] * g[q, i, 0], w * det[q] * g[q, i, 1], w * det[q] * g[q, i, 2]
+                for a in range(count):
+                    s = s0 * grad[3 * q, a] + s1 * grad[3 * q + 1, a] + s2 * grad[3 * q + 2, a]
+                    swell[0, i, a] += s
+                    swell[1, i, a] += s * lean
+        k_out = out[m]
+        k_out[:] = np.dot(left.T, grad).reshape(6, count, count)
+        for kind in range(2):
+            scale = law[4 + kind] / rest
+            for p in range(6):
+                for a in range(count):
+                    size = scale * swell[kind, _I[p], a]
+                    for b in range(count):
+                        k_out[p, a, b] += size * swell[kind, _K[p], b]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _distortion_stress(elements, gradients, weights, law, control):
+    count = elements.shape[1]
+    x = np.zeros((3, count))
+    f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
+    det, stress = np.zeros(8), np.zeros((3, 3))
+    out = np.zeros((len(elements), 8, 3, 3))
+    for m in range(len(elements)):
+        for a in range(count):
+            for i in range(3):
+                x[i, a] = control[elements[m, a], i]
+        _kinematics(x, gradients[m], weights[m], f, g, det)
+        for q in range(8):
+            distortion(law, f[q], det[q], g[q], stress)
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):  # S = F^-1 P, and g is F^-T
+                        out[m, q, i, j] += g[q, k, i] * stress[k, j]
+    return out

@@ -1,8 +1,11 @@
 """Direct solution of the assembled equations: multifrontal elimination with nested dissection.
 
-Duff & Reid 1983 (multifrontal method), George 1973 (nested dissection of a grid). The mesh is a
-square grid of columns of nodes, so the dissection is known: cut the longer side in the middle,
-recurse. All arithmetic is dense LAPACK on the fronts; the order is found once per mesh.
+Duff & Reid 1983 (multifrontal method), George 1973 (nested dissection of a grid). The elements stand on a
+square grid, so the dissection is known: cut the longer side in the middle, recurse; a control is
+eliminated in the smallest box that holds all of its elements. All arithmetic is dense LAPACK on the
+fronts; the order is found once per sensor. Some unknowns can be kept: what is left for them is a dense
+matrix (static condensation; Guyan 1965), on which contact, that changes from iteration to iteration, is
+cheap to solve.
 """
 
 from dataclasses import dataclass
@@ -11,7 +14,11 @@ import numba
 import numpy as np
 from scipy.linalg import blas, lapack
 
-_LEAF_COLUMNS = 12
+from twin.mechanics.elements import PAIRS
+
+_LEAF_ELEMENTS = 16
+_I = np.array([i for i, _ in PAIRS])
+_K = np.array([k for _, k in PAIRS])
 
 
 class NotPositiveDefinite(Exception):
@@ -22,187 +29,206 @@ class NotPositiveDefinite(Exception):
 class _Front:
     own: np.ndarray  # unknowns eliminated here
     border: np.ndarray  # later unknowns they are coupled to
-    elements: np.ndarray  # elements assembled here
-    places: np.ndarray  # (elements, 24) rows of the front, -1 for clamped
-    parent: int
-    into_parent: np.ndarray  # rows of the parent's front for ``border``
+    controls_left: np.ndarray  # controls of the border
+    assembled: list  # for each kind of element: which are assembled here, and (elements, 3 b) their rows, direction-major; -1 for clamped
+    parent: int = -1
+    into_parent: np.ndarray = None  # rows of the parent's front for ``border``
+    head: np.ndarray = None  # (own, own), Fortran order, lower triangle, overwritten by its factor
+    below: np.ndarray = None  # (border, own)
+    rest: np.ndarray = None  # (border, border)
 
 
 class FrontalSolver:
-    """Symbolic elimination of a mesh; ``factor`` then eliminates any matrix given by its elements.
+    """Symbolic elimination of a body; ``eliminate`` then works on any matrix given by its elements.
 
     Parameters
     ----------
-    hexes : (m, 8) int
+    groups : list of (m, b) int
+        Controls of each element of each kind.
+    boxes : list of (m, 4) int
+        Where each element lies: rows and columns of the grid (first, last + 1).
     fixed : (n,) bool
-    grid : (3,) int
-        Layers of nodes and nodes along both sides (see ``SensorMesh``).
+    keep : (n,) bool
+        Controls that are not eliminated.
     """
 
-    def __init__(self, hexes: np.ndarray, fixed: np.ndarray, grid: tuple[int, int, int]):
-        per_layer = grid[1] * grid[2]
+    def __init__(self, groups: list[np.ndarray], boxes: list[np.ndarray], fixed: np.ndarray, keep: np.ndarray):
         free = ~fixed
         self.unknown = np.full((len(fixed), 3), -1)
         self.unknown[free] = np.arange(3 * np.count_nonzero(free)).reshape(-1, 3)
         self.size = 3 * int(np.count_nonzero(free))
-        column_of_node = np.arange(len(fixed)) % per_layer
-        free_nodes = [[] for _ in range(per_layer)]
-        for node in np.flatnonzero(free):
-            free_nodes[column_of_node[node]].append(node)
-        used = np.array([bool(nodes) for nodes in free_nodes]).reshape(grid[1:])
-        boxes = []
-        _dissect(1, grid[1] - 1, 1, grid[2] - 1, boxes)
-        stage = np.full(grid[1:], -1)
-        for number, (rows, columns) in enumerate(boxes):
-            stage[np.ix_(rows, columns)] = number
-        if (stage[used] < 0).any():
-            raise ValueError("free nodes on the border of the grid: the rim must be clamped")
-        stage = stage.ravel()
-
-        unknowns_of = [self.unknown[nodes].ravel() if nodes else np.zeros(0, int) for nodes in free_nodes]
-        quads = column_of_node[hexes[:, [0, 1, 2, 3]]]
-        stages = np.where(stage[quads] < 0, len(boxes), stage[quads])
-        first = stages.min(axis=1)
-        borders: list[set] = [set() for _ in boxes]
-        children: list[list[int]] = [[] for _ in boxes]
-        parents = np.full(len(boxes), -1)
-        for number in range(len(boxes)):
-            touched = set(quads[first == number].ravel().tolist())
-            for child in children[number]:
-                touched |= borders[child]
-            borders[number] = {c for c in touched if stage[c] > number}
-            if borders[number]:
-                parents[number] = min(stage[c] for c in borders[number])
-                children[parents[number]].append(number)
+        support = np.tile([1 << 30, 0, 1 << 30, 0], (len(fixed), 1))
+        for controls, box in zip(groups, boxes, strict=True):
+            for column, better in enumerate((np.minimum, np.maximum, np.minimum, np.maximum)):
+                better.at(support[:, column], controls, box[:, column, None])
+        side = int(max(box[:, 1].max() for box in boxes if len(box)))
+        tree: list[tuple] = []
+        _dissect((0, side, 0, side), tree)
+        stage = np.full(len(fixed), len(tree))  # where a control is eliminated: the smallest box that holds its support
+        for number, (box, _) in enumerate(tree):
+            stage[_inside(support, box) & free & ~keep & (stage == len(tree))] = number
 
         self._fronts: list[_Front] = []
-        rows_of = []
-        for number in range(len(boxes)):
-            own_columns = np.flatnonzero(stage == number)
-            border_columns = sorted(borders[number], key=lambda c: (stage[c], c))
-            own = np.concatenate([unknowns_of[c] for c in own_columns])
-            border = np.concatenate([unknowns_of[c] for c in border_columns]) if border_columns else np.zeros(0, int)
+        for number, (box, children) in enumerate(tree):
+            assembled, touched = [], [self._fronts[c].controls_left for c in children]
+            for controls, where in zip(groups, boxes, strict=True):
+                which = np.flatnonzero(_inside(where, box)) if not children else np.zeros(0, int)
+                assembled.append((which, controls[which]))
+                touched.append(controls[which].ravel())
+            touched = np.unique(np.concatenate(touched))
+            touched = touched[free[touched]]
+            order = np.lexsort((touched, stage[touched]))
+            own, left = np.split(touched[order], [np.count_nonzero(stage[touched] == number)])
             rows = np.full(self.size + 1, -1)
-            rows[np.concatenate([own, border])] = np.arange(len(own) + len(border))
-            rows_of.append(rows)
-            elements = np.flatnonzero(first == number)
-            places = rows[self.unknown[hexes[elements]]].reshape(len(elements), 24)
-            self._fronts.append(_Front(own, border, elements, places, int(parents[number]), np.zeros(0, int)))
-        for front in self._fronts:
-            if front.parent >= 0:
-                front.into_parent = rows_of[front.parent][front.border]
+            unknowns = self.unknown[np.concatenate([own, left])].ravel()
+            rows[unknowns] = np.arange(len(unknowns))
+            front = _Front(
+                own=self.unknown[own].ravel(),
+                border=self.unknown[left].ravel(),
+                controls_left=left,
+                assembled=[
+                    (
+                        which,
+                        np.ascontiguousarray(rows[self.unknown[controls]].transpose(0, 2, 1).reshape(len(which), 3 * controls.shape[1])),
+                    )
+                    for which, controls in assembled
+                ],
+            )
+            for child in children:
+                self._fronts[child].parent = number
+                self._fronts[child].into_parent = rows[self._fronts[child].border]
+            front.head = np.zeros((len(front.own), len(front.own)), order="F")
+            front.below = np.zeros((len(front.border), len(front.own)), order="F")
+            front.rest = np.zeros((len(front.border), len(front.border)), order="F")
+            self._fronts.append(front)
+        self.kept = self._fronts[-1].border
 
-    def factor(self, elements: np.ndarray, *, symmetric: bool, shift: float = 0.0) -> "Factors":
-        """Eliminate the matrix whose element blocks are ``elements`` (m, 24, 24), plus ``shift`` on the diagonal.
+    def eliminate(self, blocks: list[np.ndarray], *, shift: float = 0.0) -> "Eliminated":
+        """Eliminate all but the kept unknowns; the result is valid until the next call.
+
+        Parameters
+        ----------
+        blocks : list of (m, 6, b, b) float
+            Symmetric blocks of each kind of element, as ``Elements.stiffness`` leaves them.
+        shift : float
+            Added to the diagonal of what is eliminated.
 
         Raises
         ------
         NotPositiveDefinite
-            If ``symmetric`` and the matrix is not positive definite.
         """
-        pending: list[list] = [[] for _ in self._fronts]
-        blocks = []
-        for number, front in enumerate(self._fronts):
-            size, own = len(front.own) + len(front.border), len(front.own)
-            matrix = np.zeros((size, size), order="F")
-            _assemble(elements, front.elements, front.places, matrix)
-            for child, update in pending[number]:
-                _extend(matrix, update, child.into_parent)
-            pending[number] = []
+        fronts = self._fronts
+        for front in fronts:
+            front.head[:] = 0.0
+            front.below[:] = 0.0
+            front.rest[:] = 0.0
+            for block, (which, places) in zip(blocks, front.assembled, strict=True):
+                _assemble(block, which, places, front.head, front.below, front.rest)
             if shift:
-                matrix[np.arange(own), np.arange(own)] += shift
-            head, right = matrix[:own, :own], matrix[:own, own:]
-            if symmetric:
-                lower, info = lapack.dpotrf(head, lower=1, clean=0)
+                front.head[np.arange(len(front.own)), np.arange(len(front.own))] += shift
+        for front in fronts:
+            if len(front.own):
+                _, info = lapack.dpotrf(front.head, lower=1, clean=0, overwrite_a=1)
                 if info > 0:
                     raise NotPositiveDefinite
-                right = blas.dtrsm(1.0, lower, right, lower=1)
-                rest = blas.dsyrk(-1.0, right, beta=1.0, c=matrix[own:, own:], trans=1, lower=1) if len(front.border) else None
-                blocks.append((lower, right))
-                if rest is not None:
-                    rest = _mirror(rest)
-            else:
-                below = matrix[own:, :own]
-                factor, pivots, info = lapack.dgetrf(head)
-                if info > 0:
-                    raise NotPositiveDefinite
-                right = lapack.dgetrs(factor, pivots, right)[0] if len(front.border) else right
-                rest = blas.dgemm(-1.0, below, right, beta=1.0, c=matrix[own:, own:]) if len(front.border) else None
-                blocks.append((factor, pivots, right, np.asfortranarray(below)))
+                if len(front.border):
+                    blas.dtrsm(1.0, front.head, front.below, side=1, lower=1, trans_a=1, overwrite_b=1)
+                    blas.dsyrk(-1.0, front.below, beta=1.0, c=front.rest, lower=1, overwrite_c=1)
             if front.parent >= 0:
-                pending[front.parent].append((front, rest))
-        return Factors(self._fronts, blocks, symmetric)
+                up = fronts[front.parent]
+                _extend(front.rest, front.into_parent, up.head, up.below, up.rest)
+        return Eliminated(fronts, self.kept)
 
 
-class Factors:
-    """An eliminated matrix."""
+class Eliminated:
+    """A matrix with all but the kept unknowns eliminated.
 
-    def __init__(self, fronts: list[_Front], blocks: list[tuple], symmetric: bool):
-        self._fronts, self._blocks, self._symmetric = fronts, blocks, symmetric
+    Attributes
+    ----------
+    kept : (k,) int
+        The kept unknowns.
+    matrix : (k, k) float
+        What is left for them (Schur complement); lower triangle.
+    """
 
-    def solve(self, right_side: np.ndarray) -> np.ndarray:
-        """Solution for right sides (unknowns,) or (unknowns, k)."""
+    def __init__(self, fronts: list[_Front], kept: np.ndarray):
+        self._fronts = [front for front in fronts if len(front.own)]
+        self.kept, self.matrix = kept, fronts[-1].rest
+
+    def forward(self, right_side: np.ndarray) -> np.ndarray:
+        """Eliminate in a right side (unknowns,): what is left at ``kept`` is the right side for ``matrix``."""
         x = np.array(right_side, float)
-        flat = x.ndim == 1
-        x = x.reshape(len(x), -1)
-        for front, block in zip(self._fronts, self._blocks, strict=True):
-            if self._symmetric:
-                part = blas.dtrsm(1.0, block[0], x[front.own], lower=1)
-                x[front.border] -= block[1].T @ part
-            else:
-                part = lapack.dgetrs(block[0], block[1], x[front.own])[0]
-                x[front.border] -= block[3] @ part
+        for front in self._fronts:
+            part = lapack.dtrtrs(front.head, x[front.own], lower=1)[0]
+            x[front.border] -= front.below @ part
             x[front.own] = part
-        for front, block in zip(reversed(self._fronts), reversed(self._blocks), strict=True):
-            if self._symmetric:
-                x[front.own] = blas.dtrsm(1.0, block[0], x[front.own] - block[1] @ x[front.border], lower=1, trans_a=1)
-            else:
-                x[front.own] -= block[2] @ x[front.border]
-        return x[:, 0] if flat else x
+        return x
+
+    def backward(self, eliminated: np.ndarray, kept_values: np.ndarray) -> np.ndarray:
+        """The whole solution (unknowns,) from an eliminated right side and the solution at ``kept``."""
+        x = eliminated.copy()
+        x[self.kept] = kept_values
+        for front in reversed(self._fronts):
+            x[front.own] = lapack.dtrtrs(front.head, x[front.own] - front.below.T @ x[front.border], lower=1, trans=1)[0]
+        return x
 
 
-def _dissect(row0, row1, column0, column1, boxes):
-    """Append (rows, columns) of the sub-grid's pieces, children before their separator."""
-    rows, columns = row1 - row0, column1 - column0
-    if rows <= 0 or columns <= 0:
-        return
-    if rows * columns <= _LEAF_COLUMNS or max(rows, columns) < 3:
-        boxes.append((range(row0, row1), range(column0, column1)))
-    elif rows >= columns:
-        middle = (row0 + row1) // 2
-        _dissect(row0, middle, column0, column1, boxes)
-        _dissect(middle + 1, row1, column0, column1, boxes)
-        boxes.append((range(middle, middle + 1), range(column0, column1)))
-    else:
-        middle = (column0 + column1) // 2
-        _dissect(row0, row1, column0, middle, boxes)
-        _dissect(row0, row1, middle + 1, column1, boxes)
-        boxes.append((range(row0, row1), range(middle, middle + 1)))
+def _dissect(box, tree):
+    """Append (box, children) of a box of elements cut in two again and again, children before their parent; its place in the list."""
+    row0, row1, column0, column1 = box
+    children = []
+    if (row1 - row0) * (column1 - column0) > _LEAF_ELEMENTS:
+        if row1 - row0 >= column1 - column0:
+            middle = row0 + (row1 - row0) // 4 * 2
+            halves = (row0, middle, column0, column1), (middle, row1, column0, column1)
+        else:
+            middle = column0 + (column1 - column0) // 4 * 2
+            halves = (row0, row1, column0, middle), (row0, row1, middle, column1)
+        children = [_dissect(half, tree) for half in halves]
+    tree.append((box, children))
+    return len(tree) - 1
 
 
-@numba.njit(cache=True)
-def _assemble(elements, which, places, matrix):
-    for k in range(len(which)):
-        block = elements[which[k]]
-        for c in range(24):
-            column = places[k, c]
-            if column >= 0:
-                for r in range(24):
-                    row = places[k, r]
-                    if row >= 0:
-                        matrix[row, column] += block[r, c]
+def _inside(boxes, box):
+    return (boxes[:, 0] >= box[0]) & (boxes[:, 1] <= box[1]) & (boxes[:, 2] >= box[2]) & (boxes[:, 3] <= box[3])
 
 
 @numba.njit(cache=True)
-def _extend(matrix, update, places):
+def _assemble(elements, which, places, head, below, rest):
+    """Add symmetric blocks to a front's lower triangle."""
+    own, count = len(head), elements.shape[2]
+    for e in range(len(which)):
+        block = elements[which[e]]
+        place = places[e]
+        for p in range(6):
+            i, k = _I[p], _K[p]
+            for a in range(count):
+                r = place[count * i + a]
+                if r < 0:
+                    continue
+                for b in range(count if i != k else a + 1):
+                    c = place[count * k + b]
+                    if c < 0:
+                        continue
+                    low, high = (r, c) if r < c else (c, r)
+                    if high < own:
+                        head[high, low] += block[p, a, b]
+                    elif low < own:
+                        below[high - own, low] += block[p, a, b]
+                    else:
+                        rest[high - own, low - own] += block[p, a, b]
+
+
+@numba.njit(cache=True)
+def _extend(update, places, head, below, rest):
+    own = len(head)
     for c in range(len(places)):
-        for r in range(len(places)):
-            matrix[places[r], places[c]] += update[r, c]
-
-
-@numba.njit(cache=True)
-def _mirror(lower):
-    for c in range(len(lower)):
-        for r in range(c):
-            lower[r, c] = lower[c, r]
-    return lower
+        low = places[c]
+        for r in range(c, len(places)):
+            high = places[r]
+            if high < own:
+                head[high, low] += update[r, c]
+            elif low < own:
+                below[high - own, low] += update[r, c]
+            else:
+                rest[high - own, low - own] += update[r, c]

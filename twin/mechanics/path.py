@@ -1,8 +1,9 @@
-"""Where the object goes: from first touch through the press to the end of the shear."""
+"""Where the object goes: a path of poses through which it is moved."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError
@@ -42,37 +43,59 @@ class ContactPose:
 
 @dataclass(frozen=True)
 class ContactPath:
-    """Object poses along a contact: progress 0 is first touch, 1 fully pressed, 2 fully sheared.
+    """Poses through which an object is moved: approach, tap, shear, twist, slide, hold, retract, in any order.
+
+    Between two poses the object's origin moves on a straight line while it turns about a fixed axis (slerp).
+    The first pose must be free of contact or a first touch.
 
     Attributes
     ----------
-    pose : ContactPose
-    T_touch : (4, 4) float
-        ``T_sensor_object`` at first touch.
+    poses : (k, 4, 4) float
+        ``T_sensor_object``, k >= 2.
+    times_s : (k,) float, optional
+        When each is reached, rising; only a viscoelastic sensor cares. Two equal poses hold the object still.
+        Default: one second each.
     """
 
-    pose: ContactPose
-    T_touch: np.ndarray
+    poses: np.ndarray
+    times_s: np.ndarray | None = None
 
-    @property
-    def end(self) -> float:
-        """Progress at the end of the path."""
-        return 2.0 if any(self.pose.shear_mm) or self.pose.twist_deg else 1.0
+    def __post_init__(self):
+        poses = np.asarray(self.poses, float)
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2 or not np.isfinite(poses).all():
+            raise ContactError(f"a path needs at least two finite 4x4 poses, got an array of shape {poses.shape}")
+        turn = poses[:, :3, :3]
+        if np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(turn) < 0).any():
+            raise ContactError("a pose of the path is not a rigid motion; give rotations in its upper left 3x3")
+        times = np.arange(len(poses), dtype=float) if self.times_s is None else np.asarray(self.times_s, float)
+        if times.shape != (len(poses),) or not (np.diff(times) > 0).all():
+            raise ContactError(f"times_s must rise, one for each of the {len(poses)} poses, got {times}")
+        object.__setattr__(self, "poses", poses)
+        object.__setattr__(self, "times_s", times)
 
     def at(self, progress: float) -> np.ndarray:
-        """``T_sensor_object`` (4, 4) at a progress from 0 to 2."""
-        pressed, sheared = min(progress, 1.0), max(progress - 1.0, 0.0)
-        T = self.T_touch.copy()
-        T[2, 3] -= pressed * self.pose.indent_mm
-        move = np.eye(4)
-        angle = np.radians(self.pose.twist_deg) * sheared
-        move[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        move[:2, 3] = np.multiply(self.pose.shear_mm, sheared)
-        return move @ T
+        """``T_sensor_object`` (4, 4) at a progress from 0 (first pose) to k - 1 (last)."""
+        leg = int(np.clip(np.floor(progress), 0, len(self.poses) - 2))
+        share = progress - leg
+        start, stop = self.poses[leg], self.poses[leg + 1]
+        turn = Rotation.from_matrix(stop[:3, :3] @ start[:3, :3].T).as_rotvec()
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ start[:3, :3]
+        T[:3, 3] = (1 - share) * start[:3, 3] + share * stop[:3, 3]
+        return T
+
+    def time_s(self, progress: float) -> float:
+        """Time at a progress."""
+        return float(np.interp(progress, np.arange(len(self.poses)), self.times_s))
+
+    def there_and_back(self) -> "ContactPath":
+        """The path, then the same way back."""
+        span = self.times_s[-1] - self.times_s[::-1]
+        return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([self.times_s, self.times_s[-1] + span[1:]]))
 
 
 def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
-    """Check a pose and find its first touch with the undeformed skin.
+    """Check a pose and find its first touch with the undeformed skin: poses at touch, pressed, and (if it moves further) sheared.
 
     The object comes down along z by its smallest distance to the dome, again and again, which never
     passes the first touch where distances are exact (sphere tracing, Hart 1996). The dome is sampled evenly, then finely
@@ -92,8 +115,7 @@ def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
     T[:3, :3] = turn_y @ turn_x
     T[:3, 3] = [*pose.offset_mm, radius]
     lowest_z = spec.skin.rim_z_mm / radius
-    directions = _sphere_points(_DOME_POINTS)
-    directions = directions[directions[:, 2] >= lowest_z]
+    directions = dome_directions(spec, _DOME_POINTS)
     height, nearest = _bring_down(stimulus, T, radius * directions, _START_MM, radius - spec.skin.rim_z_mm)
     # around the nearest point the sampling is refined 30 times
     spread = 3 / np.sqrt(_DOME_POINTS)
@@ -102,7 +124,22 @@ def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
     near = near[near[:, 2] >= lowest_z]
     height, _ = _bring_down(stimulus, T, radius * near, height + spread * radius, radius - spec.skin.rim_z_mm)
     T[2, 3] += height
-    return ContactPath(pose, T)
+    pressed = T.copy()
+    pressed[2, 3] -= max(pose.indent_mm, 0.0)
+    poses = [T, pressed]
+    if any(pose.shear_mm) or pose.twist_deg:
+        move = np.eye(4)
+        angle = np.radians(pose.twist_deg)
+        move[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        move[:2, 3] = pose.shear_mm
+        poses.append(move @ pressed)
+    return ContactPath(np.stack(poses))
+
+
+def dome_directions(spec: SensorSpec, count: int) -> np.ndarray:
+    """(k, 3) unit vectors evenly over the dome, about ``count`` on the whole sphere."""
+    directions = _sphere_points(count)
+    return directions[directions[:, 2] >= spec.skin.rim_z_mm / spec.skin.outer_radius_mm]
 
 
 def _check(spec: SensorSpec, pose: ContactPose) -> None:

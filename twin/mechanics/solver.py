@@ -1,6 +1,8 @@
-"""From a sensor, an object and a pose to converged contact states."""
+"""From a sensor, an object and a path to converged contact states."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -8,22 +10,40 @@ from threadpoolctl import ThreadpoolController
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError
-from twin.geometry.mesh import SKIN, Resolution, build_mesh, pin_pose
-from twin.mechanics.contact import ContactForces, contact_points, no_anchors, spread_forces
-from twin.mechanics.elements import element_table, lame_constants
+from twin.geometry.chart import Focus, dome_points
+from twin.geometry.mesh import build_mesh
+from twin.geometry.solid import Resolution, Solid, build_solid, pin_pose
+from twin.geometry.view import NodeView
+from twin.mechanics.contact import contact_points
+from twin.mechanics.elements import Elements
 from twin.mechanics.linear import FrontalSolver
-from twin.mechanics.newton import RESIDUAL_TOLERANCE, Balance, Body, LoadState, LoadStepper, NoConvergence
-from twin.mechanics.path import ContactPath, ContactPose, plan_path
+from twin.mechanics.material import law_coefficients
+from twin.mechanics.newton import RESIDUAL_TOLERANCE, Balance, Body, Friction, LoadState, LoadStepper, NoConvergence
+from twin.mechanics.path import ContactPath, ContactPose, dome_directions, plan_path
+from twin.mechanics.relaxation import History
 from twin.stimulus import Stimulus, build_stimulus
 from twin.types import ContactState
 
 _PENALTY_MPA_MM = 30.0
-_STEP_MM, _STEP_DEG = 0.75, 8.0
+_STEP_MM = 0.6  # largest motion of the object across the contact in one load step
 _SMALLEST_STRIDE = 1 / 64  # of a regular load step
+_FOCUS_POINTS = 2000  # on the sphere, to see where the object will press
+_FOCUS_POLAR_DEG, _FOCUS_AZIMUTH_DEG = 5.0, 15.0  # the focus's direction is rounded to these
+_FOCUS_RADIUS_RAD = np.radians(50.0)
+_MARGIN_RAD = np.radians(15.0)  # skin this far around what the rigid object would pass through may touch it
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """A solid, and what is derived from it."""
+
+    solid: Solid
+    body: Body
+    view: NodeView
 
 
 class SkinSolver:
-    """Presses one sensor; the mesh and everything derived from it are computed once.
+    """Presses one sensor; what depends on the sensor alone is computed once.
 
     Parameters
     ----------
@@ -32,29 +52,41 @@ class SkinSolver:
     """
 
     def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None):
-        self.spec = spec
-        self.mesh = build_mesh(spec, resolution=resolution)
-        skin, gel = (lame_constants(m.young_modulus_mpa, m.poisson_ratio) for m in (spec.skin, spec.gel))
-        is_skin = self.mesh.material == SKIN
-        table = element_table(self.mesh.nodes_mm, self.mesh.hexes, np.where(is_skin, skin[0], gel[0]), np.where(is_skin, skin[1], gel[1]))
-        points = contact_points(self.mesh, spec.skin.outer_radius_mm)
-        self.body = Body(table, points, FrontalSolver(self.mesh.hexes, self.mesh.fixed, self.mesh.grid), ~self.mesh.fixed)
+        self.spec, self.resolution = spec, resolution or Resolution()
+        self.mesh = build_mesh(spec)
         self._blas = ThreadpoolController()  # the fronts are small: more BLAS threads only wait for each other
+        self._setting = lru_cache(maxsize=32)(self._set_up)
 
     def rest(self, *, T_sensor_object: np.ndarray | None = None) -> ContactState:
         """The undeformed sensor."""
-        none = np.zeros((0, 3))
-        base, axis, caps = pin_pose(self.mesh, self.mesh.nodes_mm)
-        pose = np.eye(4) if T_sensor_object is None else T_sensor_object
-        zero = np.zeros(3)
-        return ContactState(self.mesh.nodes_mm, base, axis, caps, zero, zero.copy(), 0.0, np.zeros(0, int), none, pose, 0.0)
+        setting = self._setting(Focus(radius_rad=_FOCUS_RADIUS_RAD))
+        base, axis, caps = pin_pose(setting.solid, setting.solid.control_mm)
+        return ContactState(
+            nodes_mm=self.mesh.nodes_mm,
+            base_mm=base,
+            axis=axis,
+            caps_mm=caps,
+            force_n=np.zeros(3),
+            torque_nmm=np.zeros(3),
+            area_mm2=0.0,
+            contact_mm=np.zeros((0, 3)),
+            normal=np.zeros((0, 3)),
+            normal_n=np.zeros(0),
+            tangential_n=np.zeros((0, 3)),
+            point_area_mm2=np.zeros(0),
+            slipping=np.zeros(0, bool),
+            T_sensor_object=np.eye(4) if T_sensor_object is None else T_sensor_object,
+            elastic_nmm=0.0,
+            dissipated_nmm=0.0,
+            residual=0.0,
+        )
 
     def press(
         self,
         stimulus: Stimulus | ObjectSpec,
-        pose: ContactPose,
+        pose: ContactPose | ContactPath,
         *,
-        friction: float | None = None,
+        friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
         progress: Callable[[float, ContactState], None] | None = None,
     ) -> ContactState:
@@ -67,11 +99,12 @@ class SkinSolver:
     def path(
         self,
         stimulus: Stimulus | ObjectSpec,
-        pose: ContactPose,
+        pose: ContactPose | ContactPath,
         *,
-        friction: float | None = None,
+        friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
         release: bool = False,
+        step_mm: float = _STEP_MM,
     ) -> Iterator[tuple[float, ContactState]]:
         """Every converged state of a contact, in order.
 
@@ -79,10 +112,12 @@ class SkinSolver:
         ----------
         stimulus : Stimulus or ObjectSpec
             With a bare ``Stimulus``, friction and compliance default to 0.
-        friction, compliance_mm_per_n : float, optional
+        friction, compliance_mm_per_n : optional
             Override the object's.
         release : bool
             Afterwards lift the object off again, the way it came.
+        step_mm : float
+            Largest motion across the contact in one load step.
 
         Yields
         ------
@@ -93,29 +128,48 @@ class SkinSolver:
         Raises
         ------
         ContactError
-            Pose out of range, object out of reach, or no convergence: names the step and the residual.
+            Pose out of range, object out of reach or starting inside the skin, or no convergence: names the
+            step and the residual.
         """
         spec = stimulus if isinstance(stimulus, ObjectSpec) else None
         field = build_stimulus(spec) if spec else stimulus
-        mu = friction if friction is not None else (spec.friction if spec else 0.0)
+        law = _friction(spec, friction)
         compliance = compliance_mm_per_n if compliance_mm_per_n is not None else (spec.compliance_mm_per_n if spec else 0.0)
-        plan = plan_path(self.spec, field, pose)
-        if pose.indent_mm <= 0:
+        plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec, field, pose)
+        if release:
+            plan = plan.there_and_back()
+        if isinstance(pose, ContactPose) and pose.indent_mm <= 0:
             yield 1.0, self.rest(T_sensor_object=plan.at(1.0))
             return
-        stops = _stops(plan, release)
-        stepper = LoadStepper(self.body, field, mu, compliance)
-        start = no_anchors(self.body.points)
-        state = LoadState(self.mesh.nodes_mm, 0.0, start, np.zeros(len(start.held)), _PENALTY_MPA_MM, plan.at(0.0))
+        reached = self._reached(field, plan)
+        setting = self._setting(_focus(reached))
+        body = setting.body
+        count = len(body.points.area_mm2)
+        state = LoadState(
+            control_mm=setting.solid.control_mm,
+            border=np.zeros(2),
+            anchor_mm=np.zeros((count, 3)),
+            held=np.zeros(count, bool),
+            slid_mm=np.zeros(count),
+            penalty_mpa_mm=_PENALTY_MPA_MM,
+            T=plan.at(0.0),
+        )
+        terms = [self.spec.skin.relaxation, self.spec.gel.relaxation, self.spec.gel.relaxation]
+        past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, terms, strict=True)]
+        stepper = LoadStepper(body, self._frontal(setting.solid, reached), field, law, compliance)
+        stops = _stops(plan, reached, step_mm)
         for number in range(1, len(stops)):
             done, stride = 0.0, 1.0
             while done < 1:
                 stride = min(stride, 1 - done)
+                start = stops[number - 1] + done * (stops[number] - stops[number - 1])
                 at = stops[number - 1] + (done + stride) * (stops[number] - stops[number - 1])
-                T = plan.at(min(at, 2 * plan.end - at))
+                span_s = plan.time_s(at) - plan.time_s(start)
+                now = [p.before(kind, term, span_s) for p, kind, term in zip(past, body.kinds, terms, strict=True)]
                 try:
                     with self._blas.limit(limits=1, user_api="blas"):
-                        state, balance = stepper.step(state, T)
+                        stepper.follow(replace(body, kinds=tuple(kind for kind, _ in now)))
+                        state, balance, looked = stepper.step(state, plan.at(at), [given for _, given in now])
                 except NoConvergence as failure:
                     stride /= 2
                     if stride >= _SMALLEST_STRIDE:
@@ -125,50 +179,110 @@ class SkinSolver:
                         f"{failure.relative:.1e}, needed {RESIDUAL_TOLERANCE:.0e}; try less indentation, shear or friction, "
                         f"a rounder object, or another resolution"
                     ) from None
+                past = [p.after(kind, term, span_s, state.control_mm) for p, kind, term in zip(past, body.kinds, terms, strict=True)]
                 done += stride
                 stride = min(2 * stride, 1.0)
-                yield float(at / stops[-1]), self._contact_state(state, balance)
+                yield float(at / stops[-1]), self._contact_state(setting, state, balance, looked)
 
-    def _contact_state(self, state: LoadState, balance: Balance) -> ContactState:
-        traction = np.zeros_like(state.nodes_mm)
-        spread_forces(self.body.points.nodes, self.body.points.weights, -balance.point_force_n, traction)
-        touched = np.flatnonzero((traction != 0).any(axis=1))
-        base, axis, caps = pin_pose(self.mesh, state.nodes_mm)
+    def _set_up(self, focus: Focus) -> _Setting:
+        spec = self.spec
+        solid = build_solid(spec, resolution=self.resolution, focus=focus)
+        gel = law_coefficients(spec.gel, layer=False)
+        kinds = (Elements(solid.skin, law_coefficients(spec.skin, layer=True)), Elements(solid.gel_top, gel), Elements(solid.gel_deep, gel))
+        points = contact_points(solid, spec.skin.outer_radius_mm)
+        return _Setting(solid, Body(kinds, points, ~solid.fixed, spec.gel.sealed), NodeView.of(spec, self.mesh, solid))
+
+    def _frontal(self, solid: Solid, reached: np.ndarray) -> FrontalSolver:
+        """Elimination of all but the outer controls that may be touched: those around the reached directions."""
+        side = solid.basis.count
+        v, u = np.meshgrid(solid.basis.greville, solid.basis.greville, indexing="ij")
+        outer = dome_points(
+            solid.chart.disc(np.column_stack([u.ravel(), v.ravel()])), 1.0, self.spec.skin.rim_z_mm / self.spec.skin.outer_radius_mm
+        )
+        nearest = (outer @ reached.T).max(axis=1)
+        keep = np.zeros(len(solid.fixed), bool)
+        keep[: side * side] = nearest > np.cos(_MARGIN_RAD)
+        return FrontalSolver(
+            [c.controls for c in (solid.skin, solid.gel_top, solid.gel_deep)], list(solid.boxes), solid.fixed, keep & ~solid.fixed
+        )
+
+    def _reached(self, field: Stimulus, plan: ContactPath) -> np.ndarray:
+        """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""
+        radius = self.spec.skin.outer_radius_mm
+        directions = dome_directions(self.spec, _FOCUS_POINTS)
+        deepest = np.full(len(directions), np.inf)
+        limit = 0.5 * (radius - self.spec.skin.thickness_mm - self.spec.lens.z_mm)
+        for number, T in enumerate(plan.poses):
+            gap = field.distance((radius * directions - T[:3, 3]) @ T[:3, :3])
+            if number == 0 and gap.min() < -0.05:
+                raise ContactError(f"the object starts {-gap.min():.2f} mm inside the skin; begin the path clear of it")
+            if -gap.min() > limit:
+                raise ContactError(
+                    f"pose {number} of the path goes {-gap.min():.1f} mm into the dome, more than {limit:.1f} (half the gel's depth)"
+                )
+            deepest = np.minimum(deepest, gap)
+        pressed = deepest < 0
+        return directions[pressed] if pressed.any() else directions[[deepest.argmin()]]
+
+    def _contact_state(self, setting: _Setting, state: LoadState, balance: Balance, looked: np.ndarray) -> ContactState:
+        contact, points = balance.contact, setting.body.points
+        touched = np.flatnonzero(contact.penetration_mm > 0)
+        where = looked[touched]
+        turn = state.T[:3, :3]
+        at = points.positions(state.control_mm)[where]
+        normal = contact.normal[touched] @ turn.T
+        force = -balance.point_force_n[touched]
+        normal_n = contact.normal_n[touched]
+        base, axis, caps = pin_pose(setting.solid, state.control_mm)
         pose = state.T.copy()
-        pose[2, 3] += state.yield_mm
+        pose[2, 3] += state.border[0]
         return ContactState(
-            nodes_mm=state.nodes_mm,
+            nodes_mm=setting.view.nodes(state.control_mm),
             base_mm=base,
             axis=axis,
             caps_mm=caps,
-            force_n=traction.sum(axis=0),
-            torque_nmm=np.cross(state.nodes_mm, traction).sum(axis=0),
-            area_mm2=self._contact_area(state.nodes_mm, balance.contact),
-            contact_nodes=touched,
-            traction_n=traction[touched],
+            force_n=force.sum(axis=0),
+            torque_nmm=np.cross(at, force).sum(axis=0),
+            area_mm2=float(points.area_mm2[where].sum()),
+            contact_mm=at,
+            normal=normal,
+            normal_n=normal_n,
+            tangential_n=force + normal_n[:, None] * normal,
+            point_area_mm2=points.area_mm2[where],
+            slipping=contact.slipping[touched],
             T_sensor_object=pose,
+            elastic_nmm=state.elastic_nmm,
+            dissipated_nmm=state.dissipated_nmm,
             residual=balance.relative,
         )
 
-    def _contact_area(self, nodes_mm: np.ndarray, contact: ContactForces) -> float:
-        """Deformed area of the Gauss points in contact: their rest area times their quad's change of area."""
-        quads = self.mesh.outer_quads
 
-        def areas(nodes):
-            return np.linalg.norm(np.cross(nodes[quads[:, 2]] - nodes[quads[:, 0]], nodes[quads[:, 3]] - nodes[quads[:, 1]]), axis=1) / 2
+def _friction(spec: ObjectSpec | None, override: float | Friction | None) -> Friction:
+    if isinstance(override, Friction):
+        return override
+    if override is not None:
+        return Friction(override, override)
+    if spec is None:
+        return Friction(0.0, 0.0)
+    return Friction(spec.friction, spec.friction if spec.kinetic_friction is None else spec.kinetic_friction, spec.slip_weakening_mm)
 
-        growth = areas(nodes_mm) / areas(self.mesh.nodes_mm)
-        counted = self.body.points.counted & (contact.penetration_mm > 0)
-        return float((self.body.points.area_mm2 * growth[self.body.points.element])[counted].sum())
+
+def _focus(reached: np.ndarray) -> Focus:
+    """Where the object presses, rounded, so that similar contacts share a solid."""
+    middle = reached.mean(axis=0)
+    polar = np.degrees(np.arctan2(np.hypot(middle[0], middle[1]), middle[2]))
+    polar = _FOCUS_POLAR_DEG * np.round(polar / _FOCUS_POLAR_DEG)
+    azimuth = _FOCUS_AZIMUTH_DEG * np.round(np.degrees(np.arctan2(middle[1], middle[0])) / _FOCUS_AZIMUTH_DEG) if polar else 0.0
+    return Focus(float(np.radians(polar)), float(np.radians(azimuth)), float(_FOCUS_RADIUS_RAD))
 
 
-def _stops(plan: ContactPath, release: bool) -> np.ndarray:
-    """Progress at the regular load steps (beyond ``plan.end``: the way back)."""
-    pose = plan.pose
-    press = int(np.ceil(pose.indent_mm / _STEP_MM))
-    stops = [np.linspace(0, 1, press + 1)]
-    if plan.end > 1:
-        slide = int(np.ceil(max(np.hypot(*pose.shear_mm) / _STEP_MM, abs(pose.twist_deg) / _STEP_DEG)))
-        stops.append(np.linspace(1, 2, slide + 1)[1:])
-    there = np.concatenate(stops)
-    return np.concatenate([there, 2 * plan.end - there[-2::-1]]) if release else there
+def _stops(plan: ContactPath, reached: np.ndarray, step_mm: float) -> np.ndarray:
+    """Progress at the regular load steps: the poses, and between them no point near the contact moves farther than a step."""
+    out = [np.zeros(1)]
+    for leg in range(len(plan.poses) - 1):
+        start, stop = plan.poses[leg], plan.poses[leg + 1]
+        at = 20.0 * reached  # any point near the contact will do
+        moved = (at - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - at
+        count = max(1, int(np.ceil(np.linalg.norm(moved, axis=1).max() / step_mm)))
+        out.append(leg + np.arange(1, count + 1) / count)
+    return np.concatenate(out)

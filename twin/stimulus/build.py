@@ -11,14 +11,23 @@ from twin.stimulus.texture import WireMesh
 
 
 class Stimulus(Protocol):
-    """A solid in the object frame.
+    """A solid in the object frame, as a signed-distance field at points (k, 3) in mm."""
 
-    ``distance(points (k, 3)) -> (k,)`` in mm, positive outside; ``gradient(points) -> (k, 3)`` unit, outwards.
-    """
+    def distance(self, points_mm: np.ndarray) -> np.ndarray:
+        """(k,) in mm, positive outside."""
+        ...
 
-    def distance(self, points_mm: np.ndarray) -> np.ndarray: ...
+    def gradient(self, points_mm: np.ndarray) -> np.ndarray:
+        """(k, 3) unit, outwards."""
+        ...
 
-    def gradient(self, points_mm: np.ndarray) -> np.ndarray: ...
+    def probe(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distance (k,), gradient (k, 3) and Hessian (k, 3, 3) in 1/mm, in one evaluation.
+
+        The Hessian is the second derivative of the distance: symmetric, with the gradient in its null space, zero across
+        creases. Where a field is no exact distance it is the derivative of the unit gradient along the level set.
+        """
+        ...
 
 
 def build_stimulus(spec: ObjectSpec) -> Stimulus:

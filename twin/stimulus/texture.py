@@ -2,13 +2,17 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
+from twin.stimulus.level_set import Probed, unit_normals
+
 _BLEND = 0.15  # blending length of a joint, as a fraction of the wire's diameter
+_CREASE_MM = 1e-3  # nearer to a wire's axis there is no curvature
 
 
 @dataclass(frozen=True)
-class WireMesh:
+class WireMesh(Probed):
     """Round wires that lie on the base's surface, in two crossing families at a pitch; one wire of
     each family passes over the origin.
 
@@ -21,30 +25,43 @@ class WireMesh:
     pitch_mm: float
     wire_diameter_mm: float
 
-    def distance(self, points_mm: np.ndarray) -> np.ndarray:
-        return self._join(points_mm)[0]
+    def probe(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        distance, slope, hessian = self.base.probe(points_mm)
+        along, along_slope, along_bend = self.base.unroll(points_mm)
+        _lay_wires(distance, slope, hessian, along, along_slope, along_bend, self.pitch_mm, self.wire_diameter_mm)
+        unit_normals(slope, hessian)
+        return distance, slope, hessian
 
-    def gradient(self, points_mm: np.ndarray) -> np.ndarray:
-        slope = self._join(points_mm)[1]
-        return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
 
-    def _join(self, points_mm):
-        radius = self.wire_diameter_mm / 2
-        base, base_slope = self.base.distance(points_mm), self.base.gradient(points_mm)
-        along, along_slope = self.base.unroll(points_mm)
-        to_wire = along - self.pitch_mm * np.round(along / self.pitch_mm)
-        distance, slope = base, base_slope
+@numba.njit(cache=True, error_model="numpy")
+def _lay_wires(distance, slope, hessian, along, along_slope, along_bend, pitch, diameter):
+    """Join both families of wires to the base's distance (k,), slope (k, 3) and Hessian (k, 3, 3), in place."""
+    radius, blend = diameter / 2, _BLEND * diameter
+    base, base_bend, wire = np.empty(3), np.empty((3, 3)), np.empty(3)
+    for k in range(len(distance)):
+        lift = distance[k] - radius
+        for i in range(3):
+            base[i] = slope[k, i]
+            for j in range(3):
+                base_bend[i, j] = hessian[k, i, j]
         for family in range(2):
-            s, s_slope = to_wire[:, family], along_slope[:, family]
-            from_axis = np.maximum(np.hypot(base - radius, s), 1e-9)
-            wire_slope = ((base - radius)[:, None] * base_slope + s[:, None] * s_slope) / from_axis[:, None]
-            distance, slope = _smooth_minimum(distance, slope, from_axis - radius, wire_slope, _BLEND * self.wire_diameter_mm)
-        return distance, slope
-
-
-def _smooth_minimum(a, a_slope, b, b_slope, blend):
-    """min(a, b) - max(k - |a - b|, 0)^2 / (4 k), with its gradient."""
-    near = np.maximum(blend - np.abs(a - b), 0)
-    share = near / (2 * blend)
-    weight_b = np.where(b < a, 1 - share, share)[:, None]
-    return np.minimum(a, b) - near**2 / (4 * blend), (1 - weight_b) * a_slope + weight_b * b_slope
+            s = along[k, family] - pitch * np.floor(along[k, family] / pitch + 0.5)
+            away = max(np.sqrt(lift * lift + s * s), 1e-9)
+            # smooth minimum of a, b: (1 - w) a + w b - blend w (1 - w), w = (1 + (a - b) / blend) / 2 kept in 0..1
+            w = min(0.5 + (distance[k] - away + radius) / (2 * blend), 1.0)
+            if w <= 0:
+                continue
+            distance[k] = (1 - w) * distance[k] + w * (away - radius) - blend * w * (1 - w)
+            for i in range(3):
+                wire[i] = (lift * base[i] + s * along_slope[k, family, i]) / away
+            turning = w / away if away > _CREASE_MM else 0.0
+            joining = 1 / (2 * blend) if w < 1 else 0.0
+            for i in range(3):
+                for j in range(i, 3):
+                    bend = base[i] * base[j] + lift * base_bend[i, j] - wire[i] * wire[j]
+                    bend += along_slope[k, family, i] * along_slope[k, family, j] + s * along_bend[k, family, i, j]
+                    bend = (1 - w) * hessian[k, i, j] + turning * bend
+                    hessian[k, i, j] = bend - joining * (slope[k, i] - wire[i]) * (slope[k, j] - wire[j])
+                    hessian[k, j, i] = hessian[k, i, j]
+            for i in range(3):
+                slope[k, i] = (1 - w) * slope[k, i] + w * wire[i]

@@ -1,0 +1,53 @@
+"""B-splines, the basis of the skin and the gel.
+
+A quadratic basis of m elements has m + 2 functions and is C1, a linear one m + 1 and C0; both
+interpolate their first and last coefficient (open knot vector; Piegl & Tiller, "The NURBS Book", ch. 2).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+
+@dataclass(frozen=True)
+class Basis:
+    """B-splines of a degree between ``breaks`` (elements + 1,)."""
+
+    breaks: np.ndarray
+    degree: int = 2
+
+    @property
+    def elements(self) -> int:
+        """Number of intervals."""
+        return len(self.breaks) - 1
+
+    @property
+    def count(self) -> int:
+        """Number of functions."""
+        return self.elements + self.degree
+
+    @property
+    def _knots(self) -> np.ndarray:
+        return np.concatenate([[self.breaks[0]] * self.degree, self.breaks, [self.breaks[-1]] * self.degree])
+
+    @property
+    def greville(self) -> np.ndarray:
+        """(count,) means of adjoining knots: a linear function's coefficients are its values there."""
+        knots = self._knots
+        return np.array([knots[i + 1 : i + 1 + self.degree].mean() for i in range(self.count)])
+
+    def values(self, at: np.ndarray, *, derivative: int = 0) -> np.ndarray:
+        """(k, count) values, or a derivative's, of all functions at points (k,)."""
+        splines = BSpline(self._knots, np.eye(self.count), self.degree)
+        return (splines.derivative(derivative) if derivative else splines)(np.clip(at, self.breaks[0], self.breaks[-1]))
+
+    def element_of(self, at: np.ndarray) -> np.ndarray:
+        """(k,) index of the element that holds each point."""
+        return np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, self.elements - 1)
+
+    def gauss(self, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss points and weights (elements, points) of every element."""
+        local, weights = np.polynomial.legendre.leggauss(points)
+        half = np.diff(self.breaks)[:, None] / 2
+        return (self.breaks[1:] + self.breaks[:-1])[:, None] / 2 + half * local, half * weights

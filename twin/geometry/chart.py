@@ -1,0 +1,102 @@
+"""Charts of the dome: from a square to a disc to directions, fine where a contact is.
+
+A place on the dome is a point w of the unit disc (as a complex number): its radius is the polar angle
+over the largest one, its azimuth the azimuth. A ``Focus`` turns and stretches the square's image:
+
+    (u, v) -> w1 (squared disc) -> w2 = w1 s(|w1|) / |w1| -> w = e^(i phi) (w2 + a) / (1 + a w2)
+
+The elliptical map x = u sqrt(1 - v^2 / 2), y = v sqrt(1 - u^2 / 2) makes a disc of the square without
+collapsing an element (Fong, "Analytical methods for squaring the disc", 2015); s(r) = c r + (1 - c) r^7
+gathers the lines of the grid at the centre; a Moebius transformation moves the centre to where the
+contact is, keeping the rim on the rim. All are smooth.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_POWER = 5
+_FINE = 0.75  # of the square's half side: lines within lie over the focus
+
+
+@dataclass(frozen=True)
+class Focus:
+    """Where a grid over the dome is fine.
+
+    Attributes
+    ----------
+    polar_rad, azimuth_rad : float
+        Direction of the centre.
+    radius_rad : float
+        Angle around it that the fine part covers.
+    """
+
+    polar_rad: float = 0.0
+    azimuth_rad: float = 0.0
+    radius_rad: float = np.radians(50.0)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """The map (u, v) in [-1, 1]^2 <-> disc for a focus, on a dome down to ``largest_polar_rad``."""
+
+    focus: Focus
+    largest_polar_rad: float
+
+    @property
+    def _shift(self) -> float:
+        return min(self.focus.polar_rad / self.largest_polar_rad, 0.6)
+
+    @property
+    def _centre_slope(self) -> float:
+        share = self.focus.radius_rad / self.largest_polar_rad / (1 - self._shift**2)
+        return float(np.clip((share - _FINE**_POWER) / (_FINE - _FINE**_POWER), 0.2, 1.0))
+
+    def disc(self, square: np.ndarray) -> np.ndarray:
+        """Complex disc points (k,) of square points (k, 2)."""
+        u, v = square.T
+        w = u * np.sqrt(1 - v * v / 2) + 1j * v * np.sqrt(1 - u * u / 2)
+        r = np.minimum(np.abs(w), 1.0)
+        c = self._centre_slope
+        w = w * (c + (1 - c) * r ** (_POWER - 1))
+        a = self._shift
+        return (w + a) / (1 + a * w) * np.exp(1j * self.focus.azimuth_rad)
+
+    def square(self, disc: np.ndarray) -> np.ndarray:
+        """Square points (k, 2) of complex disc points (k,)."""
+        w = disc * np.exp(-1j * self.focus.azimuth_rad)
+        a = self._shift
+        w = (w - a) / (1 - a * w)
+        wanted = np.minimum(np.abs(w), 1.0)
+        c, r = self._centre_slope, np.sqrt(wanted)
+        low, high = np.zeros_like(r), np.ones_like(r)
+        for _ in range(60):  # Newton's method kept inside a shrinking bracket
+            off = c * r + (1 - c) * r**_POWER - wanted
+            low, high = np.where(off < 0, r, low), np.where(off > 0, r, high)
+            r = r - off / (c + _POWER * (1 - c) * r ** (_POWER - 1))
+            r = np.where((r < low) | (r > high), (low + high) / 2, r)
+            if np.abs(off).max(initial=0) < 1e-15:
+                break
+        w = w / np.maximum(np.abs(w), 1e-300) * r
+        x, y = w.real, w.imag
+        root = 2 * np.sqrt(2)
+
+        def half(p, q):
+            plus = np.sqrt(np.maximum(2 + p * p - q * q + root * p, 0))
+            return (plus - np.sqrt(np.maximum(2 + p * p - q * q - root * p, 0))) / 2
+
+        return np.column_stack([half(x, y), half(y, x)])
+
+
+def dome_points(disc: np.ndarray, radius_mm: float, rim_z_mm: float) -> np.ndarray:
+    """Points (k, 3) on a sphere's cap that ends in the rim plane, from complex disc points (k,)."""
+    polar = np.arccos(rim_z_mm / radius_mm) * np.abs(disc)
+    azimuth = np.angle(disc)
+    return radius_mm * np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+
+
+def disc_points(points_mm: np.ndarray, radius_mm: float, rim_z_mm: float) -> np.ndarray:
+    """Inverse of ``dome_points`` for points on its sphere."""
+    across = np.hypot(points_mm[:, 0], points_mm[:, 1])
+    polar = np.arctan2(across, points_mm[:, 2])
+    return polar / np.arccos(rim_z_mm / radius_mm) * np.exp(1j * np.arctan2(points_mm[:, 1], points_mm[:, 0]))

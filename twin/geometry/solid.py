@@ -1,0 +1,276 @@
+"""The sensor's body as a spline solid: what the mechanics computes with.
+
+A square grid of columns is bent over the dome (``chart``); each runs through the skin and the gel down
+to the lens. Shape and displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell
+& Bazilevs 2005): quadratic and C1 over the dome, linear through the skin, quadratic through the gel. A
+skin bent by contact is smooth and needs fewer unknowns than with trilinear elements. What the gel does
+inside is smoother still: below its surface it has a grid of half the lines, nested in the skin's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.geometry.bspline import Basis
+from twin.geometry.chart import Chart, Focus, disc_points, dome_points
+from twin.geometry.pins import rest_pins
+
+_GEL_GRADING = 1.5  # power law of the depths between the gel's elements: thin below the skin
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """How fine the solid is.
+
+    Attributes
+    ----------
+    across : int
+        Elements along each side of the square grid over the dome (even, at least 4).
+    skin_layers, gel_layers : int
+        Elements through the skin and from the skin to the lens.
+    """
+
+    across: int = 16
+    skin_layers: int = 1
+    gel_layers: int = 2
+
+    def __post_init__(self):
+        if self.across < 4 or self.across % 2 or self.skin_layers < 1 or self.gel_layers < 1:
+            raise ValueError(f"a solid needs an even across >= 4, skin_layers >= 1 and gel_layers >= 1, got {self}")
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Elements of one kind.
+
+    Attributes
+    ----------
+    controls : (m, b) int
+        By depth, row and column (the last runs fastest).
+    gradients : (m, 8, 3, b) float
+        Shape functions' gradients at 2x2x2 Gauss points, the first four on the outer level, in 1/mm at rest.
+    weights_mm3 : (m, 8) float
+        Rest volume of each Gauss point.
+    """
+
+    controls: np.ndarray
+    gradients: np.ndarray
+    weights_mm3: np.ndarray
+
+
+@dataclass(frozen=True)
+class Solid:
+    """Skin and gel at rest, in the sensor frame.
+
+    The body is given by coefficients ("controls") of its splines: ``skin_layers + 1`` layers of ``side^2``
+    from the outside to the inside of the skin, row by row, then the gel's below, ``coarse_side^2`` each.
+
+    Attributes
+    ----------
+    control_mm : (n, 3) float
+    fixed : (n,) bool
+        Clamped: rim, wall and lens.
+    skin, gel_top, gel_deep : Cells
+        The skin's elements layer by layer from the outside; the gel's first layer of elements, which has
+        the skin's grid above and the coarse one below; and the rest of the gel.
+    boxes : tuple of (m, 4) int
+        For each kind of cells: first and last row, first and last column (exclusive) on the skin's grid.
+    chart : Chart
+    basis, coarse, through : Basis
+        Along the square's sides for skin and gel, and through the gel (1 at the skin, 2 at the lens).
+    inner : slice
+        Controls of the skin's inside.
+    pin_value, pin_slope_u, pin_slope_v : (N, side^2) float
+        Position and derivatives of the skin's inside at the pins' feet, from its layer of controls.
+    pin_base_mm, pin_axis : (N, 3) float
+        Feet and axes at rest.
+    pin_cap_length_mm : float
+        Foot to cap centre.
+    """
+
+    control_mm: np.ndarray
+    fixed: np.ndarray
+    skin: Cells
+    gel_top: Cells
+    gel_deep: Cells
+    boxes: tuple[np.ndarray, np.ndarray, np.ndarray]
+    chart: Chart
+    basis: Basis
+    coarse: Basis
+    through: Basis
+    inner: slice
+    pin_value: np.ndarray
+    pin_slope_u: np.ndarray
+    pin_slope_v: np.ndarray
+    pin_base_mm: np.ndarray
+    pin_axis: np.ndarray
+    pin_cap_length_mm: float
+
+
+def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus: Focus | None = None) -> Solid:
+    """The body of a sensor, its grid fine around a focus (default: evenly around the apex)."""
+    resolution, skin_spec = resolution or Resolution(), spec.skin
+    inner_mm = skin_spec.outer_radius_mm - skin_spec.thickness_mm
+    chart = Chart(focus or Focus(), float(np.arccos(skin_spec.rim_z_mm / inner_mm)))
+    basis = Basis(np.linspace(-1, 1, resolution.across + 1))
+    coarse = Basis(basis.breaks[::2])
+    layers = resolution.skin_layers
+    through_skin = Basis(np.linspace(0, 1, layers + 1), degree=1)
+    through = Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING)
+    side, coarse_side = basis.count, coarse.count
+
+    fine = [_fit(basis, chart, spec, depth) for depth in through_skin.greville]
+    deep = [_fit(coarse, chart, spec, depth) for depth in through.greville[1:]]
+    control = np.concatenate(fine + deep)
+    index = np.arange(len(fine) * side * side).reshape(-1, side, side)
+    below = (len(fine) * side * side + np.arange(len(deep) * coarse_side**2)).reshape(-1, coarse_side, coarse_side)
+    fixed_fine, fixed_coarse = np.zeros(index.shape, bool), np.zeros(below.shape, bool)
+    for clamped in (fixed_fine, fixed_coarse):
+        clamped[:, [0, -1], :] = clamped[:, :, [0, -1]] = True
+    fixed_coarse[-1] = True
+
+    skin_parts = [[(index[e + d], basis, _local(through_skin, e, d)) for d in (0, 1)] for e in range(layers)]
+    top = [(index[-1], basis, _local(through, 0, 0))] + [(below[d - 1], coarse, _local(through, 0, d)) for d in (1, 2)]
+    deep_parts = [[(below[e + d - 1], coarse, _local(through, e, d)) for d in range(3)] for e in range(1, resolution.gel_layers)]
+    skin = _joined([_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)])
+    gel_top = _cells(basis, top, through, 0, control)
+    gel_deep = _joined([_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)])
+    boxes = (
+        np.tile(_boxes(resolution.across, 1), (layers, 1)),
+        _boxes(resolution.across, 1),
+        np.tile(_boxes(resolution.across // 2, 2), (resolution.gel_layers - 1, 1)),
+    )
+
+    pins = rest_pins(spec)
+    at = chart.square(disc_points(pins.base_mm, inner_mm, skin_spec.rim_z_mm))
+    value, slope_u, slope_v = surface_operators(basis, at)
+    return Solid(
+        control_mm=control,
+        fixed=np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
+        skin=skin,
+        gel_top=gel_top,
+        gel_deep=gel_deep,
+        boxes=boxes,
+        chart=chart,
+        basis=basis,
+        coarse=coarse,
+        through=through,
+        inner=slice(layers * side * side, (layers + 1) * side * side),
+        pin_value=value,
+        pin_slope_u=slope_u,
+        pin_slope_v=slope_v,
+        pin_base_mm=pins.base_mm,
+        pin_axis=pins.axis,
+        pin_cap_length_mm=spec.pins.length_mm + spec.pins.cap_height_mm / 2,
+    )
+
+
+def surface_operators(basis: Basis, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (k, side^2) that give value, d/du and d/dv of a layer at points (k, 2) of the square from its controls."""
+    u, v = square.T
+    u0, u1, v0, v1 = basis.values(u), basis.values(u, derivative=1), basis.values(v), basis.values(v, derivative=1)
+    return tuple(
+        (along_v[:, :, None] * along_u[:, None, :]).reshape(len(square), -1) for along_v, along_u in ((v0, u0), (v0, u1), (v1, u0))
+    )
+
+
+def pin_pose(solid: Solid, control_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Feet, axes and cap centres of the pins on a deformed skin.
+
+    The tangents and unit normal of the skin's inside at a foot, at rest and deformed, give
+    F = [t_u t_v n] [T_u T_v N]^-1; the pin turns with the rotation of F's polar decomposition, which
+    takes N to n. At rest this is exactly ``rest_pins``; a rigid motion of the body is a rigid motion of
+    the pins.
+
+    Parameters
+    ----------
+    control_mm : (n, 3) float
+        Deformed controls.
+
+    Returns
+    -------
+    base_mm, axis, caps_mm : (N, 3) float
+    """
+    rest_foot, rest_frame = _surface(solid, solid.control_mm)
+    foot, frame = _surface(solid, control_mm)
+    left, _, right = np.linalg.svd(frame @ np.linalg.inv(rest_frame))
+    turn = left @ right
+    base = foot + np.einsum("kij,kj->ki", turn, solid.pin_base_mm - rest_foot)
+    axis = np.einsum("kij,kj->ki", turn, solid.pin_axis)
+    return base, axis, base + solid.pin_cap_length_mm * axis
+
+
+def body_points(spec: SensorSpec, disc: np.ndarray, depth: float) -> np.ndarray:
+    """Places (k, 3) of the body at rest: depth 0 outside of the skin, 1 its inside, 2 the lens; straight lines between."""
+    skin = spec.skin
+    inner_mm = skin.outer_radius_mm - skin.thickness_mm
+    inner = dome_points(disc, inner_mm, skin.rim_z_mm)
+    if depth <= 1:
+        outer = dome_points(disc, skin.outer_radius_mm, skin.rim_z_mm)
+        return outer + depth * (inner - outer)
+    flat = np.sqrt(inner_mm**2 - skin.rim_z_mm**2) * disc
+    lens = np.column_stack([flat.real, flat.imag, np.full(len(disc), spec.lens.z_mm)])
+    return inner + (depth - 1) * (lens - inner)
+
+
+def _fit(basis: Basis, chart: Chart, spec: SensorSpec, depth: float) -> np.ndarray:
+    """Controls (side^2, 3) of the spline surface through the body's places at one depth."""
+    v, u = np.meshgrid(basis.greville, basis.greville, indexing="ij")
+    places = body_points(spec, chart.disc(np.column_stack([u.ravel(), v.ravel()])), depth)
+    inverse = np.linalg.inv(basis.values(basis.greville))
+    return np.einsum("ri,cj,ijx->rcx", inverse, inverse, places.reshape(basis.count, basis.count, 3), optimize=True).reshape(-1, 3)
+
+
+def _local(through: Basis, element: int, function: int) -> tuple[np.ndarray, np.ndarray]:
+    """Value and slope (2,) at an element's Gauss points of one of the functions that live there."""
+    at = through.gauss(2)[0][element]
+    return tuple(through.values(at, derivative=d)[:, element + function] for d in (0, 1))
+
+
+def _cells(grid: Basis, parts: list, through: Basis, layer: int, control_mm: np.ndarray) -> Cells:
+    """Elements of one layer over the intervals of ``grid``.
+
+    ``parts``: for each function through the depth, its controls (side, side), their basis, and its values and slopes.
+    """
+    at, weights = grid.gauss(2)
+    shapes, controls = [], []
+    for index, basis, (value, slope) in parts:
+        first = basis.element_of((grid.breaks[1:] + grid.breaks[:-1]) / 2)
+        window = first[:, None] + np.arange(3)
+        f0, f1 = (
+            np.take_along_axis(basis.values(at.ravel(), derivative=d).reshape(*at.shape, -1), window[:, None, :], axis=2) for d in (0, 1)
+        )
+        # derivatives by (row, column, depth): right-handed, as depth runs inwards
+        factors = ((value, f1, f0), (value, f0, f1), (slope, f0, f0))
+        shapes.append(np.stack([np.einsum("p,rqj,csk->rcpqsjk", *f).reshape(-1, 8, 9) for f in factors], axis=2))
+        controls.append(index[window[:, None, :, None], window[None, :, None, :]].reshape(-1, 9))
+    shapes, controls = np.concatenate(shapes, axis=3), np.concatenate(controls, axis=1)
+    jacobian = np.einsum("mqja,mai->mqji", shapes, control_mm[controls], optimize=True).swapaxes(2, 3)
+    depth_weights = through.gauss(2)[1][layer]
+    volume = np.linalg.det(jacobian) * np.einsum("d,rq,cs->rcdqs", depth_weights, weights, weights).reshape(-1, 8)
+    if volume.min() <= 0:
+        raise ValueError(f"{np.count_nonzero(volume.min(axis=1) <= 0)} elements are inside out at rest; check the sensor's geometry")
+    gradients = np.matmul(np.linalg.inv(jacobian).swapaxes(2, 3), shapes)
+    return Cells(controls, np.ascontiguousarray(gradients), volume)
+
+
+def _joined(parts: list[Cells]) -> Cells:
+    if not parts:
+        return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
+    return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("controls", "gradients", "weights_mm3")))
+
+
+def _boxes(count: int, size: int) -> np.ndarray:
+    """(count^2, 4) row and column ranges of even elements of a size on the skin's grid."""
+    rows, columns = (g.ravel() * size for g in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
+    return np.column_stack([rows, rows + size, columns, columns + size])
+
+
+def _surface(solid: Solid, control_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Foot (N, 3) and frame [t_u t_v n] (N, 3, 3) of the inner surface under each pin."""
+    inner = control_mm[solid.inner]
+    along_u, along_v = solid.pin_slope_u @ inner, solid.pin_slope_v @ inner
+    normal = np.cross(along_u, along_v)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return solid.pin_value @ inner, np.stack([along_u, along_v, normal], axis=2)

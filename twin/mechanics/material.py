@@ -1,0 +1,117 @@
+"""Hyperelastic laws: stress and stiffness of a nearly incompressible rubber at one point.
+
+All laws split off the change of volume (Holzapfel, "Nonlinear Solid Mechanics", ch. 6):
+
+    W = c10 (I1 - 3) + c01 (I2 - 3) + c20 (I1 - 3)^2 + c30 (I1 - 3)^3 + kappa / 2 (J - 1)^2
+
+with I1 = J^(-2/3) tr C and I2 = J^(-4/3) (tr^2 C - tr C^2) / 2. Neo-Hooke has c10 alone, Mooney-Rivlin
+c10 and c01, Yeoh c10, c20 and c30. At small strain the shear modulus is 2 (c10 + c01), the bulk
+modulus kappa.
+"""
+
+import numba
+import numpy as np
+
+from scenes.sensor import MaterialSpec
+
+
+def law_coefficients(spec: MaterialSpec, *, layer: bool) -> np.ndarray:
+    """(6,) c10, c01, c20, c30, kappa and kappa_d of a material, MPa.
+
+    ``layer``: for elements that are linear through the depth of a skin (see ``elements``).
+    """
+    mu = spec.young_modulus_mpa / (2 * (1 + spec.poisson_ratio))
+    kappa = spec.young_modulus_mpa / (3 * (1 - 2 * spec.poisson_ratio))
+    difference = 2 * mu * (spec.poisson_ratio / (1 - spec.poisson_ratio) + 1 / 3) if layer else kappa
+    half = mu / 2
+    share = spec.second_invariant_share
+    return np.array([half * (1 - share), half * share, half * spec.c20_c10, half * spec.c30_c10, kappa, difference])
+
+
+@numba.njit(cache=True, inline="always")
+def invariants(f, g):
+    """det F and, into ``g`` (3, 3), F^-T; det F <= 0 leaves ``g`` alone."""
+    g00 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
+    g01 = f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
+    g02 = f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0]
+    det = f[0, 0] * g00 + f[0, 1] * g01 + f[0, 2] * g02
+    if det > 0:
+        d = 1 / det
+        g[0, 0], g[0, 1], g[0, 2] = g00 * d, g01 * d, g02 * d
+        g[1, 0] = (f[0, 2] * f[2, 1] - f[0, 1] * f[2, 2]) * d
+        g[1, 1] = (f[0, 0] * f[2, 2] - f[0, 2] * f[2, 0]) * d
+        g[1, 2] = (f[0, 1] * f[2, 0] - f[0, 0] * f[2, 1]) * d
+        g[2, 0] = (f[0, 1] * f[1, 2] - f[0, 2] * f[1, 1]) * d
+        g[2, 1] = (f[0, 2] * f[1, 0] - f[0, 0] * f[1, 2]) * d
+        g[2, 2] = (f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]) * d
+    return det
+
+
+@numba.njit(cache=True)
+def distortion(law, f, det, g, stress):
+    """Energy density of the part of the law without kappa; its derivative by F into ``stress`` (3, 3), MPa."""
+    trace = 0.0
+    for i in range(3):
+        for j in range(3):
+            trace += f[i, j] * f[i, j]
+    scale = det ** (-2 / 3)
+    first = scale * trace - 3
+    slope = law[0] + first * (2 * law[2] + 3 * law[3] * first)
+    energy = first * (law[0] + first * (law[2] + law[3] * first))
+    for i in range(3):
+        for j in range(3):
+            stress[i, j] = 2 * slope * scale * (f[i, j] - trace / 3 * g[i, j])
+    if law[1] != 0:
+        second, slopes = _second_invariant(f, trace)
+        scale *= scale
+        energy += law[1] * (scale * second - 3)
+        for i in range(3):
+            for j in range(3):
+                stress[i, j] += law[1] * scale * (slopes[i, j] - 4 / 3 * second * g[i, j])
+    return energy
+
+
+@numba.njit(cache=True)
+def distortion_stiffness(law, f, det, g, out):
+    """Second derivative of ``distortion`` by F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
+    trace = 0.0
+    for i in range(3):
+        for j in range(3):
+            trace += f[i, j] * f[i, j]
+    scale = det ** (-2 / 3)
+    first = scale * trace - 3
+    slope = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
+    bend = 4 * scale * scale * (2 * law[2] + 6 * law[3] * first)
+    second, slopes = (0.0, f)
+    if law[1] != 0:
+        second, slopes = _second_invariant(f, trace)
+    scale2 = law[1] * scale * scale
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    mixed, straight = g[i, m] * g[k, j], g[i, j] * g[k, m]
+                    value = slope * (trace * (2 / 9 * straight + mixed / 3) - 2 / 3 * (f[i, j] * g[k, m] + g[i, j] * f[k, m]))
+                    if i == k and j == m:
+                        value += slope
+                    if bend != 0:
+                        value += bend * (f[i, j] - trace / 3 * g[i, j]) * (f[k, m] - trace / 3 * g[k, m])
+                    if scale2 != 0:
+                        curve = 4 * f[i, j] * f[k, m] - 2 * f[i, m] * f[k, j]
+                        if i == k:
+                            curve -= 2 * (f[0, j] * f[0, m] + f[1, j] * f[1, m] + f[2, j] * f[2, m])
+                            if j == m:
+                                curve += 2 * trace
+                        if j == m:
+                            curve -= 2 * (f[i, 0] * f[k, 0] + f[i, 1] * f[k, 1] + f[i, 2] * f[k, 2])
+                        curve += second * (16 / 9 * straight + 4 / 3 * mixed) - 4 / 3 * (slopes[i, j] * g[k, m] + g[i, j] * slopes[k, m])
+                        value += scale2 * curve
+                    out[i, j, k, m] = value
+
+
+@numba.njit(cache=True)
+def _second_invariant(f, trace):
+    """I2 of C and its derivative 2 (tr C F - F C) by F."""
+    c = f.T @ f
+    second = (trace * trace - (c * c).sum()) / 2
+    return second, 2 * (trace * f - f @ c)

@@ -1,0 +1,55 @@
+"""Viscoelastic rubber: stress that relaxes, and so lags behind and loses energy.
+
+Finite linear viscoelasticity with a Prony series (Simo 1987; Simo & Hughes, "Computational Inelasticity",
+ch. 10): the distortion part S of the second Piola-Kirchhoff stress is followed by Maxwell elements,
+
+    S(t) -> (1 - sum g_i) S + sum H_i,    dH_i / dt + H_i / tau_i = g_i dS / dt
+
+integrated over a step h by H_i' = e^(-h / tau_i) H_i + g_i e^(-h / 2 tau_i) (S' - S). Within a step that
+is the elastic law times a factor plus a given stress, so each step still has an energy to minimise.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scenes.sensor import RelaxationTerm
+from twin.mechanics.elements import Elements
+
+
+@dataclass(frozen=True)
+class History:
+    """What one kind of elements remembers: ``stress`` S (m, 8, 3, 3) at the last state, ``branches`` H (terms, m, 8, 3, 3), MPa."""
+
+    stress: np.ndarray
+    branches: np.ndarray
+
+    @classmethod
+    def at_rest(cls, kind: Elements, terms: tuple[RelaxationTerm, ...]) -> "History":
+        """Nothing has happened for a long time."""
+        shape = kind.cells.weights_mm3.shape + (3, 3)
+        return cls(np.zeros(shape if terms else (0, *shape[1:])), np.zeros((len(terms), *shape) if terms else (0, 0, *shape[1:])))
+
+    def before(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float) -> tuple[Elements, np.ndarray]:
+        """The elements of a step of a duration, their law scaled, and the given stress (see ``Elements.add_forces``)."""
+        if not terms:
+            return kind, self.stress
+        share, fade, late = _decay(terms, step_s)
+        law = kind.law.copy()
+        law[:4] *= 1 - sum(term.fraction for term in terms) + (share * late).sum()
+        given = np.einsum("t,tmqij->mqij", fade, self.branches) - (share * late).sum() * self.stress
+        return replace(kind, law=law), given
+
+    def after(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float, control_mm: np.ndarray) -> "History":
+        """What is remembered after the step; ``kind`` with the unscaled law."""
+        if not terms:
+            return self
+        share, fade, late = _decay(terms, step_s)
+        stress = kind.distortion_stress(control_mm)
+        change = (share * late)[:, None, None, None, None] * (stress - self.stress)
+        return History(stress, fade[:, None, None, None, None] * self.branches + change)
+
+
+def _decay(terms, step_s):
+    share, time = np.array([[term.fraction, term.time_s] for term in terms]).T
+    return share, np.exp(-step_s / time), np.exp(-step_s / (2 * time))

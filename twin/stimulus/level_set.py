@@ -1,0 +1,50 @@
+"""What every signed-distance field shares: distance and gradient from one probe, and unit normals of a field that is no exact distance."""
+
+import numba
+import numpy as np
+
+_FLAT = 1e-12  # slope below which a field has no direction
+
+
+class Probed:
+    """Distance and gradient of a field whose ``probe`` gives distance, unit gradient and Hessian at once."""
+
+    def distance(self, points_mm: np.ndarray) -> np.ndarray:
+        """(k,) in mm, positive outside."""
+        return self.probe(points_mm)[0]
+
+    def gradient(self, points_mm: np.ndarray) -> np.ndarray:
+        """(k, 3) unit, outwards."""
+        return self.probe(points_mm)[1]
+
+
+def rows(points_mm: np.ndarray) -> np.ndarray:
+    """Points as the kernels take them: C-ordered float64, so that each kernel is compiled once."""
+    return np.ascontiguousarray(points_mm, dtype=np.float64)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def unit_normals(slope, hessian):
+    """Turn, in place, a field's slope g (k, 3) into the unit normal n and its second derivative H (k, 3, 3) into P H P / |g|, P = I - n n.
+
+    That is the derivative of n along the level set: symmetric, H n = 0. What it leaves out, how n turns along
+    n itself, vanishes for an exact distance. A flat place looks to -z, unbent.
+    """
+    for k in range(len(slope)):
+        size = np.sqrt(slope[k, 0] ** 2 + slope[k, 1] ** 2 + slope[k, 2] ** 2)
+        if size < _FLAT:
+            slope[k], slope[k, 2], hessian[k] = 0.0, -1.0, 0.0
+            continue
+        x, y, z = slope[k, 0] / size, slope[k, 1] / size, slope[k, 2] / size
+        h = hessian[k]
+        hx = h[0, 0] * x + h[0, 1] * y + h[0, 2] * z
+        hy = h[1, 0] * x + h[1, 1] * y + h[1, 2] * z
+        hz = h[2, 0] * x + h[2, 1] * y + h[2, 2] * z
+        along = hx * x + hy * y + hz * z
+        h[0, 0] = (h[0, 0] - 2 * hx * x + along * x * x) / size
+        h[1, 1] = (h[1, 1] - 2 * hy * y + along * y * y) / size
+        h[2, 2] = (h[2, 2] - 2 * hz * z + along * z * z) / size
+        h[0, 1] = h[1, 0] = (h[0, 1] - hx * y - hy * x + along * x * y) / size
+        h[0, 2] = h[2, 0] = (h[0, 2] - hx * z - hz * x + along * x * z) / size
+        h[1, 2] = h[2, 1] = (h[1, 2] - hy * z - hz * y + along * y * z) / size
+        slope[k, 0], slope[k, 1], slope[k, 2] = x, y, z

@@ -7,15 +7,18 @@ skin bent by contact is smooth and needs fewer unknowns than with trilinear elem
 inside is smoother still: below its surface it has a grid of half the lines, nested in the skin's.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
+from twin.cache import cached_arrays
 from twin.geometry.bspline import Basis
 from twin.geometry.chart import Chart, Focus, disc_points, dome_points
 from twin.geometry.pins import rest_pins
 
+_VERSION = 1  # raised whenever the arrays change for the same key
+_CELL_PARTS = ("controls", "gradients", "weights_mm3")
 _GEL_GRADING = 1.5  # power law of the depths between the gel's elements: thin below the skin
 
 
@@ -109,15 +112,46 @@ class Solid:
 
 
 def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus: Focus | None = None) -> Solid:
-    """The body of a sensor, its grid fine around a focus (default: evenly around the apex)."""
-    resolution, skin_spec = resolution or Resolution(), spec.skin
-    inner_mm = skin_spec.outer_radius_mm - skin_spec.thickness_mm
-    chart = Chart(focus or Focus(), float(np.arccos(skin_spec.rim_z_mm / inner_mm)))
+    """The body of a sensor, its grid fine around a focus (default: around the apex).
+
+    It depends on the sensor's geometry alone, and is kept on disk (see ``twin.cache``).
+    """
+    resolution, focus = resolution or Resolution(), focus or Focus()
+    inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
     basis = Basis(np.linspace(-1, 1, resolution.across + 1))
-    coarse = Basis(basis.breaks[::2])
-    layers = resolution.skin_layers
+    frame = {
+        "chart": Chart(focus, float(np.arccos(spec.skin.rim_z_mm / inner_mm))),
+        "basis": basis,
+        "coarse": Basis(basis.breaks[::2]),
+        "through": Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING),
+    }
+    geometry = ("outer_radius_mm", "thickness_mm", "rim_z_mm")
+    key = {
+        "version": _VERSION,
+        "skin": {name: getattr(spec.skin, name) for name in geometry},
+        "lens_mm": spec.lens.z_mm,
+        "pins": spec.pins.model_dump(mode="json"),
+        "resolution": asdict(resolution),
+        "focus": asdict(focus),
+    }
+    kept = cached_arrays("solid", key, lambda: _arrays(spec, resolution, **frame))
+    cells = {name: Cells(*(kept.pop(f"{name}_{part}") for part in _CELL_PARTS)) for name in ("skin", "gel_top", "gel_deep")}
+    boxes = tuple(kept.pop(f"boxes_{kind}") for kind in range(3))
+    upper = basis.count**2
+    return Solid(
+        **cells,
+        **frame,
+        **kept,
+        boxes=boxes,
+        inner=slice(resolution.skin_layers * upper, (resolution.skin_layers + 1) * upper),
+        pin_cap_length_mm=spec.pins.length_mm + spec.pins.cap_height_mm / 2,
+    )
+
+
+def _arrays(spec: SensorSpec, resolution: Resolution, chart: Chart, basis: Basis, coarse: Basis, through: Basis) -> dict[str, np.ndarray]:
+    """The arrays of a ``Solid``, by name."""
+    inner_mm, layers = spec.skin.outer_radius_mm - spec.skin.thickness_mm, resolution.skin_layers
     through_skin = Basis(np.linspace(0, 1, layers + 1), degree=1)
-    through = Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING)
     side, coarse_side = basis.count, coarse.count
 
     fine = [_fit(basis, chart, spec, depth) for depth in through_skin.greville]
@@ -133,37 +167,26 @@ def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus
     skin_parts = [[(index[e + d], basis, _local(through_skin, e, d)) for d in (0, 1)] for e in range(layers)]
     top = [(index[-1], basis, _local(through, 0, 0))] + [(below[d - 1], coarse, _local(through, 0, d)) for d in (1, 2)]
     deep_parts = [[(below[e + d - 1], coarse, _local(through, e, d)) for d in range(3)] for e in range(1, resolution.gel_layers)]
-    skin = _joined([_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)])
-    gel_top = _cells(basis, top, through, 0, control)
-    gel_deep = _joined([_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)])
-    boxes = (
-        np.tile(_boxes(resolution.across, 1), (layers, 1)),
-        _boxes(resolution.across, 1),
-        np.tile(_boxes(resolution.across // 2, 2), (resolution.gel_layers - 1, 1)),
-    )
-
+    cells = {
+        "skin": _joined([_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)]),
+        "gel_top": _cells(basis, top, through, 0, control),
+        "gel_deep": _joined([_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
+    }
     pins = rest_pins(spec)
-    at = chart.square(disc_points(pins.base_mm, inner_mm, skin_spec.rim_z_mm))
-    value, slope_u, slope_v = surface_operators(basis, at)
-    return Solid(
-        control_mm=control,
-        fixed=np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
-        skin=skin,
-        gel_top=gel_top,
-        gel_deep=gel_deep,
-        boxes=boxes,
-        chart=chart,
-        basis=basis,
-        coarse=coarse,
-        through=through,
-        inner=slice(layers * side * side, (layers + 1) * side * side),
-        pin_value=value,
-        pin_slope_u=slope_u,
-        pin_slope_v=slope_v,
-        pin_base_mm=pins.base_mm,
-        pin_axis=pins.axis,
-        pin_cap_length_mm=spec.pins.length_mm + spec.pins.cap_height_mm / 2,
-    )
+    value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, spec.skin.rim_z_mm)))
+    return {
+        **{f"{name}_{part}": getattr(kind, part) for name, kind in cells.items() for part in _CELL_PARTS},
+        "boxes_0": np.tile(_boxes(resolution.across, 1), (layers, 1)),
+        "boxes_1": _boxes(resolution.across, 1),
+        "boxes_2": np.tile(_boxes(resolution.across // 2, 2), (resolution.gel_layers - 1, 1)),
+        "control_mm": control,
+        "fixed": np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
+        "pin_value": value,
+        "pin_slope_u": slope_u,
+        "pin_slope_v": slope_v,
+        "pin_base_mm": pins.base_mm,
+        "pin_axis": pins.axis,
+    }
 
 
 def surface_operators(basis: Basis, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -258,7 +281,7 @@ def _cells(grid: Basis, parts: list, through: Basis, layer: int, control_mm: np.
 def _joined(parts: list[Cells]) -> Cells:
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
-    return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("controls", "gradients", "weights_mm3")))
+    return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in _CELL_PARTS))
 
 
 def _boxes(count: int, size: int) -> np.ndarray:

@@ -1,7 +1,8 @@
 """The skin's mechanics: one sensor pressed against one object."""
 
+from twin.mechanics.batch import ContactJob, ContactOutcome, press_many
 from twin.mechanics.newton import Friction
 from twin.mechanics.path import ContactPath, ContactPose
 from twin.mechanics.solver import SkinSolver
 
-__all__ = ["ContactPath", "ContactPose", "Friction", "SkinSolver"]
+__all__ = ["ContactJob", "ContactOutcome", "ContactPath", "ContactPose", "Friction", "SkinSolver", "press_many"]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from twin.geometry.solid import Solid, surface_operators
+from twin.geometry.solid import Solid
 
 SMOOTH_GAP_MM = 0.006
 STICK_CREEP_MM = 0.01
@@ -56,17 +56,22 @@ def contact_points(solid: Solid, radius_mm: float) -> ContactPoints:
     count = basis.elements * POINTS_PER_ELEMENT
     step = (basis.breaks[-1] - basis.breaks[0]) / count
     at = basis.breaks[0] + (np.arange(count) + 0.5) * step
-    v, u = (a.ravel() for a in np.meshgrid(at, at, indexing="ij"))
-    value, slope_u, slope_v = surface_operators(basis, np.column_stack([u, v]))
-    outer = solid.control_mm[: value.shape[1]]
-    flat = value @ outer
-    element = basis.element_of(v) * basis.elements + basis.element_of(u)
-    controls = solid.skin.controls[element, :9]
+    outer = solid.control_mm[: basis.count**2].reshape(basis.count, basis.count, 3)
+    value, slope = basis.values(at), basis.values(at, derivative=1)
+
+    def surface(rows, columns):
+        return np.einsum("ri,cj,ijx->rcx", rows, columns, outer, optimize=True).reshape(-1, 3)
+
+    flat = surface(value, value)
+    growth = np.cross(surface(value, slope), surface(slope, value))
+    first = basis.element_of(at)
+    local = np.take_along_axis(value, first[:, None] + np.arange(3), axis=1)
+    element = (first[:, None] * basis.elements + first).ravel()
     return ContactPoints(
-        controls=controls,
-        weights=np.take_along_axis(value, controls, axis=1),
+        controls=solid.skin.controls[element, :9],
+        weights=np.einsum("ri,cj->rcij", local, local).reshape(-1, 9),
         lift_mm=flat * (radius_mm / np.linalg.norm(flat, axis=1, keepdims=True) - 1),
-        area_mm2=np.linalg.norm(np.cross(slope_u @ outer, slope_v @ outer), axis=1) * step**2,
+        area_mm2=np.linalg.norm(growth, axis=1) * step**2,
         element=element,
     )
 

@@ -97,9 +97,9 @@ class FrontalSolver:
             for child in children:
                 self._fronts[child].parent = number
                 self._fronts[child].into_parent = rows[self._fronts[child].border]
-            front.head = np.zeros((len(front.own), len(front.own)), order="F")
-            front.below = np.zeros((len(front.border), len(front.own)), order="F")
-            front.rest = np.zeros((len(front.border), len(front.border)), order="F")
+            front.head = np.zeros((len(front.own), len(front.own)), np.float32, order="F")
+            front.below = np.zeros((len(front.border), len(front.own)), np.float32, order="F")
+            front.rest = np.zeros((len(front.border), len(front.border)), np.float32, order="F")
             self._fronts.append(front)
         self.kept = self._fronts[-1].border
 
@@ -128,12 +128,12 @@ class FrontalSolver:
                 front.head[np.arange(len(front.own)), np.arange(len(front.own))] += shift
         for front in fronts:
             if len(front.own):
-                _, info = lapack.dpotrf(front.head, lower=1, clean=0, overwrite_a=1)
+                _, info = lapack.spotrf(front.head, lower=1, clean=0, overwrite_a=1)
                 if info > 0:
                     raise NotPositiveDefinite
                 if len(front.border):
-                    blas.dtrsm(1.0, front.head, front.below, side=1, lower=1, trans_a=1, overwrite_b=1)
-                    blas.dsyrk(-1.0, front.below, beta=1.0, c=front.rest, lower=1, overwrite_c=1)
+                    blas.strsm(1.0, front.head, front.below, side=1, lower=1, trans_a=1, overwrite_b=1)
+                    blas.ssyrk(-1.0, front.below, beta=1.0, c=front.rest, lower=1, overwrite_c=1)
             if front.parent >= 0:
                 up = fronts[front.parent]
                 _extend(front.rest, front.into_parent, up.head, up.below, up.rest)
@@ -157,19 +157,19 @@ class Eliminated:
 
     def forward(self, right_side: np.ndarray) -> np.ndarray:
         """Eliminate in a right side (unknowns,): what is left at ``kept`` is the right side for ``matrix``."""
-        x = np.array(right_side, float)
+        x = np.array(right_side, np.float32)
         for front in self._fronts:
-            part = lapack.dtrtrs(front.head, x[front.own], lower=1)[0]
+            part = lapack.strtrs(front.head, x[front.own], lower=1)[0]
             x[front.border] -= front.below @ part
             x[front.own] = part
         return x
 
     def backward(self, eliminated: np.ndarray, kept_values: np.ndarray) -> np.ndarray:
         """The whole solution (unknowns,) from an eliminated right side and the solution at ``kept``."""
-        x = eliminated.copy()
+        x = eliminated.astype(np.float32)
         x[self.kept] = kept_values
         for front in reversed(self._fronts):
-            x[front.own] = lapack.dtrtrs(front.head, x[front.own] - front.below.T @ x[front.border], lower=1, trans=1)[0]
+            x[front.own] = lapack.strtrs(front.head, x[front.own] - front.below.T @ x[front.border], lower=1, trans=1)[0]
         return x
 
 

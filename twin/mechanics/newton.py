@@ -21,14 +21,15 @@ RESIDUAL_TOLERANCE = 1e-6  # of the sum of the contact forces
 _FORCE_FLOOR_N = 1e-3  # the residual's scale is never less
 _PENALTY_GROWTH, _PENALTY_RAISES = 4.0, 5
 _OUTER_ITERATIONS, _INNER_ITERATIONS, _HASTY_ITERATIONS = 30, 60, 15
-_KEEP_TANGENT = 0.3  # contraction of the residual up to which an old tangent is kept
+_WORSE = 2.0  # growth of the residual that is put up with
+_KEEP_TANGENT = 0.2  # contraction of the residual up to which an old tangent is kept
 _LARGEST_MOVE_MM = 1.5  # of a control in one iteration
 _SMALLEST_SHIFT_N_MM, _LARGEST_SHIFT_N_MM = 0.01, 50.0  # on the tangent's diagonal, where it leads astray
 _SOFTENING = 0.1  # of the contact, on the way to a far solution
 _INEXACT = 0.01  # the inner iteration ends at this share of the outer one's residual, but not before the scale's tolerance
 _GEL_STEPS = 2  # tangents for which the gel's is kept
 _NOTHING = np.zeros((0, 8, 3, 3))
-_REACH_MM = 0.4  # contact points farther than this from the object are left out, and checked at the end
+_REACH_MM = 0.15  # contact points farther than this from the object are left out, and checked at the end
 
 
 class NoConvergence(Exception):
@@ -279,7 +280,7 @@ class LoadStepper:
             new[self._body.free] += size * move.reshape(-1, 3)
             trial = problem.balance(new, new_border)
             # the first move brings the object's motion: only then may the residual be anything
-            if trial is None or size < 1 or (accepted and trial.absolute > 1.2 * balance.absolute):
+            if trial is None or size < 1 or (accepted and trial.absolute > _WORSE * balance.absolute):
                 astray = True
                 if not fresh:
                     last = 0.0  # an old tangent is to blame first
@@ -288,8 +289,7 @@ class LoadStepper:
                     if shift > _LARGEST_SHIFT_N_MM:
                         raise NoConvergence(balance.relative)
                 continue
-            shift = shift / 8 if shift > _SMALLEST_SHIFT_N_MM else 0.0
-            astray = False
+            shift, astray = 0.0, False
             last, accepted = balance.absolute, accepted + 1
             control, border, balance = new, new_border, trial
         raise NoConvergence(balance.relative)

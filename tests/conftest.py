@@ -8,6 +8,14 @@ import pytest
 from scenes import load_sensor
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory):
+    """The tests keep their arrays apart from the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TACTIP_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def real_dir() -> Path:
     """Folder of real recordings; tests that need it skip, with the reason, where it is missing."""

@@ -88,6 +88,15 @@ class ContactState:
     dissipated_nmm: float
     residual: float
 
+    @classmethod
+    def untouched(cls, nodes_mm, base_mm, axis, caps_mm, *, T_sensor_object=None) -> "ContactState":
+        """The undeformed sensor, nothing touching it."""
+        none, zero = np.zeros((0, 3)), np.zeros(3)
+        pose = np.eye(4) if T_sensor_object is None else T_sensor_object
+        contact = {"contact_mm": none, "point_area_mm2": none[:, 0], "normal": none, "normal_n": none[:, 0], "tangential_n": none}
+        forces = {"force_n": zero, "torque_nmm": zero, "area_mm2": 0.0, "elastic_nmm": 0.0, "dissipated_nmm": 0.0, "residual": 0.0}
+        return cls(nodes_mm, base_mm, axis, caps_mm, slipping=np.zeros(0, bool), T_sensor_object=pose, **contact, **forces)
+
 
 @dataclass(frozen=True)
 class PinGraph:

@@ -9,8 +9,7 @@ from twin.types import ContactState, Form
 
 
 def state_at(base, axis, caps):
-    zero = np.zeros(3)
-    return ContactState(np.zeros((0, 3)), base, axis, caps, zero, zero, 0.0, np.zeros(0, int), np.zeros((0, 3)), np.eye(4), 0.0)
+    return ContactState.untouched(np.zeros((0, 3)), base, axis, caps)
 
 
 def rest_state(spec):

@@ -1,6 +1,5 @@
 """Many contacts of one sensor, in parallel processes."""
 
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
@@ -59,7 +58,7 @@ def press_many(
     spec : SensorSpec
     jobs : sequence of ContactJob
     processes : int
-        1: in this process. More: fresh processes (spawned, one BLAS thread each).
+        1: in this process. More: fresh (spawned) processes.
     """
     if processes < 1:
         raise ValueError(f"processes must be at least 1, got {processes}")
@@ -81,7 +80,6 @@ def press_many(
 
 def _start(spec: SensorSpec, resolution: Resolution | None) -> None:
     global _solver
-    os.environ["OMP_NUM_THREADS"] = "1"
     _solver = SkinSolver(spec, resolution=resolution)
 
 

@@ -54,32 +54,15 @@ class SkinSolver:
     def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None):
         self.spec, self.resolution = spec, resolution or Resolution()
         self.mesh = build_mesh(spec)
-        self._blas = ThreadpoolController()  # the fronts are small: more BLAS threads only wait for each other
+        self._blas = ThreadpoolController()
         self._setting = lru_cache(maxsize=32)(self._set_up)
 
     def rest(self, *, T_sensor_object: np.ndarray | None = None) -> ContactState:
         """The undeformed sensor."""
-        setting = self._setting(Focus(radius_rad=_FOCUS_RADIUS_RAD))
+        with self._one_thread():
+            setting = self._setting(Focus(radius_rad=_FOCUS_RADIUS_RAD))
         base, axis, caps = pin_pose(setting.solid, setting.solid.control_mm)
-        return ContactState(
-            nodes_mm=self.mesh.nodes_mm,
-            base_mm=base,
-            axis=axis,
-            caps_mm=caps,
-            force_n=np.zeros(3),
-            torque_nmm=np.zeros(3),
-            area_mm2=0.0,
-            contact_mm=np.zeros((0, 3)),
-            normal=np.zeros((0, 3)),
-            normal_n=np.zeros(0),
-            tangential_n=np.zeros((0, 3)),
-            point_area_mm2=np.zeros(0),
-            slipping=np.zeros(0, bool),
-            T_sensor_object=np.eye(4) if T_sensor_object is None else T_sensor_object,
-            elastic_nmm=0.0,
-            dissipated_nmm=0.0,
-            residual=0.0,
-        )
+        return ContactState.untouched(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=T_sensor_object)
 
     def press(
         self,
@@ -142,7 +125,9 @@ class SkinSolver:
             yield 1.0, self.rest(T_sensor_object=plan.at(1.0))
             return
         reached = self._reached(field, plan)
-        setting = self._setting(_focus(reached))
+        with self._one_thread():
+            setting = self._setting(_focus(reached))
+            stepper = LoadStepper(setting.body, self._frontal(setting.solid, reached), field, law, compliance)
         body = setting.body
         count = len(body.points.area_mm2)
         state = LoadState(
@@ -156,7 +141,6 @@ class SkinSolver:
         )
         terms = [self.spec.skin.relaxation, self.spec.gel.relaxation, self.spec.gel.relaxation]
         past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, terms, strict=True)]
-        stepper = LoadStepper(body, self._frontal(setting.solid, reached), field, law, compliance)
         stops = _stops(plan, reached, step_mm)
         for number in range(1, len(stops)):
             done, stride = 0.0, 1.0
@@ -167,9 +151,10 @@ class SkinSolver:
                 span_s = plan.time_s(at) - plan.time_s(start)
                 now = [p.before(kind, term, span_s) for p, kind, term in zip(past, body.kinds, terms, strict=True)]
                 try:
-                    with self._blas.limit(limits=1, user_api="blas"):
+                    with self._one_thread():
                         stepper.follow(replace(body, kinds=tuple(kind for kind, _ in now)))
                         state, balance, looked = stepper.step(state, plan.at(at), [given for _, given in now])
+                        result = self._contact_state(setting, state, balance, looked)
                 except NoConvergence as failure:
                     stride /= 2
                     if stride >= _SMALLEST_STRIDE:
@@ -182,7 +167,11 @@ class SkinSolver:
                 past = [p.after(kind, term, span_s, state.control_mm) for p, kind, term in zip(past, body.kinds, terms, strict=True)]
                 done += stride
                 stride = min(2 * stride, 1.0)
-                yield float(at / stops[-1]), self._contact_state(setting, state, balance, looked)
+                yield float(at / stops[-1]), result
+
+    def _one_thread(self):
+        """BLAS on one thread: the matrices are small, and the result must not depend on the number of cores."""
+        return self._blas.limit(limits=1, user_api="blas")
 
     def _set_up(self, focus: Focus) -> _Setting:
         spec = self.spec

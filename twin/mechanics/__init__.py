@@ -1,7 +1,7 @@
 """The skin's mechanics: one sensor pressed against one object."""
 
+from twin.mechanics.balance import Friction
 from twin.mechanics.batch import ContactJob, ContactOutcome, press_many
-from twin.mechanics.newton import Friction
 from twin.mechanics.path import ContactPath, ContactPose
 from twin.mechanics.solver import SkinSolver
 

@@ -9,7 +9,7 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError, MeshError
 from twin.geometry.solid import Resolution
-from twin.mechanics.newton import Friction
+from twin.mechanics.balance import Friction
 from twin.mechanics.path import ContactPath, ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.types import ContactState

@@ -14,11 +14,12 @@ from twin.geometry.chart import Focus, dome_points
 from twin.geometry.mesh import build_mesh
 from twin.geometry.solid import Resolution, Solid, build_solid, pin_pose
 from twin.geometry.view import NodeView
+from twin.mechanics.balance import Balance, Body, Friction, LoadState
 from twin.mechanics.contact import contact_points
 from twin.mechanics.elements import Elements
 from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.material import law_coefficients
-from twin.mechanics.newton import RESIDUAL_TOLERANCE, Balance, Body, Friction, LoadState, LoadStepper, NoConvergence
+from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
 from twin.mechanics.path import ContactPath, ContactPose, dome_directions, plan_path
 from twin.mechanics.relaxation import History
 from twin.stimulus import Stimulus, build_stimulus

@@ -1,0 +1,163 @@
+"""The equations of one load step: elastic forces against contact and friction."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.mechanics.contact import ContactForces, ContactPoints, contact_forces, positions, spread_forces
+from twin.mechanics.elements import Elements
+
+FORCE_FLOOR_N = 1e-3  # the residual's scale is never less
+
+
+@dataclass(frozen=True)
+class Body:
+    """What a sensor brings to every contact.
+
+    Attributes
+    ----------
+    kinds : tuple of Elements
+        Skin first, then the gel.
+    points : ContactPoints
+    free : (n,) bool
+        Controls that move.
+    sealed : bool
+        Whether the gel's volume is held.
+    """
+
+    kinds: tuple[Elements, ...]
+    points: ContactPoints
+    free: np.ndarray
+    sealed: bool
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Coulomb friction with slip weakening (Ida 1972).
+
+    A point that has slid by s since it last stuck has mu = kinetic + (static - kinetic) exp(-s / weakening_mm).
+    """
+
+    static: float
+    kinetic: float
+    weakening_mm: float = 0.1
+
+
+@dataclass(frozen=True)
+class LoadState:
+    """A converged state.
+
+    Attributes
+    ----------
+    control_mm : (n, 3) float
+    border : (2,) float
+        How far the object has given way along z (mm), and the pressure of a sealed gel (MPa).
+    anchor_mm : (p, 3) float
+        Friction's anchors in the object's frame; meaningful where ``held (p,)``.
+    slid_mm : (p,) float
+        Slip since the point last stuck.
+    penalty_mpa_mm : float
+    T : (4, 4) float
+        The object's pose before it gave way.
+    elastic_nmm, dissipated_nmm : float
+        Energy stored in the body, and lost to friction in the step that led here.
+    """
+
+    control_mm: np.ndarray
+    border: np.ndarray
+    anchor_mm: np.ndarray
+    held: np.ndarray
+    slid_mm: np.ndarray
+    penalty_mpa_mm: float
+    T: np.ndarray
+    elastic_nmm: float = 0.0
+    dissipated_nmm: float = 0.0
+
+
+@dataclass(frozen=True)
+class Balance:
+    """The equations at a trial state.
+
+    Attributes
+    ----------
+    elastic : (unknowns,) float
+        Elastic force on the free controls; ``residual`` less the contact's.
+    border_residual : (2,) float
+        Of yield / compliance + force = 0 (N) and of the sealed gel's volume (mm^3).
+    contact : ContactForces
+        At the points looked at, in the object's frame; ``point_force_n`` (q, 3) the same forces in the sensor's.
+    scale_n : float
+        Sum of the contact forces.
+    elastic_nmm : float
+        Energy stored in the body.
+    """
+
+    elastic: np.ndarray
+    residual: np.ndarray
+    border_residual: np.ndarray
+    contact: ContactForces
+    point_force_n: np.ndarray
+    scale_n: float
+    elastic_nmm: float
+
+    @property
+    def absolute(self) -> float:
+        """Norm of the residual in N."""
+        return float(np.hypot(np.linalg.norm(self.residual), np.linalg.norm(self.border_residual)))
+
+    @property
+    def relative(self) -> float:
+        """Norm of the residual over the sum of the contact forces."""
+        return self.absolute / self.scale_n
+
+
+class Problem:
+    """The equations of one load step: anchors, penalty, pose and what is left of the past held."""
+
+    def __init__(self, body: Body, stimulus, law: Friction, compliance: float, state: LoadState, anchor_mm, looked, penalty, T, given):
+        self.body, self.compliance, self._stimulus = body, compliance, stimulus
+        self._given, self.T = given, T
+        self.looked, self.penalty = looked, penalty
+        points = body.points
+        self.controls, self.weights = points.controls[looked], points.weights[looked]
+        self.lift = points.lift_mm[looked]
+        self.anchor_mm = anchor_mm[looked]
+        self.stiff = penalty * points.area_mm2[looked]
+        self.friction = law.kinetic + (law.static - law.kinetic) * np.exp(-state.slid_mm[looked] / law.weakening_mm)
+
+    def contact(self, at_sensor, border, soften: float = 1.0) -> ContactForces:
+        """Contact with the points looked at in places (q, 3) of the sensor's frame."""
+        at = (at_sensor - self.T[:3, 3] - [0, 0, border[0]]) @ self.T[:3, :3]
+        return contact_forces(self._stimulus, at, self.stiff, self.anchor_mm, self.friction, soften=soften)
+
+    def balance(self, control, border) -> Balance | None:
+        """The equations; None if an element is inside out."""
+        body = self.body
+        residual = np.zeros_like(control)
+        elastic_nmm = 0.0
+        for number, (kind, given) in enumerate(zip(body.kinds, self._given, strict=True)):
+            elastic_nmm += kind.add_forces(control, given, residual, border[1] if number else 0.0)
+        if not np.isfinite(elastic_nmm):
+            return None
+        elastic = residual[body.free].ravel()
+        contact = self.contact(positions(self.controls, self.weights, self.lift, control), border)
+        force = contact.force_n @ self.T[:3, :3].T
+        spread_forces(self.controls, self.weights, -force, residual)
+        border_residual = np.zeros(2)
+        if self.compliance:  # the skin pushes the object with -sum f
+            border_residual[0] = border[0] / self.compliance + float(force[:, 2].sum())
+        if body.sealed:
+            border_residual[1] = self.volume(control, np.zeros_like(control))
+            elastic_nmm -= border[1] * border_residual[1]
+        scale = max(float(np.linalg.norm(force, axis=1).sum()), FORCE_FLOOR_N)
+        return Balance(elastic, residual[body.free].ravel(), border_residual, contact, force, scale, elastic_nmm)
+
+    def stiffness(self, control, border, blocks, *, gel: bool) -> None:
+        """The elements' tangents into ``blocks``; the gel's only on request."""
+        for number, (kind, given, block) in enumerate(zip(self.body.kinds, self._given, blocks, strict=True)):
+            if number == 0 or gel:
+                kind.stiffness(control, given, border[1] if number else 0.0, block)
+
+    def volume(self, control, out) -> float:
+        """How much the gel's volume has grown, mm^3; adds its gradient to ``out``."""
+        return sum(kind.add_volume(control, out) for kind in self.body.kinds[1:])

@@ -10,7 +10,7 @@ from threadpoolctl import ThreadpoolController
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError
-from twin.geometry.chart import Focus, dome_points
+from twin.geometry.chart import Focus
 from twin.geometry.mesh import build_mesh
 from twin.geometry.solid import Resolution, Solid, build_solid, pin_pose
 from twin.geometry.view import NodeView
@@ -128,7 +128,7 @@ class SkinSolver:
         reached = self._reached(field, plan)
         with self._one_thread():
             setting = self._setting(_focus(reached))
-            stepper = LoadStepper(setting.body, self._frontal(setting.solid, reached), field, law, compliance)
+            stepper = LoadStepper(setting.body, self._frontal(setting, reached), field, law, compliance)
         body = setting.body
         count = len(body.points.area_mm2)
         state = LoadState(
@@ -182,16 +182,13 @@ class SkinSolver:
         points = contact_points(solid, spec.skin.outer_radius_mm)
         return _Setting(solid, Body(kinds, points, ~solid.fixed, spec.gel.sealed), NodeView.of(spec, self.mesh, solid))
 
-    def _frontal(self, solid: Solid, reached: np.ndarray) -> FrontalSolver:
-        """Elimination of all but the outer controls that may be touched: those around the reached directions."""
-        side = solid.basis.count
-        v, u = np.meshgrid(solid.basis.greville, solid.basis.greville, indexing="ij")
-        outer = dome_points(
-            solid.chart.disc(np.column_stack([u.ravel(), v.ravel()])), 1.0, self.spec.skin.rim_z_mm / self.spec.skin.outer_radius_mm
-        )
-        nearest = (outer @ reached.T).max(axis=1)
+    def _frontal(self, setting: _Setting, reached: np.ndarray) -> FrontalSolver:
+        """Elimination of all but the outer controls that may be touched: those that carry points around the reached directions."""
+        solid, points = setting.solid, setting.body.points
+        directions = points.positions(solid.control_mm) / self.spec.skin.outer_radius_mm
+        near = (directions @ reached.T).max(axis=1) > np.cos(_MARGIN_RAD)
         keep = np.zeros(len(solid.fixed), bool)
-        keep[: side * side] = nearest > np.cos(_MARGIN_RAD)
+        keep[points.controls[near]] = True
         return FrontalSolver(
             [c.controls for c in (solid.skin, solid.gel_top, solid.gel_deep)], list(solid.boxes), solid.fixed, keep & ~solid.fixed
         )

@@ -82,7 +82,7 @@ class ObjectSpec(Section):
     """An object, complete. ``name`` is the file's stem.
 
     ``friction`` is the static coefficient; ``kinetic_friction`` (default: the same) is what it falls to once a
-    point has slid by some ``slip_weakening_mm``.
+    point has slid by some ``slip_weakening_mm``. ``shear_strength_mpa`` bounds the friction stress (default: no bound).
     """
 
     name: str
@@ -93,6 +93,7 @@ class ObjectSpec(Section):
     friction: NonNegative = 0.5
     kinetic_friction: NonNegative | None = None
     slip_weakening_mm: Positive = 0.1
+    shear_strength_mpa: Positive | None = None
     compliance_mm_per_n: NonNegative = 0.0
 
     @model_validator(mode="after")

@@ -36,11 +36,13 @@ class Friction:
     """Coulomb friction with slip weakening (Ida 1972).
 
     A point that has slid by s since it last stuck has mu = kinetic + (static - kinetic) exp(-s / weakening_mm).
+    The shear stress never exceeds ``shear_strength_mpa``.
     """
 
     static: float
     kinetic: float
     weakening_mm: float = 0.1
+    shear_strength_mpa: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -123,12 +125,13 @@ class Problem:
         self.lift = points.lift_mm[looked]
         self.anchor_mm = anchor_mm[looked]
         self.stiff = penalty * points.area_mm2[looked]
+        self.bound_n = law.shear_strength_mpa * points.area_mm2[looked]
         self.friction = law.kinetic + (law.static - law.kinetic) * np.exp(-state.slid_mm[looked] / law.weakening_mm)
 
     def contact(self, at_sensor, border, soften: float = 1.0) -> ContactForces:
         """Contact with the points looked at in places (q, 3) of the sensor's frame."""
         at = (at_sensor - self.T[:3, 3] - [0, 0, border[0]]) @ self.T[:3, :3]
-        return contact_forces(self._stimulus, at, self.stiff, self.anchor_mm, self.friction, soften=soften)
+        return contact_forces(self._stimulus, at, self.stiff, self.anchor_mm, self.friction, bound_n=self.bound_n, soften=soften)
 
     def balance(self, control, border) -> Balance | None:
         """The equations; None if an element is inside out."""

@@ -3,12 +3,13 @@
 At contact points of rest area A with signed distance d, outward object normal n and penetration
 g = max(-d, 0), the force on the skin is (Wriggers, "Computational Contact Mechanics", ch. 5)
 
-    f = A (p n - mu p phi(|s| / delta) s / |s|),    phi(x) = 2 x - x^2 for x < 1 (stick), else 1 (slip)
+    f = A (p n - min(mu p, tau) phi(|s| / delta) s / |s|),    phi(x) = 2 x - x^2 for x < 1 (stick), else 1 (slip)
 
 p is the pressure k g, but for g < eps it starts as k g^2 / 2 eps, so that touching is smooth. s is the
 tangential travel since the point's anchor, which is fixed to the object: where the point touched it,
-moved after a slip so that |s| = delta. A sticking point creeps by less than delta; no point ever leaves
-Coulomb's cone. Everything here is in the object's frame.
+moved after a slip so that |s| = delta. tau bounds the shear stress that the pair of surfaces can bear,
+however hard it is pressed (as between rubbers; Orowan's friction). A sticking point creeps by less than
+delta; no point ever leaves Coulomb's cone. Everything here is in the object's frame.
 """
 
 from dataclasses import dataclass
@@ -116,7 +117,7 @@ class ContactForces:
     anchor_mm: np.ndarray
 
 
-def contact_forces(stimulus, at_mm, stiff, anchor_mm, friction, *, soften: float = 1.0) -> ContactForces:
+def contact_forces(stimulus, at_mm, stiff, anchor_mm, friction, *, bound_n=None, soften: float = 1.0) -> ContactForces:
     """Forces and their stiffness with contact points at ``at_mm`` (p, 3), object frame.
 
     Parameters
@@ -127,16 +128,19 @@ def contact_forces(stimulus, at_mm, stiff, anchor_mm, friction, *, soften: float
         Where friction holds each point, if it presses.
     friction : (p,) float
         Coefficient at each point.
+    bound_n : (p,) float, optional
+        Friction force that a point never exceeds (tau A).
     soften : float
         Below 1: the penalty times it, and the smooth gap and the creep over it (on the way to a solution).
     """
     distance, normal, hessian = stimulus.probe(at_mm)
     scales = SMOOTH_GAP_MM / soften, STICK_CREEP_MM / soften
-    return ContactForces(normal, *_law(at_mm, distance, normal, hessian, soften * stiff, anchor_mm, friction, *scales))
+    bound = np.full(len(at_mm), np.inf) if bound_n is None else bound_n
+    return ContactForces(normal, *_law(at_mm, distance, normal, hessian, soften * stiff, anchor_mm, friction, bound, *scales))
 
 
 @numba.njit(cache=True)
-def _law(at, distance, normal, hessian, stiff, anchor, friction, eps, delta):
+def _law(at, distance, normal, hessian, stiff, anchor, friction, bound, eps, delta):
     count = len(at)
     force, k = np.zeros((count, 3)), np.zeros((count, 3, 3))
     pressing, depth = np.zeros(count), np.zeros(count)
@@ -159,7 +163,9 @@ def _law(at, distance, normal, hessian, stiff, anchor, friction, eps, delta):
             force[p, i] = press * n[i]
             for j in range(3):
                 k[p, i, j] = rise * n[i] * n[j] - press * h[i, j]
-        limit = friction[p] * press
+        limit, growth = friction[p] * press, friction[p] * rise
+        if limit > bound[p]:
+            limit, growth = bound[p], 0.0
         if limit == 0:
             continue
         along, length = 0.0, 0.0
@@ -196,7 +202,7 @@ def _law(at, distance, normal, hessian, stiff, anchor, friction, eps, delta):
                 for m in range(3):
                     lengthways += way[m] * turn[m, j]
                 k[p, i, j] += across * (turn[i, j] - way[i] * lengthways) + along_way * way[i] * lengthways
-                k[p, i, j] -= friction[p] * rise * hold * way[i] * n[j]
+                k[p, i, j] -= growth * hold * way[i] * n[j]
     return force, pressing, depth, slipping, k, moved
 
 

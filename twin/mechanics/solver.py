@@ -251,7 +251,8 @@ def _friction(spec: ObjectSpec | None, override: float | Friction | None) -> Fri
         return Friction(override, override)
     if spec is None:
         return Friction(0.0, 0.0)
-    return Friction(spec.friction, spec.friction if spec.kinetic_friction is None else spec.kinetic_friction, spec.slip_weakening_mm)
+    kinetic = spec.friction if spec.kinetic_friction is None else spec.kinetic_friction
+    return Friction(spec.friction, kinetic, spec.slip_weakening_mm, spec.shear_strength_mpa or np.inf)
 
 
 def _focus(reached: np.ndarray) -> Focus:

@@ -26,7 +26,7 @@ from twin.stimulus import Stimulus, build_stimulus
 from twin.types import ContactState
 
 _PENALTY_MPA_MM = 30.0
-_STEP_MM = 0.6  # largest motion of the object across the contact in one load step
+_STEP_MM = 0.4  # largest motion of the object across the contact in one load step
 _SMALLEST_STRIDE = 1 / 64  # of a regular load step
 _FOCUS_POINTS = 2000  # on the sphere, to see where the object will press
 _FOCUS_POLAR_DEG, _FOCUS_AZIMUTH_DEG = 5.0, 15.0  # the focus's direction is rounded to these

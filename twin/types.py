@@ -63,7 +63,7 @@ class ContactState:
     T_sensor_object : (4, 4) float
         The object's pose.
     elastic_nmm : float
-        Energy stored in skin and gel, N mm.
+        Energy stored in skin and gel, N mm (in a relaxing sensor: the potential of its last load step).
     dissipated_nmm : float
         Energy that friction took in the load step that ends here, N mm.
     residual : float

@@ -36,7 +36,7 @@ class Resolution:
 
     across: int = 16
     skin_layers: int = 1
-    gel_layers: int = 2
+    gel_layers: int = 3
 
     def __post_init__(self):
         if self.across < 4 or self.across % 2 or self.skin_layers < 1 or self.gel_layers < 1:
@@ -168,9 +168,9 @@ def _arrays(spec: SensorSpec, resolution: Resolution, chart: Chart, basis: Basis
     top = [(index[-1], basis, _local(through, 0, 0))] + [(below[d - 1], coarse, _local(through, 0, d)) for d in (1, 2)]
     deep_parts = [[(below[e + d - 1], coarse, _local(through, e, d)) for d in range(3)] for e in range(1, resolution.gel_layers)]
     cells = {
-        "skin": _joined([_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)]),
-        "gel_top": _cells(basis, top, through, 0, control),
-        "gel_deep": _joined([_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
+        "skin": joined_cells([spline_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)]),
+        "gel_top": spline_cells(basis, top, through, 0, control),
+        "gel_deep": joined_cells([spline_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
     }
     pins = rest_pins(spec)
     value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, spec.skin.rim_z_mm)))
@@ -251,7 +251,7 @@ def _local(through: Basis, element: int, function: int) -> tuple[np.ndarray, np.
     return tuple(through.values(at, derivative=d)[:, element + function] for d in (0, 1))
 
 
-def _cells(grid: Basis, parts: list, through: Basis, layer: int, control_mm: np.ndarray) -> Cells:
+def spline_cells(grid: Basis, parts: list, through: Basis, layer: int, control_mm: np.ndarray) -> Cells:
     """Elements of one layer over the intervals of ``grid``.
 
     ``parts``: for each function through the depth, its controls (side, side), their basis, and its values and slopes.
@@ -278,7 +278,7 @@ def _cells(grid: Basis, parts: list, through: Basis, layer: int, control_mm: np.
     return Cells(controls, np.ascontiguousarray(gradients), volume)
 
 
-def _joined(parts: list[Cells]) -> Cells:
+def joined_cells(parts: list[Cells]) -> Cells:
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
     return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in _CELL_PARTS))

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from twin.errors import ContactError
 from twin.mechanics.contact import ContactForces, ContactPoints, contact_forces, positions, spread_forces
 from twin.mechanics.elements import Elements
 
@@ -43,6 +44,10 @@ class Friction:
     kinetic: float
     weakening_mm: float = 0.1
     shear_strength_mpa: float = np.inf
+
+    def __post_init__(self):
+        if not (0 <= self.kinetic <= self.static < np.inf and self.weakening_mm > 0 and self.shear_strength_mpa > 0):
+            raise ContactError(f"friction needs 0 <= kinetic <= static, weakening_mm > 0 and shear_strength_mpa > 0, got {self}")
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def press_many(
                 for future in done:
                     yield future.result()
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
 
 
 def _start(spec: SensorSpec, resolution: Resolution | None) -> None:

@@ -19,7 +19,7 @@ Two Gauss points per direction under-integrate the quadratic splines just enough
 membrane and shear locking, and leave no mode without stiffness, since the splines are C1.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numba
 import numpy as np
@@ -34,10 +34,24 @@ _K = np.array([k for _, k in PAIRS])
 
 @dataclass(frozen=True)
 class Elements:
-    """Elements of one kind and their material: ``cells`` of m elements with b controls, and ``law`` (6,), see ``law_coefficients``."""
+    """Elements of one kind and their material.
+
+    Attributes
+    ----------
+    cells : Cells
+        m elements with b controls each.
+    law : (6,) float
+        See ``law_coefficients``.
+    layer : bool
+        Whether they are linear through a skin, so that kappa_d is a matter of shear.
+    difference_mpa : (m,) or (0,) float
+        Given stress that works on half the difference of the two levels' volume strains; none in an elastic body.
+    """
 
     cells: Cells
     law: np.ndarray
+    layer: bool = False
+    difference_mpa: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def add_forces(self, control_mm: np.ndarray, stress: np.ndarray, out: np.ndarray, pressure_mpa: float = 0.0) -> float:
         """Elastic energy in N mm; adds its gradient by the controls to ``out`` (n, 3) in N.
@@ -51,12 +65,19 @@ class Elements:
     def add_volume(self, control_mm: np.ndarray, out: np.ndarray) -> float:
         """Growth of the volume in mm^3; adds its gradient by the controls to ``out`` (n, 3) in mm^2."""
         cells = self.cells
-        return _forces(cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), control_mm, np.zeros((0, 8, 3, 3)), 1.0, out)
+        return _forces(
+            cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), np.zeros(0), control_mm, np.zeros((0, 8, 3, 3)), 1.0, out
+        )
 
     def distortion_stress(self, control_mm: np.ndarray) -> np.ndarray:
         """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa."""
         cells = self.cells
         return _distortion_stress(cells.controls, cells.gradients, cells.weights_mm3, self.law, control_mm)
+
+    def difference_stress(self, control_mm: np.ndarray) -> np.ndarray:
+        """kappa_d times half the difference of the levels' volume strains, (m,) in MPa."""
+        cells = self.cells
+        return self.law[5] * _half_difference(cells.controls, cells.gradients, cells.weights_mm3, control_mm)
 
     def stiffness(self, control_mm: np.ndarray, stress: np.ndarray, pressure_mpa: float, out: np.ndarray) -> None:
         """Second derivative of each element's energy into ``out`` (m, 6, b, b), N/mm.
@@ -68,7 +89,7 @@ class Elements:
 
     @property
     def _arrays(self):
-        return self.cells.controls, self.cells.gradients, self.cells.weights_mm3, self.law
+        return self.cells.controls, self.cells.gradients, self.cells.weights_mm3, self.law, self.difference_mpa
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -95,7 +116,7 @@ def _kinematics(x, grad, weights, f, g, det):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _forces(elements, gradients, weights, law, control, given, sealing, out):
+def _forces(elements, gradients, weights, law, extra, control, given, sealing, out):
     count = elements.shape[1]
     x, push = np.zeros((3, count)), np.zeros((3, count))
     f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
@@ -110,11 +131,12 @@ def _forces(elements, gradients, weights, law, control, given, sealing, out):
             return np.inf
         rest = r0 + r1
         mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
-        energy += rest / 2 * (law[4] * mean**2 + law[5] * half**2) + sealing * rest * mean
+        more = extra[m] if len(extra) else 0.0
+        energy += rest * (law[4] / 2 * mean**2 + law[5] / 2 * half**2 + sealing * mean + more * half)
         push[:] = 0.0
         for q in range(8):
             w = weights[m, q]
-            pressure = sealing + law[4] * mean + law[5] * half * (rest / (2 * r0) if q < 4 else -rest / (2 * r1))
+            pressure = sealing + law[4] * mean + (law[5] * half + more) * (rest / (2 * r0) if q < 4 else -rest / (2 * r1))
             energy += w * distortion(law, f[q], det[q], g[q], stress)
             if len(given):
                 for i in range(3):
@@ -137,7 +159,7 @@ def _forces(elements, gradients, weights, law, control, given, sealing, out):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _stiffness(elements, gradients, weights, law, control, given, sealing, out):
+def _stiffness(elements, gradients, weights, law, extra, control, given, sealing, out):
     count = elements.shape[1]
     x = np.zeros((3, count))
     f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
@@ -153,11 +175,12 @@ def _stiffness(elements, gradients, weights, law, control, given, sealing, out):
         r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, g, det)
         rest = r0 + r1
         mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
+        more = extra[m] if len(extra) else 0.0
         swell[:] = 0.0
         for q in range(8):
             w = weights[m, q]
             lean = rest / (2 * r0) if q < 4 else -rest / (2 * r1)
-            push = (sealing + law[4] * mean + law[5] * half * lean) * det[q]
+            push = (sealing + law[4] * mean + (law[5] * half + more) * lean) * det[q]
             distortion_stiffness(law, f[q], det[q], g[q], tangent)
             for p in range(6):
                 i, k = _I[p], _K[p]
@@ -207,4 +230,19 @@ def _distortion_stress(elements, gradients, weights, law, control):
                 for j in range(3):
                     for k in range(3):  # S = F^-1 P, and g is F^-T
                         out[m, q, i, j] += g[q, k, i] * stress[k, j]
+    return out
+
+
+@numba.njit(cache=True, fastmath=True)
+def _half_difference(elements, gradients, weights, control):
+    count = elements.shape[1]
+    x = np.zeros((3, count))
+    f, g, det = np.zeros((8, 3, 3)), np.zeros((8, 3, 3)), np.zeros(8)
+    out = np.zeros(len(elements))
+    for m in range(len(elements)):
+        for a in range(count):
+            for i in range(3):
+                x[i, a] = control[elements[m, a], i]
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, g, det)
+        out[m] = (v0 / r0 - v1 / r1) / 2
     return out

@@ -9,6 +9,7 @@ often, and is cheap to find there.
 
 import numpy as np
 
+from twin.errors import ContactError
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem
 from twin.mechanics.condensed import Near, SmallContact, Tangent
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite
@@ -95,7 +96,9 @@ class LoadStepper:
             missed = left_out[self._stimulus.distance(self._seen(control, border, T)[left_out]) < 0]
             if len(missed):
                 if not self._reachable[missed].all():
-                    raise NoConvergence(np.inf)
+                    raise ContactError(
+                        "skin far from where the rigid object would press has come to touch it; use less indentation or shear"
+                    )
                 looked = np.sort(np.concatenate([looked, missed]))
             elif balance.contact.penetration_mm.max(initial=0.0) > GAP_BOUND_MM:
                 penalty *= _PENALTY_GROWTH
@@ -171,6 +174,8 @@ class LoadStepper:
             shift, astray = 0.0, False
             last, accepted = balance.absolute, accepted + 1
             control, border, balance = new, new_border, trial
+        if balance.relative <= RESIDUAL_TOLERANCE:
+            return control, border, balance
         raise NoConvergence(balance.relative)
 
     def _linearise(self, problem: "Problem", control, border, shift: float) -> Tangent:

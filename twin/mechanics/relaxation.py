@@ -19,35 +19,55 @@ from twin.mechanics.elements import Elements
 
 @dataclass(frozen=True)
 class History:
-    """What one kind of elements remembers: ``stress`` S (m, 8, 3, 3) at the last state, ``branches`` H (terms, m, 8, 3, 3), MPa."""
+    """What one kind of elements remembers, in MPa.
+
+    Attributes
+    ----------
+    stress : (m, 8, 3, 3) float
+        S at the last state, and ``branches`` H (terms, m, 8, 3, 3).
+    difference : (m,) float
+        The same of the skin's kappa_d part (see ``Elements.difference_stress``), and ``difference_branches`` (terms, m).
+    """
 
     stress: np.ndarray
     branches: np.ndarray
+    difference: np.ndarray
+    difference_branches: np.ndarray
 
     @classmethod
     def at_rest(cls, kind: Elements, terms: tuple[RelaxationTerm, ...]) -> "History":
         """Nothing has happened for a long time."""
-        shape = kind.cells.weights_mm3.shape + (3, 3)
-        return cls(np.zeros(shape if terms else (0, *shape[1:])), np.zeros((len(terms), *shape) if terms else (0, 0, *shape[1:])))
+        count = len(kind.cells.weights_mm3) if terms else 0
+        shape = (count, 8, 3, 3)
+        return cls(np.zeros(shape), np.zeros((len(terms), *shape)), np.zeros(count), np.zeros((len(terms), count)))
 
     def before(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float) -> tuple[Elements, np.ndarray]:
         """The elements of a step of a duration, their law scaled, and the given stress (see ``Elements.add_forces``)."""
         if not terms:
             return kind, self.stress
         share, fade, late = _decay(terms, step_s)
+        kept = (share * late).sum()
         law = kind.law.copy()
-        law[:4] *= 1 - sum(term.fraction for term in terms) + (share * late).sum()
-        given = np.einsum("t,tmqij->mqij", fade, self.branches) - (share * late).sum() * self.stress
-        return replace(kind, law=law), given
+        law[:4] *= 1 - share.sum() + kept
+        changed = replace(kind, law=law)
+        if kind.layer:
+            law[5] *= 1 - share.sum() + kept
+            changed = replace(changed, difference_mpa=fade @ self.difference_branches - kept * self.difference)
+        return changed, np.einsum("t,tmqij->mqij", fade, self.branches) - kept * self.stress
 
     def after(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float, control_mm: np.ndarray) -> "History":
         """What is remembered after the step; ``kind`` with the unscaled law."""
         if not terms:
             return self
         share, fade, late = _decay(terms, step_s)
-        stress = kind.distortion_stress(control_mm)
-        change = (share * late)[:, None, None, None, None] * (stress - self.stress)
-        return History(stress, fade[:, None, None, None, None] * self.branches + change)
+        stress, difference = kind.distortion_stress(control_mm), kind.difference_stress(control_mm)
+        grown = share * late
+        return History(
+            stress,
+            fade[:, None, None, None, None] * self.branches + grown[:, None, None, None, None] * (stress - self.stress),
+            difference,
+            fade[:, None] * self.difference_branches + grown[:, None] * (difference - self.difference),
+        )
 
 
 def _decay(terms, step_s):

@@ -28,6 +28,7 @@ from twin.types import ContactState
 _PENALTY_MPA_MM = 30.0
 _STEP_MM = 0.4  # largest motion of the object across the contact in one load step
 _SMALLEST_STRIDE = 1 / 64  # of a regular load step
+_LOOK_MM = 2.0  # between the poses of the path at which that is looked for
 _FOCUS_POINTS = 2000  # on the sphere, to see where the object will press
 _FOCUS_POLAR_DEG, _FOCUS_AZIMUTH_DEG = 5.0, 15.0  # the focus's direction is rounded to these
 _FOCUS_RADIUS_RAD = np.radians(50.0)
@@ -142,7 +143,7 @@ class SkinSolver:
         )
         terms = [self.spec.skin.relaxation, self.spec.gel.relaxation, self.spec.gel.relaxation]
         past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, terms, strict=True)]
-        stops = _stops(plan, reached, step_mm)
+        stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
         for number in range(1, len(stops)):
             done, stride = 0.0, 1.0
             while done < 1:
@@ -178,7 +179,11 @@ class SkinSolver:
         spec = self.spec
         solid = build_solid(spec, resolution=self.resolution, focus=focus)
         gel = law_coefficients(spec.gel, layer=False)
-        kinds = (Elements(solid.skin, law_coefficients(spec.skin, layer=True)), Elements(solid.gel_top, gel), Elements(solid.gel_deep, gel))
+        kinds = (
+            Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True),
+            Elements(solid.gel_top, gel),
+            Elements(solid.gel_deep, gel),
+        )
         points = contact_points(solid, spec.skin.outer_radius_mm)
         return _Setting(solid, Body(kinds, points, ~solid.fixed, spec.gel.sealed), NodeView.of(spec, self.mesh, solid))
 
@@ -199,13 +204,14 @@ class SkinSolver:
         directions = dome_directions(self.spec, _FOCUS_POINTS)
         deepest = np.full(len(directions), np.inf)
         limit = 0.5 * (radius - self.spec.skin.thickness_mm - self.spec.lens.z_mm)
-        for number, T in enumerate(plan.poses):
+        for at in _stops(plan, directions, radius, _LOOK_MM):
+            T = plan.at(at)
             gap = field.distance((radius * directions - T[:3, 3]) @ T[:3, :3])
-            if number == 0 and gap.min() < -0.05:
+            if at == 0 and gap.min() < -0.05:
                 raise ContactError(f"the object starts {-gap.min():.2f} mm inside the skin; begin the path clear of it")
             if -gap.min() > limit:
                 raise ContactError(
-                    f"pose {number} of the path goes {-gap.min():.1f} mm into the dome, more than {limit:.1f} (half the gel's depth)"
+                    f"the path goes {-gap.min():.1f} mm into the dome about its pose {at:.2g}, more than {limit:.1f} (half the gel's depth)"
                 )
             deepest = np.minimum(deepest, gap)
         pressed = deepest < 0
@@ -264,12 +270,12 @@ def _focus(reached: np.ndarray) -> Focus:
     return Focus(float(np.radians(polar)), float(np.radians(azimuth)), float(_FOCUS_RADIUS_RAD))
 
 
-def _stops(plan: ContactPath, reached: np.ndarray, step_mm: float) -> np.ndarray:
-    """Progress at the regular load steps: the poses, and between them no point near the contact moves farther than a step."""
+def _stops(plan: ContactPath, directions: np.ndarray, radius_mm: float, step_mm: float) -> np.ndarray:
+    """Progress at regular load steps: the poses, and between them no point of the dome in these directions sees the object move farther."""
     out = [np.zeros(1)]
     for leg in range(len(plan.poses) - 1):
         start, stop = plan.poses[leg], plan.poses[leg + 1]
-        at = 20.0 * reached  # any point near the contact will do
+        at = radius_mm * directions
         moved = (at - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - at
         count = max(1, int(np.ceil(np.linalg.norm(moved, axis=1).max() / step_mm)))
         out.append(leg + np.arange(1, count + 1) / count)

@@ -20,7 +20,7 @@ from twin.stimulus.analytic import Plane, Sphere
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "calculix.json").read_text())
 DEFAULT, FINER = Resolution().across, 24
-BOUNDS = {DEFAULT: (0.04, 0.03), FINER: (0.03, 0.015)}  # at 3 mm: of force, and of displacement relative to the largest
+BOUNDS = {DEFAULT: (0.03, 0.03), FINER: (0.03, 0.015)}  # at 3 mm: of force, and of displacement relative to the largest
 SHALLOW = {DEFAULT: (0.06, 0.07), FINER: (0.03, 0.015)}  # at 1 and 2 mm: the ball's contact is as small as the default's elements
 
 

@@ -24,10 +24,10 @@ from twin.stimulus.analytic import Plane
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127"}
-FRAMES, FRICTION_FRAMES, SEED = 120, 12, 20
+FRAMES, FRICTION_FRAMES, SEED = 80, 10, 20
 STEP_MM = 0.4
 FRICTION = {"mg400-331": 0.36, "mg400-127": 0.32}  # fitted with the sensors' other values
-FRICTION_GRID = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.62, 0.8, 1.2, 2.0)
+FRICTION_GRID = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.65, 1.0, 2.0)
 MOST_PX = {"mg400-331": 0.9, "mg400-127": 1.1}  # one friction for all frames
 MOST_PER_FRAME_PX = {"mg400-331": 0.75, "mg400-127": 0.75}  # one friction a frame
 MOST_NOT_EXECUTED_PX = {"mg400-331": 0.6, "mg400-127": 0.55}

@@ -44,14 +44,7 @@ def read_surface_labels(folder: Path) -> SurfaceLabels:
     FrameError
         If ``targets.csv`` or one of its columns is missing.
     """
-    rows = _read_rows(folder / "targets.csv", ("image_name", "pose_2", "pose_6", "move_1", "move_6"))
-    executed_file = folder / "move_executed.csv"
-    executed_of = {}
-    if executed_file.is_file():
-        executed_of = {
-            row["image_name"]: float(row["executed_estimate"]) for row in _read_rows(executed_file, ("image_name", "executed_estimate"))
-        }
-    executed = np.array([executed_of.get(row["image_name"], 1.0) for row in rows])
+    rows, executed = published_rows(folder)
     column = {key: np.array([float(row[key]) for row in rows]) for key in ("pose_2", "pose_6", "move_1", "move_6")}
     return SurfaceLabels(
         image_name=np.array([row["image_name"] for row in rows]),
@@ -60,6 +53,25 @@ def read_surface_labels(folder: Path) -> SurfaceLabels:
         shear_mm=executed * column["move_1"],
         shear_deg=executed * column["move_6"],
     )
+
+
+def published_rows(folder: Path) -> tuple[list[dict], np.ndarray]:
+    """Rows of ``targets.csv`` as published, and how likely each move was executed (M,): 1 without ``move_executed.csv``.
+
+    Raises
+    ------
+    FrameError
+        If ``targets.csv`` or one of its columns is missing.
+    """
+    rows = _read_rows(folder / "targets.csv", ("image_name", "pose_2", "pose_6", "move_1", "move_6"))
+    executed_file = folder / "move_executed.csv"
+    executed_of = {}
+    if executed_file.is_file():
+        executed_of = {
+            row["image_name"]: float(row["executed_estimate"]) for row in _read_rows(executed_file, ("image_name", "executed_estimate"))
+        }
+    executed = np.array([executed_of.get(row["image_name"], 1.0) for row in rows])
+    return rows, executed
 
 
 def _read_rows(path: Path, columns: tuple[str, ...]) -> list[dict]:

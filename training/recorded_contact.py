@@ -12,13 +12,12 @@ and the plate is the line Y = Y0 + plate_tilt X, Y0 such that an unturned sensor
 ``pose_2 + tap + contact_offset``. In a frame whose move was not executed the path ends after the tap.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from training.labels import read_surface_labels
+from training.labels import published_rows
 from twin.mechanics.path import ContactPath
 
 TAP_MM = 5.0  # the recordings' meta.json: tap_move
@@ -80,16 +79,11 @@ def read_surface_rows(folder: Path) -> list[SurfaceRow]:
     Raises
     ------
     FrameError
-        As ``read_surface_labels``.
+        As ``published_rows``.
     """
-    labels = read_surface_labels(folder)
-    executed = {}
-    if (folder / "move_executed.csv").is_file():
-        with (folder / "move_executed.csv").open(newline="") as file:
-            executed = {row["image_name"]: float(row["executed_estimate"]) > 0.5 for row in csv.DictReader(file)}
-    with (folder / "targets.csv").open(newline="") as file:
-        published = [tuple(float(row[key]) for key in ("pose_2", "pose_6", "move_1", "move_6")) for row in csv.DictReader(file)]
-    return [SurfaceRow(*values, executed.get(name, True)) for name, values in zip(labels.image_name, published, strict=True)]
+    rows, executed = published_rows(folder)
+    keys = ("pose_2", "pose_6", "move_1", "move_6")
+    return [SurfaceRow(*(float(row[key]) for key in keys), bool(done > 0.5)) for row, done in zip(rows, executed, strict=True)]
 
 
 def recorded_path(tap: SurfaceTap, row: SurfaceRow) -> ContactPath | None:

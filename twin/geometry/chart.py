@@ -6,7 +6,7 @@ over the largest one, its azimuth the azimuth. A ``Focus`` turns and stretches t
     (u, v) -> w1 (squared disc) -> w2 = w1 s(|w1|) / |w1| -> w = e^(i phi) (w2 + a) / (1 + a w2)
 
 The elliptical map x = u sqrt(1 - v^2 / 2), y = v sqrt(1 - u^2 / 2) makes a disc of the square without
-collapsing an element (Fong, "Analytical methods for squaring the disc", 2015); s(r) = c r + (1 - c) r^7
+collapsing an element (Fong, "Analytical methods for squaring the disc", 2015); s(r) = c r + (1 - c) r^5
 gathers the lines of the grid at the centre; a Moebius transformation moves the centre to where the
 contact is, keeping the rim on the rim. All are smooth.
 """
@@ -33,7 +33,7 @@ class Focus:
 
     polar_rad: float = 0.0
     azimuth_rad: float = 0.0
-    radius_rad: float = np.radians(50.0)
+    radius_rad: float = float(np.radians(50.0))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ inside is smoother still: below its surface it has a grid of half the lines, nes
 """
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -109,6 +110,12 @@ class Solid:
     pin_base_mm: np.ndarray
     pin_axis: np.ndarray
     pin_cap_length_mm: float
+
+    @cached_property
+    def pin_rest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Foot (N, 3) and inverse frame (N, 3, 3) of the skin's inside under each pin at rest."""
+        foot, frame = _surface(self, self.control_mm)
+        return foot, np.linalg.inv(frame)
 
 
 def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus: Focus | None = None) -> Solid:
@@ -215,9 +222,9 @@ def pin_pose(solid: Solid, control_mm: np.ndarray) -> tuple[np.ndarray, np.ndarr
     -------
     base_mm, axis, caps_mm : (N, 3) float
     """
-    rest_foot, rest_frame = _surface(solid, solid.control_mm)
+    rest_foot, rest_inverse = solid.pin_rest
     foot, frame = _surface(solid, control_mm)
-    left, _, right = np.linalg.svd(frame @ np.linalg.inv(rest_frame))
+    left, _, right = np.linalg.svd(frame @ rest_inverse)
     turn = left @ right
     base = foot + np.einsum("kij,kj->ki", turn, solid.pin_base_mm - rest_foot)
     axis = np.einsum("kij,kj->ki", turn, solid.pin_axis)
@@ -279,6 +286,7 @@ def spline_cells(grid: Basis, parts: list, through: Basis, layer: int, control_m
 
 
 def joined_cells(parts: list[Cells]) -> Cells:
+    """One list of elements; of no layers, none of the gel's."""
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
     return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in _CELL_PARTS))

@@ -118,6 +118,11 @@ class Balance:
         return self.absolute / self.scale_n
 
 
+def in_object(points_mm: np.ndarray, T: np.ndarray, border: np.ndarray) -> np.ndarray:
+    """Points (k, 3) of the sensor's frame in that of the object at ``T``, which has given way by ``border[0]`` along z."""
+    return (points_mm - T[:3, 3] - [0, 0, border[0]]) @ T[:3, :3]
+
+
 class Problem:
     """The equations of one load step: anchors, penalty, pose and what is left of the past held."""
 
@@ -135,7 +140,7 @@ class Problem:
 
     def contact(self, at_sensor, border, soften: float = 1.0) -> ContactForces:
         """Contact with the points looked at in places (q, 3) of the sensor's frame."""
-        at = (at_sensor - self.T[:3, 3] - [0, 0, border[0]]) @ self.T[:3, :3]
+        at = in_object(at_sensor, self.T, border)
         return contact_forces(self._stimulus, at, self.stiff, self.anchor_mm, self.friction, bound_n=self.bound_n, soften=soften)
 
     def balance(self, control, border) -> Balance | None:

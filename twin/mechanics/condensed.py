@@ -10,7 +10,7 @@ from twin.mechanics.contact import ContactForces, positions, spread_forces, spre
 from twin.mechanics.linear import Eliminated
 
 _ITERATIONS, _HASTY_ITERATIONS = 60, 15
-_LARGEST_MOVE_MM = 1.5  # of a control in one iteration
+LARGEST_MOVE_MM = 1.5  # of a control in one iteration
 _SOFTENING = 0.1  # of the contact, on the way to a far solution
 _INEXACT = 0.01  # the iteration ends at this share of the whole problem's residual, but not before ``least`` of the scale
 
@@ -108,7 +108,7 @@ class SmallContact:
                 return y, True
             self.iterations += 1
             move = self._direction(contact, residual)
-            size = min(1.0, _LARGEST_MOVE_MM / max(np.abs(move[:-2]).max(initial=0.0), 1e-300))
+            size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move[:-2]).max(initial=0.0), 1e-300))
             best = None
             for _ in range(6):
                 trial, trial_contact = self._equations(y + size * move, soften)

@@ -3,7 +3,7 @@
 Duff & Reid 1983 (multifrontal method), George 1973 (nested dissection of a grid). The elements stand on a
 square grid, so the dissection is known: cut the longer side in the middle, recurse; a control is
 eliminated in the smallest box that holds all of its elements. All arithmetic is dense LAPACK on the
-fronts; the order is found once per sensor. Some unknowns can be kept: what is left for them is a dense
+fronts; the order is found once per path. Some unknowns can be kept: what is left for them is a dense
 matrix (static condensation; Guyan 1965), on which contact, that changes from iteration to iteration, is
 cheap to solve.
 """

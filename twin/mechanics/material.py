@@ -50,12 +50,7 @@ def invariants(f, g):
 @numba.njit(cache=True)
 def distortion(law, f, det, g, stress):
     """Energy density of the part of the law without kappa; its derivative by F into ``stress`` (3, 3), MPa."""
-    trace = 0.0
-    for i in range(3):
-        for j in range(3):
-            trace += f[i, j] * f[i, j]
-    scale = det ** (-2 / 3)
-    first = scale * trace - 3
+    trace, scale, first = _first_invariant(f, det)
     slope = law[0] + first * (2 * law[2] + 3 * law[3] * first)
     energy = first * (law[0] + first * (law[2] + law[3] * first))
     for i in range(3):
@@ -74,12 +69,7 @@ def distortion(law, f, det, g, stress):
 @numba.njit(cache=True)
 def distortion_stiffness(law, f, det, g, out):
     """Second derivative of ``distortion`` by F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
-    trace = 0.0
-    for i in range(3):
-        for j in range(3):
-            trace += f[i, j] * f[i, j]
-    scale = det ** (-2 / 3)
-    first = scale * trace - 3
+    trace, scale, first = _first_invariant(f, det)
     slope = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
     bend = 4 * scale * scale * (2 * law[2] + 6 * law[3] * first)
     second, slopes = (0.0, f)
@@ -107,6 +97,17 @@ def distortion_stiffness(law, f, det, g, out):
                         curve += second * (16 / 9 * straight + 4 / 3 * mixed) - 4 / 3 * (slopes[i, j] * g[k, m] + g[i, j] * slopes[k, m])
                         value += scale2 * curve
                     out[i, j, k, m] = value
+
+
+@numba.njit(cache=True)
+def _first_invariant(f, det):
+    """tr C, J^(-2/3) and I1 - 3."""
+    trace = 0.0
+    for i in range(3):
+        for j in range(3):
+            trace += f[i, j] * f[i, j]
+    scale = det ** (-2 / 3)
+    return trace, scale, scale * trace - 3
 
 
 @numba.njit(cache=True)

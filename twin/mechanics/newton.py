@@ -10,9 +10,10 @@ often, and is cheap to find there.
 import numpy as np
 
 from twin.errors import ContactError
-from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem
-from twin.mechanics.condensed import Near, SmallContact, Tangent
+from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
+from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite
+from twin.mechanics.path import carried
 
 GAP_BOUND_MM = 0.01  # no contact point ends deeper inside the object
 RESIDUAL_TOLERANCE = 1e-6  # of the sum of the contact forces
@@ -20,7 +21,6 @@ _PENALTY_GROWTH, _PENALTY_RAISES = 4.0, 5
 _ITERATIONS = 30
 _WORSE = 2.0  # growth of the residual that is put up with
 _KEEP_TANGENT = 0.2  # contraction of the residual up to which an old tangent is kept
-_LARGEST_MOVE_MM = 1.5  # of a control in one iteration
 _SMALLEST_SHIFT_N_MM, _LARGEST_SHIFT_N_MM = 0.01, 50.0  # on the tangent's diagonal, where it leads astray
 _GEL_TANGENTS = 2  # for so many tangents the gel's, which changes little, is kept
 _NOTHING = np.zeros((0, 8, 3, 3))
@@ -114,10 +114,7 @@ class LoadStepper:
         if not len(at):
             return state.control_mm, state.border
 
-        def carried(start, stop):
-            return ((at - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - at).ravel()
-
-        before, now = carried(old.T, state.T), carried(state.T, T)
+        before, now = carried(at, old.T, state.T).ravel(), carried(at, state.T, T).ravel()
         ratio = (before @ now) / max(before @ before, 1e-300)
         if before @ now < 0.95 * np.linalg.norm(before) * np.linalg.norm(now) or ratio > 2:
             return state.control_mm, state.border
@@ -125,7 +122,7 @@ class LoadStepper:
         inside_out = any(np.isinf(kind.add_forces(control, _NOTHING, np.zeros_like(control))) for kind in self._body.kinds)
         return (state.control_mm if inside_out else control), state.border
 
-    def _accepted(self, state: LoadState, problem: "Problem", control, border, balance: Balance) -> LoadState:
+    def _accepted(self, state: LoadState, problem: Problem, control, border, balance: Balance) -> LoadState:
         contact, looked, count = balance.contact, problem.looked, len(state.held)
         self._last = state
         held, anchor, slid = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count)
@@ -138,9 +135,9 @@ class LoadStepper:
 
     def _seen(self, control, border, T) -> np.ndarray:
         """All contact points in the object's frame, (p, 3)."""
-        return (self._body.points.positions(control) - T[:3, 3] - [0, 0, border[0]]) @ T[:3, :3]
+        return in_object(self._body.points.positions(control), T, border)
 
-    def _solve(self, problem: "Problem", control, border, extrapolated: bool):
+    def _solve(self, problem: Problem, control, border, extrapolated: bool):
         balance = problem.balance(control, border)
         astray = False
         tangent, fresh, shift, last, accepted = self._tangent, False, 0.0, np.inf, 0
@@ -157,7 +154,7 @@ class LoadStepper:
                 fresh = False
             soften = astray or not (accepted or extrapolated)
             move, border_move = self._contact_move(problem, tangent, control, border, balance, soften)
-            size = min(1.0, _LARGEST_MOVE_MM / max(np.abs(move).max(), 1e-300))
+            size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move).max(), 1e-300))
             new, new_border = control.copy(), border + size * border_move
             new[self._body.free] += size * move.reshape(-1, 3)
             trial = problem.balance(new, new_border)
@@ -178,7 +175,7 @@ class LoadStepper:
             return control, border, balance
         raise NoConvergence(balance.relative)
 
-    def _linearise(self, problem: "Problem", control, border, shift: float) -> Tangent:
+    def _linearise(self, problem: Problem, control, border, shift: float) -> Tangent:
         """The body's tangent at a state, plus a shift on the diagonal."""
         self.eliminations += 1
         self._gel_age += 1
@@ -203,7 +200,7 @@ class LoadStepper:
         inner[eliminated.kept] = False
         return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]))
 
-    def _contact_move(self, problem: "Problem", tangent: Tangent, control, border, balance: Balance, soften: bool):
+    def _contact_move(self, problem: Problem, tangent: Tangent, control, border, balance: Balance, soften: bool):
         """The move (unknowns,) and (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept

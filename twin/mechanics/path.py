@@ -94,6 +94,16 @@ class ContactPath:
         return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([self.times_s, self.times_s[-1] + span[1:]]))
 
 
+def carried(points_mm: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+    """How far points (k, 3) move with an object that goes from one pose (4, 4) to another."""
+    return (points_mm - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - points_mm
+
+
+def deepest_mm(spec: SensorSpec) -> float:
+    """Half the gel's depth: no contact goes deeper."""
+    return 0.5 * (spec.skin.outer_radius_mm - spec.skin.thickness_mm - spec.lens.z_mm)
+
+
 def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
     """Check a pose and find its first touch with the undeformed skin: poses at touch, pressed, and (if it moves further) sheared.
 
@@ -147,9 +157,8 @@ def _check(spec: SensorSpec, pose: ContactPose) -> None:
     if values.shape != (8,) or not np.isfinite(values).all():
         raise ContactError(f"a contact pose needs finite numbers, got {values}; give numbers in mm and deg")
     radius = spec.skin.outer_radius_mm
-    deepest = 0.5 * (radius - spec.skin.thickness_mm - spec.lens.z_mm)
     limits = [
-        ("indent_mm", pose.indent_mm, deepest, "half the gel's depth"),
+        ("indent_mm", pose.indent_mm, deepest_mm(spec), "half the gel's depth"),
         ("tilt_deg", max(map(abs, pose.tilt_deg)), _LARGEST_TILT_DEG, "the dome's reach"),
         ("shear_mm", float(np.hypot(*pose.shear_mm)), radius / 2, "half the dome's radius"),
         ("twist_deg", abs(pose.twist_deg), _LARGEST_TWIST_DEG, "a quarter turn"),

@@ -20,7 +20,7 @@ from twin.mechanics.elements import Elements
 from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
-from twin.mechanics.path import ContactPath, ContactPose, dome_directions, plan_path
+from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, dome_directions, plan_path
 from twin.mechanics.relaxation import History
 from twin.stimulus import Stimulus, build_stimulus
 from twin.types import ContactState
@@ -31,7 +31,6 @@ _SMALLEST_STRIDE = 1 / 64  # of a regular load step
 _LOOK_MM = 2.0  # between the poses of the path at which that is looked for
 _FOCUS_POINTS = 2000  # on the sphere, to see where the object will press
 _FOCUS_POLAR_DEG, _FOCUS_AZIMUTH_DEG = 5.0, 15.0  # the focus's direction is rounded to these
-_FOCUS_RADIUS_RAD = np.radians(50.0)
 _MARGIN_RAD = np.radians(15.0)  # skin this far around what the rigid object would pass through may touch it
 
 
@@ -62,7 +61,7 @@ class SkinSolver:
     def rest(self, *, T_sensor_object: np.ndarray | None = None) -> ContactState:
         """The undeformed sensor."""
         with self._one_thread():
-            setting = self._setting(Focus(radius_rad=_FOCUS_RADIUS_RAD))
+            setting = self._setting(Focus())
         base, axis, caps = pin_pose(setting.solid, setting.solid.control_mm)
         return ContactState.untouched(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=T_sensor_object)
 
@@ -194,16 +193,15 @@ class SkinSolver:
         near = (directions @ reached.T).max(axis=1) > np.cos(_MARGIN_RAD)
         keep = np.zeros(len(solid.fixed), bool)
         keep[points.controls[near]] = True
-        return FrontalSolver(
-            [c.controls for c in (solid.skin, solid.gel_top, solid.gel_deep)], list(solid.boxes), solid.fixed, keep & ~solid.fixed
-        )
+        groups = [kind.cells.controls for kind in setting.body.kinds]
+        return FrontalSolver(groups, list(solid.boxes), solid.fixed, keep & ~solid.fixed)
 
     def _reached(self, field: Stimulus, plan: ContactPath) -> np.ndarray:
         """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""
         radius = self.spec.skin.outer_radius_mm
         directions = dome_directions(self.spec, _FOCUS_POINTS)
         deepest = np.full(len(directions), np.inf)
-        limit = 0.5 * (radius - self.spec.skin.thickness_mm - self.spec.lens.z_mm)
+        limit = deepest_mm(self.spec)
         for at in _stops(plan, directions, radius, _LOOK_MM):
             T = plan.at(at)
             gap = field.distance((radius * directions - T[:3, 3]) @ T[:3, :3])
@@ -267,7 +265,7 @@ def _focus(reached: np.ndarray) -> Focus:
     polar = np.degrees(np.arctan2(np.hypot(middle[0], middle[1]), middle[2]))
     polar = _FOCUS_POLAR_DEG * np.round(polar / _FOCUS_POLAR_DEG)
     azimuth = _FOCUS_AZIMUTH_DEG * np.round(np.degrees(np.arctan2(middle[1], middle[0])) / _FOCUS_AZIMUTH_DEG) if polar else 0.0
-    return Focus(float(np.radians(polar)), float(np.radians(azimuth)), float(_FOCUS_RADIUS_RAD))
+    return Focus(float(np.radians(polar)), float(np.radians(azimuth)))
 
 
 def _stops(plan: ContactPath, directions: np.ndarray, radius_mm: float, step_mm: float) -> np.ndarray:
@@ -275,8 +273,7 @@ def _stops(plan: ContactPath, directions: np.ndarray, radius_mm: float, step_mm:
     out = [np.zeros(1)]
     for leg in range(len(plan.poses) - 1):
         start, stop = plan.poses[leg], plan.poses[leg + 1]
-        at = radius_mm * directions
-        moved = (at - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - at
+        moved = carried(radius_mm * directions, start, stop)
         count = max(1, int(np.ceil(np.linalg.norm(moved, axis=1).max() / step_mm)))
         out.append(leg + np.arange(1, count + 1) / count)
     return np.concatenate(out)

@@ -53,17 +53,21 @@ def _step_in(point, low, spacing, count):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+def _place(points, k, corner, spacing, counts):
+    """Point k's cells along the three axes, and its way there from outside the grid in mm."""
+    x, away_x = _step_in(points[k, 0], corner[0], spacing, counts[0])
+    y, away_y = _step_in(points[k, 1], corner[1], spacing, counts[1])
+    z, away_z = _step_in(points[k, 2], corner[2], spacing, counts[2])
+    return _cell(x, counts[0]), _cell(y, counts[1]), _cell(z, counts[2]), (away_x, away_y, away_z)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
 def spline_value(coefficients, corner, spacing, points):
     """Values (k,) at points (k, 3); outside the grid the distance to it is added."""
     value = np.empty(len(points))
     counts = coefficients.shape
     for k in range(len(points)):
-        (x, away_x), (y, away_y), (z, away_z) = (
-            _step_in(points[k, 0], corner[0], spacing, counts[0]),
-            _step_in(points[k, 1], corner[1], spacing, counts[1]),
-            _step_in(points[k, 2], corner[2], spacing, counts[2]),
-        )
-        (i, tx), (j, ty), (m, tz) = _cell(x, counts[0]), _cell(y, counts[1]), _cell(z, counts[2])
+        (i, tx), (j, ty), (m, tz), (away_x, away_y, away_z) = _place(points, k, corner, spacing, counts)
         wx, wy, wz = _weights(tx), _weights(ty), _weights(tz)
         f = np.sqrt(away_x * away_x + away_y * away_y + away_z * away_z)
         for a in range(4):
@@ -79,12 +83,7 @@ def spline_probe(coefficients, corner, spacing, points):
     value, slope, hessian = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3, 3))
     counts, per_mm = coefficients.shape, 1 / spacing
     for k in range(len(points)):
-        (x, away_x), (y, away_y), (z, away_z) = (
-            _step_in(points[k, 0], corner[0], spacing, counts[0]),
-            _step_in(points[k, 1], corner[1], spacing, counts[1]),
-            _step_in(points[k, 2], corner[2], spacing, counts[2]),
-        )
-        (i, tx), (j, ty), (m, tz) = _cell(x, counts[0]), _cell(y, counts[1]), _cell(z, counts[2])
+        (i, tx), (j, ty), (m, tz), (away_x, away_y, away_z) = _place(points, k, corner, spacing, counts)
         wx, sx, bx = _weights(tx), _slopes(tx), _bends(tx)
         wy, sy, by = _weights(ty), _slopes(ty), _bends(ty)
         wz, sz, bz = _weights(tz), _slopes(tz), _bends(tz)

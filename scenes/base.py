@@ -7,6 +7,8 @@ from pydantic import BaseModel, ConfigDict, Field
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Index = Annotated[float, Field(ge=1, le=3)]
+NearOne = Annotated[float, Field(ge=0.9, le=1.1)]
 Rgb = tuple[Fraction, Fraction, Fraction]
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from scenes.base import Fraction, NonNegative, Positive, Rgb, Section
+from scenes.base import Fraction, Index, NearOne, NonNegative, Positive, Rgb, Section
 
 
 class RelaxationTerm(Section):
@@ -57,16 +57,32 @@ class SkinSpec(MaterialSpec):
 
 
 class GelSpec(MaterialSpec):
-    """Gel between skin and lens. ``sealed``: its volume as a whole stays exactly constant, whatever its Poisson's ratio."""
+    """Gel between skin and lens.
+
+    ``sealed``: its volume as a whole stays exactly constant, whatever its Poisson's ratio. ``absorption_per_mm``:
+    Beer-Lambert coefficients for red, green and blue. ``haze``: share of the light towards the camera that the gel
+    scatters forward, over a Gaussian of ``haze_sigma_px``.
+    """
 
     sealed: bool = False
+    refractive_index: Index = 1.41
+    absorption_per_mm: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
+    haze: Fraction = 0.0
+    haze_sigma_px: Positive = 20.0
 
 
 class LensSpec(Section):
-    """Rigid flat window that closes the gel; ``z_mm`` is its gel-side face."""
+    """Rigid flat window (acrylic) that closes the gel; ``z_mm`` is its gel-side face. Behind it is air."""
 
     z_mm: float
     radius_mm: Positive
+    thickness_mm: Positive = 2.0
+    refractive_index: Index = 1.49
+
+    @property
+    def back_mm(self) -> float:
+        """z of the face towards the camera."""
+        return self.z_mm - self.thickness_mm
 
 
 class PinsSpec(Section):
@@ -96,15 +112,20 @@ class PinsSpec(Section):
 
 
 class CameraSpec(Section):
-    """Effective pinhole camera, seen from inside the gel (window refraction absorbed).
+    """Camera in the air behind the window; refraction at the window comes on top of what is given here.
 
-    ``distance_mm``: pinhole to dome centre (the pinhole is at z = -distance). Tilts turn the
-    camera about its pinhole. Distortion: Brown-Conrady k1, k2, p1, p2 on normalised coordinates.
+    ``distance_mm``: entrance pupil to dome centre (the pupil is at z = -distance). Tilts turn the camera about its
+    pupil. ``projection``: ``perspective`` with Brown-Conrady distortion k1, k2, p1, p2 of the tangents, or ``fisheye``
+    (Kannala and Brandt 2006) with theta (1 + k1 theta^2 + k2 theta^4). ``aperture_mm`` is the pupil's diameter (0:
+    everything is sharp), ``focus_mm`` the distance in air, from the pupil, of what is sharp. ``vignetting`` is the
+    share of light lost at the corners, rising with the square of the distance from the image's middle.
+    ``red_scale`` and ``blue_scale``: size of these colours' images about (cx, cy) against green's.
     """
 
     width_px: Annotated[int, Field(ge=16, le=8192)]
     height_px: Annotated[int, Field(ge=16, le=8192)]
     channels: Literal["color", "mono"]
+    projection: Literal["perspective", "fisheye"] = "perspective"
     fx_px: Positive
     fy_px: Positive
     cx_px: float
@@ -116,13 +137,26 @@ class CameraSpec(Section):
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+    aperture_mm: NonNegative = 0.0
+    focus_mm: Positive = 50.0
+    vignetting: Fraction = 0.0
+    red_scale: NearOne = 1.0
+    blue_scale: NearOne = 1.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.projection == "fisheye" and (self.p1 or self.p2):
+            raise ValueError("p1 and p2 belong to projection = 'perspective'")
+        return self
 
 
 class LedRingSpec(Section):
-    """LEDs as apparent emitters on the gel's side (refraction absorbed): azimuths in the sensor frame.
+    """LEDs in the air behind the window, shining along +z: azimuths in the sensor frame.
 
-    Each is a square of ``size_mm`` at ``radius_mm`` from the axis in the plane ``z_mm``, shining along +z.
-    ``off`` lists indices of dead ones.
+    Each is a square of ``size_mm`` at ``radius_mm`` from the axis in the plane ``z_mm``, turned to face the axis.
+    ``power`` is the light of one LED (independent of its size), ``balance`` each one's share of it (empty: all 1),
+    ``off`` lists indices of dead ones. ``core_share`` of an LED's light comes from its middle (a Gaussian of sd
+    ``core_mm``): it shows in the LED's reflection in the window only.
     """
 
     azimuth_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=64)]
@@ -130,18 +164,28 @@ class LedRingSpec(Section):
     z_mm: float
     size_mm: Positive
     power: Positive = 1.0
+    balance: tuple[NonNegative, ...] = ()
     color: Rgb = (1.0, 1.0, 1.0)
     off: tuple[int, ...] = ()
+    core_share: Fraction = 0.0
+    core_mm: Positive = 0.3
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.balance and len(self.balance) != len(self.azimuth_deg):
+            raise ValueError("balance needs one number for each of azimuth_deg")
+        return self
 
 
 class HousingSpec(Section):
-    """The bright ring and wall around the disc the camera sees, at its apparent place.
+    """The bright ring and wall around the disc the camera sees, in the air.
 
     A flat annulus about (``center_mm``, ``z_mm``). Its light is relative to the LEDs' power: ``ambient``
     falls off outwards over ``ambient_falloff_mm``; each LED adds ``glow * (1 + d^2 / h^2)^-n`` at a distance
     d from its place at ``glow_radius_mm``, with h the ``glow_height_mm`` and n the ``glow_exponent`` (1.5: a
     small source at height h above matt material; higher: a glossy one). Outside a lip of ``lip_width_mm``
-    the wall shows only ``wall_fraction`` of this light.
+    the wall shows only ``wall_fraction`` of this light. ``fill`` is the radiance with which the innermost
+    ``fill_width_mm`` of the ring light the gel.
     """
 
     aperture_radius_mm: Positive
@@ -157,6 +201,8 @@ class HousingSpec(Section):
     glow_exponent: Positive = 1.5
     lip_width_mm: NonNegative = 1.0
     wall_fraction: Fraction = 1.0
+    fill: NonNegative = 0.0
+    fill_width_mm: Positive = 4.0
 
     @model_validator(mode="after")
     def _check(self):
@@ -165,34 +211,60 @@ class HousingSpec(Section):
         return self
 
 
-class AppearanceSpec(Section):
-    """Reflectances (linear, 0 to 1) of what the camera sees, and the LEDs' reflections in the lens.
+class SpeckSpec(Section):
+    """A bubble or grain on the window's gel side: a soft disc that hides ``opacity`` of what is behind it and sends ``light``."""
 
-    A glint is a square of ``glint_size_mm`` at ``glint_radius_mm`` in the housing's plane; its strength is
-    relative to the LEDs' power, 0 for none. ``cap_variation`` is the relative sd of the caps' reflectance
-    from pin to pin, a fixed pattern of ``cap_pattern`` (another number: another print of the same sensor).
+    x_mm: float
+    y_mm: float
+    radius_mm: Positive
+    opacity: Fraction
+    light: NonNegative = 0.0
+
+
+class AppearanceSpec(Section):
+    """Reflectances (linear, 0 to 1) of what the camera sees.
+
+    ``skin_gloss`` and ``cap_gloss`` are the weights of a rough specular lobe. ``cap_levels`` is each cap's
+    reflectance relative to ``cap_albedo``, in pin order, where it has been measured; without them ``cap_variation``
+    is the relative sd of a random pattern of number ``cap_pattern`` (another number: another print of the sensor).
+    ``cap_shapes``: each cap's outline, relative to a circle, as measured: coefficients a_2, b_2, a_3, b_3, ... of
+    ``1 + sum a_m cos(m t) + b_m sin(m t)``, t turning from the sensor's x towards y.
     """
 
     skin_albedo: Rgb
-    skin_gloss: Fraction
+    skin_gloss: Fraction = 0.0
+    skin_roughness: Annotated[float, Field(ge=0.05, le=1)] = 0.25
     pin_albedo: Rgb
     cap_albedo: Rgb
+    cap_gloss: Fraction = 0.0
+    cap_roughness: Annotated[float, Field(ge=0.05, le=1)] = 0.25
     cap_variation: Fraction = 0.0
     cap_pattern: Annotated[int, Field(ge=0)] = 0
-    glint_strength: Fraction = 0.5
-    glint_radius_mm: Positive = 16.5
-    glint_size_mm: Positive = 1.0
+    cap_levels: tuple[Positive, ...] = ()
+    cap_shapes: tuple[tuple[float, ...], ...] = ()
+    specks: tuple[SpeckSpec, ...] = ()
 
 
 class ResponseSpec(Section):
-    """From linear light to 8-bit gray levels: exposure, response curve, blur, noise."""
+    """From linear light to 8-bit gray levels, in this order.
+
+    ``blur_sigma_px`` of the optics; ``exposure`` and ``white_balance``; ``brightness_drift``: relative sd of a gain
+    drawn for each frame; noise with variance ``read_noise^2 + shot_noise * light``, light 1 being saturation;
+    the curve ``black + (255 - black) light^(1 / gamma)``; ``sharpening``: weight of the unsharp mask of
+    ``sharpening_sigma_px`` that cameras apply; ``jpeg_quality`` of the stream (0: not compressed).
+    """
 
     exposure: Positive
     gamma: Positive
     black_level: Annotated[float, Field(ge=0, lt=128)]
     white_balance: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     blur_sigma_px: NonNegative
-    noise_sd: NonNegative
+    brightness_drift: Fraction = 0.0
+    read_noise: NonNegative = 2e-4
+    shot_noise: NonNegative = 6e-5
+    sharpening: NonNegative = 0.0
+    sharpening_sigma_px: Positive = 1.5
+    jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 0
 
 
 class RecordingSpec(Section):
@@ -271,8 +343,16 @@ class SensorSpec(Section):
             raise ValueError("lens.z_mm must not lie in front of skin.rim_z_mm")
         if self.skin.rim_z_mm >= inner_mm * math.cos(math.radians(pins.max_polar_deg)):
             raise ValueError("pins.max_polar_deg puts pins behind skin.rim_z_mm")
-        if self.camera.distance_mm <= -self.lens.z_mm:
-            raise ValueError("camera.distance_mm must put the pinhole behind the lens (greater than -lens.z_mm)")
+        if self.camera.distance_mm <= -self.lens.back_mm:
+            raise ValueError("camera.distance_mm must put the pupil behind the window (greater than lens.thickness_mm - lens.z_mm)")
+        if self.leds.z_mm > self.lens.back_mm:
+            raise ValueError("leds.z_mm must not lie in front of the window's back (lens.z_mm - lens.thickness_mm)")
+        if self.appearance.cap_shapes and {len(c) % 2 for c in self.appearance.cap_shapes} | {
+            len(self.appearance.cap_shapes) - pins.count
+        } != {0}:
+            raise ValueError(f"appearance.cap_shapes needs pairs of coefficients for each of the {pins.count} pins")
+        if self.appearance.cap_levels and len(self.appearance.cap_levels) != pins.count:
+            raise ValueError(f"appearance.cap_levels needs one number for each of the {pins.count} pins")
         if (self.recording is None) != (self.pipeline.recording is None):
             raise ValueError("recording and pipeline.recording go together: give both or neither")
         return self

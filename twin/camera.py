@@ -3,39 +3,123 @@
 import cv2
 import numpy as np
 
-from scenes.sensor import RecordingSpec, ResponseSpec
+from scenes.sensor import CameraSpec, GelSpec, RecordingSpec, ResponseSpec, SensorSpec
 from twin.errors import FrameError
 
+JPEG_BLOCK_PX = 16  # the unit of a JPEG with halved chroma
 MEDIAN_PX = 5  # the recorder's own despeckling before its threshold
 
 
-def expose(linear: np.ndarray, response: ResponseSpec, rng: np.random.Generator | None = None) -> np.ndarray:
-    """What the camera makes of the light: a raw frame.
+def expose(
+    linear: np.ndarray, spec: SensorSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
+) -> np.ndarray:
+    """What gel, lens and camera make of the light: a raw frame.
 
-    Blur (defocus and optics) acts on light, then ``gray = black + (255 - black) * clip(exposure * balance * light)^(1 / gamma)``,
-    then noise. Its sd is one number in gray levels: measured over time in real frames it hardly depends on the level,
-    the response curve compressing the shot noise of bright pixels.
+    Gel haze, lateral chromatic aberration, blur and vignetting act on light; then come gain, noise, the response curve,
+    sharpening of the gray levels and the stream's compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). A step whose
+    parameter is neutral does nothing at all.
 
     Parameters
     ----------
     linear : (H, W, 3) or (H, W) float
-    response : ResponseSpec
-        White balance applies to colour only.
+        Chromatic aberration and white balance apply to colour only.
+    spec : SensorSpec
     rng : numpy.random.Generator, optional
-        Source of the noise; no noise without it.
+        Source of the frame's gain and noise; without it there is neither.
+    origin_px : (x, y)
+        Place of ``linear``'s first pixel in the camera's full frame, where only a part was rendered.
 
     Returns
     -------
     (H, W, 3) or (H, W) uint8
     """
-    light = np.asarray(linear, np.float32)
-    if response.blur_sigma_px > 0:
-        light = cv2.GaussianBlur(light, (0, 0), response.blur_sigma_px, borderType=cv2.BORDER_REPLICATE)
-    gain = response.exposure * (np.array(response.white_balance, np.float32) if light.ndim == 3 else 1.0)
-    gray = response.black_level + (255 - response.black_level) * np.clip(gain * light, 0, 1) ** (1 / response.gamma)
-    if rng is not None and response.noise_sd > 0:
-        gray = gray + response.noise_sd * rng.standard_normal(gray.shape, dtype=np.float32)
-    return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    response = spec.response
+    light = hazed(np.asarray(linear, np.float32), spec.gel)
+    light = dispersed(light, spec.camera, origin_px)
+    light = blurred(light, response.blur_sigma_px)
+    light = vignetted(light, spec.camera, origin_px)
+    light = amplified(light, response, rng)
+    light = noisy(light, response, rng)
+    gray = sharpened(curve(light, response), response)
+    return compressed(np.clip(np.rint(gray), 0, 255).astype(np.uint8), response.jpeg_quality, origin_px)
+
+
+def hazed(light: np.ndarray, gel: GelSpec) -> np.ndarray:
+    """A share of the light scattered forward by the gel."""
+    if gel.haze == 0:
+        return light
+    return light + np.float32(gel.haze) * (blurred(light, gel.haze_sigma_px) - light)
+
+
+def dispersed(light: np.ndarray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Red and blue images at their own scale about the principal point: ``red'(c + scale (p - c)) = red(p)``."""
+    scales = {0: camera.red_scale, 2: camera.blue_scale}
+    if light.ndim == 2 or set(scales.values()) == {1.0}:
+        return light
+    light = light.copy()
+    for channel, scale in scales.items():
+        if scale != 1:
+            across = _scaled(np.ascontiguousarray(light[..., channel].T), scale, camera.cx_px - origin_px[0])
+            light[..., channel] = _scaled(np.ascontiguousarray(across.T), scale, camera.cy_px - origin_px[1])
+    return light
+
+
+def blurred(light: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Gaussian blur that keeps the light's sum: the frame goes on mirrored."""
+    return cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT) if sigma_px > 0 else light
+
+
+def vignetted(light: np.ndarray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Light times ``1 - vignetting r^2``, r the distance from the full frame's middle over that of its corners."""
+    if camera.vignetting == 0:
+        return light
+    x = origin_px[0] + np.arange(light.shape[1]) - (camera.width_px - 1) / 2
+    y = origin_px[1] + np.arange(light.shape[0]) - (camera.height_px - 1) / 2
+    r2 = 4 * (x**2 + y[:, None] ** 2) / (camera.width_px**2 + camera.height_px**2)
+    loss = (1 - camera.vignetting * r2).astype(np.float32)
+    return light * (loss[..., None] if light.ndim == 3 else loss)
+
+
+def amplified(light: np.ndarray, response: ResponseSpec, rng: np.random.Generator | None = None) -> np.ndarray:
+    """Exposure, white balance (colour only) and, with a generator, the frame's own gain."""
+    gain = response.exposure * np.array(response.white_balance if light.ndim == 3 else 1.0)
+    if rng is not None and response.brightness_drift > 0:
+        gain = gain * max(1 + response.brightness_drift * rng.standard_normal(), 0)
+    return light if np.all(gain == 1) else light * gain.astype(np.float32)
+
+
+def noisy(light: np.ndarray, response: ResponseSpec, rng: np.random.Generator | None = None) -> np.ndarray:
+    """Normal noise of variance ``read_noise^2 + shot_noise * light``; none without a generator."""
+    if rng is None or (response.read_noise == 0 and response.shot_noise == 0):
+        return light
+    sd = np.sqrt(np.float32(response.read_noise**2) + np.float32(response.shot_noise) * np.maximum(light, 0))
+    return light + sd * rng.standard_normal(light.shape, dtype=np.float32)
+
+
+def curve(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
+    """Gray levels ``black + (255 - black) clip(light)^(1 / gamma)``, not rounded."""
+    shown = np.clip(light, 0, 1)
+    shown = shown if response.gamma == 1 else shown ** np.float32(1 / response.gamma)
+    return np.float32(response.black_level) + np.float32(255 - response.black_level) * shown
+
+
+def sharpened(gray: np.ndarray, response: ResponseSpec) -> np.ndarray:
+    """Unsharp mask: gray levels pushed away from their blurred ones."""
+    if response.sharpening == 0:
+        return gray
+    return gray + np.float32(response.sharpening) * (gray - blurred(gray, response.sharpening_sigma_px))
+
+
+def compressed(frame: np.ndarray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """What a JPEG stream with halved chroma leaves of a frame (0: all). Blocks lie where the full frame's do."""
+    if quality == 0:
+        return frame
+    left, top = (place % JPEG_BLOCK_PX for place in origin_px)
+    whole = cv2.copyMakeBorder(frame, top, 0, left, 0, cv2.BORDER_REPLICATE)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    _, stream = cv2.imencode(".jpg", whole[..., ::-1] if frame.ndim == 3 else whole, options)
+    back = cv2.imdecode(stream, cv2.IMREAD_UNCHANGED)[top:, left:]
+    return np.ascontiguousarray(back[..., ::-1] if frame.ndim == 3 else back)
 
 
 def record(raw: np.ndarray, recording: RecordingSpec, *, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
@@ -67,3 +151,12 @@ def record(raw: np.ndarray, recording: RecordingSpec, *, origin_px: tuple[int, i
     binary = cv2.adaptiveThreshold(calm, 255, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, block, offset)
     size = (recording.width_px, recording.height_px)
     return binary if binary.shape[::-1] == size else cv2.resize(binary, size, interpolation=cv2.INTER_AREA)
+
+
+def _scaled(plane: np.ndarray, scale: float, centre: float) -> np.ndarray:
+    """Rows of a plane (n, m) drawn apart about row ``centre``: cubic convolution (Keys 1981), which keeps centroids exactly."""
+    place = centre + (np.arange(len(plane)) - centre) / scale
+    first = np.floor(place).astype(int)
+    t = (place - first)[:, None].astype(np.float32)
+    taps = (((2 - t) * t - 1) * t / 2, ((3 * t - 5) * t * t + 2) / 2, ((4 - 3 * t) * t + 1) * t / 2, (t - 1) * t * t / 2)
+    return sum(tap * plane[np.clip(first + k - 1, 0, len(plane) - 1)] for k, tap in enumerate(taps))

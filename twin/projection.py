@@ -1,22 +1,32 @@
-"""The camera's projection: sensor-frame points to raw-frame pixels and back to rays.
+"""The camera's projection: sensor-frame points to raw-frame pixels and back to rays, through the window.
 
-Brown-Conrady distortion (Brown 1966): with x = X / Z, y = Y / Z, r^2 = x^2 + y^2,
+The camera stands in air behind a plane window (acrylic), before which is gel. All planes are normal to z, so a ray stays
+in one plane through the axis of the pupil and obeys n sin(theta) = const. With u the tangent of its angle in air,
+a point at a height h_k in each layer k is met at the distance
+
+    rho(u) = sum_k h_k tan(theta_k),   sin(theta_k) = u / (n_k sqrt(1 + u^2))
+
+from that axis. rho grows with u and is concave: Newton's method from the left converges monotonically.
+
+Distortion: Brown-Conrady (Brown 1966) with x = X / Z, y = Y / Z, r^2 = x^2 + y^2,
 x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),
-y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y.
+y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y;
+or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 + k2 theta^4).
 """
 
 import numpy as np
 
-from scenes.sensor import CameraSpec
+from scenes.sensor import CameraSpec, SensorSpec
 
 NEWTON_STEPS = 12  # quadratic: the last ones only polish
 MOST_NEWTON_MOVE = 0.1  # per step, normalised: keeps far starts from jumping past the fold
+GRAZING = 1e6  # tangent beyond which a ray counts as parallel to the window
 
 
 def sensor_to_camera(camera: CameraSpec) -> np.ndarray:
     """``T_camera_sensor`` (4, 4): camera looks along +z with x right and y down.
 
-    The pinhole is at (0, 0, -distance) of the sensor frame; the camera is turned about it
+    The entrance pupil is at (0, 0, -distance) of the sensor frame; the camera is turned about it
     by tilt_x (about x), then tilt_y (about y).
     """
     ax, ay = np.radians([camera.tilt_x_deg, camera.tilt_y_deg])
@@ -29,9 +39,13 @@ def sensor_to_camera(camera: CameraSpec) -> np.ndarray:
 
 
 def distort(camera: CameraSpec, xy: np.ndarray) -> np.ndarray:
-    """Ideal normalised image coordinates (..., 2) to distorted ones."""
+    """Tangents (..., 2) of rays in the camera frame to normalised image coordinates."""
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
+    if camera.projection == "fisheye":
+        radius = np.sqrt(r2)
+        scale = _fisheye(camera, np.arctan(radius)) / np.maximum(radius, 1e-12)
+        return xy * np.where(radius > 1e-12, scale, 1.0)[..., None]
     radial = 1 + camera.k1 * r2 + camera.k2 * r2 * r2
     return np.stack(
         [
@@ -43,10 +57,17 @@ def distort(camera: CameraSpec, xy: np.ndarray) -> np.ndarray:
 
 
 def undistort(camera: CameraSpec, seen: np.ndarray, *, guess: np.ndarray | None = None) -> np.ndarray:
-    """Distorted normalised coordinates (..., 2) to ideal ones: Newton's method on ``distort(ideal) = seen``.
+    """Normalised image coordinates (..., 2) to tangents: Newton's method on ``distort(ideal) = seen``.
 
     Starts at ``guess`` (default: ``seen``). Meaningless where the distortion folds back, outside its valid field.
     """
+    if camera.projection == "fisheye":
+        radius = np.linalg.norm(seen, axis=-1)
+        angle = radius if guess is None else np.arctan(np.linalg.norm(guess, axis=-1))
+        for _ in range(NEWTON_STEPS):
+            slope = 1 + 3 * camera.k1 * angle**2 + 5 * camera.k2 * angle**4
+            angle = np.clip(angle - (_fisheye(camera, angle) - radius) / np.maximum(slope, 0.05), 0, np.pi / 2 - 1e-6)
+        return seen * (np.tan(angle) / np.maximum(radius, 1e-12))[..., None]
     ideal, step = np.array(seen if guess is None else guess, float), 1e-6
     for _ in range(NEWTON_STEPS):
         along_x, along_y = ((distort(camera, ideal + d) - distort(camera, ideal - d)) / (2 * step) for d in ([step, 0.0], [0.0, step]))
@@ -57,21 +78,66 @@ def undistort(camera: CameraSpec, seen: np.ndarray, *, guess: np.ndarray | None 
     return ideal
 
 
+def project(spec: SensorSpec, points_mm: np.ndarray) -> np.ndarray:
+    """Sensor-frame points (..., 3) in front of the camera to raw-frame pixels (..., 2), pixel centres at integers.
+
+    A point's height decides the layers its ray passes: points behind the window are seen straight.
+    """
+    camera = spec.camera
+    rho = np.linalg.norm(points_mm[..., :2], axis=-1)
+    tangent = window_tangent(spec, rho, points_mm[..., 2])
+    across = points_mm[..., :2] * (tangent / np.maximum(rho, 1e-12))[..., None]
+    in_sensor = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
+    in_camera = in_sensor @ sensor_to_camera(camera)[:3, :3].T
+    return distort(camera, in_camera[..., :2] / in_camera[..., 2:]) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+
+
+def window_tangent(spec: SensorSpec, rho_mm: np.ndarray, z_mm: np.ndarray, *, behind_mm: float | None = None) -> np.ndarray:
+    """Tangent u of the angle in air of the rays that join (0, z0) to (rho, z), z0 the pupil's or ``behind_mm``."""
+    heights, indices = _layers(spec, z_mm, -spec.camera.distance_mm if behind_mm is None else behind_mm)
+    u = rho_mm / sum(h / n for h, n in zip(heights, indices, strict=True))
+    for _ in range(NEWTON_STEPS):
+        reach, slope = 0.0, 0.0
+        for h, n in zip(heights, indices, strict=True):
+            rest = n * n + (n * n - 1) * u * u  # tan(theta) = u / sqrt(rest)
+            reach = reach + h * u / np.sqrt(rest)
+            slope = slope + h * n * n / rest**1.5
+        u = np.clip(u + (rho_mm - reach) / slope, 0, GRAZING)
+    return u
+
+
+def pixel_rays(spec: SensorSpec, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays of raw-frame pixels (..., 2) enter the gel, (..., 3) mm, and their unit directions (..., 3) in it."""
+    camera = spec.camera
+    ideal = undistort(camera, (np.asarray(pixels, float) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px])
+    in_camera = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
+    direction = in_camera @ sensor_to_camera(camera)[:3, :3]
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    place = np.zeros_like(direction)
+    place[..., 2] = -camera.distance_mm
+    for index, before, height in (
+        (1.0, 1.0, spec.lens.back_mm + camera.distance_mm),
+        (spec.lens.refractive_index, 1.0, spec.lens.thickness_mm),
+        (spec.gel.refractive_index, spec.lens.refractive_index, 0.0),
+    ):
+        across = direction[..., :2] * before / index
+        up = np.sqrt(np.maximum(1 - np.sum(across**2, axis=-1, keepdims=True), 0))
+        direction = np.concatenate([across, up], axis=-1)
+        place = place + direction * height / np.maximum(up, 1e-12)
+    return place, direction
+
+
+def _layers(spec: SensorSpec, z_mm: np.ndarray, from_mm: float) -> tuple[tuple, tuple]:
+    """Heights of air, window and gel between the planes ``from_mm`` (in the air) and ``z_mm``, and their indices."""
+    back, front = spec.lens.back_mm, spec.lens.z_mm
+    z = np.asarray(z_mm, float)
+    heights = np.minimum(z, back) - from_mm, np.clip(z, back, front) - back, np.maximum(z - front, 0)
+    return heights, (1.0, spec.lens.refractive_index, spec.gel.refractive_index)
+
+
+def _fisheye(camera: CameraSpec, angle: np.ndarray) -> np.ndarray:
+    return angle * (1 + camera.k1 * angle**2 + camera.k2 * angle**4)
+
+
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def project(camera: CameraSpec, points_mm: np.ndarray) -> np.ndarray:
-    """Sensor-frame points (..., 3) to raw-frame pixels (..., 2), pixel centres at integers."""
-    T = sensor_to_camera(camera)
-    in_camera = points_mm @ T[:3, :3].T + T[:3, 3]
-    xy = distort(camera, in_camera[..., :2] / in_camera[..., 2:])
-    return xy * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
-
-
-def pixel_rays(camera: CameraSpec, pixels: np.ndarray) -> np.ndarray:
-    """Unit ray directions (..., 3) in the camera frame for raw-frame pixels (..., 2)."""
-    xy = (np.asarray(pixels, float) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-    ideal = undistort(camera, xy)
-    rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)

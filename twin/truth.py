@@ -6,7 +6,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.preprocess.forms import frame_size, from_raw
-from twin.projection import project
+from twin.projection import pixel_rays, project
 from twin.types import ContactState, Form
 
 
@@ -32,23 +32,23 @@ class CapTruth:
 
 def cap_truth(spec: SensorSpec, rest: ContactState, state: ContactState, form: Form) -> CapTruth:
     """Ground truth of a contact for frames of the given form."""
-    caps_px = from_raw(spec, form, project(spec.camera, state.caps_mm))
-    rest_px = from_raw(spec, form, project(spec.camera, rest.caps_mm))
+    caps_px = from_raw(spec, form, project(spec, state.caps_mm))
+    rest_px = from_raw(spec, form, project(spec, rest.caps_mm))
     inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
     return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec, state))
 
 
 def occluded(spec: SensorSpec, state: ContactState) -> np.ndarray:
-    """(N,) bool: the segment from the pinhole to the cap's centre passes through another pin.
+    """(N,) bool: the ray in the gel from the window to the cap's centre passes through another pin.
 
     Pins count as capsules of the cap's radius around the axis from foot to cap.
     """
-    eye = np.array([0.0, 0.0, -spec.camera.distance_mm])
+    window_mm, _ = pixel_rays(spec, project(spec, state.caps_mm))
     radius = spec.pins.cap_diameter_mm / 2
     count = len(state.caps_mm)
     hidden = np.zeros(count, bool)
     for i in range(count):
-        gap = _segment_distance(eye, state.caps_mm[i], state.base_mm, state.caps_mm)
+        gap = _segment_distance(window_mm[i], state.caps_mm[i], state.base_mm, state.caps_mm)
         gap[i] = np.inf
         hidden[i] = gap.min(initial=np.inf) < radius
     return hidden

@@ -67,7 +67,7 @@ class Comparison:
         return self.no_contact_px + self._pixels(state) - self.rest_px
 
     def _pixels(self, state):
-        return raw_to_recording(self.spec, project(self.spec.camera, state.caps_mm))
+        return raw_to_recording(self.spec, project(self.spec, state.caps_mm))
 
 
 @pytest.fixture(scope="module", params=SETS)

@@ -1,19 +1,59 @@
-"""The capture side: exposure, response, noise, and the recorder's binary images."""
+"""The capture side: gel, lens, camera, and the recorder's binary images."""
 
 import cv2
 import numpy as np
 import pytest
 
-from scenes.sensor import RecordingSpec, ResponseSpec
-from twin.camera import expose, record
+from scenes import load_sensor
+from scenes.sensor import RecordingSpec, SensorSpec
+from twin.camera import amplified, blurred, compressed, curve, dispersed, expose, hazed, noisy, record, sharpened, vignetted
 from twin.errors import FrameError
 
-PLAIN = ResponseSpec(exposure=1.0, gamma=2.2, black_level=4.0, blur_sigma_px=0.0, noise_sd=0.0)
 RECORDING = RecordingSpec(crop_px=(20, 10, 140, 110), width_px=120, height_px=100, threshold_block_px=61, threshold_offset=-5.0)
+WIDTH, HEIGHT = 160, 120
+NEUTRAL = {
+    "gel": {"haze": 0.0},
+    "camera": {
+        "vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "width_px": WIDTH, "height_px": HEIGHT, "cx_px": 83.0, "cy_px": 56.5,
+    },
+    "response": {
+        "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "gamma": 1.0, "black_level": 0.0, "blur_sigma_px": 0.0,
+        "brightness_drift": 0.0, "read_noise": 0.0, "shot_noise": 0.0, "sharpening": 0.0, "jpeg_quality": 0,
+    },
+}  # fmt: skip
+FULL = {
+    "gel": {"haze": 0.1, "haze_sigma_px": 4.0},
+    "camera": {"vignetting": 0.3, "red_scale": 1.01, "blue_scale": 0.99},
+    "response": {"exposure": 0.8, "white_balance": (1.2, 1.0, 0.9), "gamma": 2.2, "blur_sigma_px": 0.6, "sharpening": 0.5},
+}
+SECTIONS = [(section, key, value) for section, values in FULL.items() for key, value in values.items() if key != "haze_sigma_px"]
 
 
-def with_(spec, **change):
-    return spec.model_copy(update=change)
+def changed(spec: SensorSpec, **sections) -> SensorSpec:
+    """A copy of the specification with values changed, section by section."""
+    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
+
+
+PLAIN = changed(load_sensor("ur5-331"), **NEUTRAL)
+CURVED = changed(PLAIN, response={"gamma": 2.2, "black_level": 4.0})
+
+
+def picture(seed: int = 0) -> np.ndarray:
+    """Smooth light (H, W, 3) between 0 and 1."""
+    light = cv2.GaussianBlur(np.random.default_rng(seed).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32), (0, 0), 2.0)
+    return (light - light.min()) / np.ptp(light)
+
+
+def spot(x: float, y: float, sigma_px: float = 2.5) -> np.ndarray:
+    """A Gaussian spot of light (H, W, 3), the same in all colours."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    return np.repeat(np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma_px**2))[..., None], 3, axis=2).astype(np.float32)
+
+
+def centroid(image: np.ndarray) -> np.ndarray:
+    """Light-weighted centroid (x, y)."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    return np.array([(image * x).sum(), (image * y).sum()], float) / image.sum(dtype=float)
 
 
 def dots(gray: int = 120) -> np.ndarray:
@@ -25,50 +65,169 @@ def dots(gray: int = 120) -> np.ndarray:
     return frame
 
 
+def test_a_neutral_camera_only_rounds():
+    light = picture()
+    assert (expose(light, PLAIN) == np.rint(255 * light)).all()
+    assert (expose(light, PLAIN, np.random.default_rng(0)) == expose(light, PLAIN)).all(), "noise of size zero"
+
+
+@pytest.mark.parametrize(("section", "key", "value"), SECTIONS)
+def test_each_step_acts_in_the_chain(section, key, value):
+    full = changed(PLAIN, **FULL)
+    without = changed(full, **{section: {key: NEUTRAL[section][key]}})
+    assert (expose(picture(), full) != expose(picture(), without)).any()
+
+
+def test_a_neutral_step_hands_the_very_same_light_on():
+    light, frame, rng = picture(), expose(picture(), PLAIN), np.random.default_rng(0)
+    optics = hazed(light, PLAIN.gel), dispersed(light, PLAIN.camera), blurred(light, 0.0), vignetted(light, PLAIN.camera)
+    film = amplified(light, PLAIN.response, rng), noisy(light, PLAIN.response, rng), sharpened(light, PLAIN.response)
+    assert all(handed is light for handed in (*optics, *film)) and compressed(frame, 0) is frame
+    assert rng.standard_normal() == np.random.default_rng(0).standard_normal(), "a neutral step drew a number"
+
+
 def test_black_is_the_black_level_and_white_saturates():
-    assert (expose(np.zeros((4, 5)), PLAIN) == 4).all()
-    assert (expose(np.full((4, 5, 3), 7.0), PLAIN) == 255).all()
+    assert (expose(np.zeros((4, 5)), CURVED) == 4).all()
+    assert (expose(np.full((4, 5, 3), 7.0), CURVED) == 255).all()
 
 
 def test_more_exposure_is_never_darker():
-    light = np.random.default_rng(0).uniform(0, 1.2, (40, 30, 3))
-    frames = [expose(light, with_(PLAIN, exposure=e, blur_sigma_px=0.8)).astype(int) for e in (0.3, 0.6, 1.2)]
+    frames = [expose(picture(), changed(CURVED, response={"exposure": e, "blur_sigma_px": 0.8})).astype(int) for e in (0.3, 0.6, 1.2)]
     assert (np.diff(frames, axis=0) >= 0).all() and frames[2].mean() > frames[0].mean() + 20
 
 
-def test_white_balance_acts_on_its_channel():
+def test_white_balance_acts_on_its_channel_and_on_colour_only():
+    warm = changed(CURVED, response={"white_balance": (2.0, 1.0, 1.0)})
     light = np.full((4, 4, 3), 0.2)
-    assert expose(light, with_(PLAIN, white_balance=(2.0, 1.0, 1.0)))[0, 0, 0] > expose(light, PLAIN)[0, 0, 0]
-    assert (expose(light, with_(PLAIN, white_balance=(2.0, 1.0, 1.0)))[..., 1:] == expose(light, PLAIN)[..., 1:]).all()
+    assert expose(light, warm)[0, 0, 0] > expose(light, CURVED)[0, 0, 0]
+    assert (expose(light, warm)[..., 1:] == expose(light, CURVED)[..., 1:]).all()
+    assert (expose(light[..., 0], warm) == expose(light[..., 0], CURVED)).all()
 
 
-@pytest.mark.parametrize("sd", [0.9, 3.0])
-def test_noise_has_the_specified_sd(sd):
-    light = np.full((400, 400), 0.2)
-    noisy = expose(light, with_(PLAIN, noise_sd=sd), np.random.default_rng(1)).astype(float)
-    quantisation_var = 1 / 12
-    sampling_tolerance = 0.02  # relative; 160 000 pixels give 0.2 %
-    assert noisy.std() == pytest.approx(np.sqrt(sd**2 + quantisation_var), rel=sampling_tolerance)
-    assert (expose(light, with_(PLAIN, noise_sd=sd)) == expose(light, PLAIN)).all(), "no generator, no noise"
+@pytest.mark.parametrize("gray", [23.0, 125.0])
+def test_noise_is_read_and_shot_noise_through_the_curve(gray):
+    """sd of gray = slope of the curve at the mean light times sqrt(read^2 + shot light); here dark skin and caps of real frames."""
+    noise = {"read_noise": 2e-4, "shot_noise": 6e-5}
+    light = np.float32(((gray - 4) / 251) ** 2.2)
+    frames = expose(np.full((600, 600), light), changed(CURVED, response=noise), np.random.default_rng(1)).astype(float)
+    slope = (251 / 2.2) * light ** (1 / 2.2 - 1)
+    expected = np.hypot(slope * np.sqrt(noise["read_noise"] ** 2 + noise["shot_noise"] * light), np.sqrt(1 / 12))
+    curvature = 0.03  # relative: the curve is not straight over the noise; sampling adds 0.1 %
+    assert frames.std() == pytest.approx(expected, rel=curvature)
+    real_sd = 1.0  # gray levels; 0.8 to 1.1 in real frames
+    assert frames.std() == pytest.approx(real_sd, abs=0.35)
+
+
+def test_a_frames_gain_varies_by_the_drift_and_is_one_for_all_pixels():
+    spec, rng = changed(PLAIN, response={"brightness_drift": 0.05}), np.random.default_rng(3)
+    frames = np.array([expose(np.full((4, 5, 3), 0.5), spec, rng) for _ in range(800)], float)
+    assert (np.ptp(frames, axis=(1, 2, 3)) == 0).all()
+    few = 0.08  # relative: 800 draws give a sd to 2.5 %
+    assert frames[:, 0, 0, 0].std() == pytest.approx(0.05 * 0.5 * 255, rel=few)
 
 
 def test_noise_is_new_in_every_frame_and_the_same_for_the_same_seed():
-    light, response = np.full((50, 50), 0.2), with_(PLAIN, noise_sd=1.0)
+    light = np.full((50, 50), 0.2)
+    spec = changed(CURVED, response={"read_noise": 1e-2, "brightness_drift": 0.01})
     rng = np.random.default_rng(5)
-    first, second = expose(light, response, rng), expose(light, response, rng)
+    first, second = expose(light, spec, rng), expose(light, spec, rng)
     assert (first != second).any()
-    assert (expose(light, response, np.random.default_rng(5)) == first).all()
+    assert (expose(light, spec, np.random.default_rng(5)) == first).all()
+    assert (expose(light, spec) == expose(light, CURVED)).all(), "no generator, no noise and no drift"
 
 
-def test_blur_keeps_the_light_and_widens_an_edge_by_its_sigma():
-    """Linear response: the blurred step is the normal distribution function, 10-90 % over 2.563 sigma."""
-    light = np.zeros((20, 200))
+def test_blur_widens_an_edge_by_its_sigma():
+    """The blurred step is the normal distribution function, 10-90 % over 2.563 sigma."""
+    light = np.zeros((20, 200), np.float32)
     light[:, 100:] = 0.8
-    linear = with_(PLAIN, gamma=1.0, black_level=0.0, blur_sigma_px=4.0)
-    row = expose(light, linear)[10].astype(float) / (0.8 * 255)
+    row = blurred(light, 4.0)[10] / 0.8
     width = np.interp(0.9, row, np.arange(200)) - np.interp(0.1, row, np.arange(200))
-    quantisation_px = 0.2
-    assert width == pytest.approx(2.563 * 4.0, abs=quantisation_px)
+    sampling_px = 0.06  # of kernel and step
+    assert width == pytest.approx(2.563 * 4.0, abs=sampling_px)
+
+
+def test_blur_and_haze_keep_the_light():
+    light, rounding = picture(), 1e-6
+    gel = PLAIN.gel.model_copy(update={"haze": 0.3, "haze_sigma_px": 20.0})
+    for spread in (blurred(light, 3.0), hazed(light, gel)):
+        np.testing.assert_allclose(spread.mean(axis=(0, 1), dtype=float), light.mean(axis=(0, 1), dtype=float), rtol=rounding)
+    even = np.full_like(light, 0.4)
+    np.testing.assert_allclose(hazed(even, gel), even, rtol=rounding)
+
+
+def test_haze_takes_its_share_from_a_spot():
+    """What is left of a spot much smaller than the haze's reach is 1 - haze of it."""
+    light, gel = spot(80, 60, 1.0), PLAIN.gel.model_copy(update={"haze": 0.2, "haze_sigma_px": 15.0})
+    spread_light = 0.2 * (1.0**2 / 15.0**2)  # the peak of what is scattered
+    np.testing.assert_allclose(hazed(light, gel)[60, 80], 1 - 0.2, atol=2 * spread_light)
+
+
+@pytest.mark.parametrize("place", [(30.3, 20.2), (120.7, 90.5), (83.0, 56.5)])
+def test_red_and_blue_move_by_their_scale_times_the_distance(place):
+    spec = changed(PLAIN, camera={"red_scale": 1.02, "blue_scale": 0.985})
+    seen = dispersed(spot(*place), spec.camera)
+    middle = np.array([spec.camera.cx_px, spec.camera.cy_px])
+    rounding_px = 1e-3
+    for channel, scale in ((0, 1.02), (1, 1.0), (2, 0.985)):
+        moved = centroid(seen[..., channel]) - centroid(spot(*place)[..., channel])
+        np.testing.assert_allclose(moved, (scale - 1) * (np.array(place) - middle), atol=rounding_px)
+
+
+def test_mono_light_is_not_dispersed():
+    light = picture()[..., 0]
+    assert dispersed(light, changed(PLAIN, camera={"red_scale": 1.02}).camera) is light
+
+
+def test_vignetting_takes_its_share_at_the_corners_and_falls_with_the_square():
+    loss = 1 - vignetted(np.ones((HEIGHT, WIDTH, 3)), changed(PLAIN, camera={"vignetting": 0.4}).camera)
+    half_pixel = 0.01  # relative: a corner pixel's centre is not the corner
+    np.testing.assert_allclose(loss[[0, 0, -1, -1], [0, -1, 0, -1]], 0.4, rtol=2 * half_pixel)
+    x, y = WIDTH / 4, HEIGHT / 4  # half way to a corner
+    np.testing.assert_allclose(loss[int(y), int(x)], 0.4 / 4, rtol=4 * half_pixel)
+
+
+def test_sharpening_leaves_even_light_and_overshoots_at_an_edge():
+    sharp = changed(PLAIN, response={"sharpening": 1.0, "sharpening_sigma_px": 1.5})
+    light = np.full((40, 40), 0.2)
+    assert (expose(light, sharp) == expose(light, PLAIN)).all()
+    light[:, 20:] = 0.6
+    row = expose(light, sharp)[20].astype(int)
+    assert row[:20].min() < 51 - 10 and row[20:].max() > 153 + 10 and row[0] == 51 and row[-1] == 153
+
+
+def test_a_window_of_a_frame_is_exposed_as_the_frame_is():
+    """Away from the window's borders, where blur and haze know what is outside; the blocks of the stream lie alike."""
+    spec = changed(CURVED, **FULL)
+    spec = changed(spec, response={"jpeg_quality": 80})
+    x0, y0, border = 21, 13, 16 + 16
+    whole = expose(picture(), spec)
+    part = expose(picture()[y0:118, x0:157], spec, origin_px=(x0, y0))
+    gray_levels = 2  # sums of floats in another order may round to either side before the stream does
+    apart = np.abs(part[border:-border, border:-border].astype(int) - whole[y0:118, x0:157][border:-border, border:-border])
+    assert apart.mean() < 0.01 and apart.max() <= gray_levels
+    without = expose(picture()[y0:118, x0:157], spec)[border:-border, border:-border].astype(int)
+    assert np.abs(without - whole[y0:118, x0:157][border:-border, border:-border]).mean() > 1, "the origin has no effect"
+
+
+@pytest.mark.parametrize("mono", [False, True])
+def test_a_stream_of_lower_quality_is_further_from_the_frame(mono):
+    light = picture()[..., 1] if mono else picture()
+    clean = expose(light, PLAIN).astype(float)
+    errors = [np.sqrt(((expose(light, changed(PLAIN, response={"jpeg_quality": q})) - clean) ** 2).mean()) for q in (98, 80, 40, 10)]
+    fine_gray = 2 if mono else 6  # gray levels; the finest stream still halves the resolution of colour
+    assert errors == sorted(errors) and errors[0] < fine_gray and errors[-1] > 1.5 * errors[0]
+
+
+def test_a_stream_keeps_colours_in_their_channels():
+    light = np.full((64, 64, 3), (0.7, 0.4, 0.1))
+    gray_levels = 2  # colour is rounded in another space
+    assert np.abs(expose(light, changed(PLAIN, response={"jpeg_quality": 95})).astype(int) - expose(light, PLAIN)).max() <= gray_levels
+
+
+def test_the_curve_is_the_inverse_of_its_power_law():
+    light = np.linspace(0, 1, 101, dtype=np.float32)
+    rounding = 1e-5
+    np.testing.assert_allclose(((curve(light, CURVED.response) - 4) / 251) ** 2.2, light, atol=rounding)
 
 
 def test_a_recording_is_binary_and_shows_the_dots():
@@ -80,7 +239,7 @@ def test_a_recording_is_binary_and_shows_the_dots():
 
 
 def test_a_resized_recording_has_gray_edges():
-    image = record(dots(), with_(RECORDING, width_px=90, height_px=80))
+    image = record(dots(), RECORDING.model_copy(update={"width_px": 90, "height_px": 80}))
     assert image.shape == (80, 90) and 0 < np.mean((image > 0) & (image < 255)) < 0.3
 
 

@@ -179,11 +179,11 @@ def test_friction_vanishes_without_friction_and_slides_at_its_coefficient(solver
 
 
 def test_more_friction_drags_the_pins_further_along_the_shear(solver, sensor):
-    rest = project(sensor.camera, solver.rest().caps_mm)
+    rest = project(sensor, solver.rest().caps_mm)
     moved = []
     for mu in (0.0, 0.2, 1.0):
         state = solver.press(load_object("plane"), ContactPose(2.0, shear_mm=(1.2, 0.0)), friction=mu)
-        moved.append((project(sensor.camera, state.caps_mm) - rest).mean(axis=0)[0])
+        moved.append((project(sensor, state.caps_mm) - rest).mean(axis=0)[0])
     assert abs(moved[0]) < 0.1 < moved[1] < moved[2]
 
 
@@ -196,10 +196,10 @@ def test_tilt_presses_the_side_that_comes_first(solver):
 
 
 def test_area_force_energy_and_mean_spread_grow_with_depth(solver, sensor):
-    rest = project(sensor.camera, solver.rest().caps_mm)
+    rest = project(sensor, solver.rest().caps_mm)
     centre, path = rest[0], []
     for _, state in solver.path(load_object("plane"), ContactPose(4.5)):
-        radial = np.linalg.norm(project(sensor.camera, state.caps_mm) - centre, axis=1) - np.linalg.norm(rest - centre, axis=1)
+        radial = np.linalg.norm(project(sensor, state.caps_mm) - centre, axis=1) - np.linalg.norm(rest - centre, axis=1)
         path.append((state.force_n[2], radial.mean(), state.area_mm2, state.elastic_nmm))
     force, spread, area, energy = np.array(path).T
     assert (np.diff(force) > 0).all() and (np.diff(energy) > 0).all()

@@ -5,30 +5,71 @@ import pytest
 
 from scenes import load_sensor
 from twin.geometry.pins import pin_lattice, rest_pins
-from twin.projection import distort, pixel_rays, project, sensor_to_camera, undistort
+from twin.projection import distort, pixel_rays, project, undistort
 
-ROUND_TRIP_PX = 1e-6
+ROUND_TRIP_MM = 1e-9
 
 
 def test_projection_and_rays_are_inverse(sensor):
     caps = rest_pins(sensor).cap_mm
-    T = sensor_to_camera(sensor.camera)
-    in_camera = caps @ T[:3, :3].T + T[:3, 3]
-    rays = pixel_rays(sensor.camera, project(sensor.camera, caps))
-    expected = in_camera / np.linalg.norm(in_camera, axis=1, keepdims=True)
-    focal = sensor.camera.fx_px
-    assert np.abs(rays - expected).max() * focal < ROUND_TRIP_PX
+    place, direction = pixel_rays(sensor, project(sensor, caps))
+    along = (caps[:, 2:] - place[:, 2:]) / direction[:, 2:]
+    assert np.abs(place + along * direction - caps).max() < ROUND_TRIP_MM
+    assert np.allclose(place[:, 2], sensor.lens.z_mm) and np.allclose(np.linalg.norm(direction, axis=1), 1)
+
+
+def test_rays_obey_snell_at_both_faces_of_the_window(sensor):
+    """The tangential part of index times direction is the same in air and gel, whatever the window between them."""
+    pixels = np.random.default_rng(1).uniform([200, 150], [420, 330], (200, 2))
+    _, in_gel = pixel_rays(sensor, pixels)
+    bare = sensor.model_copy(
+        update={
+            "lens": sensor.lens.model_copy(update={"refractive_index": 1.0}),
+            "gel": sensor.gel.model_copy(update={"refractive_index": 1.0}),
+        }
+    )
+    _, in_air = pixel_rays(bare, pixels)
+    assert np.allclose(sensor.gel.refractive_index * in_gel[:, :2], in_air[:, :2], atol=1e-12)
+
+
+def test_the_way_through_the_window_takes_least_time(sensor):
+    """Fermat: moving the points of entry does not shorten the optical path from pupil to cap."""
+    caps = rest_pins(sensor).cap_mm[::7]
+    pupil = np.array([0.0, 0.0, -sensor.camera.distance_mm])
+    front, direction = pixel_rays(sensor, project(sensor, caps))
+    within = direction[:, :2] * sensor.gel.refractive_index / sensor.lens.refractive_index
+    back = front[:, :2] - within / np.sqrt(1 - (within**2).sum(axis=1, keepdims=True)) * sensor.lens.thickness_mm
+
+    def optical_mm(shift_back, shift_front):
+        first = np.column_stack([back + shift_back, np.full(len(caps), sensor.lens.back_mm)])
+        second = front + [*shift_front, 0]
+        legs = np.linalg.norm(first - pupil, axis=1), np.linalg.norm(second - first, axis=1), np.linalg.norm(caps - second, axis=1)
+        return legs[0] + sensor.lens.refractive_index * legs[1] + sensor.gel.refractive_index * legs[2]
+
+    least = optical_mm(np.zeros(2), np.zeros(2))
+    for shift in np.random.default_rng(2).normal(size=(20, 4)) * 0.05:
+        assert (optical_mm(shift[:2], shift[2:]) > least).all()
+
+
+@pytest.mark.parametrize(("k1", "k2"), [(0.0, 0.0), (0.05, 0.02), (-0.03, 0.0)])
+def test_fisheye_distortion_and_its_inverse(k1, k2):
+    camera = load_sensor("mg400-331").camera.model_copy(update={"projection": "fisheye", "k1": k1, "k2": k2})
+    angle = np.linspace(0.01, 1.45, 50)
+    tangents = np.tan(angle)[:, None] * [[0.6, 0.8]]
+    seen = distort(camera, tangents)
+    assert np.allclose(np.linalg.norm(seen, axis=1), angle * (1 + k1 * angle**2 + k2 * angle**4))
+    assert np.allclose(np.arctan(np.linalg.norm(undistort(camera, seen), axis=1)), angle, atol=1e-9)
 
 
 def test_undistort_inverts_distort_with_every_coefficient():
-    camera = load_sensor("mg400-331").camera.model_copy(update={"k1": 0.1, "k2": -0.05, "p1": 0.01, "p2": -0.02})
+    camera = load_sensor("ur5-331").camera.model_copy(update={"k1": 0.1, "k2": -0.05, "p1": 0.01, "p2": -0.02})
     xy = np.random.default_rng(0).uniform(-0.7, 0.7, (500, 2))
     assert np.abs(undistort(camera, distort(camera, xy)) - xy).max() < 1e-9
 
 
 def test_the_camera_looks_out_of_the_tip_with_x_right_and_y_down(sensor):
     apex = np.array([0.0, 0.0, sensor.skin.outer_radius_mm])
-    origin, right, down = project(sensor.camera, apex + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    origin, right, down = project(sensor, apex + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
     assert right[0] > origin[0] + 1 and abs(right[1] - origin[1]) < 0.2
     assert down[1] > origin[1] + 1 and abs(down[0] - origin[0]) < 0.2
 

@@ -2,23 +2,26 @@
 
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
-from twin.optics import scene as scene_module
-from twin.optics.lens import ray_table
+from twin.optics.camera_rays import CameraRays
+from twin.optics.sampling import PixelSamples
+from twin.optics.scalar import ScalarView
+from twin.optics.scene import build_scene
+from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import SkinSurface, Surface, caps, stems
+from twin.optics.tracer import GelTracer, luminance
 from twin.optics.variant import VariantChoice, choose_variant, use_variant
+from twin.optics.window import Window
 
 Quality = Literal["preview", "standard", "high"]
 SAMPLES = {"preview": 4, "standard": 16, "high": 64}  # per pixel
 SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}  # the scalar variant is several times slower
-MAX_DEPTH = 4  # dark skin: a fourth bounce changes no gray level
+BOUNCES = 2  # dark skin: a third changes no gray level
 MOST_SAMPLES_AT_ONCE = 6_000_000  # bounds the memory of one pass
-PINHOLE_OVERSAMPLING = 1.3  # pixels of the ideal image per pixel of the frame, where it is remapped
 
 
 class Renderer:
@@ -37,8 +40,8 @@ class Renderer:
         Part of the raw frame to render, end exclusive; the whole frame by default.
     spp : int, optional
         Samples per pixel instead of the quality's.
-    max_depth : int
-        Longest light path, in segments.
+    bounces : int
+        Scatterings of a path after its first.
     """
 
     def __init__(
@@ -50,7 +53,7 @@ class Renderer:
         mesh=None,
         window_px: tuple[int, int, int, int] | None = None,
         spp: int | None = None,
-        max_depth: int = MAX_DEPTH,
+        bounces: int = BOUNCES,
     ):
         if quality not in SAMPLES:
             raise RenderError(f"quality={quality!r} is unknown: use {', '.join(SAMPLES)}")
@@ -67,8 +70,11 @@ class Renderer:
         self._rest = rest_pins(spec)
         self._inner = None if mesh is None else np.unique(mesh.inner_quads)
         self._skin = SkinSurface(spec, self._rest.base_mm if mesh is None else mesh.nodes_mm[self._inner])
-        self._max_depth = max_depth
-        self._scene = None
+        self._bounces = bounces
+        self._light, cover = static_layer(spec, window)
+        self._open = 1 - cover
+        self._pixels = np.flatnonzero(self._open > 0)
+        self._view = None
 
     def render(self, state=None, seed: int = 0) -> np.ndarray:
         """Linear light on the film.
@@ -87,20 +93,24 @@ class Renderer:
             RGB for a color camera, luminance for a mono one; H and W of the window.
         """
         mi = use_variant(self.choice)
-        surfaces = self._surfaces(self._rest if state is None else state)
-        if self._scene is None:
-            self._build(mi, surfaces)
+        state = self._rest if state is None else state
+        surfaces = self.surfaces(state)
+        if self._view is None:
+            kind = ScalarView if self._scalar else GelView
+            self._view = kind(mi, self.spec, self.window_px, surfaces, self._bounces)
         else:
-            self._move(surfaces)
-        image = self._render_passes(mi, seed)
-        if self._remap is not None:
-            image = cv2.remap(image, *self._remap, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        image = np.maximum(image, 0)
-        if self.spec.camera.channels == "color":
-            return image
-        return np.ascontiguousarray(image[..., 0] if self.choice.mono else scene_module.luminance(image).astype(np.float32))
+            self._view.move(surfaces)
+        gel = self._view.gel_light(self._pixels, self.spp, seed, state)
+        mono = self.spec.camera.channels == "mono"
+        image = (luminance(self._light).astype(np.float32) if mono else self._light).copy()
+        if mono and gel.shape[1] == 3:
+            gel = luminance(gel)[:, None]
+        flat = image.reshape(len(self._open.ravel()), -1)
+        flat[self._pixels] += self._open.ravel()[self._pixels, None] * gel.astype(np.float32)
+        return np.maximum(image, 0)
 
-    def _surfaces(self, state) -> dict[str, Surface]:
+    def surfaces(self, state) -> dict[str, Surface]:
+        """Skin, stems and caps of a state, by the names of the scene's meshes."""
         cap_mm = state.caps_mm if hasattr(state, "caps_mm") else state.cap_mm
         if state.base_mm.shape != self._rest.base_mm.shape:
             raise RenderError(f"the state has {len(state.base_mm)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
@@ -112,34 +122,52 @@ class Renderer:
             "caps": caps(self.spec, cap_mm, state.axis),
         }
 
-    def _build(self, mi, surfaces: dict[str, Surface]) -> None:
-        self._scene = scene_module.build_scene(mi, self.spec, **surfaces, max_depth=self._max_depth)
-        self._params = mi.traverse(self._scene)
-        table = ray_table(self.spec.camera, self.window_px)
-        if self._scalar:
-            centres = 0.25 * (table[:-1, :-1] + table[1:, :-1] + table[:-1, 1:] + table[1:, 1:])
-            half_field = float(np.abs(table).max())
-            pixels_per_unit = max(self.spec.camera.fx_px, self.spec.camera.fy_px)
-            size = int(np.ceil(2 * half_field * pixels_per_unit * PINHOLE_OVERSAMPLING))
-            self._camera = scene_module.build_pinhole_camera(mi, self.spec, half_field, size, spp=self.spp)
-            places = ((centres / half_field + 1) * 0.5 * size - 0.5).astype(np.float32)
-            self._remap = places[..., 0], places[..., 1]
-        else:
-            self._camera = scene_module.build_table_camera(mi, self.spec, table, spp=self.spp)
-            self._remap = None
 
-    def _move(self, surfaces: dict[str, Surface]) -> None:
+class GelView:
+    """The gel seen through lens and window by the vectorised variants.
+
+    Parameters
+    ----------
+    mi : module
+        Mitsuba, its variant set.
+    spec : SensorSpec
+    window_px : (x0, y0, x1, y1)
+    surfaces : dict of Surface
+        As ``Renderer.surfaces`` gives them.
+    bounces : int
+    """
+
+    def __init__(self, mi, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int):
+        import drjit as dr
+
+        self._mi, self._dr = mi, dr
+        scene = build_scene(mi, spec, **surfaces)
+        self.params = mi.traverse(scene)
+        self.tracer = GelTracer.of(mi, spec, scene, bounces)
+        self.rays = CameraRays(mi, dr, spec.camera, Window.of(spec), window_px)
+
+    def move(self, surfaces: dict[str, Surface]) -> None:
+        """Move the meshes' vertices."""
         for name, surface in surfaces.items():
-            self._params[f"{name}.vertex_positions"] = np.ascontiguousarray(surface.vertices_mm, np.float32).ravel()
-        self._params.update()
+            self.params[f"{name}.vertex_positions"] = np.ascontiguousarray(surface.vertices_mm, np.float32).ravel()
+        self.params.update()
 
-    def _render_passes(self, mi, seed: int) -> np.ndarray:
-        width, height = self._camera.film().size()
-        passes, each = 1, self.spp
-        while not self._scalar and each > 1 and each * width * height > MOST_SAMPLES_AT_ONCE:
-            passes, each = 2 * passes, -(-each // 2)  # halves: the sampler stratifies powers of two well
+    def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state=None) -> np.ndarray:
+        """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row."""
+        passes, each = 1, spp
+        while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
+            passes, each = 2 * passes, -(-each // 2)  # halves: nets of powers of two are even
         total = 0.0
         for k in range(passes):
-            image = mi.render(self._scene, sensor=self._camera, spp=each, seed=(seed * 1009 + k) % 2**32)
-            total = total + np.array(image, dtype=np.float32)
+            total = total + np.array(self.trace(self._mi.UInt32(pixels.astype(np.uint32)), each, (seed * 1009 + k) % 2**32)).T
         return total / passes
+
+    def trace(self, pixels, spp: int, seed: int):
+        """The same as a spectrum of Dr.Jit, differentiable in what the tracer and the scene hold."""
+        mi, dr = self._mi, self._dr
+        number = dr.arange(mi.UInt32, len(pixels) * spp)
+        pixel = dr.gather(mi.UInt32, pixels, number // spp)
+        random = PixelSamples(mi, dr, pixel, number % spp, spp, seed)
+        place, direction, transmittance = self.rays.sample(mi, dr, pixel, random)
+        light = self.tracer.radiance(mi, dr, place, direction, random) * transmittance
+        return mi.Spectrum(*(dr.block_sum(channel, spp) / spp for channel in light))

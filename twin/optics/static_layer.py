@@ -1,0 +1,121 @@
+"""What the camera sees besides the gel: the housing, the LEDs' reflections in the window, specks. Contact never changes it.
+
+Found once, without noise, on a fine grid of places within each pixel.
+"""
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.optics.lens import ray_table, subpixel_rays
+from twin.optics.lights import led_patches, lights
+from twin.projection import sensor_to_camera
+
+ACROSS = 4  # places a pixel, each way
+ROWS_AT_ONCE = 32
+
+
+def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Light and cover of a window of the raw frame.
+
+    Returns
+    -------
+    light : (H, W, 3) float32
+        Linear RGB that reaches the film whatever the gel does.
+    cover : (H, W) float32
+        Share of the gel's light that is hidden: the film gets ``light + (1 - cover) * gel``.
+    """
+    table = ray_table(spec.camera, window_px) @ sensor_to_camera(spec.camera)[:3, :3]
+    height, width = table.shape[0] - 1, table.shape[1] - 1
+    light, cover = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
+    for start in range(0, height, ROWS_AT_ONCE):
+        rows = slice(start, min(start + ROWS_AT_ONCE, height))
+        rays = subpixel_rays(table[start : rows.stop + 1], ACROSS)
+        seen, hidden = _seen(spec, rays)
+        light[rows], cover[rows] = seen.mean(axis=2), hidden.mean(axis=2)
+    return light, cover
+
+
+def _seen(spec: SensorSpec, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Light (..., 3) and cover (...) along rays (..., 3) from the pupil, sensor frame, of any length."""
+    camera, ring = spec.camera, spec.housing
+    tangents = rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)
+    at_ring = tangents * (ring.z_mm + camera.distance_mm)
+    wall = np.linalg.norm(at_ring - ring.center_mm, axis=-1) >= ring.aperture_radius_mm
+    light = np.where(wall[..., None], housing_light(spec, at_ring), reflections(spec, tangents))
+    hidden, shine = _specks(spec, tangents)
+    return np.where(wall[..., None], light, light + shine), np.where(wall, 1.0, hidden)
+
+
+def housing_light(spec: SensorSpec, at_mm: np.ndarray) -> np.ndarray:
+    """Radiance (..., 3) that the ring and wall send to the camera from places (..., 2) of their plane.
+
+    ``albedo * power * (ambient * lit share of LEDs * exp(-(rho - aperture) / falloff)
+    + glow * sum over LEDs of balance * (1 + |p - led|^2 / h^2)^-n)``.
+    """
+    ring, patches = spec.housing, led_patches(spec)
+    place = at_mm - ring.center_mm
+    out = np.linalg.norm(place, axis=-1) - ring.aperture_radius_mm
+    full = max(p.radiance.max() for p in patches) or 1.0
+    shares = [p.radiance.max() / full for p in patches]
+    light = ring.ambient * np.mean(shares) * np.exp(-np.maximum(out, 0) / ring.ambient_falloff_mm)
+    for patch, share in zip(patches, shares, strict=True):
+        led = patch.center_mm[:2] / np.linalg.norm(patch.center_mm[:2])
+        away2 = np.sum((place - ring.glow_radius_mm * led) ** 2, axis=-1) / ring.glow_height_mm**2
+        light = light + ring.glow * share * (1 + away2) ** -ring.glow_exponent
+    light = spec.leds.power * light * np.where(out < ring.lip_width_mm, 1.0, ring.wall_fraction)
+    return light[..., None] * np.array(ring.albedo)
+
+
+def reflections(spec: SensorSpec, tangents: np.ndarray) -> np.ndarray:
+    """Radiance (..., 3) of the lights mirrored in both faces of the window, for tangents (..., 2) of rays in air."""
+    lens, distance = spec.lens, spec.camera.distance_mm
+    u2 = np.sum(tangents**2, axis=-1)
+    cos_air = 1 / np.sqrt(1 + u2)
+    sine2 = 1 - cos_air**2
+    cos_window = np.sqrt(1 - sine2 / lens.refractive_index**2)
+    cos_gel = np.sqrt(np.maximum(1 - sine2 / spec.gel.refractive_index**2, 0))
+    outer = _fresnel(1 / lens.refractive_index, cos_air, cos_window)
+    inner = _fresnel(lens.refractive_index / spec.gel.refractive_index, cos_window, cos_gel)
+    from_front = (1 - outer) ** 2 * inner / (1 - outer * inner)
+    # tan(window) / tan(air): the detour through the window and back
+    detour = 2 * lens.thickness_mm * cos_air / (lens.refractive_index * cos_window)
+    total = 0.0
+    for patch in lights(spec):
+        straight = (lens.back_mm + distance) + (lens.back_mm - patch.center_mm[2])
+        for weight, reach in ((outer, straight), (from_front, straight + detour)):
+            at = tangents * np.asarray(reach)[..., None] - patch.center_mm[:2]
+            total = total + (weight * _profile(spec, patch, at))[..., None] * patch.radiance
+    return total
+
+
+def _profile(spec: SensorSpec, patch, at_mm: np.ndarray) -> np.ndarray:
+    """A light's radiance at places (..., 2) about its centre, relative to its mean."""
+    inner, outer = patch.radii_mm
+    if outer > 0:
+        rho = np.linalg.norm(at_mm, axis=-1)
+        return ((rho >= inner) & (rho <= outer)).astype(float)
+    within = np.all(np.abs(at_mm @ np.linalg.inv(patch.half_mm)) <= 1, axis=-1)
+    share, sd = spec.leds.core_share, spec.leds.core_mm
+    core = patch.area_mm2 / (2 * np.pi * sd**2) * np.exp(-np.sum(at_mm**2, axis=-1) / (2 * sd**2)) if share else 0.0
+    return (1 - share) * within + share * core
+
+
+def _specks(spec: SensorSpec, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cover (...) and light (..., 3) of the specks on the window's gel side."""
+    hidden, shine = np.zeros(tangents.shape[:-1]), np.zeros((*tangents.shape[:-1], 3))
+    lens, u2 = spec.lens, np.sum(tangents**2, axis=-1, keepdims=True)
+    within = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)
+    at = tangents * (lens.back_mm + spec.camera.distance_mm + lens.thickness_mm * within)
+    for speck in spec.appearance.specks:
+        away = np.linalg.norm(at - [speck.x_mm, speck.y_mm], axis=-1) / speck.radius_mm
+        disc = np.clip(2 - 2 * away, 0, 1)  # full up to half the radius
+        hidden = 1 - (1 - hidden) * (1 - speck.opacity * disc)
+        shine = shine + (disc * speck.light)[..., None]
+    return hidden, shine
+
+
+def _fresnel(index: float, cos_here: np.ndarray, cos_there: np.ndarray) -> np.ndarray:
+    """Unpolarised reflectance of a face with n_here / n_there = ``index``."""
+    s = (index * cos_here - cos_there) / (index * cos_here + cos_there)
+    p = (cos_here - index * cos_there) / (cos_here + index * cos_there)
+    return 0.5 * (s * s + p * p)

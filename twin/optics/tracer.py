@@ -1,0 +1,169 @@
+"""Path tracing on the gel's side of the window.
+
+At every vertex the light of all patches is found through the window without shadows (a sum of closed forms), and one
+of them, drawn in proportion to what it would give, is tested for a shadow: where nothing is in the way there is no noise
+from the choice. Paths that leave towards the window are reflected by it (with total reflection) or lost in the housing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.optics.lights import Patch, lights
+from twin.optics.window import Window
+
+SURVIVAL_GAIN = 0.7  # a path goes on with a probability of this times its weight
+NEVER = 1e-12
+
+
+@dataclass(frozen=True)
+class Emitters:
+    """Patches as arrays for Dr.Jit, radiances as its spectra so that they can carry gradients."""
+
+    patches: list[Patch]
+    radiance: list
+
+
+@dataclass
+class GelTracer:
+    """Light that reaches the camera's side of the window along rays in the gel.
+
+    Attributes
+    ----------
+    scene : mi.Scene
+        Skin, stems and caps, without lights.
+    window : Window
+    emitters : Emitters
+    absorption : tuple of float
+        Beer-Lambert coefficients, 1/mm.
+    bounces : int
+        Scatterings of a path after its first vertex.
+    """
+
+    scene: object
+    window: Window
+    emitters: Emitters
+    absorption: tuple
+    bounces: int
+
+    @classmethod
+    def of(cls, mi, spec: SensorSpec, scene, bounces: int) -> "GelTracer":
+        """For a sensor, its gel-side scene and a number of bounces."""
+        patches = lights(spec)
+        return cls(
+            scene, Window.of(spec), Emitters(patches, [spectrum(mi, p.radiance) for p in patches]), spec.gel.absorption_per_mm, bounces
+        )
+
+    def radiance(self, mi, dr, place, direction, random):
+        """Radiance in the gel, divided by n^2, along rays that start at the window's gel side.
+
+        Few paths go on after the first vertex (the skin is dark): they are gathered, so that the others cost nothing.
+
+        Parameters
+        ----------
+        place : mi.Point3f
+        direction : mi.Vector3f
+        random : PixelSamples
+
+        Returns
+        -------
+        mi.Spectrum
+        """
+        ray, weight = mi.Ray3f(place, direction), mi.Spectrum(1.0)
+        hit = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+        active = hit.is_valid()
+        weight *= self._absorbed(mi, dr, hit.t, active)
+        result, sample = mi.Spectrum(0.0), None
+        for bounce in range(self.bounces + 1):
+            bsdf = hit.bsdf(ray)
+            light = dr.select(active, weight * self._direct(mi, dr, hit, bsdf, random, active), 0.0)
+            if sample is None:
+                result += light
+            else:
+                dr.scatter_add(result, light, sample, active)
+            if bounce == self.bounces:
+                break
+            out, value = bsdf.sample(mi.BSDFContext(), hit, random.next_1d(), random.next_2d(), active)
+            weight *= value
+            survival = dr.clip(SURVIVAL_GAIN * dr.detach(dr.max(weight)), 0.0, 1.0)
+            active &= random.next_1d() < survival
+            weight /= dr.maximum(survival, NEVER)
+            ray = hit.spawn_ray(hit.to_world(out.wo))
+            dr.eval(active, ray.o, ray.d, weight, result)
+            alive = dr.compress(active)
+            if len(alive) == 0:
+                break
+            ray = mi.Ray3f(dr.gather(mi.Point3f, ray.o, alive), dr.gather(mi.Vector3f, ray.d, alive))
+            weight = dr.gather(mi.Spectrum, weight, alive)
+            sample = alive if sample is None else dr.gather(mi.UInt32, sample, alive)
+            random = random.of(alive)
+            ray, hit, weight, active = self._follow(mi, dr, ray, weight, random)
+        return result / self.window.gel_index**2
+
+    def _follow(self, mi, dr, ray, weight, random):
+        """The next vertices of rays within the gel; those that miss everything on their way to the window come back from it."""
+        first = self.scene.ray_intersect_preliminary(ray, coherent=False)
+        up = ~first.is_valid() & (ray.d.z < -1e-6)
+        far = dr.select(up, (self.window.front - ray.o.z) / dr.minimum(ray.d.z, -1e-6), 0.0)
+        place, back, share = self.window.mirror(dr, mi, ray.o + ray.d * far, ray.d, random.next_1d())
+        up &= dr.squared_norm(mi.Point2f(place.x, place.y)) < self.window.radius**2
+        ray = mi.Ray3f(dr.select(up, place, ray.o), dr.select(up, back, ray.d))
+        hit = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=up | first.is_valid())
+        active = hit.is_valid()
+        weight *= dr.select(up, share, 1.0) * self._absorbed(mi, dr, far + hit.t, active)
+        return ray, hit, weight, active
+
+    def _direct(self, mi, dr, hit, bsdf, random, active):
+        """Reflected radiance of the patches' light at a vertex."""
+        place, ways, shares = random.next_2d(), [], []
+        total = mi.Float(0.0)
+        for patch, radiance in zip(self.emitters.patches, self.emitters.radiance, strict=True):
+            toward, length, factor = self.window.connect(dr, mi, hit.p, _point(mi, dr, patch, place))
+            ways.append((toward, length, factor * patch.area_mm2 * radiance))
+            strength = dr.detach(dr.max(radiance)) * factor * patch.area_mm2 * dr.maximum(dr.dot(toward, hit.sh_frame.n), 0.0)
+            total += dr.select(active, strength, 0.0)
+            shares.append(mi.Float(total))
+        at = random.next_1d() * total
+        toward, length, arriving, share = mi.Vector3f(0.0, 0.0, -1.0), mi.Float(0.0), mi.Spectrum(0.0), mi.Float(0.0)
+        before = mi.Float(0.0)
+        for (way, far, light), after in zip(ways, shares, strict=True):
+            chosen = (at >= before) & (at < after)
+            toward, length = dr.select(chosen, way, toward), dr.select(chosen, far, length)
+            arriving, share = dr.select(chosen, light, arriving), dr.select(chosen, after - before, share)
+            before = after
+        leaves = hit.p + toward * length
+        lit = active & (share > NEVER) & (dr.squared_norm(mi.Point2f(leaves.x, leaves.y)) < self.window.radius**2)
+        shadow = hit.spawn_ray(toward)
+        shadow.maxt = length * (1 - 1e-4)
+        lit &= ~self.scene.ray_test(shadow, coherent=False, active=lit)
+        reflected = bsdf.eval(mi.BSDFContext(), hit, hit.to_local(toward), lit)
+        arriving *= self._absorbed(mi, dr, length, lit)
+        return dr.select(lit, reflected * arriving * (total / dr.maximum(share, NEVER)), 0.0)
+
+    def _absorbed(self, mi, dr, length, active):
+        if not any(self.absorption):
+            return mi.Spectrum(1.0)
+        return dr.exp(-spectrum(mi, np.array(self.absorption)) * dr.select(active, length, 0.0))
+
+
+def spectrum(mi, rgb: np.ndarray):
+    """Linear RGB (3,) as a spectrum of the current variant (luminance in a mono one)."""
+    return mi.Spectrum(luminance(rgb)) if mi.variant().endswith("mono") else mi.Spectrum(*(float(c) for c in rgb))
+
+
+def luminance(rgb: np.ndarray) -> np.ndarray:
+    """Rec. 709 luminance (...,) of linear RGB (..., 3)."""
+    return np.asarray(rgb) @ [0.212671, 0.715160, 0.072169]
+
+
+def _point(mi, dr, patch: Patch, square):
+    """Points of a patch for points of the unit square, uniform over its area."""
+    (x, y, z), (inner, outer) = (float(v) for v in patch.center_mm), (float(r) for r in patch.radii_mm)
+    if outer > 0:
+        radius = dr.sqrt(inner**2 + (outer**2 - inner**2) * square.x)
+        sine, cosine = dr.sincos(2 * dr.pi * square.y)
+        return mi.Point3f(x + radius * cosine, y + radius * sine, z)
+    u, v = 2 * square.x - 1, 2 * square.y - 1
+    (ux, uy), (vx, vy) = patch.half_mm
+    return mi.Point3f(x + float(ux) * u + float(vx) * v, y + float(uy) * u + float(vy) * v, z)

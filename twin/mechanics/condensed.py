@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack, lu_factor, lu_solve
+from scipy.linalg import blas, lapack
 
 from twin.mechanics.balance import FORCE_FLOOR_N, Balance, Problem
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
@@ -33,34 +33,54 @@ class Tangent:
 class Near:
     """The tangent once more eliminated, down to the controls that carry the points looked at.
 
-    ``near``, ``far``: kept unknowns that stay and go. ``local (q, 9)``: place of each point's controls among
-    those that stay (their number: none of them).
+    The far part of the tangent is L L^T; all in single precision.
+
+    Attributes
+    ----------
+    near, far : (n,), (f,) int
+        Kept unknowns that stay and go.
+    local : (q, 9) int
+        Place of each point's controls among those that stay (their number: none of them).
+    matrix : (n, n) float
+        What is left of the tangent, symmetric; ``column`` (n,) of the volume's column.
+    factor : (f, f) float
+        L, Fortran order, lower triangle.
+    coupling, far_column : (f, n), (f,) float
+        L^-1 applied to the coupling of far and near, and to the volume's column.
     """
 
     near: np.ndarray
     far: np.ndarray
     local: np.ndarray
     matrix: np.ndarray
-    factor: tuple | None
-    coupling: np.ndarray  # (far, near)
-    carried: np.ndarray  # the far part's inverse applied to the coupling and to the volume's column
-    column: np.ndarray  # (k,) volume's
+    column: np.ndarray
+    factor: np.ndarray
+    coupling: np.ndarray
+    far_column: np.ndarray
 
     @classmethod
     def of(cls, tangent: Tangent, local: np.ndarray) -> "Near":
         matrix, count = tangent.matrix, len(tangent.matrix)
-        controls = np.unique(local[local >= 0])
-        n = (3 * controls[:, None] + np.arange(3)).ravel()
-        f = np.setdiff1d(np.arange(count), n, assume_unique=True)
+        stays = np.zeros(count // 3 + 1, bool)
+        stays[local] = True
+        stays = np.repeat(stays[:-1], 3)
+        far = np.flatnonzero(~stays)
+        factor, info = lapack.spotrf(matrix[np.ix_(far, far)].T, lower=1, clean=0, overwrite_a=1) if len(far) else (np.zeros((0, 0)), 0)
+        if info > 0:  # only contact holds some of the far controls up: let all stay
+            stays[:], far, factor = True, far[:0], np.zeros((0, 0))
+        near = np.flatnonzero(stays)
+        controls = near[::3] // 3
         renumber = np.full(count // 3 + 1, len(controls))
         renumber[controls] = np.arange(len(controls))
-        column = np.zeros(count) if tangent.volume_column is None else tangent.volume_column[tangent.eliminated.kept]
-        coupling, rest = matrix[np.ix_(f, n)], matrix[np.ix_(n, n)]
-        if not len(f):
-            return cls(n, f, renumber[local], rest, None, coupling, np.zeros((0, len(n) + 1)), column)
-        factor = lu_factor(matrix[np.ix_(f, f)], check_finite=False)
-        carried = lu_solve(factor, np.column_stack([coupling, column[f]]), check_finite=False)
-        return cls(n, f, renumber[local], rest - coupling.T @ carried[:, :-1], factor, coupling, carried, column)
+        column = np.zeros(count, np.float32) if tangent.volume_column is None else tangent.volume_column[tangent.eliminated.kept]
+        rest, column, far_column = matrix[np.ix_(near, near)], column[near], column[far]
+        coupling = np.zeros((0, len(near)), np.float32)
+        if len(far):
+            coupling = blas.strsm(1.0, factor, matrix[np.ix_(near, far)].T, lower=1, overwrite_b=1)
+            far_column = lapack.strtrs(factor, far_column, lower=1)[0]
+            rest = rest - coupling.T @ coupling
+            column = column - coupling.T @ far_column
+        return cls(near, far, renumber[local], rest, column, factor, coupling, far_column)
 
 
 class SmallContact:
@@ -73,12 +93,11 @@ class SmallContact:
         self._problem, self._border, self._near = problem, border, near
         self.iterations = 0
         self._at = positions(problem.controls, problem.weights, problem.lift, control)
-        n, f = near.near, near.far
-        self._far_residual = residual[f]
-        self._r = residual[n] - near.carried[:, :-1].T @ residual[f]
-        self._v = near.column[n] - near.coupling.T @ near.carried[:, -1]
-        self._g = volume_residual - near.carried[:, -1] @ residual[f]
-        self._q = pivot - near.carried[:, -1] @ near.column[f]
+        self._far_residual = lapack.strtrs(near.factor, residual[near.far], lower=1)[0] if len(near.far) else residual[near.far]
+        self._r = residual[near.near] - near.coupling.T @ self._far_residual
+        self._v = near.column
+        self._g = volume_residual - near.far_column @ self._far_residual
+        self._q = pivot - near.far_column @ near.far_column
 
     def solve(self, balance: Balance, *, soften: bool, least: float):
         """Moves of all kept unknowns (k,) and of the border (2,).
@@ -93,11 +112,11 @@ class SmallContact:
             y, _ = self._newton(start, _SOFTENING, wanted, _ITERATIONS)
             y, _ = self._newton(y, 1.0, wanted, _ITERATIONS)
         near = self._near
-        out = np.zeros(len(near.column))
+        out = np.zeros(len(near.near) + len(near.far))
         out[near.near] = y[:-2]
         if len(near.far):
-            right = self._far_residual + near.column[near.far] * y[-1] + near.coupling @ y[:-2]
-            out[near.far] = -lu_solve(near.factor, right, check_finite=False)
+            right = self._far_residual + near.far_column * y[-1] + near.coupling @ y[:-2].astype(np.float32)
+            out[near.far] = -lapack.strtrs(near.factor, right, lower=1, trans=1)[0]
         return out, y[-2:]
 
     def _newton(self, y, soften: float, wanted: float, most: int):

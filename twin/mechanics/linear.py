@@ -194,6 +194,17 @@ def _inside(boxes, box):
 
 
 @numba.njit(cache=True)
+def whole(lower, shift):
+    """A symmetric matrix from its lower triangle, plus a shift on the diagonal."""
+    out = np.empty_like(lower)
+    for c in range(len(lower)):
+        out[c, c] = lower[c, c] + shift
+        for r in range(c + 1, len(lower)):
+            out[r, c] = out[c, r] = lower[r, c]
+    return out
+
+
+@numba.njit(cache=True)
 def _assemble(elements, which, places, head, below, rest):
     """Add symmetric blocks to a front's lower triangle."""
     own, count = len(head), elements.shape[2]

@@ -12,7 +12,7 @@ import numpy as np
 from twin.errors import ContactError
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
-from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite
+from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
 
 GAP_BOUND_MM = 0.01  # no contact point ends deeper inside the object
@@ -190,7 +190,7 @@ class LoadStepper:
                 shift = max(8 * shift, _SMALLEST_SHIFT_N_MM)
                 if shift > _LARGEST_SHIFT_N_MM:
                     raise NoConvergence(np.inf) from None
-        matrix = np.tril(eliminated.matrix) + np.tril(eliminated.matrix, -1).T + shift * np.eye(len(eliminated.matrix))
+        matrix = whole(eliminated.matrix, shift)
         if not self._body.sealed:
             return Tangent(eliminated, matrix, None, 0.0)
         column = np.zeros_like(control)

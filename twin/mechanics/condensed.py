@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from scipy.linalg import blas, lapack
 
@@ -11,6 +12,7 @@ from twin.mechanics.linear import Eliminated
 
 _ITERATIONS, _HASTY_ITERATIONS = 60, 15
 LARGEST_MOVE_MM = 1.5  # of a control in one iteration
+_KEEP_FACTORS = 0.1  # contraction of the residual up to which old factors are kept
 _SOFTENING = 0.1  # of the contact, on the way to a far solution
 _INEXACT = 0.01  # the iteration ends at this share of the whole problem's residual, but not before ``least`` of the scale
 
@@ -29,7 +31,7 @@ class Tangent:
     volume_pivot: float
 
 
-@dataclass(frozen=True)
+@dataclass
 class Near:
     """The tangent once more eliminated, down to the controls that carry the points looked at.
 
@@ -47,6 +49,8 @@ class Near:
         L, Fortran order, lower triangle.
     coupling, far_column : (f, n), (f,) float
         L^-1 applied to the coupling of far and near, and to the volume's column.
+    solved : tuple
+        The contact's softening, and the factors of the matrix (n + 2, n + 2) for which Newton's direction was last found.
     """
 
     near: np.ndarray
@@ -57,6 +61,7 @@ class Near:
     factor: np.ndarray
     coupling: np.ndarray
     far_column: np.ndarray
+    solved: tuple | None = None
 
     @classmethod
     def of(cls, tangent: Tangent, local: np.ndarray) -> "Near":
@@ -126,7 +131,15 @@ class SmallContact:
             if norm <= wanted:
                 return y, True
             self.iterations += 1
-            move = self._direction(contact, residual)
+            if self._near.solved and self._near.solved[0] == soften:  # what touches and sticks may not have changed since
+                trial_y = y - self._solved(residual)
+                trial, trial_contact = self._equations(trial_y, soften)
+                trial_norm = np.linalg.norm(trial)
+                if trial_norm < max(_KEEP_FACTORS * norm, wanted):
+                    y, residual, contact, norm = trial_y, trial, trial_contact, trial_norm
+                    continue
+            self._factorise(contact, soften)
+            move = -self._solved(residual)
             size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move[:-2]).max(initial=0.0), 1e-300))
             best = None
             for _ in range(6):
@@ -143,22 +156,19 @@ class SmallContact:
 
     def _equations(self, y, soften: float):
         problem, near = self._problem, self._near
-        moves = np.concatenate([y[:-2].reshape(-1, 3), np.zeros((1, 3))])
         border = self._border + y[-2:]
-        contact = problem.contact(positions(near.local, problem.weights, self._at, moves), border, soften)
-        force = contact.force_n @ problem.T[:3, :3].T
-        pull = np.zeros_like(moves)
-        spread_forces(near.local, problem.weights, force, pull)
+        at = _moved(near.local, problem.weights, self._at, y, problem.T, border[0])
+        contact = problem.contact(at, soften)
         out = np.zeros(len(y))
-        out[:-2] = near.matrix @ y[:-2] + self._r + self._v * y[-1] - pull[:-1].ravel()
+        force_z = _residual(near.matrix, y, self._r, self._v, near.local, problem.weights, contact.force_n, problem.T, out)
         if problem.compliance:
-            out[-2] = border[0] / problem.compliance + force[:, 2].sum()
+            out[-2] = border[0] / problem.compliance + force_z
         if problem.body.sealed:
             out[-1] = self._g + self._v @ y[:-2] + self._q * y[-1]
         return out, contact
 
-    def _direction(self, contact: ContactForces, residual):
-        """Newton's direction; solved in single precision, which costs half and no convergence."""
+    def _factorise(self, contact: ContactForces, soften: float):
+        """The matrix of Newton's direction; in single precision, which costs half and no convergence."""
         problem, local, count = self._problem, self._near.local, len(self._near.near)
         turn = problem.T[:3, :3]
         stiffness = turn @ contact.stiffness @ turn.T
@@ -175,4 +185,54 @@ class SmallContact:
         if problem.body.sealed:
             matrix[:count, count + 1] = matrix[count + 1, :count] = self._v
             matrix[count + 1, count + 1] = self._q
-        return lapack.sgesv(matrix, -residual.astype(np.float32), overwrite_a=1)[2].astype(float)
+        self._near.solved = (soften, *lapack.sgetrf(matrix, overwrite_a=1)[:2])
+
+    def _solved(self, right_side):
+        return lapack.sgetrs(*self._near.solved[1:], right_side.astype(np.float32))[0].astype(float)
+
+
+@numba.njit(cache=True)
+def _moved(local, weights, at, y, T, yielded):
+    """Points (q, 3) in the object's frame after moves ``y`` of their controls."""
+    controls = (len(y) - 2) // 3
+    out = np.empty_like(at)
+    for p in range(len(at)):
+        x0, x1, x2 = at[p, 0] - T[0, 3], at[p, 1] - T[1, 3], at[p, 2] - T[2, 3] - yielded
+        for a in range(9):
+            c = local[p, a]
+            if c < controls:
+                w = weights[p, a]
+                x0 += w * y[3 * c]
+                x1 += w * y[3 * c + 1]
+                x2 += w * y[3 * c + 2]
+        for i in range(3):
+            out[p, i] = x0 * T[0, i] + x1 * T[1, i] + x2 * T[2, i]
+    return out
+
+
+@numba.njit(cache=True, fastmath=True)
+def _residual(matrix, y, start, column, local, weights, force, T, out):
+    """Forces on the near controls into ``out``; the sum of the contact's along z, all in the sensor's frame."""
+    count = len(y) - 2
+    for r in range(count):
+        total = start[r] + column[r] * y[count + 1]
+        for c in range(count):
+            total += matrix[r, c] * y[c]
+        out[r] = total
+    force_z = 0.0
+    for p in range(len(force)):
+        f0, f1, f2 = force[p, 0], force[p, 1], force[p, 2]
+        if f0 == 0 and f1 == 0 and f2 == 0:
+            continue
+        g0 = T[0, 0] * f0 + T[0, 1] * f1 + T[0, 2] * f2
+        g1 = T[1, 0] * f0 + T[1, 1] * f1 + T[1, 2] * f2
+        g2 = T[2, 0] * f0 + T[2, 1] * f1 + T[2, 2] * f2
+        force_z += g2
+        for a in range(9):
+            c = 3 * local[p, a]
+            if c < count:
+                w = weights[p, a]
+                out[c] -= w * g0
+                out[c + 1] -= w * g1
+                out[c + 2] -= w * g2
+    return force_z

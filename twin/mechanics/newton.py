@@ -52,7 +52,7 @@ class LoadStepper:
         self._body, self._frontal, self._stimulus, self._friction = body, frontal, stimulus, friction
         self._compliance = compliance_mm_per_n
         shapes = [(len(kind.cells.controls), 6, *2 * kind.cells.controls.shape[1:]) for kind in body.kinds]
-        self._blocks = [np.empty(shape) for shape in shapes]
+        self._blocks = [np.empty(shape, np.float32) for shape in shapes]
         local = np.full(len(body.free), -1)  # place of each control among the kept ones
         kept_controls = np.flatnonzero(np.isin(frontal.unknown[:, 0], frontal.kept))
         local[kept_controls] = np.arange(len(kept_controls))

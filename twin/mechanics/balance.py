@@ -164,11 +164,10 @@ class Problem:
         scale = max(float(np.linalg.norm(force, axis=1).sum()), FORCE_FLOOR_N)
         return Balance(elastic, residual[body.free].ravel(), border_residual, contact, force, scale, elastic_nmm)
 
-    def stiffness(self, control, border, blocks, *, gel: bool) -> None:
-        """The elements' tangents into ``blocks``; the gel's only on request."""
+    def stiffness(self, control, border, blocks) -> None:
+        """The elements' tangents into ``blocks``."""
         for number, (kind, given, block) in enumerate(zip(self.body.kinds, self._given, blocks, strict=True)):
-            if number == 0 or gel:
-                kind.stiffness(control, given, border[1] if number else 0.0, block)
+            kind.stiffness(control, given, border[1] if number else 0.0, block)
 
     def volume(self, control, out) -> float:
         """How much the gel's volume has grown, mm^3; adds its gradient to ``out``."""

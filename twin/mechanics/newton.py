@@ -20,9 +20,8 @@ RESIDUAL_TOLERANCE = 1e-6  # of the sum of the contact forces
 _PENALTY_GROWTH, _PENALTY_RAISES = 4.0, 5
 _ITERATIONS = 30
 _WORSE = 2.0  # growth of the residual that is put up with
-_KEEP_TANGENT = 0.2  # contraction of the residual up to which an old tangent is kept
+_KEEP_TANGENT = 0.3  # contraction of the residual up to which an old tangent is kept
 _SMALLEST_SHIFT_N_MM, _LARGEST_SHIFT_N_MM = 0.01, 50.0  # on the tangent's diagonal, where it leads astray
-_GEL_TANGENTS = 2  # for so many tangents the gel's, which changes little, is kept
 _NOTHING = np.zeros((0, 8, 3, 3))
 _REACH_MM = 0.15  # contact points farther than this from the object are left out, and checked at the end
 
@@ -62,7 +61,6 @@ class LoadStepper:
         self._tangent: Tangent | None = None
         self._shift = 0.0
         self._near: tuple | None = None
-        self._gel_age = _GEL_TANGENTS
         self._last: LoadState | None = None
         self.iterations, self.inner_iterations, self.eliminations = 0, 0, 0
 
@@ -178,10 +176,8 @@ class LoadStepper:
     def _linearise(self, problem: Problem, control, border, shift: float) -> Tangent:
         """The body's tangent at a state, plus a shift on the diagonal."""
         self.eliminations += 1
-        self._gel_age += 1
-        problem.stiffness(control, border, self._blocks, gel=self._gel_age > _GEL_TANGENTS)
-        if self._gel_age > _GEL_TANGENTS:
-            self._gel_age = 0
+        self._tangent = None  # its room is used again
+        problem.stiffness(control, border, self._blocks)
         while True:
             try:
                 eliminated = self._frontal.eliminate(self._blocks, shift=shift)

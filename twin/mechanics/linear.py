@@ -16,7 +16,7 @@ from scipy.linalg import blas, lapack
 
 from twin.mechanics.elements import PAIRS
 
-_LEAF_ELEMENTS = 16
+_LEAF_ELEMENTS = 36
 _I = np.array([i for i, _ in PAIRS])
 _K = np.array([k for _, k in PAIRS])
 

@@ -22,7 +22,6 @@ _ITERATIONS = 30
 _WORSE = 2.0  # growth of the residual that is put up with
 _KEEP_TANGENT = 0.3  # contraction of the residual up to which an old tangent is kept
 _SMALLEST_SHIFT_N_MM, _LARGEST_SHIFT_N_MM = 0.01, 50.0  # on the tangent's diagonal, where it leads astray
-_NOTHING = np.zeros((0, 8, 3, 3))
 _REACH_MM = 0.15  # contact points farther than this from the object are left out, and checked at the end
 
 
@@ -105,7 +104,10 @@ class LoadStepper:
         raise NoConvergence(balance.relative)
 
     def _extrapolate(self, state: LoadState, T: np.ndarray):
-        """Where the body will be if it goes on as in the last step; where it is if the object turns another way."""
+        """Where the body will be if it goes on as in the last step; where it is if the object turns another way.
+
+        If that leaves an element inside out, the step isn't solved, and a shorter one goes less far.
+        """
         if self._last is None or not self._last.held.any():  # a first contact grows in no straight line
             return state.control_mm, state.border
         old, at = self._last, self._body.points.positions(state.control_mm)[state.held]
@@ -116,9 +118,7 @@ class LoadStepper:
         ratio = (before @ now) / max(before @ before, 1e-300)
         if before @ now < 0.95 * np.linalg.norm(before) * np.linalg.norm(now) or ratio > 2:
             return state.control_mm, state.border
-        control = state.control_mm + ratio * (state.control_mm - old.control_mm)
-        inside_out = any(np.isinf(kind.add_forces(control, _NOTHING, np.zeros_like(control))) for kind in self._body.kinds)
-        return (state.control_mm if inside_out else control), state.border
+        return state.control_mm + ratio * (state.control_mm - old.control_mm), state.border
 
     def _accepted(self, state: LoadState, problem: Problem, control, border, balance: Balance) -> LoadState:
         contact, looked, count = balance.contact, problem.looked, len(state.held)

@@ -138,9 +138,8 @@ class Problem:
         self.bound_n = law.shear_strength_mpa * points.area_mm2[looked]
         self.friction = law.kinetic + (law.static - law.kinetic) * np.exp(-state.slid_mm[looked] / law.weakening_mm)
 
-    def contact(self, at_sensor, border, soften: float = 1.0) -> ContactForces:
-        """Contact with the points looked at in places (q, 3) of the sensor's frame."""
-        at = in_object(at_sensor, self.T, border)
+    def contact(self, at, soften: float = 1.0) -> ContactForces:
+        """Contact with the points looked at in places (q, 3) of the object's frame."""
         return contact_forces(self._stimulus, at, self.stiff, self.anchor_mm, self.friction, bound_n=self.bound_n, soften=soften)
 
     def balance(self, control, border) -> Balance | None:
@@ -153,7 +152,7 @@ class Problem:
         if not np.isfinite(elastic_nmm):
             return None
         elastic = residual[body.free].ravel()
-        contact = self.contact(positions(self.controls, self.weights, self.lift, control), border)
+        contact = self.contact(in_object(positions(self.controls, self.weights, self.lift, control), self.T, border))
         force = contact.force_n @ self.T[:3, :3].T
         spread_forces(self.controls, self.weights, -force, residual)
         border_residual = np.zeros(2)
@@ -165,11 +164,10 @@ class Problem:
         scale = max(float(np.linalg.norm(force, axis=1).sum()), FORCE_FLOOR_N)
         return Balance(elastic, residual[body.free].ravel(), border_residual, contact, force, scale, elastic_nmm)
 
-    def stiffness(self, control, border, blocks, *, gel: bool) -> None:
-        """The elements' tangents into ``blocks``; the gel's only on request."""
+    def stiffness(self, control, border, blocks) -> None:
+        """The elements' tangents into ``blocks``."""
         for number, (kind, given, block) in enumerate(zip(self.body.kinds, self._given, blocks, strict=True)):
-            if number == 0 or gel:
-                kind.stiffness(control, given, border[1] if number else 0.0, block)
+            kind.stiffness(control, given, border[1] if number else 0.0, block)
 
     def volume(self, control, out) -> float:
         """How much the gel's volume has grown, mm^3; adds its gradient to ``out``."""

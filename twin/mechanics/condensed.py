@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
-from scipy.linalg import lapack, lu_factor, lu_solve
+from scipy.linalg import blas, lapack
 
 from twin.mechanics.balance import FORCE_FLOOR_N, Balance, Problem
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
@@ -11,6 +12,7 @@ from twin.mechanics.linear import Eliminated
 
 _ITERATIONS, _HASTY_ITERATIONS = 60, 15
 LARGEST_MOVE_MM = 1.5  # of a control in one iteration
+_KEEP_FACTORS = 0.1  # contraction of the residual up to which old factors are kept
 _SOFTENING = 0.1  # of the contact, on the way to a far solution
 _INEXACT = 0.01  # the iteration ends at this share of the whole problem's residual, but not before ``least`` of the scale
 
@@ -29,38 +31,61 @@ class Tangent:
     volume_pivot: float
 
 
-@dataclass(frozen=True)
+@dataclass
 class Near:
     """The tangent once more eliminated, down to the controls that carry the points looked at.
 
-    ``near``, ``far``: kept unknowns that stay and go. ``local (q, 9)``: place of each point's controls among
-    those that stay (their number: none of them).
+    The far part of the tangent is L L^T; all in single precision.
+
+    Attributes
+    ----------
+    near, far : (n,), (f,) int
+        Kept unknowns that stay and go.
+    local : (q, 9) int
+        Place of each point's controls among those that stay (their number: none of them).
+    matrix : (n, n) float
+        What is left of the tangent, symmetric; ``column`` (n,) of the volume's column.
+    factor : (f, f) float
+        L, Fortran order, lower triangle.
+    coupling, far_column : (f, n), (f,) float
+        L^-1 applied to the coupling of far and near, and to the volume's column.
+    solved : tuple
+        The contact's softening, and the factors of the matrix (n + 2, n + 2) for which Newton's direction was last found.
     """
 
     near: np.ndarray
     far: np.ndarray
     local: np.ndarray
     matrix: np.ndarray
-    factor: tuple | None
-    coupling: np.ndarray  # (far, near)
-    carried: np.ndarray  # the far part's inverse applied to the coupling and to the volume's column
-    column: np.ndarray  # (k,) volume's
+    column: np.ndarray
+    factor: np.ndarray
+    coupling: np.ndarray
+    far_column: np.ndarray
+    solved: tuple | None = None
 
     @classmethod
     def of(cls, tangent: Tangent, local: np.ndarray) -> "Near":
         matrix, count = tangent.matrix, len(tangent.matrix)
-        controls = np.unique(local[local >= 0])
-        n = (3 * controls[:, None] + np.arange(3)).ravel()
-        f = np.setdiff1d(np.arange(count), n, assume_unique=True)
+        stays = np.zeros(count // 3 + 1, bool)
+        stays[local] = True
+        stays = np.repeat(stays[:-1], 3)
+        far = np.flatnonzero(~stays)
+        factor, info = lapack.spotrf(matrix[np.ix_(far, far)].T, lower=1, clean=0, overwrite_a=1) if len(far) else (np.zeros((0, 0)), 0)
+        if info > 0:  # only contact holds some of the far controls up: let all stay
+            stays[:], far, factor = True, far[:0], np.zeros((0, 0))
+        near = np.flatnonzero(stays)
+        controls = near[::3] // 3
         renumber = np.full(count // 3 + 1, len(controls))
         renumber[controls] = np.arange(len(controls))
-        column = np.zeros(count) if tangent.volume_column is None else tangent.volume_column[tangent.eliminated.kept]
-        coupling, rest = matrix[np.ix_(f, n)], matrix[np.ix_(n, n)]
-        if not len(f):
-            return cls(n, f, renumber[local], rest, None, coupling, np.zeros((0, len(n) + 1)), column)
-        factor = lu_factor(matrix[np.ix_(f, f)], check_finite=False)
-        carried = lu_solve(factor, np.column_stack([coupling, column[f]]), check_finite=False)
-        return cls(n, f, renumber[local], rest - coupling.T @ carried[:, :-1], factor, coupling, carried, column)
+        column = np.zeros(count, np.float32) if tangent.volume_column is None else tangent.volume_column[tangent.eliminated.kept]
+        rest, column, far_column = matrix[np.ix_(near, near)], column[near], column[far]
+        coupling = np.zeros((0, len(near)), np.float32)
+        if len(far):
+            coupling = blas.strsm(1.0, factor, matrix[np.ix_(near, far)].T, lower=1, overwrite_b=1)
+            far_column = lapack.strtrs(factor, far_column, lower=1)[0]
+            rest = rest - coupling.T @ coupling
+            column = column - coupling.T @ far_column
+        return cls(near, far, renumber[local], rest, column, factor, coupling, far_column)
 
 
 class SmallContact:
@@ -73,12 +98,11 @@ class SmallContact:
         self._problem, self._border, self._near = problem, border, near
         self.iterations = 0
         self._at = positions(problem.controls, problem.weights, problem.lift, control)
-        n, f = near.near, near.far
-        self._far_residual = residual[f]
-        self._r = residual[n] - near.carried[:, :-1].T @ residual[f]
-        self._v = near.column[n] - near.coupling.T @ near.carried[:, -1]
-        self._g = volume_residual - near.carried[:, -1] @ residual[f]
-        self._q = pivot - near.carried[:, -1] @ near.column[f]
+        self._far_residual = lapack.strtrs(near.factor, residual[near.far], lower=1)[0] if len(near.far) else residual[near.far]
+        self._r = residual[near.near] - near.coupling.T @ self._far_residual
+        self._v = near.column
+        self._g = volume_residual - near.far_column @ self._far_residual
+        self._q = pivot - near.far_column @ near.far_column
 
     def solve(self, balance: Balance, *, soften: bool, least: float):
         """Moves of all kept unknowns (k,) and of the border (2,).
@@ -93,11 +117,11 @@ class SmallContact:
             y, _ = self._newton(start, _SOFTENING, wanted, _ITERATIONS)
             y, _ = self._newton(y, 1.0, wanted, _ITERATIONS)
         near = self._near
-        out = np.zeros(len(near.column))
+        out = np.zeros(len(near.near) + len(near.far))
         out[near.near] = y[:-2]
         if len(near.far):
-            right = self._far_residual + near.column[near.far] * y[-1] + near.coupling @ y[:-2]
-            out[near.far] = -lu_solve(near.factor, right, check_finite=False)
+            right = self._far_residual + near.far_column * y[-1] + near.coupling @ y[:-2].astype(np.float32)
+            out[near.far] = -lapack.strtrs(near.factor, right, lower=1, trans=1)[0]
         return out, y[-2:]
 
     def _newton(self, y, soften: float, wanted: float, most: int):
@@ -107,7 +131,15 @@ class SmallContact:
             if norm <= wanted:
                 return y, True
             self.iterations += 1
-            move = self._direction(contact, residual)
+            if self._near.solved and self._near.solved[0] == soften:  # what touches and sticks may not have changed since
+                trial_y = y - self._solved(residual)
+                trial, trial_contact = self._equations(trial_y, soften)
+                trial_norm = np.linalg.norm(trial)
+                if trial_norm < max(_KEEP_FACTORS * norm, wanted):
+                    y, residual, contact, norm = trial_y, trial, trial_contact, trial_norm
+                    continue
+            self._factorise(contact, soften)
+            move = -self._solved(residual)
             size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move[:-2]).max(initial=0.0), 1e-300))
             best = None
             for _ in range(6):
@@ -124,22 +156,19 @@ class SmallContact:
 
     def _equations(self, y, soften: float):
         problem, near = self._problem, self._near
-        moves = np.concatenate([y[:-2].reshape(-1, 3), np.zeros((1, 3))])
         border = self._border + y[-2:]
-        contact = problem.contact(positions(near.local, problem.weights, self._at, moves), border, soften)
-        force = contact.force_n @ problem.T[:3, :3].T
-        pull = np.zeros_like(moves)
-        spread_forces(near.local, problem.weights, force, pull)
+        at = _moved(near.local, problem.weights, self._at, y, problem.T, border[0])
+        contact = problem.contact(at, soften)
         out = np.zeros(len(y))
-        out[:-2] = near.matrix @ y[:-2] + self._r + self._v * y[-1] - pull[:-1].ravel()
+        force_z = _residual(near.matrix, y, self._r, self._v, near.local, problem.weights, contact.force_n, problem.T, out)
         if problem.compliance:
-            out[-2] = border[0] / problem.compliance + force[:, 2].sum()
+            out[-2] = border[0] / problem.compliance + force_z
         if problem.body.sealed:
             out[-1] = self._g + self._v @ y[:-2] + self._q * y[-1]
         return out, contact
 
-    def _direction(self, contact: ContactForces, residual):
-        """Newton's direction; solved in single precision, which costs half and no convergence."""
+    def _factorise(self, contact: ContactForces, soften: float):
+        """The matrix of Newton's direction; in single precision, which costs half and no convergence."""
         problem, local, count = self._problem, self._near.local, len(self._near.near)
         turn = problem.T[:3, :3]
         stiffness = turn @ contact.stiffness @ turn.T
@@ -156,4 +185,54 @@ class SmallContact:
         if problem.body.sealed:
             matrix[:count, count + 1] = matrix[count + 1, :count] = self._v
             matrix[count + 1, count + 1] = self._q
-        return lapack.sgesv(matrix, -residual.astype(np.float32), overwrite_a=1)[2].astype(float)
+        self._near.solved = (soften, *lapack.sgetrf(matrix, overwrite_a=1)[:2])
+
+    def _solved(self, right_side):
+        return lapack.sgetrs(*self._near.solved[1:], right_side.astype(np.float32))[0].astype(float)
+
+
+@numba.njit(cache=True)
+def _moved(local, weights, at, y, T, yielded):
+    """Points (q, 3) in the object's frame after moves ``y`` of their controls."""
+    controls = (len(y) - 2) // 3
+    out = np.empty_like(at)
+    for p in range(len(at)):
+        x0, x1, x2 = at[p, 0] - T[0, 3], at[p, 1] - T[1, 3], at[p, 2] - T[2, 3] - yielded
+        for a in range(9):
+            c = local[p, a]
+            if c < controls:
+                w = weights[p, a]
+                x0 += w * y[3 * c]
+                x1 += w * y[3 * c + 1]
+                x2 += w * y[3 * c + 2]
+        for i in range(3):
+            out[p, i] = x0 * T[0, i] + x1 * T[1, i] + x2 * T[2, i]
+    return out
+
+
+@numba.njit(cache=True, fastmath=True)
+def _residual(matrix, y, start, column, local, weights, force, T, out):
+    """Forces on the near controls into ``out``; the sum of the contact's along z, all in the sensor's frame."""
+    count = len(y) - 2
+    for r in range(count):
+        total = start[r] + column[r] * y[count + 1]
+        for c in range(count):
+            total += matrix[r, c] * y[c]
+        out[r] = total
+    force_z = 0.0
+    for p in range(len(force)):
+        f0, f1, f2 = force[p, 0], force[p, 1], force[p, 2]
+        if f0 == 0 and f1 == 0 and f2 == 0:
+            continue
+        g0 = T[0, 0] * f0 + T[0, 1] * f1 + T[0, 2] * f2
+        g1 = T[1, 0] * f0 + T[1, 1] * f1 + T[1, 2] * f2
+        g2 = T[2, 0] * f0 + T[2, 1] * f1 + T[2, 2] * f2
+        force_z += g2
+        for a in range(9):
+            c = 3 * local[p, a]
+            if c < count:
+                w = weights[p, a]
+                out[c] -= w * g0
+                out[c + 1] -= w * g1
+                out[c + 2] -= w * g2
+    return force_z

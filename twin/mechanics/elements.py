@@ -80,7 +80,7 @@ class Elements:
         return self.law[5] * _half_difference(cells.controls, cells.gradients, cells.weights_mm3, control_mm)
 
     def stiffness(self, control_mm: np.ndarray, stress: np.ndarray, pressure_mpa: float, out: np.ndarray) -> None:
-        """Second derivative of each element's energy into ``out`` (m, 6, b, b), N/mm.
+        """Second derivative of each element's energy into ``out`` (m, 6, b, b), N/mm; in its precision.
 
         Block p couples direction ``PAIRS[p][0]`` of the first control with ``PAIRS[p][1]`` of the second;
         the other three are transposes.
@@ -165,8 +165,9 @@ def _stiffness(elements, gradients, weights, law, extra, control, given, sealing
     f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
     det = np.zeros(8)
     tangent = np.zeros((3, 3, 3, 3))
-    left = np.zeros((24, 6 * count))
-    swell = np.zeros((2, 3, count))
+    left, right = np.zeros((24, 6 * count), out.dtype), np.zeros((24, count), out.dtype)
+    swell, product = np.zeros((2, 3, count), out.dtype), np.zeros((6 * count, count), out.dtype)
+    scale = np.zeros(2, out.dtype)
     for m in range(len(elements)):
         for a in range(count):
             for i in range(3):
@@ -201,15 +202,14 @@ def _stiffness(elements, gradients, weights, law, extra, control, given, sealing
                     s = s0 * grad[3 * q, a] + s1 * grad[3 * q + 1, a] + s2 * grad[3 * q + 2, a]
                     swell[0, i, a] += s
                     swell[1, i, a] += s * lean
-        k_out = out[m]
-        k_out[:] = np.dot(left.T, grad).reshape(6, count, count)
-        for kind in range(2):
-            scale = law[4 + kind] / rest
-            for p in range(6):
-                for a in range(count):
-                    size = scale * swell[kind, _I[p], a]
-                    for b in range(count):
-                        k_out[p, a, b] += size * swell[kind, _K[p], b]
+        right[:] = grad
+        np.dot(left.T, right, product)
+        scale[0], scale[1] = law[4] / rest, law[5] / rest
+        for p in range(6):
+            for a in range(count):
+                size, lean_size = scale[0] * swell[0, _I[p], a], scale[1] * swell[1, _I[p], a]
+                for b in range(count):
+                    out[m, p, a, b] = product[count * p + a, b] + size * swell[0, _K[p], b] + lean_size * swell[1, _K[p], b]
 
 
 @numba.njit(cache=True, fastmath=True)

@@ -16,7 +16,7 @@ from scipy.linalg import blas, lapack
 
 from twin.mechanics.elements import PAIRS
 
-_LEAF_ELEMENTS = 16
+_LEAF_ELEMENTS = 36
 _I = np.array([i for i, _ in PAIRS])
 _K = np.array([k for _, k in PAIRS])
 
@@ -31,11 +31,10 @@ class _Front:
     border: np.ndarray  # later unknowns they are coupled to
     controls_left: np.ndarray  # controls of the border
     assembled: list  # for each kind of element: which are assembled here, and (elements, 3 b) their rows, direction-major; -1 for clamped
-    parent: int = -1
-    into_parent: np.ndarray = None  # rows of the parent's front for ``border``
-    head: np.ndarray = None  # (own, own), Fortran order, lower triangle, overwritten by its factor
-    below: np.ndarray = None  # (border, own)
-    rest: np.ndarray = None  # (border, border)
+    children: list  # fronts that are added to this one, and the runs of their borders in it, see ``_runs``
+    head: np.ndarray  # (own, own), Fortran order, lower triangle, overwritten by its factor
+    below: np.ndarray  # (border, own)
+    rest: np.ndarray = None  # (border, border); in room that other fronts use before and after
 
 
 class FrontalSolver:
@@ -93,14 +92,12 @@ class FrontalSolver:
                     )
                     for which, controls in assembled
                 ],
+                children=[(self._fronts[c], _runs(rows[self._fronts[c].border], 3 * len(own))) for c in children],
+                head=np.zeros((3 * len(own), 3 * len(own)), np.float32, order="F"),
+                below=np.zeros((3 * len(left), 3 * len(own)), np.float32, order="F"),
             )
-            for child in children:
-                self._fronts[child].parent = number
-                self._fronts[child].into_parent = rows[self._fronts[child].border]
-            front.head = np.zeros((len(front.own), len(front.own)), np.float32, order="F")
-            front.below = np.zeros((len(front.border), len(front.own)), np.float32, order="F")
-            front.rest = np.zeros((len(front.border), len(front.border)), np.float32, order="F")
             self._fronts.append(front)
+        self._make_room([children for _, children in tree])
         self.kept = self._fronts[-1].border
 
     def eliminate(self, blocks: list[np.ndarray], *, shift: float = 0.0) -> "Eliminated":
@@ -117,27 +114,41 @@ class FrontalSolver:
         ------
         NotPositiveDefinite
         """
-        fronts = self._fronts
-        for front in fronts:
+        for front in self._fronts:
             front.head[:] = 0.0
             front.below[:] = 0.0
             front.rest[:] = 0.0
             for block, (which, places) in zip(blocks, front.assembled, strict=True):
-                _assemble(block, which, places, front.head, front.below, front.rest)
+                if len(which):
+                    _assemble(block, which, places, front.head, front.below, front.rest)
+            for child, runs in front.children:
+                _extend(child.rest.T, runs, front.head.T, front.below.T, front.rest.T)
+            if not len(front.own):
+                continue
             if shift:
                 front.head[np.arange(len(front.own)), np.arange(len(front.own))] += shift
-        for front in fronts:
-            if len(front.own):
-                _, info = lapack.spotrf(front.head, lower=1, clean=0, overwrite_a=1)
-                if info > 0:
-                    raise NotPositiveDefinite
-                if len(front.border):
-                    blas.strsm(1.0, front.head, front.below, side=1, lower=1, trans_a=1, overwrite_b=1)
-                    blas.ssyrk(-1.0, front.below, beta=1.0, c=front.rest, lower=1, overwrite_c=1)
-            if front.parent >= 0:
-                up = fronts[front.parent]
-                _extend(front.rest, front.into_parent, up.head, up.below, up.rest)
-        return Eliminated(fronts, self.kept)
+            _, info = lapack.spotrf(front.head, lower=1, clean=0, overwrite_a=1)
+            if info > 0:
+                raise NotPositiveDefinite
+            if len(front.border):
+                blas.strsm(1.0, front.head, front.below, side=1, lower=1, trans_a=1, overwrite_b=1)
+                blas.ssyrk(-1.0, front.below, beta=1.0, c=front.rest, lower=1, overwrite_c=1)
+        return Eliminated(self._fronts, self.kept)
+
+    def _make_room(self, children: list[list[int]]) -> None:
+        """Give every front its ``rest``: what a front leaves is needed only until it was added to the next one, so few rooms do."""
+        room, sizes, unused = [], [], []
+        for front, before in zip(self._fronts, children, strict=True):
+            if not unused:
+                unused.append(len(sizes))
+                sizes.append(0)
+            room.append(unused.pop())
+            sizes[room[-1]] = max(sizes[room[-1]], len(front.border) ** 2)
+            unused += [room[child] for child in before]
+        rooms = [np.empty(size, np.float32) for size in sizes]
+        for front, number in zip(self._fronts, room, strict=True):
+            size = len(front.border)
+            front.rest = rooms[number][: size * size].reshape(size, size, order="F")
 
 
 class Eliminated:
@@ -194,6 +205,25 @@ def _inside(boxes, box):
 
 
 @numba.njit(cache=True)
+def whole(lower, shift):
+    """A symmetric matrix from its lower triangle, plus a shift on the diagonal."""
+    out = np.empty_like(lower)
+    for c in range(len(lower)):
+        out[c, c] = lower[c, c] + shift
+        for r in range(c + 1, len(lower)):
+            out[r, c] = out[c, r] = lower[r, c]
+    return out
+
+
+def _runs(places, own):
+    """Runs (k, 3) of rising places: first row, first place and length; none lies across ``own``."""
+    first = np.flatnonzero(np.diff(places, prepend=-2) != 1)
+    first = np.union1d(first, np.searchsorted(places, own))
+    first = first[first < len(places)]
+    return np.column_stack([first, places[first], np.diff(first, append=len(places))])
+
+
+@numba.njit(cache=True)
 def _assemble(elements, which, places, head, below, rest):
     """Add symmetric blocks to a front's lower triangle."""
     own, count = len(head), elements.shape[2]
@@ -210,25 +240,34 @@ def _assemble(elements, which, places, head, below, rest):
                     c = place[count * k + b]
                     if c < 0:
                         continue
-                    low, high = (r, c) if r < c else (c, r)
-                    if high < own:
-                        head[high, low] += block[p, a, b]
-                    elif low < own:
+                    low, high = min(r, c), max(r, c)
+                    if low >= own:
+                        rest[high - own, low - own] += block[p, a, b]
+                    elif high >= own:
                         below[high - own, low] += block[p, a, b]
                     else:
-                        rest[high - own, low - own] += block[p, a, b]
+                        head[high, low] += block[p, a, b]
 
 
 @numba.njit(cache=True)
-def _extend(update, places, head, below, rest):
+def _extend(update, runs, head, below, rest):
+    """Add what an earlier front leaves, (border, border), to a front; all transposed, so that columns lie in one piece."""
     own = len(head)
-    for c in range(len(places)):
-        low = places[c]
-        for r in range(c, len(places)):
-            high = places[r]
-            if high < own:
-                head[high, low] += update[r, c]
-            elif low < own:
-                below[high - own, low] += update[r, c]
-            else:
-                rest[high - own, low - own] += update[r, c]
+    for j in range(len(runs)):
+        for shift in range(runs[j, 2]):
+            source, low = update[runs[j, 0] + shift], runs[j, 1] + shift
+            for k in range(j, len(runs)):
+                skip = shift if k == j else 0
+                row, place, count = runs[k, 0] + skip, runs[k, 1] + skip, runs[k, 2] - skip
+                if place < own:
+                    _add(source[row : row + count], head[low, place : place + count])
+                elif low < own:
+                    _add(source[row : row + count], below[low, place - own : place - own + count])
+                else:
+                    _add(source[row : row + count], rest[low - own, place - own : place - own + count])
+
+
+@numba.njit(cache=True)
+def _add(values, out):
+    for k in range(len(values)):
+        out[k] += values[k]

@@ -47,7 +47,7 @@ def invariants(f, g):
     return det
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=True)
 def distortion(law, f, det, g, stress):
     """Energy density of the part of the law without kappa; its derivative by F into ``stress`` (3, 3), MPa."""
     trace, scale, first = _first_invariant(f, det)
@@ -66,40 +66,45 @@ def distortion(law, f, det, g, stress):
     return energy
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=True)
 def distortion_stiffness(law, f, det, g, out):
     """Second derivative of ``distortion`` by F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
     trace, scale, first = _first_invariant(f, det)
     slope = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
     bend = 4 * scale * scale * (2 * law[2] + 6 * law[3] * first)
-    second, slopes = (0.0, f)
+    for i in range(3):
+        for j in range(3):
+            to_k, to_g = -2 / 3 * slope * g[i, j], slope * (2 / 9 * trace * g[i, j] - 2 / 3 * f[i, j])
+            curved = bend * (f[i, j] - trace / 3 * g[i, j])
+            for k in range(3):
+                turned = slope * trace / 3 * g[k, j]
+                for m in range(3):
+                    out[i, j, k, m] = to_k * f[k, m] + to_g * g[k, m] + turned * g[i, m] + curved * (f[k, m] - trace / 3 * g[k, m])
+            out[i, j, i, j] += slope
     if law[1] != 0:
-        second, slopes = _second_invariant(f, trace)
-    scale2 = law[1] * scale * scale
+        _add_second_stiffness(law[1] * scale * scale, f, g, trace, out)
+
+
+@numba.njit(cache=True, fastmath=True)
+def _add_second_stiffness(factor, f, g, trace, out):
+    """Add the c01 part of ``distortion_stiffness``."""
+    second, slopes = _second_invariant(f, trace)
     for i in range(3):
         for j in range(3):
             for k in range(3):
                 for m in range(3):
-                    mixed, straight = g[i, m] * g[k, j], g[i, j] * g[k, m]
-                    value = slope * (trace * (2 / 9 * straight + mixed / 3) - 2 / 3 * (f[i, j] * g[k, m] + g[i, j] * f[k, m]))
-                    if i == k and j == m:
-                        value += slope
-                    if bend != 0:
-                        value += bend * (f[i, j] - trace / 3 * g[i, j]) * (f[k, m] - trace / 3 * g[k, m])
-                    if scale2 != 0:
-                        curve = 4 * f[i, j] * f[k, m] - 2 * f[i, m] * f[k, j]
-                        if i == k:
-                            curve -= 2 * (f[0, j] * f[0, m] + f[1, j] * f[1, m] + f[2, j] * f[2, m])
-                            if j == m:
-                                curve += 2 * trace
+                    curve = 4 * f[i, j] * f[k, m] - 2 * f[i, m] * f[k, j]
+                    if i == k:
+                        curve -= 2 * (f[0, j] * f[0, m] + f[1, j] * f[1, m] + f[2, j] * f[2, m])
                         if j == m:
-                            curve -= 2 * (f[i, 0] * f[k, 0] + f[i, 1] * f[k, 1] + f[i, 2] * f[k, 2])
-                        curve += second * (16 / 9 * straight + 4 / 3 * mixed) - 4 / 3 * (slopes[i, j] * g[k, m] + g[i, j] * slopes[k, m])
-                        value += scale2 * curve
-                    out[i, j, k, m] = value
+                            curve += 2 * trace
+                    if j == m:
+                        curve -= 2 * (f[i, 0] * f[k, 0] + f[i, 1] * f[k, 1] + f[i, 2] * f[k, 2])
+                    curve += second * (16 / 9 * g[i, j] * g[k, m] + 4 / 3 * g[i, m] * g[k, j])
+                    out[i, j, k, m] += factor * (curve - 4 / 3 * (slopes[i, j] * g[k, m] + g[i, j] * slopes[k, m]))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=True)
 def _first_invariant(f, det):
     """tr C, J^(-2/3) and I1 - 3."""
     trace = 0.0
@@ -110,7 +115,7 @@ def _first_invariant(f, det):
     return trace, scale, scale * trace - 3
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=True)
 def _second_invariant(f, trace):
     """I2 of C and its derivative 2 (tr C F - F C) by F."""
     c = f.T @ f

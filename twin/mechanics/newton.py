@@ -12,7 +12,7 @@ import numpy as np
 from twin.errors import ContactError
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
-from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite
+from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
 
 GAP_BOUND_MM = 0.01  # no contact point ends deeper inside the object
@@ -20,10 +20,8 @@ RESIDUAL_TOLERANCE = 1e-6  # of the sum of the contact forces
 _PENALTY_GROWTH, _PENALTY_RAISES = 4.0, 5
 _ITERATIONS = 30
 _WORSE = 2.0  # growth of the residual that is put up with
-_KEEP_TANGENT = 0.2  # contraction of the residual up to which an old tangent is kept
+_KEEP_TANGENT = 0.3  # contraction of the residual up to which an old tangent is kept
 _SMALLEST_SHIFT_N_MM, _LARGEST_SHIFT_N_MM = 0.01, 50.0  # on the tangent's diagonal, where it leads astray
-_GEL_TANGENTS = 2  # for so many tangents the gel's, which changes little, is kept
-_NOTHING = np.zeros((0, 8, 3, 3))
 _REACH_MM = 0.15  # contact points farther than this from the object are left out, and checked at the end
 
 
@@ -52,7 +50,7 @@ class LoadStepper:
         self._body, self._frontal, self._stimulus, self._friction = body, frontal, stimulus, friction
         self._compliance = compliance_mm_per_n
         shapes = [(len(kind.cells.controls), 6, *2 * kind.cells.controls.shape[1:]) for kind in body.kinds]
-        self._blocks = [np.empty(shape) for shape in shapes]
+        self._blocks = [np.empty(shape, np.float32) for shape in shapes]
         local = np.full(len(body.free), -1)  # place of each control among the kept ones
         kept_controls = np.flatnonzero(np.isin(frontal.unknown[:, 0], frontal.kept))
         local[kept_controls] = np.arange(len(kept_controls))
@@ -62,7 +60,6 @@ class LoadStepper:
         self._tangent: Tangent | None = None
         self._shift = 0.0
         self._near: tuple | None = None
-        self._gel_age = _GEL_TANGENTS
         self._last: LoadState | None = None
         self.iterations, self.inner_iterations, self.eliminations = 0, 0, 0
 
@@ -107,7 +104,10 @@ class LoadStepper:
         raise NoConvergence(balance.relative)
 
     def _extrapolate(self, state: LoadState, T: np.ndarray):
-        """Where the body will be if it goes on as in the last step; where it is if the object turns another way."""
+        """Where the body will be if it goes on as in the last step; where it is if the object turns another way.
+
+        If that leaves an element inside out, the step isn't solved, and a shorter one goes less far.
+        """
         if self._last is None or not self._last.held.any():  # a first contact grows in no straight line
             return state.control_mm, state.border
         old, at = self._last, self._body.points.positions(state.control_mm)[state.held]
@@ -118,9 +118,7 @@ class LoadStepper:
         ratio = (before @ now) / max(before @ before, 1e-300)
         if before @ now < 0.95 * np.linalg.norm(before) * np.linalg.norm(now) or ratio > 2:
             return state.control_mm, state.border
-        control = state.control_mm + ratio * (state.control_mm - old.control_mm)
-        inside_out = any(np.isinf(kind.add_forces(control, _NOTHING, np.zeros_like(control))) for kind in self._body.kinds)
-        return (state.control_mm if inside_out else control), state.border
+        return state.control_mm + ratio * (state.control_mm - old.control_mm), state.border
 
     def _accepted(self, state: LoadState, problem: Problem, control, border, balance: Balance) -> LoadState:
         contact, looked, count = balance.contact, problem.looked, len(state.held)
@@ -178,10 +176,8 @@ class LoadStepper:
     def _linearise(self, problem: Problem, control, border, shift: float) -> Tangent:
         """The body's tangent at a state, plus a shift on the diagonal."""
         self.eliminations += 1
-        self._gel_age += 1
-        problem.stiffness(control, border, self._blocks, gel=self._gel_age > _GEL_TANGENTS)
-        if self._gel_age > _GEL_TANGENTS:
-            self._gel_age = 0
+        self._tangent = None  # its room is used again
+        problem.stiffness(control, border, self._blocks)
         while True:
             try:
                 eliminated = self._frontal.eliminate(self._blocks, shift=shift)
@@ -190,7 +186,7 @@ class LoadStepper:
                 shift = max(8 * shift, _SMALLEST_SHIFT_N_MM)
                 if shift > _LARGEST_SHIFT_N_MM:
                     raise NoConvergence(np.inf) from None
-        matrix = np.tril(eliminated.matrix) + np.tril(eliminated.matrix, -1).T + shift * np.eye(len(eliminated.matrix))
+        matrix = whole(eliminated.matrix, shift)
         if not self._body.sealed:
             return Tangent(eliminated, matrix, None, 0.0)
         column = np.zeros_like(control)

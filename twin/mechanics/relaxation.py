@@ -26,7 +26,8 @@ class History:
     stress : (m, 8, 3, 3) float
         S at the last state, and ``branches`` H (terms, m, 8, 3, 3).
     difference : (m,) float
-        The same of the skin's kappa_d part (see ``Elements.difference_stress``), and ``difference_branches`` (terms, m).
+        The same of the skin's kappa_d part (see ``Elements.difference_stress``), and ``difference_branches`` (terms, m); zero in
+        the gel.
     """
 
     stress: np.ndarray
@@ -60,7 +61,8 @@ class History:
         if not terms:
             return self
         share, fade, late = _decay(terms, step_s)
-        stress, difference = kind.distortion_stress(control_mm), kind.difference_stress(control_mm)
+        stress = kind.distortion_stress(control_mm)
+        difference = kind.difference_stress(control_mm) if kind.layer else self.difference
         grown = share * late
         return History(
             stress,

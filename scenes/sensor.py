@@ -224,7 +224,8 @@ class SpeckSpec(Section):
 class AppearanceSpec(Section):
     """Reflectances (linear, 0 to 1) of what the camera sees.
 
-    ``skin_gloss`` and ``cap_gloss`` are the weights of a rough specular lobe. ``cap_levels`` is each cap's
+    ``skin_gloss`` and ``cap_gloss`` are the weights of a rough specular lobe. ``cap_bump`` is the share of the light that
+    a cap takes as a small ball would, whatever its direction, not as a flat disc: printed caps are round and translucent. ``cap_levels`` is each cap's
     reflectance relative to ``cap_albedo``, in pin order, where it has been measured; without them ``cap_variation``
     is the relative sd of a random pattern of number ``cap_pattern`` (another number: another print of the sensor).
     ``cap_shapes``: each cap's outline, relative to a circle, as measured: coefficients a_2, b_2, a_3, b_3, ... of
@@ -238,6 +239,7 @@ class AppearanceSpec(Section):
     cap_albedo: Rgb
     cap_gloss: Fraction = 0.0
     cap_roughness: Annotated[float, Field(ge=0.05, le=1)] = 0.25
+    cap_bump: Fraction = 0.0
     cap_variation: Fraction = 0.0
     cap_pattern: Annotated[int, Field(ge=0)] = 0
     cap_levels: tuple[Positive, ...] = ()

@@ -43,10 +43,9 @@ def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.nd
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def subpixel_rays(table: np.ndarray, across: int) -> np.ndarray:
-    """Directions (H, W, across^2, 3) of a regular grid of places within each pixel, not normalised."""
+def subpixel_rays(corners: np.ndarray, across: int) -> np.ndarray:
+    """Directions (n, across^2, 3) of a regular grid of places within n pixels, not normalised; ``corners`` (2, 2, n, 3) by row, column."""
     offset = (np.arange(across) + 0.5) / across
     s, t = (g.ravel()[:, None] for g in np.meshgrid(offset, offset))
-    top = (1 - s) * table[:-1, :-1, None] + s * table[:-1, 1:, None]
-    bottom = (1 - s) * table[1:, :-1, None] + s * table[1:, 1:, None]
-    return (1 - t) * top + t * bottom
+    first, second = ((1 - s) * row[0, :, None] + s * row[1, :, None] for row in corners)
+    return (1 - t) * first + t * second

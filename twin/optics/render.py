@@ -1,5 +1,6 @@
 """From a sensor's state to the linear light on its camera's film."""
 
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -71,10 +72,14 @@ class Renderer:
         self._inner = None if mesh is None else np.unique(mesh.inner_quads)
         self._skin = SkinSurface(spec, self._rest.base_mm if mesh is None else mesh.nodes_mm[self._inner])
         self._bounces = bounces
-        self._light, cover = static_layer(spec, window)
-        self._open = 1 - cover
-        self._pixels = np.flatnonzero(self._open > 0)
         self._view = None
+
+    @cached_property
+    def static(self) -> tuple[np.ndarray, np.ndarray]:
+        """Light (H, W, 3) or (H, W) of the static layer, and the share (H, W) of the gel's light that it lets through."""
+        light, cover = static_layer(self.spec, self.window_px)
+        mono = self.spec.camera.channels == "mono"
+        return (luminance(light).astype(np.float32) if mono else light), 1 - cover
 
     def render(self, state=None, seed: int = 0) -> np.ndarray:
         """Linear light on the film.
@@ -100,13 +105,13 @@ class Renderer:
             self._view = kind(mi, self.spec, self.window_px, surfaces, self._bounces)
         else:
             self._view.move(surfaces)
-        gel = self._view.gel_light(self._pixels, self.spp, seed, state)
-        mono = self.spec.camera.channels == "mono"
-        image = (luminance(self._light).astype(np.float32) if mono else self._light).copy()
-        if mono and gel.shape[1] == 3:
+        light, through = self.static
+        pixels = np.flatnonzero(through > 0)
+        gel = self._view.gel_light(pixels, self.spp, seed, state)
+        if light.ndim == 2 and gel.shape[1] == 3:
             gel = luminance(gel)[:, None]
-        flat = image.reshape(len(self._open.ravel()), -1)
-        flat[self._pixels] += self._open.ravel()[self._pixels, None] * gel.astype(np.float32)
+        image = light.copy()
+        image.reshape(through.size, -1)[pixels] += (through.ravel()[pixels, None] * gel).astype(np.float32)
         return np.maximum(image, 0)
 
     def surfaces(self, state) -> dict[str, Surface]:

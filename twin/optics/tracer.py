@@ -39,6 +39,8 @@ class GelTracer:
         Beer-Lambert coefficients, 1/mm.
     bounces : int
         Scatterings of a path after its first vertex.
+    bump : float
+        ``AppearanceSpec.cap_bump`` of the shape ``caps``.
     """
 
     scene: object
@@ -46,14 +48,16 @@ class GelTracer:
     emitters: Emitters
     absorption: tuple
     bounces: int
+    bump: float
+    caps: object
 
     @classmethod
     def of(cls, mi, spec: SensorSpec, scene, bounces: int) -> "GelTracer":
         """For a sensor, its gel-side scene and a number of bounces."""
         patches = lights(spec)
-        return cls(
-            scene, Window.of(spec), Emitters(patches, [spectrum(mi, p.radiance) for p in patches]), spec.gel.absorption_per_mm, bounces
-        )
+        emitters = Emitters(patches, [spectrum(mi, p.radiance) for p in patches])
+        caps = next(mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == "caps")
+        return cls(scene, Window.of(spec), emitters, spec.gel.absorption_per_mm, bounces, spec.appearance.cap_bump, caps)
 
     def radiance(self, mi, dr, place, direction, random):
         """Radiance in the gel, divided by n^2, along rays that start at the window's gel side.
@@ -118,10 +122,12 @@ class GelTracer:
         """Reflected radiance of the patches' light at a vertex."""
         place, ways, shares = random.next_2d(), [], []
         total = mi.Float(0.0)
+        bump = dr.select(hit.shape == self.caps, self.bump, 0.0)
         for patch, radiance in zip(self.emitters.patches, self.emitters.radiance, strict=True):
             toward, length, factor = self.window.connect(dr, mi, hit.p, _point(mi, dr, patch, place))
             ways.append((toward, length, factor * patch.area_mm2 * radiance))
-            strength = dr.detach(dr.max(radiance)) * factor * patch.area_mm2 * dr.maximum(dr.dot(toward, hit.sh_frame.n), 0.0)
+            taken = _taken(dr, dr.dot(toward, hit.sh_frame.n), bump)
+            strength = dr.detach(dr.max(radiance)) * factor * patch.area_mm2 * taken
             total += dr.select(active, strength, 0.0)
             shares.append(mi.Float(total))
         at = random.next_1d() * total
@@ -137,7 +143,8 @@ class GelTracer:
         shadow = hit.spawn_ray(toward)
         shadow.maxt = length * (1 - 1e-4)
         lit &= ~self.scene.ray_test(shadow, coherent=False, active=lit)
-        reflected = bsdf.eval(mi.BSDFContext(), hit, hit.to_local(toward), lit)
+        local = hit.to_local(toward)
+        reflected = bsdf.eval(mi.BSDFContext(), hit, local, lit) * (_taken(dr, local.z, bump) / dr.maximum(local.z, NEVER))
         arriving *= self._absorbed(mi, dr, length, lit)
         return dr.select(lit, reflected * arriving * (total / dr.maximum(share, NEVER)), 0.0)
 
@@ -145,6 +152,11 @@ class GelTracer:
         if not any(self.absorption):
             return mi.Spectrum(1.0)
         return dr.exp(-spectrum(mi, np.array(self.absorption)) * dr.select(active, length, 0.0))
+
+
+def _taken(dr, cosine, bump):
+    """Cosine law of a flat place, and of a ball: half of what arrives, averaged over the side that is seen."""
+    return dr.select(cosine > 0, (1 - bump) * cosine + 0.5 * bump, 0.0)
 
 
 def spectrum(mi, rgb: np.ndarray):

@@ -1,0 +1,121 @@
+"""Light of the lamps behind the window at places in the gel: closed forms without shadows (the ray's equation: ``twin.projection``)."""
+
+import numba
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.optics.lights import lights
+
+RING_PLACES = 24  # that stand for an annulus
+NEWTON_STEPS = 5  # from the paraxial start; the sixth changes a direction by less than 1e-5
+ON_AXIS_MM = 1e-4  # closer to the light's vertical than this, a way is straight
+
+
+class DirectLight:
+    """Irradiance in the gel of all LEDs and of the housing's ring, each a point (the ring: many).
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    """
+
+    def __init__(self, spec: SensorSpec):
+        lens, gel = spec.lens, spec.gel
+        self._window = np.array([lens.back_mm, lens.z_mm, lens.refractive_index, gel.refractive_index])
+        self._absorption = np.array(gel.absorption_per_mm, float)
+        places, powers = [], []
+        turn = np.arange(RING_PLACES) * 2 * np.pi / RING_PLACES
+        for patch in lights(spec):
+            ring = 0 if patch.radii_mm[1] == 0 else np.sqrt(np.mean(patch.radii_mm**2))
+            around = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1) if ring else np.zeros((1, 3))
+            places.append(patch.center_mm + ring * around)
+            powers.append(np.tile(patch.area_mm2 * patch.radiance / len(around), (len(around), 1)))
+        self._places, self._powers = np.concatenate(places or [np.zeros((0, 3))]), np.concatenate(powers or [np.zeros((0, 3))])
+
+    def __call__(self, points_mm: np.ndarray, normals: np.ndarray, bump: float = 0.0) -> np.ndarray:
+        """Irradiance times ``1 / n^2`` of the gel: a matt place then sends ``albedo / pi`` times this into the air.
+
+        Parameters
+        ----------
+        points_mm, normals : (n, 3) float
+            In the gel, sensor frame; the normals point into the gel.
+        bump : float
+            Share of the light taken as a ball would, whatever its direction (``AppearanceSpec.cap_bump``).
+
+        Returns
+        -------
+        (n, 3) float
+            Linear RGB.
+        """
+        return _irradiance(points_mm, normals, bump, self._places, self._powers, self._window, self._absorption)
+
+    def ways(self, points_mm: np.ndarray, place_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Unit directions (n, 3) in the gel, from points (n, 3), of the ways to a place (3,) in the air; lengths (n,) in the gel."""
+        return _ways(points_mm, np.asarray(place_mm, float), self._window)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _irradiance(points, normals, bump, places, powers, window, absorption):
+    result = np.zeros((len(points), 3))
+    absorbs = np.any(absorption > 0)
+    for i in range(len(points)):
+        for k in range(len(places)):
+            x, y, z, length, factor = _way(points[i], places[k], window)
+            cosine = x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]
+            if cosine > 0:
+                strength = factor * ((1 - bump) * cosine + 0.5 * bump)
+                for c in range(3):
+                    share = np.exp(-absorption[c] * length) if absorbs else 1.0
+                    result[i, c] += strength * share * powers[k, c]
+    return result
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _ways(points, place, window):
+    toward, lengths = np.empty((len(points), 3)), np.empty(len(points))
+    for i in range(len(points)):
+        toward[i, 0], toward[i, 1], toward[i, 2], lengths[i], _ = _way(points[i], place, window)
+    return toward, lengths
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _way(point, place, window):
+    """The refracted way from a point in the gel to a place in the air: direction in the gel, length there, and the solid
+    angle at the point per area at the place (facing +z) times transmittance, ``d omega = sin d(theta) d(phi)``."""
+    back, front, n_window, n_gel = window
+    air, glass, gel = back - place[2], front - back, point[2] - front
+    across_x, across_y = place[0] - point[0], place[1] - point[1]
+    rho = np.sqrt(across_x * across_x + across_y * across_y)
+    paraxial = 1 / (air + glass / n_window + gel / n_gel)
+    u, slope = rho * paraxial, 0.0
+    for step in range(NEWTON_STEPS + 1):
+        reach = air * u
+        slope = air
+        rest = 1 / np.sqrt(n_window**2 + (n_window**2 - 1) * u * u)
+        reach += glass * u * rest
+        slope += glass * n_window**2 * rest**3
+        rest = 1 / np.sqrt(n_gel**2 + (n_gel**2 - 1) * u * u)
+        reach += gel * u * rest
+        slope += gel * n_gel**2 * rest**3
+        if step < NEWTON_STEPS:
+            u = max(u + (rho - reach) / slope, 0.0)
+    cos_air = 1 / np.sqrt(1 + u * u)
+    sine = u * cos_air
+    sin_gel = sine / n_gel
+    cos_gel = np.sqrt(1 - sin_gel * sin_gel)
+    cos_window = np.sqrt(1 - (sine / n_window) ** 2)
+    sine_per_rho = sine / rho if rho > ON_AXIS_MM else paraxial
+    solid = sine_per_rho * cos_air**3 / (n_gel**2 * cos_gel * slope)
+    outer = _reflectance(1 / n_window, cos_air, cos_window)
+    inner = _reflectance(n_gel / n_window, cos_gel, cos_window)
+    through = (1 - outer) * (1 - inner) / (1 - outer * inner)
+    bend = sin_gel / rho if rho > ON_AXIS_MM else 0.0
+    return across_x * bend, across_y * bend, -cos_gel, gel / cos_gel, solid * through
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _reflectance(index, cos_here, cos_there):
+    """Unpolarised, of a face with n_here / n_there = ``index`` (Fresnel)."""
+    s = (index * cos_here - cos_there) / (index * cos_here + cos_there)
+    p = (cos_here - index * cos_there) / (cos_here + index * cos_there)
+    return 0.5 * (s * s + p * p)

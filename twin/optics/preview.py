@@ -1,0 +1,246 @@
+"""A fast picture of the sensor for interaction and control loops: drawn, not traced.
+
+Skin, stems and caps are projected through the window, shaded with the lamps' direct light (no shadows), and drawn from
+far to near, pins with exact coverage. Light that comes by way of other surfaces is a gain and an offset of each
+material, which `Preview.calibrate` takes from a path-traced frame.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from scipy.optimize import nnls
+from scipy.spatial import Delaunay
+
+from scenes.sensor import SensorSpec
+from twin.errors import RenderError
+from twin.geometry.pins import rest_pins
+from twin.optics.direct_light import DirectLight
+from twin.optics.lens import ray_table
+from twin.optics.outlines import PinOutlines
+from twin.optics.raster import draw_polygons, draw_triangles
+from twin.optics.static_layer import static_layer
+from twin.optics.surfaces import cap_albedo
+from twin.optics.tracer import luminance
+from twin.optics.window import Window
+from twin.projection import project, sensor_to_camera
+
+SKIN, STEM, SIDE, FACE = range(4)  # materials; all but the skin belong to pins
+BELT_STEP_RAD = np.radians(8.0)  # of the skin between the outermost pins and the rim
+BELT_PLACES = 48
+DARK = 1e-3  # linear light below which errors weigh alike in a fit
+TRUST = 3e-3  # of direct light alone, relative to the material seen best: decides what is hardly seen at all
+NEAR_PX = 4.0  # sd of the surroundings in which the skin's light is compared
+MOST_SKIN_GAIN = 4.0
+
+
+@dataclass(frozen=True)
+class Shading:
+    """Irradiance of skin, stems, cap sides and cap faces as ``gain * direct + offset * mean direct of the caps at rest``.
+
+    Attributes
+    ----------
+    gain, offset : (4, C) float
+        C is 1, or 3 for red, green and blue.
+    skin : (v, 1) float
+        Gain of each of the skin's corners on top of that (or one for all): pins shade it.
+    """
+
+    gain: np.ndarray = field(default_factory=lambda: np.ones((4, 1)))
+    offset: np.ndarray = field(default_factory=lambda: np.zeros((4, 1)))
+    skin: np.ndarray = field(default_factory=lambda: np.ones((1, 1)))
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """A state on the film.
+
+    Attributes
+    ----------
+    corners_px : (v, 2) float
+        Of the skin, px of the window.
+    outlines_px : (s, K, 2) float
+        What is seen of stems, sides and faces, from far to near.
+    seen : (s,) int
+        Which row each of them is of the pins' lights (3 N): stem, side and face of the first pin, of the second, ...
+    direct, ambient : list of (v, 3) or (N, 3) float
+        Irradiance of each material and that of unit light from everywhere, both times what the gel lets through to the camera.
+    """
+
+    corners_px: np.ndarray
+    outlines_px: np.ndarray
+    seen: np.ndarray
+    direct: list
+    ambient: list
+
+
+class Preview:
+    """Draws one sensor.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    window_px : (x0, y0, x1, y1), optional
+        Part of the raw frame, end exclusive; the whole frame by default.
+    light : callable, optional
+        Irradiance (n, 3), over n^2 of the gel, from points (n, 3) in mm and normals (n, 3); `DirectLight` by default.
+    shading : Shading, optional
+        Direct light alone by default.
+    static : (light, cover), optional
+        What `static_layer` gives, which is the default.
+    """
+
+    def __init__(self, spec: SensorSpec, *, window_px=None, light=None, shading: Shading | None = None, static=None):
+        self.spec, self.shading = spec, shading or Shading()
+        self.window_px = tuple(window_px or (0, 0, spec.camera.width_px, spec.camera.height_px))
+        self._color = spec.camera.channels == "color"
+        self._direct = DirectLight(spec)
+        self._light = light or self._direct
+        shine, cover = static_layer(spec, self.window_px) if static is None else static
+        through = (1 - np.asarray(cover)) * _transmittance(spec, self.window_px)
+        self._through = through[..., None].astype(np.float32)
+        self._shine = self._on_film(np.broadcast_to(shine, (*through.shape, 3)))
+        self._rest = rest_pins(spec)
+        self._outlines = PinOutlines(spec)
+        self._belt_mm, self._faces = _belt(spec, self._rest.base_mm)
+        self._belt_px = project(spec, self._belt_mm)
+        self._belt_light = self._light(self._belt_mm, -_unit(self._belt_mm))
+        self._mean_light = self._light(self._rest.cap_mm, self._rest.axis).mean()
+        look = spec.appearance
+        self._albedo = np.array([look.skin_albedo]), np.array([look.pin_albedo]), cap_albedo(spec), cap_albedo(spec)
+
+    def render(self, state=None) -> np.ndarray:
+        """Linear light on the film, as a `Renderer` gives it.
+
+        Parameters
+        ----------
+        state : ContactState or PinRest, optional
+            Anything with ``base_mm``, ``axis`` and ``caps_mm`` (or ``cap_mm``), (N, 3) each. At rest by default.
+
+        Returns
+        -------
+        (H, W, 3) or (H, W) float32
+            RGB for a color camera, luminance for a mono one; H and W of the window.
+
+        Raises
+        ------
+        RenderError
+            If the state has another number of pins.
+        """
+        drawing = self._drawing(self._rest if state is None else state)
+        film = self._shine + self._through * self._gel(drawing, self.shading)
+        return film if self._color else film[..., 0]
+
+    def calibrate(self, renderer) -> Shading:
+        """Fit the shading to a path-traced frame at rest, and use it from here on.
+
+        Least squares over the film, weighted so that an error counts about as it does in gray levels.
+
+        Parameters
+        ----------
+        renderer : Renderer
+            Of the same sensor and window.
+
+        Raises
+        ------
+        RenderError
+            If the renderer has another window.
+        """
+        if tuple(renderer.window_px) != self.window_px:
+            raise RenderError(f"the renderer's window_px is {tuple(renderer.window_px)}, the preview's {self.window_px}: build both alike")
+        traced = renderer.render().reshape(self._shine.shape)
+        drawing = self._drawing(self._rest)
+        gel, weight = traced - self._shine, (np.maximum(traced, 0) + DARK) ** -0.5
+        alone = np.eye(8).reshape(8, 2, 4, 1)  # each gain, then each offset, by itself
+        parts = np.stack([weight * self._through * self._gel(drawing, Shading(*only)) for only in alone], axis=-1)
+        fitted = [_fit(parts[..., c, :].reshape(-1, 8), (weight * gel)[..., c].ravel()) for c in range(gel.shape[2])]
+        fit = Shading(*np.stack(fitted, axis=-1).reshape(2, 4, -1))
+        self.shading = replace(fit, skin=self._skin_gain(drawing, fit, gel))
+        return self.shading
+
+    def _skin_gain(self, drawing: _Drawing, fit: Shading, gel: np.ndarray) -> np.ndarray:
+        """Traced light (H, W, C) over that of a fit, near each of the skin's corners, where there is no pin: (v, 1)."""
+        bare = np.array([[1.0], [0.0], [0.0], [0.0]])
+        pins = self._gel(drawing, Shading(1 - bare, 1 - bare)).max(axis=2)
+        free = (cv2.dilate(pins, np.ones((3, 3))) == 0) & (self._through[..., 0] > 0.5 * self._through.max())
+        skin = self._through * self._gel(drawing, Shading(fit.gain * bare, fit.offset * bare))
+        near = [cv2.GaussianBlur(np.where(free, light.sum(axis=2), 0), (0, 0), NEAR_PX) for light in (gel, skin)]
+        ratio = np.divide(*near, out=np.ones_like(near[0]), where=near[1] > 1e-3 * near[1].max())
+        x, y = np.float32(drawing.corners_px).T[..., None]
+        at_corners = cv2.remap(np.float32(ratio), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
+        return np.clip(at_corners, 0, MOST_SKIN_GAIN)
+
+    def _drawing(self, state) -> _Drawing:
+        base, axis, caps = state.base_mm, state.axis, state.caps_mm if hasattr(state, "caps_mm") else state.cap_mm
+        if base.shape != self._rest.base_mm.shape:
+            raise RenderError(f"the state has {len(base)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
+        pupil = np.array([0.0, 0.0, -self.spec.camera.distance_mm])
+        toward, _ = self._direct.ways(caps, pupil)
+        side = _unit(toward - np.sum(toward * axis, axis=1, keepdims=True) * axis)
+        half = 0.5 * self.spec.pins.cap_height_mm
+        places = [base, 0.5 * (base + caps), caps, caps + half * axis]
+        lit = np.split(self._light(np.concatenate(places), np.concatenate([axis, side, side, axis])), 4)
+        skin = np.concatenate([base, self._belt_mm])
+        kept = [self._kept(place, pupil) for place in (skin, *places[1:])]
+        direct = [light * share for light, share in zip([np.concatenate([lit[0], self._belt_light]), *lit[1:]], kept, strict=True)]
+        far_first = np.argsort(-np.linalg.norm(caps - pupil, axis=1))
+        shown = np.ones((len(base), 3), bool)
+        shown[:, FACE - STEM] = np.sum(toward * axis, axis=1) > 0
+        rows = (3 * far_first[:, None] + np.arange(3))[shown[far_first]]
+        feet_px, outlines_px = self._outlines(base, axis, caps)
+        corners_px = np.concatenate([feet_px, self._belt_px]) - self.window_px[:2]
+        return _Drawing(corners_px, outlines_px.reshape(3 * len(base), -1, 2)[rows] - self.window_px[:2], rows, direct, kept)
+
+    def _gel(self, drawing: _Drawing, shading: Shading) -> np.ndarray:
+        """Light (H, W, C) of skin and pins, before it goes through the window."""
+        image = np.zeros(self._shine.shape, np.float32)
+        offset = shading.offset * self._mean_light
+        parts = zip(self._albedo, shading.gain, drawing.direct, offset, drawing.ambient, strict=True)
+        skin, *pins = (self._on_film(albedo / np.pi * (gain * direct + more * ambient)) for albedo, gain, direct, more, ambient in parts)
+        draw_triangles(image, drawing.corners_px, skin * shading.skin.astype(np.float32), self._faces)
+        light = np.stack(pins, axis=1).reshape(-1, image.shape[2])[drawing.seen]
+        draw_polygons(image, drawing.outlines_px, light, drawing.seen % 3 == FACE - STEM)
+        return image
+
+    def _kept(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+        """Share (n, 3) of light that the gel lets through from points (n, 3) to the camera."""
+        absorption = np.array(self.spec.gel.absorption_per_mm)
+        if not absorption.any():
+            return np.ones_like(points_mm)
+        return np.exp(-absorption * self._direct.ways(points_mm, pupil_mm)[1][:, None])
+
+    def _on_film(self, rgb: np.ndarray) -> np.ndarray:
+        """RGB (..., 3) as the film's channels (..., C)."""
+        return np.asarray(rgb if self._color else luminance(rgb)[..., None], np.float32)
+
+
+def _fit(parts: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Gains and offsets (8,) for which parts (m, 8) best sum to a target (m,): not negative; direct light alone where it hardly matters."""
+    trust = TRUST * np.linalg.norm(parts, axis=0).max()
+    plain = np.repeat([1.0, 0.0], 4)
+    return nnls(np.concatenate([parts, trust * np.eye(8)]).astype(float), np.concatenate([target, trust * plain]).astype(float))[0]
+
+
+def _belt(spec: SensorSpec, feet_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (b, 3) of the skin at rest from the outermost pins to the rim, and triangles (t, 3) over the feet (N, 3) and them."""
+    inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
+    start, end = np.radians(spec.pins.max_polar_deg), np.arccos(np.clip(spec.skin.rim_z_mm / inner_mm, -1, 1))
+    steps = np.linspace(start, end, int(np.ceil((end - start) / BELT_STEP_RAD)) + 1)[1:]
+    polar, turn = (g.ravel() for g in np.meshgrid(steps, np.arange(BELT_PLACES) * 2 * np.pi / BELT_PLACES, indexing="ij"))
+    belt = inner_mm * np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
+    outward = _unit(np.concatenate([feet_mm, belt]))
+    from_axis = np.linalg.norm(outward[:, :2], axis=1, keepdims=True)
+    chart = outward[:, :2] * np.arccos(np.clip(outward[:, 2:], -1, 1)) / np.maximum(from_axis, 1e-9)
+    return belt, Delaunay(chart).simplices
+
+
+def _transmittance(spec: SensorSpec, window_px) -> np.ndarray:
+    """Share (H, W) of radiance that the window lets through to each pixel."""
+    corners = (ray_table(spec.camera, window_px) @ sensor_to_camera(spec.camera)[:3, :3])[..., 2]
+    cos_air = np.clip(0.25 * (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]), 1e-6, 1)
+    cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (spec.lens.refractive_index, spec.gel.refractive_index))
+    return Window.of(spec).transmittance(np, cos_air, cos_window, cos_gel)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

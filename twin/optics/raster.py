@@ -1,0 +1,125 @@
+"""Polygons with exact coverage and smoothly shaded triangles, drawn into float images.
+
+Places are (x, y) in px, integers at pixel centres; images are (H, W, C) and are drawn into.
+"""
+
+import numba
+import numpy as np
+
+ON_EDGE = 1e-9  # px: a pixel's centre on an edge belongs to both triangles, so that no gap opens
+
+
+@numba.njit(cache=True, error_model="numpy")
+def draw_polygons(image, polygons, light, inner):
+    """Paint closed polygons (P, K, 2) of one light (P, C) each over the image, in the order given.
+
+    A pixel takes the share of the light that the polygon covers of its square. A polygon that is ``inner`` (P,) lies
+    within the one before it and replaces that one's light: edges they share are not blended twice.
+    """
+    height, width, channels = image.shape
+    for p in range(len(polygons)):
+        polygon = polygons[p]
+        left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+        for x, y in polygon:
+            left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+        if not (right > -0.5 and bottom > -0.5 and left < width - 0.5 and top < height - 0.5):
+            continue
+        x0, y0 = int(np.floor(left + 0.5)), int(np.floor(top + 0.5))
+        cover = _cover(polygon, x0, y0, int(right + 0.5) - x0 + 1, int(bottom + 0.5) - y0 + 1)
+        for y in range(max(y0, 0), min(y0 + cover.shape[0], height)):
+            for x in range(max(x0, 0), min(x0 + cover.shape[1] - 2, width)):
+                share = cover[y - y0, x - x0]
+                if share > 0:
+                    for c in range(channels):
+                        image[y, x, c] += share * (light[p, c] - (light[p - 1, c] if inner[p] else image[y, x, c]))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _cover(polygon, x0, y0, width, height):
+    """Covered share of the pixels of a box from (x0, y0), two columns wider than asked for.
+
+    Each edge adds, row by row, the area to its right that it bounds; the running sum of the row is the cover.
+    """
+    cover = np.zeros((height, width + 2))
+    count = len(polygon)
+    for k in range(count):
+        ax, ay = polygon[k, 0] - x0 + 0.5, polygon[k, 1] - y0 + 0.5
+        bx, by = polygon[(k + 1) % count, 0] - x0 + 0.5, polygon[(k + 1) % count, 1] - y0 + 0.5
+        if ay == by:
+            continue
+        sign = 1.0
+        if ay > by:
+            ax, ay, bx, by, sign = bx, by, ax, ay, -1.0
+        slope = (bx - ax) / (by - ay)
+        for row in range(int(ay), min(int(np.ceil(by)), height)):
+            low, high = max(float(row), ay), min(row + 1.0, by)
+            _add_edge(cover[row], ax + slope * (low - ay), ax + slope * (high - ay), sign * (high - low))
+    for row in range(height):
+        total = 0.0
+        for column in range(width + 2):
+            total += cover[row, column]
+            cover[row, column] = min(abs(total), 1.0)
+    return cover
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_edge(row, start, end, rise):
+    """Add to a row of differences an edge that crosses it from x = start to end while it rises by ``rise``."""
+    left, right = min(start, end), max(start, end)
+    first, last = int(left), int(right)
+    if first == last:
+        beyond = 0.5 * (left + right) - first
+        row[first] += rise * (1 - beyond)
+        row[first + 1] += rise * beyond
+        return
+    steep = rise / (right - left)
+    for x in range(first, last + 1):  # the part of the edge within pixel x
+        a, b = max(left, float(x)), min(right, x + 1.0)
+        part = steep * (b - a)
+        beyond = 0.5 * (a + b) - x
+        row[x] += part * (1 - beyond)
+        row[x + 1] += part * beyond
+
+
+@numba.njit(cache=True, error_model="numpy")
+def draw_triangles(image, corners, light, faces):
+    """Fill triangles ``faces (m, 3)`` over corners (v, 2), lights (v, C) interpolated linearly, where pixel centres lie inside."""
+    height, width, channels = image.shape
+    at = np.empty(channels)
+    for f in range(len(faces)):
+        i, j, k = faces[f]
+        ax, ay = corners[i]
+        bx, by = corners[j, 0] - ax, corners[j, 1] - ay
+        cx, cy = corners[k, 0] - ax, corners[k, 1] - ay
+        area = bx * cy - cx * by
+        if not abs(area) > 0:
+            continue
+        # weights of j and k are linear: s = sx (x - ax) + sy (y - ay), t likewise
+        sx, sy, tx, ty = cy / area, -cx / area, -by / area, bx / area
+        top = max(int(np.ceil(ay + min(0.0, by, cy) - ON_EDGE)), 0)
+        bottom = min(int(np.floor(ay + max(0.0, by, cy) + ON_EDGE)), height - 1)
+        for y in range(top, bottom + 1):
+            s0, t0 = sy * (y - ay), ty * (y - ay)
+            low, high = _inside(sx, s0, -np.inf, np.inf)
+            low, high = _inside(tx, t0, low, high)
+            low, high = _inside(-sx - tx, 1 - s0 - t0, low, high)
+            if not low <= high:
+                continue
+            x0, x1 = max(int(np.ceil(max(ax + low, -1.0) - ON_EDGE)), 0), min(int(np.floor(min(ax + high, width) + ON_EDGE)), width - 1)
+            s, t = s0 + sx * (x0 - ax), t0 + tx * (x0 - ax)
+            for c in range(channels):
+                dj, dk = light[j, c] - light[i, c], light[k, c] - light[i, c]
+                at[c] = light[i, c] + s * dj + t * dk
+                step = sx * dj + tx * dk
+                for x in range(x0, x1 + 1):
+                    image[y, x, c] = at[c] + step * (x - x0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _inside(slope, at_zero, low, high):
+    """The part of [low, high] where ``at_zero + slope x >= 0``."""
+    if slope > 0:
+        return max(low, -at_zero / slope), high
+    if slope < 0:
+        return low, min(high, -at_zero / slope)
+    return (low, high) if at_zero >= 0 else (np.inf, -np.inf)

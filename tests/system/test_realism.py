@@ -1,0 +1,62 @@
+"""A closed loop: a rendered frame taken for a real one is found to look like its own render."""
+
+import json
+import subprocess
+import sys
+from contextlib import nullcontext
+
+import cv2
+import numpy as np
+import pytest
+
+from scenes import load_object, load_sensor
+from twin.mechanics import ContactPose
+from twin.realism.run import run_realism
+from twin.simulator import Simulator
+
+SENSOR = "ur5-331"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("frames")
+    simulator = Simulator(load_sensor(SENSOR))
+    state = simulator.press(load_object("plane"), ContactPose(indent_mm=2.5, tilt_deg=(6.0, -4.0)))
+    cv2.imwrite(str(path / "press.png"), simulator.shoot(state, seed=5).frame.image[..., ::-1])
+    cv2.imwrite(str(path / "dark.png"), np.zeros((480, 640, 3), np.uint8))
+    return path
+
+
+def test_a_render_looks_like_itself(folder, tmp_path):
+    """The skin fitted to the detected pins gives the same picture again, but for noise and a few hundredths of a pixel."""
+    metrics, written = run_realism(folder, load_sensor(SENSOR), tmp_path, lambda title: nullcontext(lambda *_: None))
+    assert metrics["refused"] == [{"image_name": "dark.png", "reason": metrics["refused"][0]["reason"]}]
+    images, found = metrics["pin_aligned"], metrics["statistics"]
+    assert images["exact_fraction"] == 1.0
+    assert images["ssim"]["mean"] > 0.9 and images["psnr_db"]["mean"] > 30 and images["flip"]["mean"] < 0.1
+    assert all(found["target"]["met"].values()), found["worst_relative_difference"]
+    assert found["spots"]["paired"] == found["spots"]["real"]
+    assert all(path.stat().st_size for path in written)
+    page = (tmp_path / "index.html").read_text()
+    for picture in (tmp_path / "pictures").iterdir():
+        assert f"pictures/{picture.name}" in page
+    assert json.loads((tmp_path / "metrics.json").read_text())["frames"] == 1
+
+
+def test_the_command_refuses_in_one_line(folder, tmp_path):
+    (tmp_path / "none").mkdir()
+    for path, word in ((tmp_path / "none", "empty"), (tmp_path / "missing", "no such"), (folder / "dark.png", "black")):
+        command = [
+            sys.executable,
+            "-c",
+            "from twin.cli import main; main()",
+            "realism",
+            str(path),
+            "--sensor",
+            SENSOR,
+            "--out",
+            str(tmp_path),
+        ]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 1 and "Traceback" not in done.stderr
+        assert any(line.startswith("twin: error:") and word in line for line in done.stderr.splitlines()), done.stderr

@@ -1,0 +1,48 @@
+"""Real frames against real frames (make validate): what the measures of realism say where there is nothing to find."""
+
+import cv2
+import pytest
+
+from scenes import load_sensor
+from training.two_sample import random_halves, two_sample
+from twin.realism.disc import lens_disc
+from twin.realism.frames import read_real
+from twin.realism.statistics import TARGET, TARGET_MEASURES, compare_statistics, measure_frame
+
+pytestmark = [pytest.mark.real, pytest.mark.slow]
+
+CHANCE = 0.05  # from one half; a few random divisions of 30 frames
+SLIGHT_BLUR_PX = 0.6
+
+
+@pytest.fixture(scope="module")
+def real(real_dir):
+    spec = load_sensor("ur5-331")
+    disc = lens_disc(spec)
+    found = read_real(real_dir / "ur5-331-raw", spec, disc)
+    assert not found.refused
+    return disc, found.frames
+
+
+def test_halves_of_the_real_frames_have_the_same_caps(real):
+    disc, frames = real
+    measured = [measure_frame(frame.gray, frame.pins_px, disc) for frame in frames]
+    found = compare_statistics(measured[::2], measured[1::2])
+    worst = {measure: found.worst(measure) for measure in TARGET_MEASURES}
+    print(worst, found.spectrum_db, found.scalars)
+    assert max(worst.values()) < TARGET
+
+
+def test_halves_of_the_real_frames_are_not_told_apart(real):
+    disc, frames = real
+    outcome = random_halves([frame.frame.image for frame in frames], disc.inside)
+    print(outcome.accuracy, outcome.low, outcome.high)
+    assert outcome.accuracy == pytest.approx(0.5, abs=CHANCE)
+
+
+def test_slightly_blurred_frames_are_told_apart(real):
+    disc, frames = real
+    images = [frame.frame.image for frame in frames]
+    outcome = two_sample(images, [cv2.GaussianBlur(image, (0, 0), SLIGHT_BLUR_PX) for image in images], disc.inside)
+    print(outcome.accuracy, outcome.low, outcome.high)
+    assert outcome.accuracy > 0.95

@@ -1,0 +1,101 @@
+"""Laws of the skin fitted to one frame's pins: rest, states of the mechanics, rotation, lost pins, refusals."""
+
+import numpy as np
+import pytest
+
+from scenes import load_object, load_sensor
+from twin.geometry.pins import rest_pins
+from twin.geometry.skin_fit import SkinFit, centroid_offset_px, fit_skin
+from twin.mechanics import ContactPose, SkinSolver
+from twin.projection import project
+
+POSES = {
+    "tilted": ContactPose(indent_mm=3.0, tilt_deg=(8.0, 5.0)),
+    "sheared": ContactPose(indent_mm=3.0, tilt_deg=(0.0, 5.0), shear_mm=(2.0, 1.0)),
+}
+PIXEL_PX = 0.01  # the seen pins are met exactly
+DEPTH_MM, AXIS_DEG = 0.05, 0.5  # medians over the pins: 0.01 to 0.02 mm and 0.1 to 0.3 deg are reached
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """A sensor whose camera looks along the axis, so that it has the layout's sixfold symmetry."""
+    spec = load_sensor("ur5-331")
+    camera = spec.camera.model_copy(update={"tilt_x_deg": 0.0, "tilt_y_deg": 0.0, "p1": 0.0, "p2": 0.0})
+    return spec.model_copy(update={"camera": camera})
+
+
+@pytest.fixture(scope="module")
+def fit(straight):
+    return SkinFit(straight)
+
+
+@pytest.fixture(scope="module")
+def states(straight):
+    solver = SkinSolver(straight)
+    return {name: solver.press(load_object("plane"), pose) for name, pose in POSES.items()}
+
+
+def seen_centroids(spec, cap_mm, axis):
+    return project(spec, cap_mm) + centroid_offset_px(spec, cap_mm, axis)
+
+
+def axis_error_deg(found, true):
+    return np.degrees(np.arccos(np.clip((found * true).sum(axis=1), -1, 1)))
+
+
+def test_no_contact_is_found_as_no_contact(straight, fit):
+    rest = rest_pins(straight)
+    found = fit(seen_centroids(straight, rest.cap_mm, rest.axis))
+    exact_mm = 1e-4  # the spline's normals differ that little from the sphere's
+    np.testing.assert_allclose(found.cap_mm, rest.cap_mm, atol=exact_mm)
+    np.testing.assert_allclose(found.axis, rest.axis, atol=exact_mm)
+    assert np.linalg.norm(found.force_n) < 1e-3
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_a_pressed_skin_is_recovered_from_its_pins(straight, fit, states, name):
+    """Seen pins are met exactly; depth and axes come from skin and gel alone, nothing being known of the object."""
+    pressed = states[name]
+    pins_px = seen_centroids(straight, pressed.caps_mm, pressed.axis)
+    found = fit(pins_px)
+    assert np.abs(seen_centroids(straight, found.cap_mm, found.axis) - pins_px).max() < PIXEL_PX
+    assert np.median(np.linalg.norm(found.cap_mm - pressed.caps_mm, axis=1)) < DEPTH_MM
+    assert np.median(axis_error_deg(found.axis, pressed.axis)) < AXIS_DEG
+    assert np.nanmedian(found.remainder_px) < 0.1
+    length = straight.pins.length_mm + straight.pins.cap_height_mm / 2
+    np.testing.assert_allclose(found.cap_mm - found.base_mm, length * found.axis, atol=1e-9)
+
+
+def test_rotated_pins_give_the_rotated_skin(straight, fit, states):
+    """A turn by 60 deg permutes the pins of ring i by i places."""
+    state = states["tilted"]
+    c, s = np.cos(np.pi / 3), np.sin(np.pi / 3)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    first = [1 + 3 * ring * (ring - 1) for ring in range(1, straight.pins.rings + 1)]
+    rings = [start + (np.arange(6 * (k + 1)) - (k + 1)) % (6 * (k + 1)) for k, start in enumerate(first)]
+    order = np.concatenate([[0], *rings])
+    there = fit(project(straight, state.caps_mm), centroids=False).cap_mm
+    turned = fit(project(straight, (state.caps_mm @ turn.T)[order]), centroids=False).cap_mm
+    grid_mm = 0.05  # the spline's square grid does not turn with the pins
+    assert np.linalg.norm(turned - (there @ turn.T)[order], axis=1).mean() < grid_mm
+
+
+def test_lost_pins_follow_the_skin(straight, fit, states):
+    state = states["tilted"]
+    pins_px = project(straight, state.caps_mm)
+    lost = np.random.default_rng(0).permutation(len(pins_px))[:30]
+    pins_px[lost] = np.nan
+    found = fit(pins_px, centroids=False)
+    assert np.isnan(found.remainder_px[lost]).all() and np.isfinite(np.delete(found.remainder_px, lost)).all()
+    missed_px = np.linalg.norm(project(straight, found.cap_mm[lost]) - project(straight, state.caps_mm[lost]), axis=1)
+    assert np.median(missed_px) < 0.2
+
+
+def test_refusals_say_what_came(straight):
+    with pytest.raises(ValueError, match=r"shape \(331, 2\)"):
+        fit_skin(straight, np.zeros((127, 2)))
+    mostly_lost = np.full((331, 2), np.nan)
+    mostly_lost[:100] = 0.0
+    with pytest.raises(ValueError, match="100 of 331"):
+        fit_skin(straight, mostly_lost)

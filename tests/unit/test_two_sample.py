@@ -1,0 +1,60 @@
+"""Laws of the two-sample test, on small pictures: nothing to tell apart, everything to tell apart, repeatable."""
+
+import numpy as np
+import pytest
+
+from training import two_sample as module
+from training.two_sample import patch_corners, two_sample
+from twin.errors import FrameError
+
+INSIDE = np.ones((72, 72), bool)
+PAIRS = 10
+CHANCE = 0.2  # few held-out pairs of few patches
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(module, "EPOCHS", 5)
+    monkeypatch.setattr(module, "BATCH", 16)
+    monkeypatch.setattr(module, "PATCHES", 6)
+
+
+def pictures(count, seed, *, blue=1.0):
+    """Bright stripes of a random phase and mean level: frames have an identity, sets only a colour."""
+    rng, x = np.random.default_rng(seed), np.mgrid[:72, :72][1]
+    out = []
+    for _ in range(count):
+        wave = rng.uniform(80, 120) + 60 * np.sin(2 * np.pi * x / 12 + rng.uniform(0, 6)) + rng.normal(0, 5, x.shape)
+        out.append(np.clip(wave[..., None] * [1.0, 1.0, blue], 0, 255).astype(np.uint8))
+    return out
+
+
+def test_what_has_one_distribution_is_not_told_apart():
+    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1), INSIDE)
+    assert outcome.accuracy == pytest.approx(0.5, abs=CHANCE)
+    assert outcome.low <= outcome.accuracy <= outcome.high
+
+
+def test_what_differs_is_told_apart_in_unseen_frames():
+    outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1, blue=0.8), INSIDE)
+    assert outcome.accuracy > 0.95
+
+
+def test_the_same_seed_gives_the_same_outcome(monkeypatch):
+    monkeypatch.setattr(module, "EPOCHS", 1)
+    first = two_sample(pictures(6, 0), pictures(6, 1), INSIDE, seed=2)
+    assert (first.by_pair == two_sample(pictures(6, 0), pictures(6, 1), INSIDE, seed=2).by_pair).all()
+
+
+def test_patches_lie_in_the_disc():
+    y, x = np.mgrid[:200, :240]
+    inside = (x - 120) ** 2 + (y - 100) ** 2 < 90**2
+    for row, column in patch_corners(inside)[::97]:
+        assert inside[row : row + 64, column : column + 64].mean() >= 0.9
+    with pytest.raises(FrameError, match="too small"):
+        patch_corners(np.zeros((200, 240), bool))
+
+
+def test_sets_of_different_length_are_refused():
+    with pytest.raises(FrameError, match="3 and 2"):
+        two_sample(pictures(3, 0), pictures(2, 1), INSIDE)

@@ -1,0 +1,213 @@
+"""The pins in space that one frame shows, found without knowing what touched the sensor.
+
+A frame gives each cap's pixel, so each cap's ray in the gel, not its depth. What is between is the sensor's body: skin
+and gel in equilibrium under some traction t on the outer skin. With x(t) the body's shape, Gauss-Newton minimises
+
+    sum_pins |project(cap(x)) - seen|^2 / sigma^2  +  integral over the skin at rest of t_n^2 / s_n^2 + |t_t|^2 / s_t^2
+
+over t and x together: each step solves the equilibrium linearised about the present shape. s_n^2 grows with the pressure
+of the step before, s_t^2 with a share of it (iteratively reweighted least squares: Daubechies et al. 2010): touch
+presses, it does not pull, it is confined to a part of the skin, and friction needs pressure. What is left, a fraction of
+a pixel, is taken by moving each pin parallel to the image.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
+
+from scenes.sensor import SensorSpec
+from twin.geometry.soft_body import SoftBody
+from twin.geometry.solid import pin_pose, surface_operators
+from twin.mechanics.elements import PAIRS
+from twin.projection import pixel_rays, project
+
+STEPS = 14  # of Gauss-Newton at most
+SETTLED_MM = 0.01  # largest move of a step that is the last
+LARGEST_MOVE_MM = 2.0  # of a control in one step
+EVEN_STEPS = 2  # with the same s everywhere, until there is a first idea of the pressure
+OUTLINE_CORNERS = 48
+PROBE_MM = 1e-4  # for the derivative of the projection
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed before a frame is seen.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Error of a pin in the image: of its detection, and of the specification's layout and camera.
+    traction_mpa : float
+        A usual traction: over 1 mm^2 of skin it counts as much as an error of ``sigma_px`` of one coordinate.
+    floor_mpa : float
+        Pressure that counts as none.
+    friction : float
+        Tangential traction relative to the pressure.
+    """
+
+    sigma_px: float = 0.1
+    traction_mpa: float = 0.02
+    floor_mpa: float = 0.001
+    friction: float = 0.5
+
+
+@dataclass(frozen=True)
+class FittedPins:
+    """Pins of a fitted skin, in the sensor frame and the specification's order: a state for the renderer.
+
+    Attributes
+    ----------
+    base_mm, axis, cap_mm : (N, 3) float
+        As ``PinRest``.
+    remainder_px : (N,) float
+        By how much the smooth skin misses each pin in the image; NaN for lost pins.
+    force_n : (3,) float
+        Sum of the tractions found, on the skin.
+    """
+
+    base_mm: np.ndarray
+    axis: np.ndarray
+    cap_mm: np.ndarray
+    remainder_px: np.ndarray
+    force_n: np.ndarray
+
+
+def fit_skin(spec: SensorSpec, pins_px: np.ndarray, *, prior: Prior | None = None, centroids: bool = True) -> FittedPins:
+    """Pins in space from pins in the image; see ``SkinFit`` for many frames of one sensor.
+
+    Raises
+    ------
+    ValueError
+        Not N pins, or fewer than half of them seen.
+    """
+    return SkinFit(spec, prior=prior)(pins_px, centroids=centroids)
+
+
+def centroid_offset_px(spec: SensorSpec, cap_mm: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """(N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
+    turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS + 1)[:, None, None]
+    u = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    rim = cap_mm + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
+    p = project(spec, rim) - project(spec, cap_mm)
+    twice = p[:-1, :, 0] * p[1:, :, 1] - p[1:, :, 0] * p[:-1, :, 1]
+    return ((p[:-1] + p[1:]) * twice[..., None]).sum(axis=0) / (3 * twice.sum(axis=0))[:, None]
+
+
+class SkinFit:
+    """Fits of one sensor; what depends on the sensor alone is computed once.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    prior : Prior, optional
+    """
+
+    def __init__(self, spec: SensorSpec, *, prior: Prior | None = None):
+        self.spec, self.prior = spec, prior or Prior()
+        self._body = SoftBody(spec)
+        solid = self._solid = self._body.solid
+        at, weights = (a.ravel() for a in solid.basis.gauss(2))
+        v, u = (g.ravel() for g in np.meshgrid(at, at, indexing="ij"))
+        value, *slopes = surface_operators(solid.basis, np.column_stack([u, v]))
+        self._outer = slice(solid.basis.count**2)
+        moving = ~solid.fixed[self._outer]
+        self._value, self._slopes = sparse.csr_array(value[:, moving]), [sparse.csr_array(s) for s in slopes]
+        across = np.cross(*(s @ solid.control_mm[self._outer] for s in self._slopes))
+        self._area_mm2 = np.linalg.norm(across, axis=1) * np.outer(weights, weights).ravel()
+        self._mass = (self._value.T @ (self._area_mm2[:, None] * self._value)).toarray()  # traction coefficients to forces
+        self._loaded = self._body.unknown[self._outer][moving]  # (m, 3) unknowns that carry the traction
+
+    def __call__(self, pins_px: np.ndarray, *, centroids: bool = True) -> FittedPins:
+        """Fit one frame.
+
+        Parameters
+        ----------
+        pins_px : (N, 2) float
+            Raw-frame px, specification's order; NaN where lost: such pins follow the skin.
+        centroids : bool
+            ``pins_px`` are centroids of caps as seen, not projections of their centres.
+
+        Raises
+        ------
+        ValueError
+            Not N pins, or fewer than half of them seen.
+        """
+        pins_px = np.asarray(pins_px, float)
+        count = self.spec.pins.count
+        if pins_px.shape != (count, 2):
+            raise ValueError(f"expected pins_px of shape ({count}, 2) for {self.spec.name}, got {pins_px.shape}")
+        seen = np.isfinite(pins_px).all(axis=1)
+        if 2 * seen.sum() < count:
+            raise ValueError(f"{seen.sum()} of {count} pins are too few to fit a skin to; at least half are needed")
+        control, traction = self._solid.control_mm.copy(), np.zeros(self._area_mm2.shape + (3,))
+        for step in range(STEPS):
+            target_px = pins_px - self._offset_px(control) * centroids
+            move, traction = self._step(control, target_px, seen, traction, even=step < EVEN_STEPS)
+            largest = np.abs(move).max()
+            control = self._body.moved(control, move * min(1.0, LARGEST_MOVE_MM / largest))
+            if step >= EVEN_STEPS and largest < SETTLED_MM:
+                break
+        pins = self._on_rays(control, pins_px - self._offset_px(control) * centroids, seen)
+        return replace(pins, force_n=self._area_mm2 @ traction)
+
+    def _offset_px(self, control: np.ndarray) -> np.ndarray:
+        _, axis, cap = pin_pose(self._solid, control)
+        return centroid_offset_px(self.spec, cap, axis)
+
+    def _on_rays(self, control: np.ndarray, target_px: np.ndarray, seen: np.ndarray) -> FittedPins:
+        """Pins of a shape, the seen ones shifted parallel to the image onto their rays."""
+        base, axis, cap = pin_pose(self._solid, control)
+        remainder = np.where(seen, np.linalg.norm(project(self.spec, cap) - target_px, axis=1), np.nan)
+        place, along = pixel_rays(self.spec, np.where(seen[:, None], target_px, 0.0))
+        on_ray = place + along * ((cap[:, 2] - place[:, 2]) / along[:, 2])[:, None]
+        shift = np.where(seen[:, None], on_ray - cap, 0.0)
+        return FittedPins(base + shift, axis, cap + shift, remainder, np.zeros(3))
+
+    def _step(self, control, target_px, seen, traction, *, even: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Move (f, 3) of the free controls, and the traction (q, 3) in MPa at the skin's points that goes with it."""
+        factor, force = self._body.factor(control), self._body.forces(control)
+        seen_px, per_control = self._pin_rows(control, seen)
+        reach = cho_solve(factor, per_control.T)  # (unknowns, 2 pins): how far a force moves the pins
+        rows = np.einsum("ab,bip->pai", self._mass, reach[self._loaded], optimize=True).reshape(len(per_control), -1)
+        wanted = (target_px[seen] - seen_px).ravel() + reach.T @ force
+        sigma2 = self.prior.sigma_px**2
+        normal = rows.T @ rows / sigma2 + self._cost(control, traction, even=even)
+        coefficients = cho_solve(cho_factor(normal), rows.T @ wanted / sigma2).reshape(-1, 3)
+        load = -force
+        load[self._loaded] += self._mass @ coefficients
+        return cho_solve(factor, load).reshape(-1, 3), self._value @ coefficients
+
+    def _cost(self, control: np.ndarray, traction: np.ndarray, *, even: bool) -> np.ndarray:
+        """Quadratic form (3 m, 3 m) of the traction's coefficients, weighted by the traction (q, 3) of the step before."""
+        prior = self.prior
+        outward = np.cross(*(s @ control[self._outer] for s in self._slopes))
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        pressure = np.full(len(outward), prior.traction_mpa) if even else np.maximum(-(traction * outward).sum(axis=1), 0)
+        across = self._area_mm2 / (prior.traction_mpa * (prior.friction * pressure + prior.floor_mpa))
+        along = self._area_mm2 / (prior.traction_mpa * (pressure + prior.floor_mpa)) - across
+        count = len(self._loaded)
+        form = np.zeros((count, 3, count, 3))
+        for i, j in PAIRS:
+            weight = along * outward[:, i] * outward[:, j] + across * (i == j)
+            form[:, i, :, j] = form[:, j, :, i] = (self._value.T @ (weight[:, None] * self._value)).toarray()
+        return form.reshape(3 * count, 3 * count)
+
+    def _pin_rows(self, control: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Projections (s, 2) of the seen caps, and their derivative (2 s, unknowns) by the free controls."""
+        solid, inner = self._solid, control[self._solid.inner]
+        _, axis, cap = pin_pose(solid, control)
+        slopes = solid.pin_slope_u, solid.pin_slope_v
+        t = np.stack([s @ inner for s in slopes], axis=1)
+        dual = np.linalg.inv(t @ t.swapaxes(1, 2)) @ t
+        here = project(self.spec, cap)
+        per_mm = np.stack([(project(self.spec, cap + PROBE_MM * unit) - here) / PROBE_MM for unit in np.eye(3)], axis=2)
+        rows = np.zeros((seen.sum(), 2, len(control), 3))
+        part = solid.pin_value[seen, None, :, None] * per_mm[seen, :, None, :]
+        for slope, toward in zip(slopes, dual.swapaxes(0, 1), strict=True):  # the axis turns as the normal: d a = -t^c (a . d t_c)
+            lever = -solid.pin_cap_length_mm * np.einsum("pki,pi->pk", per_mm, toward)
+            part += slope[seen, None, :, None] * (lever[..., None] * axis[:, None])[seen, :, None, :]
+        rows[:, :, solid.inner] = part
+        return here[seen], rows[:, :, self._body.free].reshape(2 * seen.sum(), -1)

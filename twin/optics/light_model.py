@@ -1,0 +1,130 @@
+"""The light of chosen pixels of real frames as a differentiable function of what lights and colours the sensor."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import RenderError
+from twin.optics.render import GelView, Renderer
+from twin.optics.tracer import spectrum
+from twin.optics.variant import choose_variant, use_variant
+
+SAMPLES = 32  # per pixel
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """What the fit turns: factors on the specification's light and reflectances, (3,) linear RGB where coloured.
+
+    Attributes
+    ----------
+    leds : (k,) float
+        Of each lit LED.
+    fill : float
+        Of the ring's light into the gel.
+    skin, caps, stems : (3,) float
+    """
+
+    leds: np.ndarray
+    fill: float
+    skin: np.ndarray
+    caps: np.ndarray
+    stems: np.ndarray
+
+    @classmethod
+    def neutral(cls, leds: int) -> "Knobs":
+        """Every factor 1."""
+        return cls(np.ones(leds), 1.0, np.ones(3), np.ones(3), np.ones(3))
+
+
+class LightModel:
+    """Light in the gel at chosen pixels of one state, and its derivatives by forward differentiation.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+        The start; its camera must be a colour or mono one with a variant that differentiates.
+    state : object
+        As ``Renderer.render`` takes it.
+    pixels : (n,) int
+        Of the raw frame, row by row.
+    seed : int
+
+    Raises
+    ------
+    RenderError
+        Where only the scalar variant works.
+    """
+
+    def __init__(self, spec: SensorSpec, state, pixels: np.ndarray, seed: int):
+        choice = choose_variant(spec.camera.channels)
+        if choice.backend == "scalar":
+            raise RenderError(
+                "calibration differentiates the renderer, which the scalar variant can't: run 'twin doctor' for what is missing"
+            )
+        import drjit as dr
+
+        self._mi, self._dr, self._seed = use_variant(choice), dr, seed
+        mi = self._mi
+        renderer = Renderer(spec, choice, spp=1)
+        camera = spec.camera
+        self._view = GelView(mi, spec, (0, 0, camera.width_px, camera.height_px), renderer.surfaces(state), bounces=2)
+        self._pixels = mi.UInt32(np.asarray(pixels, np.uint32))
+        emitters = self._view.tracer.emitters
+        self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
+        self._radiance = [mi.Spectrum(r) for r in emitters.radiance]
+        self._channels = len(self._radiance[0])
+        names = {key.split(".")[0]: key for key in self._view.params.keys() if key.endswith("reflectance.value") and "specular" not in key}
+        self._flat = {
+            part: (names[part], type(self._view.params[names[part]])(self._view.params[names[part]])) for part in ("skin", "stems")
+        }
+        self._paint = mi.Float(self._view.params["caps.vertex_paint"])
+
+    @property
+    def led_count(self) -> int:
+        """Lit LEDs."""
+        return self._led_count
+
+    def light(self, knobs: Knobs) -> np.ndarray:
+        """(n, channels) light of the gel on the film."""
+        self._turn(knobs, {})
+        return np.array(self._view.trace(self._pixels, SAMPLES, self._seed)).T
+
+    def slopes(self, knobs: Knobs) -> dict[str, np.ndarray]:
+        """Derivatives (n, channels) by the logarithm of each knob: ``led0``..., ``fill``, ``skin``, ``caps``, ``stems``.
+
+        A coloured knob acts on each channel alone, so that one pass serves all channels; all passes share one kernel.
+        """
+        mi, dr = self._mi, self._dr
+        names = [*(f"led{k}" for k in range(self._led_count)), "skin", "caps", "stems"]
+        if len(self._radiance) > self._led_count:
+            names.append("fill")
+        found = {}
+        for name in names:
+            steps = {each: mi.Float(0.0) for each in names}
+            dr.enable_grad(steps)
+            for each, step in steps.items():
+                dr.set_grad(step, dr.opaque(mi.Float, float(each == name)))
+            self._turn(knobs, steps)
+            image = self._view.trace(self._pixels, SAMPLES, self._seed)
+            found[name] = np.array(dr.forward_to(image)).T
+        return found
+
+    def _turn(self, knobs: Knobs, steps: dict) -> None:
+        """Set the knobs, each with its step (zero, but with a gradient) in its logarithm."""
+        mi, params = self._mi, self._view.params
+
+        def factor(knob, value):
+            return value * (1 + steps[knob]) if knob in steps else value
+
+        leds = [*((f"led{k}", float(v)) for k, v in enumerate(knobs.leds)), ("fill", float(knobs.fill))]
+        emitters = self._view.tracer.emitters
+        emitters.radiance[:] = [base * factor(knob, v) for base, (knob, v) in zip(self._radiance, leds, strict=False)]
+        for part, (key, base) in self._flat.items():
+            params[key] = base * factor(part, spectrum(mi, getattr(knobs, part)))
+        tint = spectrum(mi, knobs.caps)
+        each = mi.Float([float(c[0]) for c in tint])
+        number = self._dr.arange(mi.UInt32, len(self._paint)) % self._channels
+        params["caps.vertex_paint"] = self._paint * factor("caps", self._dr.gather(mi.Float, each, number))
+        params.update()

@@ -1,0 +1,1 @@
+"""How close rendered frames come to real ones: pictures pair by pair, and the statistics of both."""

@@ -1,0 +1,95 @@
+"""The whole comparison of a folder of real frames with their renders, into one folder."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from scenes.sensor import SensorSpec
+from twin.realism.compare import pin_aligned, pose_aligned, statistics
+from twin.realism.disc import lens_disc
+from twin.realism.frames import read_real
+from twin.realism.report import (
+    image_summary,
+    pose_summary,
+    statistics_summary,
+    write_metrics,
+    write_page,
+    write_pictures,
+    write_plots,
+    write_tables,
+)
+
+Test = Callable  # test(real images, rendered images, inside, progress) gives an object with accuracy, low and high
+
+
+def run_realism(
+    folder: Path,
+    spec: SensorSpec,
+    out: Path,
+    bar,
+    *,
+    with_poses: bool = False,
+    limit: int | None = None,
+    quality: str = "standard",
+    test: Test | None = None,
+) -> tuple[dict, list[Path]]:
+    """Compare and write everything.
+
+    Parameters
+    ----------
+    folder : Path
+        Raw frames, with ``targets.csv`` where the labels are needed.
+    spec : SensorSpec
+    out : Path
+    bar : callable
+        ``bar(title)`` is a context manager that yields ``progress(done, total)``.
+    with_poses : bool
+        Also render from the labels alone.
+    limit : int, optional
+        Most frames, evenly spread.
+    quality : {"preview", "standard", "high"}
+    test : callable, optional
+        The two-sample test.
+
+    Returns
+    -------
+    metrics : dict
+        Content of metrics.json.
+    written : list of Path
+        The page first.
+
+    Raises
+    ------
+    FrameError
+        No frame can be used, or the labels are missing.
+    RenderError
+        Nothing can be rendered here.
+    """
+    disc = lens_disc(spec)
+    with bar("read the real frames, find their pins") as progress:
+        real = read_real(folder, spec, disc, limit=limit, progress=progress)
+    with bar("fit the skin to the pins, render") as progress:
+        pairs = pin_aligned(spec, real.frames, disc, quality=quality, progress=progress)
+    poses = pose_aligned(spec, real.frames, disc, quality=quality, bar=bar) if with_poses else None
+    with bar("measure caps, skin, noise, spectra") as progress:
+        found = statistics(pairs, disc, progress=progress)
+    outcome = None
+    if test is not None and len(pairs) > 1:
+        with bar("train the two-sample test") as progress:
+            outcome = test([pair.real.frame.image for pair in pairs], [pair.image for pair in pairs], disc.inside, progress)
+    metrics = {
+        "sensor": spec.name,
+        "quality": quality,
+        "frames": len(pairs),
+        "refused": real.refused,
+        "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
+        "pin_aligned": image_summary(pairs),
+        "statistics": statistics_summary(found),
+        "two_sample": outcome and {"accuracy": outcome.accuracy, "low": outcome.low, "high": outcome.high},
+        "pose_aligned": poses and pose_summary(poses),
+    }
+    pictures = out / "pictures"
+    rows = write_pictures(pictures, pairs, "pins")
+    pose_rows = write_pictures(pictures, poses.pairs, "pose") if poses else []
+    page = write_page(out / "index.html", spec, metrics, write_plots(pictures, found), rows, pose_rows, found)
+    written = [page, write_metrics(out / "metrics.json", metrics), *write_tables(out, pairs, found, poses)]
+    return metrics, written

@@ -1,0 +1,61 @@
+"""Noise floor and radial power spectrum of gray frames."""
+
+import cv2
+import numpy as np
+
+SPECTRUM_BINS = 24
+LOWEST_CYCLES = 4.0  # per diameter of the disc: below, the window itself is seen
+GAUSSIAN_MAD = 1.4826  # sd of a Gaussian over its median absolute deviation
+CLIP_ROUNDS = 3
+NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6  # unit gain for white noise (Immerkaer 1996)
+
+
+def noise_sd(gray: np.ndarray, where: np.ndarray) -> float:
+    """Sd of the noise in gray levels, over the pixels ``where`` (H, W) bool.
+
+    Immerkaer's kernel (1996) takes constant, linear and twisted surfaces away; edges are left out as what lies beyond
+    three sd, the first sd being that of the median absolute deviation.
+    """
+    residual = cv2.filter2D(gray.astype(np.float32), cv2.CV_32F, NOISE_KERNEL)[where]
+    sd = GAUSSIAN_MAD * float(np.median(np.abs(residual)))
+    for _ in range(CLIP_ROUNDS):
+        sd = float(np.sqrt(np.mean(residual[np.abs(residual) <= 3 * sd] ** 2)))
+    return sd
+
+
+def radial_spectrum(gray: np.ndarray, center_px: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Power against spatial frequency inside a disc.
+
+    The disc's mean is taken away, a round Hann window laid over it, and the power of the discrete Fourier transform
+    averaged over rings of even width in log frequency; a white image of sd s has power s^2 everywhere.
+
+    Returns
+    -------
+    frequency : (b,) float
+        Cycles per px, up to 0.5; rings without a sample are left out.
+    power : (b,) float
+        Squared gray levels.
+    """
+    half = int(radius_px)
+    x, y = np.rint(center_px).astype(int)
+    if min(x, y) < half or x + half >= gray.shape[1] or y + half >= gray.shape[0]:
+        half = int(min(x, y, gray.shape[1] - 1 - x, gray.shape[0] - 1 - y))
+    patch = gray[y - half : y + half + 1, x - half : x + half + 1].astype(float)
+    v, u = np.mgrid[-half : half + 1, -half : half + 1] / half
+    r = np.hypot(u, v)
+    window = np.where(r < 1, np.cos(0.5 * np.pi * r) ** 2, 0.0)
+    patch = (patch - (patch * window).sum() / window.sum()) * window
+    power = np.abs(np.fft.fft2(patch)) ** 2 / (window**2).sum()
+    f = np.hypot(*np.meshgrid(np.fft.fftfreq(len(patch)), np.fft.fftfreq(len(patch))))
+    edges = np.geomspace(LOWEST_CYCLES / (2 * half), 0.5, SPECTRUM_BINS + 1)
+    ring = np.digitize(f.ravel(), edges) - 1
+    inside = (ring >= 0) & (ring < SPECTRUM_BINS)
+    count = np.bincount(ring[inside], minlength=SPECTRUM_BINS)
+    total = np.bincount(ring[inside], power.ravel()[inside], SPECTRUM_BINS)
+    used = count > 0
+    return np.sqrt(edges[:-1] * edges[1:])[used], total[used] / count[used]
+
+
+def log_distance_db(real: np.ndarray, rendered: np.ndarray) -> float:
+    """Rms over the rings of the ratio of two spectra, in dB."""
+    return float(np.sqrt(np.mean((10 * np.log10(rendered / real)) ** 2)))

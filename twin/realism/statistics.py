@@ -1,0 +1,119 @@
+"""What a set of frames looks like, and how a second set differs from it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.realism.caps import Caps, measure_caps
+from twin.realism.disc import Disc
+from twin.realism.radial import RadialRow, equal_count_edges, radial_rows
+from twin.realism.spectra import log_distance_db, noise_sd, radial_spectrum
+from twin.realism.spots import Spots, clear_of_pins, find_spots, pair_spots, steady_spots
+
+CLEAR_SHARE = 0.55  # of the pins' spacing: skin farther from every pin is bare
+RADIAL_MEASURES = ("level", "contrast", "skin", "diameter_px", "eccentricity", "edge_px")
+TARGET = 0.05  # relative difference in a bin, for level, diameter and edge width
+TARGET_MEASURES = ("level", "diameter_px", "edge_px")
+
+
+@dataclass(frozen=True)
+class FrameStatistics:
+    """Measures of one frame.
+
+    Attributes
+    ----------
+    caps : Caps
+    distance_px : (N,) float
+        Of each cap from the disc's centre.
+    skin_level : float
+        Median gray level of bare skin among the pins.
+    noise_sd : float
+        Gray levels, on bare skin.
+    frequency, power : (b,) float
+        Radial spectrum over the disc, cycles per px and squared gray levels.
+    spots : Spots
+    """
+
+    caps: Caps
+    distance_px: np.ndarray
+    skin_level: float
+    noise_sd: float
+    frequency: np.ndarray
+    power: np.ndarray
+    spots: Spots
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Real against rendered frames.
+
+    Attributes
+    ----------
+    radial : list of RadialRow
+    scalars : dict of str to (float, float)
+        Real and rendered values by name.
+    frequency, real_power, rendered_power : (b,) float
+        Mean spectra.
+    spectrum_db : float
+        Log distance of the mean spectra.
+    real_spots, rendered_spots : Spots
+    spots_apart_px : (m,) float
+        Of the spots that have a counterpart.
+    """
+
+    radial: list[RadialRow]
+    scalars: dict[str, tuple[float, float]]
+    frequency: np.ndarray
+    real_power: np.ndarray
+    rendered_power: np.ndarray
+    spectrum_db: float
+    real_spots: Spots
+    rendered_spots: Spots
+    spots_apart_px: np.ndarray
+
+    def worst(self, measure: str) -> float:
+        """Largest relative difference of a measure in any bin."""
+        return float(np.nanmax([abs(row.difference) for row in self.radial if row.measure == measure]))
+
+
+def measure_frame(gray: np.ndarray, pins_px: np.ndarray, disc: Disc) -> FrameStatistics:
+    """Measure a gray frame (H, W) uint8 with pins at (N, 2) px."""
+    distance = disc.distance_px(pins_px)
+    spacing = _spacing_px(pins_px)
+    among = disc.distance_px(np.stack(np.meshgrid(np.arange(gray.shape[1]), np.arange(gray.shape[0])), axis=2)) < np.nanmax(distance)
+    bare = clear_of_pins(gray.shape, pins_px, CLEAR_SHARE * spacing) & disc.inside & among
+    frequency, power = radial_spectrum(gray, disc.center_px, disc.radius_px)
+    return FrameStatistics(
+        caps=measure_caps(gray, pins_px),
+        distance_px=distance,
+        skin_level=float(np.median(gray[bare])) if bare.any() else np.nan,
+        noise_sd=noise_sd(gray, bare) if bare.any() else np.nan,
+        frequency=frequency,
+        power=power,
+        spots=find_spots(gray, disc, pins_px, spacing),
+    )
+
+
+def compare_statistics(real: list[FrameStatistics], rendered: list[FrameStatistics]) -> Statistics:
+    """All measures of two sets of frames, bins of equal count of the real caps."""
+    edges = equal_count_edges(np.concatenate([f.distance_px for f in real]))
+    rows = []
+    for measure in RADIAL_MEASURES:
+        sets = [
+            (np.concatenate([f.distance_px for f in frames]), np.concatenate([getattr(f.caps, measure) for f in frames]))
+            for frames in (real, rendered)
+        ]
+        rows += radial_rows(measure, *sets, edges)
+    powers = [np.mean([f.power for f in frames], axis=0) for frames in (real, rendered)]
+    spots = [steady_spots([f.spots for f in frames]) for frames in (real, rendered)]
+    names = ("skin_level", "noise_sd")
+    scalars = {name: tuple(float(np.nanmean([getattr(f, name) for f in frames])) for frames in (real, rendered)) for name in names}
+    return Statistics(rows, scalars, real[0].frequency, *powers, log_distance_db(*powers), *spots, pair_spots(*spots))
+
+
+def _spacing_px(pins_px: np.ndarray) -> float:
+    """Median distance of a pin to its nearest neighbour."""
+    pins = pins_px[np.isfinite(pins_px).all(axis=1)]
+    apart = np.linalg.norm(pins[:, None] - pins[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    return float(np.median(apart.min(axis=1)))

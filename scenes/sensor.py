@@ -225,11 +225,11 @@ class AppearanceSpec(Section):
     """Reflectances (linear, 0 to 1) of what the camera sees.
 
     ``skin_gloss`` and ``cap_gloss`` are the weights of a rough specular lobe. ``cap_bump`` is the share of the light that
-    a cap takes as a small ball would, whatever its direction, not as a flat disc: printed caps are round and translucent. ``cap_levels`` is each cap's
-    reflectance relative to ``cap_albedo``, in pin order, where it has been measured; without them ``cap_variation``
-    is the relative sd of a random pattern of number ``cap_pattern`` (another number: another print of the sensor).
-    ``cap_shapes``: each cap's outline, relative to a circle, as measured: coefficients a_2, b_2, a_3, b_3, ... of
-    ``1 + sum a_m cos(m t) + b_m sin(m t)``, t turning from the sensor's x towards y.
+    a cap takes as a small ball would, whatever its direction, not as a flat disc: printed caps are round and translucent.
+    ``cap_levels`` is each cap's reflectance relative to ``cap_albedo``, in pin order, where it has been measured; without
+    them ``cap_variation`` is the relative sd of a random pattern of number ``cap_pattern`` (another number: another print
+    of the sensor). ``cap_shapes``: each cap's outline, relative to a circle, as measured: coefficients a_0, a_2, b_2, a_3,
+    b_3, ... of ``1 + a_0 + sum a_m cos(m t) + b_m sin(m t)``, t turning from the sensor's x towards y.
     """
 
     skin_albedo: Rgb
@@ -349,10 +349,9 @@ class SensorSpec(Section):
             raise ValueError("camera.distance_mm must put the pupil behind the window (greater than lens.thickness_mm - lens.z_mm)")
         if self.leds.z_mm > self.lens.back_mm:
             raise ValueError("leds.z_mm must not lie in front of the window's back (lens.z_mm - lens.thickness_mm)")
-        if self.appearance.cap_shapes and {len(c) % 2 for c in self.appearance.cap_shapes} | {
-            len(self.appearance.cap_shapes) - pins.count
-        } != {0}:
-            raise ValueError(f"appearance.cap_shapes needs pairs of coefficients for each of the {pins.count} pins")
+        shapes = self.appearance.cap_shapes
+        if shapes and ({len(c) % 2 for c in shapes} != {1} or len({len(c) for c in shapes}) > 1 or len(shapes) != pins.count):
+            raise ValueError(f"appearance.cap_shapes needs a_0 and the same number of pairs for each of the {pins.count} pins")
         if self.appearance.cap_levels and len(self.appearance.cap_levels) != pins.count:
             raise ValueError(f"appearance.cap_levels needs one number for each of the {pins.count} pins")
         if (self.recording is None) != (self.pipeline.recording is None):

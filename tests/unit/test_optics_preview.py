@@ -127,7 +127,7 @@ def test_outlines_of_their_own_keep_to_their_shape(small):
     """``1 + a cos 2t`` has (1 + a^2 / 2) of the circle's area and is longest along x."""
     clear = changed(small, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.0})
     round_, oval = (
-        Preview(changed(clear, appearance={"cap_shapes": s}), light=evenly, static=NOTHING).render() for s in ((), ((0.2, 0.0),) * 19)
+        Preview(changed(clear, appearance={"cap_shapes": s}), light=evenly, static=NOTHING).render() for s in ((), ((0.0, 0.2, 0.0),) * 19)
     )
     assert oval.sum() / round_.sum() == pytest.approx(1 + 0.2**2 / 2, rel=0.01)
     u, v = np.rint(project(clear, rest_pins(clear).cap_mm[0])).astype(int)

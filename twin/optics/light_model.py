@@ -75,7 +75,11 @@ class LightModel:
         self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
         self._radiance = [mi.Spectrum(r) for r in emitters.radiance]
         self._channels = len(self._radiance[0])
-        names = {key.split(".")[0]: key for key in self._view.params.keys() if key.endswith("reflectance.value") and "specular" not in key}
+        names = {
+            key.split(".")[0]: key
+            for key in sorted(self._view.params.keys())
+            if key.endswith("reflectance.value") and "specular" not in key
+        }
         self._flat = {
             part: (names[part], type(self._view.params[names[part]])(self._view.params[names[part]])) for part in ("skin", "stems")
         }

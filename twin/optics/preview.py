@@ -105,7 +105,7 @@ class Preview:
         self._belt_mm, self._faces = _belt(spec, self._rest.base_mm)
         self._belt_px = project(spec, self._belt_mm)
         self._belt_light = self._light(self._belt_mm, -_unit(self._belt_mm))
-        self._mean_light = self._light(self._rest.cap_mm, self._rest.axis).mean()
+        self._mean_light = self._cap_light(self._rest.cap_mm, self._rest.axis).mean()
         look = spec.appearance
         self._albedo = np.array([look.skin_albedo]), np.array([look.pin_albedo]), cap_albedo(spec), cap_albedo(spec)
 
@@ -170,6 +170,12 @@ class Preview:
         at_corners = cv2.remap(np.float32(ratio), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
         return np.clip(at_corners, 0, MOST_SKIN_GAIN)
 
+    def _cap_light(self, places_mm: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Irradiance of caps, which take light as balls do (``cap_bump``) where the lamps are the sensor's own."""
+        if self._light is self._direct:
+            return self._direct(places_mm, normals, self.spec.appearance.cap_bump)
+        return self._light(places_mm, normals)
+
     def _drawing(self, state) -> _Drawing:
         base, axis, caps = state.base_mm, state.axis, state.caps_mm if hasattr(state, "caps_mm") else state.cap_mm
         if base.shape != self._rest.base_mm.shape:
@@ -179,7 +185,8 @@ class Preview:
         side = _unit(toward - np.sum(toward * axis, axis=1, keepdims=True) * axis)
         half = 0.5 * self.spec.pins.cap_height_mm
         places = [base, 0.5 * (base + caps), caps, caps + half * axis]
-        lit = np.split(self._light(np.concatenate(places), np.concatenate([axis, side, side, axis])), 4)
+        lit = [self._light(place, normal) for place, normal in zip(places[:2], (axis, side), strict=True)]
+        lit += [self._cap_light(place, normal) for place, normal in zip(places[2:], (side, axis), strict=True)]
         skin = np.concatenate([base, self._belt_mm])
         kept = [self._kept(place, pupil) for place in (skin, *places[1:])]
         direct = [light * share for light, share in zip([np.concatenate([lit[0], self._belt_light]), *lit[1:]], kept, strict=True)]

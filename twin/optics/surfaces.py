@@ -100,7 +100,7 @@ def cap_outlines(spec: SensorSpec, sides: int) -> np.ndarray | None:
     shapes = np.array(spec.appearance.cap_shapes)
     turn = np.arange(sides) * 2 * np.pi / sides
     orders = 2 + np.arange(shapes.shape[1] // 2)[:, None]
-    return 1 + shapes[:, 0::2] @ np.cos(orders * turn) + shapes[:, 1::2] @ np.sin(orders * turn)
+    return 1 + shapes[:, :1] + shapes[:, 1::2] @ np.cos(orders * turn) + shapes[:, 2::2] @ np.sin(orders * turn)
 
 
 def _chart(points_mm: np.ndarray) -> np.ndarray:

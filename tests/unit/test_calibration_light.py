@@ -1,0 +1,166 @@
+"""Round trips of the calibration's stages: frames rendered with known values, from which a perturbed start finds them again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes import load_sensor
+from twin.calibration.aligned import Aligned, levels_slope, revised, to_levels, to_light
+from twin.calibration.caps import cap_edges, fit_caps, harmonics
+from twin.calibration.photometry import fit_photometry
+from twin.calibration.response import apparent_mm, defocus_px, fit_aperture, fit_noise, fit_response, noise_level, sharpness
+from twin.camera import expose
+from twin.geometry.pins import rest_pins
+from twin.geometry.skin_fit import FittedPins
+from twin.optics.render import Renderer
+from twin.preprocess.forms import gray_levels
+from twin.projection import project
+
+SPP = 64
+
+
+@pytest.fixture(scope="module")
+def known():
+    """37 large caps on a 200 x 160 px film, evenly printed, LEDs of differing power; nothing but the gel in sight."""
+    return revised(
+        load_sensor("ur5-331"),
+        pins={"rings": 3, "cap_diameter_mm": 2.6, "max_polar_deg": 45.0},
+        camera={"width_px": 200, "height_px": 160, "fx_px": 200.0, "fy_px": 200.0, "cx_px": 99.0, "cy_px": 80.0, "k1": 0.0},
+        housing={"aperture_radius_mm": 1000.0, "outer_radius_mm": 1001.0},
+        leds={"balance": (1.2, 0.9, 1.0, 1.1, 0.8, 1.0), "power": 0.8, "core_share": 0.0},
+        appearance={
+            "skin_albedo": (0.01, 0.015, 0.03), "cap_albedo": (0.2, 0.4, 0.6),
+            "cap_levels": (), "cap_shapes": (), "cap_variation": 0.0, "specks": (),
+        },
+        gel={"haze": 0.03, "haze_sigma_px": 30.0},
+        response={"blur_sigma_px": 0.8, "sharpening": 0.0, "jpeg_quality": 0},
+        pipeline={"raw": load_sensor("ur5-331").pipeline.raw.model_copy(update={"mask_center_px": (99.0, 80.0), "mask_radius_px": 70.0})},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def light(known):
+    return Renderer(known, spp=SPP).render()
+
+
+@pytest.fixture(scope="module")
+def frame(known, light):
+    return aligned(known, expose(light, known))
+
+
+def aligned(spec, image) -> Aligned:
+    rest = rest_pins(spec)
+    state = FittedPins(rest.base_mm, rest.axis, rest.cap_mm, np.zeros(len(rest.cap_mm)), np.zeros(3))
+    return Aligned("rendered.png", image, project(spec, rest.cap_mm), state)
+
+
+def shoot(spec, frames):
+    renderer = Renderer(spec, spp=SPP)
+    return [expose(renderer.render(f.state), spec) for f in frames]
+
+
+def quiet(*_):
+    pass
+
+
+def test_levels_and_light_are_inverse(known):
+    levels = np.arange(12.0, 255.0, 7.0)[:, None] * np.ones(3)
+    assert np.allclose(to_levels(to_light(levels, known.response), known.response), levels)
+    step = 1e-6
+    light = to_light(levels, known.response)
+    slope = (to_levels(light + step, known.response) - to_levels(light - step, known.response)) / (2 * step)
+    assert np.allclose(levels_slope(light, known.response), slope, rtol=1e-3)
+
+
+def test_lights_and_colours_are_recovered(known, frame):
+    """What is seen: cap light (power times albedo), its colour, each LED's share. Haze and the skin's light trade in a small frame."""
+    start = revised(
+        known,
+        leds={"balance": (1.0,) * 6, "power": 0.5},
+        appearance={"skin_albedo": (0.02, 0.02, 0.02), "pin_albedo": (0.01, 0.01, 0.03), "cap_albedo": (0.5, 0.5, 0.5)},
+        gel={"haze": 0.0},
+    )
+    fit = fit_photometry(start, [frame], quiet)
+    found = fit.spec
+    rounding_levels = 2.0  # gray levels are whole, caps' rims blur
+    assert max(fit.caps_rms[1], fit.skin_rms[1]) < rounding_levels < fit.caps_rms[0]
+    shining = [s.leds.power * np.array(s.appearance.cap_albedo) for s in (found, known)]
+    np.testing.assert_allclose(*shining, rtol=0.08)
+    np.testing.assert_allclose(found.leds.balance, known.leds.balance, rtol=0.08)
+
+
+def test_each_caps_reflectance_and_outline_are_recovered(known):
+    rng = np.random.default_rng(3)
+    levels = 1 + 0.15 * rng.standard_normal(known.pins.count)
+    shapes = np.zeros((known.pins.count, 7))
+    shapes[:, :3] = 0.06 * rng.standard_normal((known.pins.count, 3))
+    printed = revised(known, appearance={"cap_levels": tuple(levels.tolist()), "cap_shapes": tuple(map(tuple, shapes.tolist()))})
+    real = [aligned(printed, shoot(printed, [aligned(printed, None)])[0])]
+    found = fit_caps(fit_caps(known, real, shoot), real, shoot)
+    seen = np.linalg.norm(rest_pins(known).cap_mm[:, :2], axis=1) < 10.0
+    np.testing.assert_allclose(np.array(found.appearance.cap_levels)[seen], levels[seen], rtol=0.04)
+    left = np.array(found.appearance.cap_shapes)[seen, :3] - shapes[seen, :3]
+    assert left.std() < 0.5 * shapes[seen, :3].std()
+
+
+def test_harmonics_are_the_outlines_fourier_series():
+    turn = np.arange(24) * 2 * np.pi / 24
+    outline = 1.05 + 0.1 * np.cos(2 * turn) - 0.05 * np.sin(3 * turn) + 0.02 * np.cos(4 * turn)
+    np.testing.assert_allclose(harmonics(outline[None])[0], [0.05, 0.1, 0, 0, -0.05, 0.02, 0], atol=1e-12)
+
+
+def test_a_rendered_round_cap_has_its_edge_at_its_radius(known, frame):
+    edges = cap_edges(known, frame, frame.image)[:19]
+    blur = 0.08  # the half level of a blurred disc lies a little inside
+    assert np.nanmedian(edges) == pytest.approx(1.0, abs=blur)
+
+
+def test_blur_and_sharpening_are_recovered(known, light, frame):
+    real = revised(known, response={"blur_sigma_px": 1.1, "sharpening": 0.8, "sharpening_sigma_px": 1.6}, camera={"red_scale": 1.004})
+    seen = replace(frame, image=expose(light, real))
+    found = fit_response(known, [seen], [light], np.ones(light.shape[:2], bool))
+    left = expose(light, found).astype(float) - seen.image
+    assert left.std() < 0.1 * (expose(light, known).astype(float) - seen.image).std()  # weight and width of the mask trade
+    assert found.response.blur_sigma_px == pytest.approx(1.1, abs=0.05)
+    assert found.camera.red_scale == pytest.approx(1.004, abs=5e-4) and found.camera.blue_scale == pytest.approx(1.0, abs=5e-4)
+    assert found.response.jpeg_quality == 0
+
+
+def test_aperture_and_focus_follow_from_edges_that_widen_with_distance(known):
+    distance = np.linspace(48.0, 57.0, 5)
+    real = np.sqrt(1.5**2 + (0.69 * defocus_px(known.camera.fx_px, 3.0, 58.0, distance)) ** 2)
+    seen = replace(sharpness_of(distance), real_px=real)
+    found = fit_aperture(known, seen)
+    grown = [
+        0.69 * defocus_px(known.camera.fx_px, *pair, distance) for pair in ((3.0, 58.0), (found.camera.aperture_mm, found.camera.focus_mm))
+    ]
+    assert np.ptp(grown[0] ** 2 - grown[1] ** 2) < 0.05
+
+
+def sharpness_of(distance):
+    from twin.calibration.response import Sharpness
+
+    return Sharpness(distance, np.full(len(distance), 1.5), np.full(len(distance), 1.5))
+
+
+def test_caps_near_the_rim_are_nearer_to_the_pupil(known):
+    caps = rest_pins(known).cap_mm
+    assert apparent_mm(known, caps[0, 2]) > apparent_mm(known, caps[-1, 2])
+    bare = revised(known, gel={"refractive_index": 1.0}, lens={"refractive_index": 1.0})
+    assert apparent_mm(bare, 5.0) == pytest.approx(5.0 + known.camera.distance_mm)
+
+
+def test_noise_is_recovered(known, light, frame):
+    inside = np.ones(light.shape[:2], bool)
+    loud = revised(known, response={"read_noise": 6e-4, "shot_noise": 2e-4})
+    real = replace(frame, image=expose(light, loud, np.random.default_rng(5)))
+    found = fit_noise(known, [real], [light], inside)
+    again = noise_level(gray_levels(expose(light, found, np.random.default_rng(6))), inside)
+    assert again == pytest.approx(noise_level(gray_levels(real.image), inside), rel=0.05)
+
+
+def test_sharper_frames_have_narrower_edges(known, light, frame):
+    soft = replace(frame, image=expose(light, revised(known, response={"blur_sigma_px": 1.6})))
+    found = sharpness(known, [soft], [frame.image], bins=2)
+    assert (found.real_px > found.rendered_px).all()

@@ -1,0 +1,1 @@
+"""Fitting a specification to frames of a real sensor."""

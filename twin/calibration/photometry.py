@@ -1,0 +1,171 @@
+"""Lights and colours from the gray levels of caps and skin, by Gauss-Newton on the differentiable renderer.
+
+Only products are seen: LED power times exposure times reflectance. The caps' largest reflectance is held at
+``CAP_ALBEDO`` (printed white) and the exposure as it is; the rest follows. What a cap has of its own stays out: residuals are
+weighted robustly, and ``caps`` finds it afterwards.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.calibration.aligned import SATURATED, Aligned, levels_slope, revised, to_levels, to_light
+from twin.optics.light_model import Knobs, LightModel
+
+CAP_ALBEDO = 0.8  # of the caps' brightest channel: white resin
+SKIN_SAMPLES = 250  # pixels of bare skin a frame
+SKIN_CLEARANCE = 1.8  # cap radii that bare skin keeps from the caps' centres
+DISC_SHARE = 0.9  # of the mask's radius: nearer to the rim other light comes in
+STEPS = 6
+SLOPES_EVERY = 2  # the light is nearly linear in the knobs
+ROBUST_LEVELS = 12.0  # residual beyond which an observation counts less (Cauchy)
+BALANCE_SD = 0.3  # of an LED's share, before the frames are seen
+LARGEST_STEP = 0.7
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Places in one frame: pixels (n, 2), levels (n, channels), light of the blurred frame there, and which are caps (n,)."""
+
+    pixels: np.ndarray
+    levels: np.ndarray
+    veil: np.ndarray
+    caps: np.ndarray
+
+
+@dataclass(frozen=True)
+class PhotometryFit:
+    """What was found: rms in gray levels of caps and skin, first and last, and relative sd of each knob."""
+
+    spec: SensorSpec
+    caps_rms: tuple[float, float]
+    skin_rms: tuple[float, float]
+    uncertain: dict[str, float]
+
+
+def sample_frame(spec: SensorSpec, frame: Aligned, rng: np.random.Generator) -> Samples:
+    """Caps' middles and bare skin of a frame, each the mean of 3 x 3 px."""
+    image = frame.image if frame.image.ndim == 3 else frame.image[..., None]
+    mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)
+    light = to_light(image, spec.response).astype(np.float32)
+    veil = cv2.GaussianBlur(light, (0, 0), spec.gel.haze_sigma_px, borderType=cv2.BORDER_REPLICATE).reshape(image.shape)
+    caps = np.rint(frame.pins_px[np.isfinite(frame.pins_px).all(axis=1)]).astype(int)
+    blob = spec.pipeline.raw
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    bare = np.hypot(x - blob.mask_center_px[0], y - blob.mask_center_px[1]) < DISC_SHARE * blob.mask_radius_px
+    pitch = np.median(np.sort(np.linalg.norm(caps[:, None] - caps[None], axis=2), axis=1)[:, 1])
+    covered = np.zeros(image.shape[:2], np.uint8)
+    for u, v in caps:
+        cv2.circle(covered, (int(u), int(v)), int(round(SKIN_CLEARANCE * pitch / 3)), 1, -1)
+    rows, columns = np.nonzero(bare & (covered == 0))
+    chosen = rng.permutation(len(rows))[:SKIN_SAMPLES]
+    pixels = np.concatenate([caps, np.column_stack([columns[chosen], rows[chosen]])])
+    at = pixels[:, 1], pixels[:, 0]
+    return Samples(pixels, mean[at], veil[at], np.arange(len(pixels)) < len(caps))
+
+
+def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> PhotometryFit:
+    """Recover LED powers, colours of caps and skin, and the gel's haze.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+        Where the fit starts; its geometry and response stay.
+    frames : list of Aligned
+    progress : callable
+        ``progress(done, total)``.
+    """
+    rng = np.random.default_rng(0)
+    samples = [sample_frame(spec, frame, rng) for frame in frames]
+    width = spec.camera.width_px
+    models = [
+        LightModel(spec, f.state, s.pixels[:, 1] * width + s.pixels[:, 0], seed)
+        for seed, (f, s) in enumerate(zip(frames, samples, strict=True))
+    ]
+    levels, veil, caps = (np.concatenate([getattr(s, name) for s in samples]) for name in ("levels", "veil", "caps"))
+    useful = (levels < SATURATED).all(axis=1)
+    channels, leds = levels.shape[1], models[0].led_count
+    layout = _Layout(leds, channels)
+    x = layout.start(spec, models, levels, caps & useful)
+    first, hessian = None, None
+    for step in range(STEPS):
+        light = np.concatenate([m.light(layout.knobs(x)) for m in models])
+        if step % SLOPES_EVERY == 0:
+            found = [m.slopes(layout.knobs(x)) for m in models]
+            slopes = {name: np.concatenate([f[name] for f in found]) for name in found[0]}
+        seen = (1 - x[-1]) * light + x[-1] * veil
+        residual = np.where(useful[:, None], levels - to_levels(seen, spec.response), 0.0)
+        jacobian = layout.jacobian(slopes, light, veil, x[-1], levels_slope(seen, spec.response)) * useful[:, None, None]
+        weight = 1 / (1 + (residual / ROBUST_LEVELS) ** 2)
+        a = jacobian.reshape(-1, len(x))
+        hessian = (a * weight.reshape(-1, 1)).T @ a
+        prior = np.zeros(len(x))
+        prior[:leds] = weight.sum() / len(frames) / leds * (1.0 / BALANCE_SD) ** 2
+        move = np.linalg.solve(hessian + np.diag(prior + 1e-9 * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
+        x = x + np.clip(move, -LARGEST_STEP, LARGEST_STEP)
+        x[-1] = np.clip(x[-1], 0, 0.5)
+        rms = tuple(float(np.sqrt(np.mean(residual[part & useful] ** 2))) for part in (caps, ~caps))
+        first = first or rms
+        progress(step + 1, STEPS)
+    spread = np.sqrt(np.diag(np.linalg.pinv(hessian)) * np.mean(residual**2))
+    return PhotometryFit(
+        layout.applied(spec, x), (first[0], rms[0]), (first[1], rms[1]), dict(zip(layout.names, spread.tolist(), strict=True))
+    )
+
+
+class _Layout:
+    """Where each knob stands in the vector of unknowns: logarithms of LEDs, skin, caps; then the haze."""
+
+    def __init__(self, leds: int, channels: int):
+        self.leds, self.channels = leds, channels
+        colours = ["red", "green", "blue"] if channels == 3 else ["gray"]
+        self.names = [*(f"led {k}" for k in range(leds)), *(f"skin {c}" for c in colours), *(f"caps {c}" for c in colours), "haze"]
+        self.skin, self.caps = slice(leds, leds + channels), slice(leds + channels, leds + 2 * channels)
+
+    def start(self, spec: SensorSpec, models, levels: np.ndarray, caps: np.ndarray) -> np.ndarray:
+        """All neutral but for the caps' light, which is scaled to the frames' medians; the skin goes with it."""
+        x = np.zeros(len(self.names))
+        light = np.concatenate([m.light(self.knobs(x)) for m in models])
+        ratio = np.median(to_light(levels[caps], spec.response), axis=0) / np.median(light[caps], axis=0)
+        x[self.caps] = x[self.skin] = np.log(ratio)
+        x[-1] = spec.gel.haze
+        return x
+
+    def knobs(self, x: np.ndarray) -> Knobs:
+        """The light model's knobs; stems go with the skin."""
+        skin, caps = (np.broadcast_to(np.exp(x[part]), 3) for part in (self.skin, self.caps))
+        return Knobs(np.exp(x[: self.leds]), 1.0, skin, caps, skin)
+
+    def jacobian(self, slopes: dict, light: np.ndarray, veil: np.ndarray, haze: float, curve: np.ndarray) -> np.ndarray:
+        """Derivatives (n, channels, unknowns) of the gray levels."""
+        result = np.zeros((*light.shape, len(self.names)))
+        for k in range(self.leds):
+            result[..., k] = slopes[f"led{k}"]
+        for c in range(self.channels):
+            result[:, c, self.skin.start + c] = (slopes["skin"] + slopes["stems"])[:, c]
+            result[:, c, self.caps.start + c] = slopes["caps"][:, c]
+        result *= (1 - haze) * curve[..., None]
+        result[..., -1] = (veil - light) * curve
+        return result
+
+    def applied(self, spec: SensorSpec, x: np.ndarray) -> SensorSpec:
+        """The specification with the unknowns put in; the ring's own look keeps its brightness."""
+        lit = [k for k in range(len(spec.leds.azimuth_deg)) if k not in spec.leds.off]
+        balance = np.array(spec.leds.balance or np.ones(len(spec.leds.azimuth_deg)))
+        balance[lit] *= np.exp(x[: self.leds])
+        knobs, look = self.knobs(x), spec.appearance
+        caps = knobs.caps * look.cap_albedo
+        scale = CAP_ALBEDO / caps.max()
+        power = float(balance[lit].mean() / scale)
+        dark = {
+            name: tuple((knobs.skin * scale * getattr(look, name)).clip(0, 1).round(6).tolist()) for name in ("skin_albedo", "pin_albedo")
+        }
+        return revised(
+            spec,
+            leds={"balance": tuple((balance / balance[lit].mean()).round(4).tolist()), "power": round(spec.leds.power * power, 6)},
+            housing={"ambient": spec.housing.ambient / power, "glow": spec.housing.glow / power, "fill": spec.housing.fill / power},
+            appearance={"cap_albedo": tuple((scale * caps).round(5).tolist())} | dark,
+            gel={"haze": round(float(x[-1]), 5)},
+        )

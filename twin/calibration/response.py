@@ -1,0 +1,158 @@
+"""Sharpness, colour fringes, compression and noise of the camera, from whole frames with the light already right."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from scenes.sensor import SensorSpec
+from twin.calibration.aligned import SATURATED, Aligned, revised
+from twin.camera import expose, hazed
+from twin.preprocess.forms import gray_levels
+from twin.projection import project
+from twin.realism.caps import measure_caps
+
+START = {"blur_sigma_px": 0.7, "sharpening": 0.3, "sharpening_sigma_px": 1.2}
+BOUNDS = {"blur_sigma_px": (0.05, 4.0), "sharpening": (0.0, 4.0), "sharpening_sigma_px": (0.5, 4.0)}
+FRINGES = {"red_scale": (0.985, 1.015), "blue_scale": (0.985, 1.015)}
+QUALITIES = (0, 95, 90, 80, 70)
+MOST_TRIES = 30  # of the least squares
+MOST_FRAMES = 3  # that the sharpness is fitted to
+EVERY = 3  # pixels that the fit looks at: one in this many, in both directions
+MOST_APERTURE_MM = 6.0
+DISC_WIDTH = 0.69  # 10-90 % edge width of a uniform disc relative to its diameter
+FLAT_LEVELS = 6.0  # spread in 5 x 5 px below which a place is flat
+NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6  # sd 1 for white noise (Immerkaer 1996)
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """Cap edge widths (10-90 %, px) by distance to the pupil: real and rendered medians of each of ``distance_mm``'s bins."""
+
+    distance_mm: np.ndarray
+    real_px: np.ndarray
+    rendered_px: np.ndarray
+
+
+def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], inside: np.ndarray) -> SensorSpec:
+    """Blur, sharpening and colour fringes by least squares over the disc, then the compression that fits best.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    frames : list of Aligned
+    light : list of (H, W, 3) or (H, W) float
+        Rendered light of each frame's state.
+    inside : (H, W) bool
+        The disc.
+    """
+    colour = spec.camera.channels == "color"
+    bounds = BOUNDS | (FRINGES if colour else {})
+    names = list(bounds)
+    pick = np.zeros_like(inside)
+    pick[::EVERY, ::EVERY] = True
+    frames, light = frames[:MOST_FRAMES], [hazed(np.asarray(x, np.float32), spec.gel) for x in light[:MOST_FRAMES]]
+    useful = [inside & pick & (gray_levels(f.image) < SATURATED) for f in frames]
+    real = np.concatenate([f.image[u].astype(float).ravel() for f, u in zip(frames, useful, strict=True)])
+    flat = revised(spec, response={"jpeg_quality": 0}, gel={"haze": 0.0})  # the light is hazed already
+
+    def with_values(values) -> SensorSpec:
+        found = dict(zip(names, map(float, values), strict=True))
+        camera = {name: found.pop(name) for name in list(found) if name in FRINGES}
+        return revised(flat, response=found, camera=camera)
+
+    def residual(values, spec_of=with_values):
+        shown = spec_of(values)
+        return np.concatenate([expose(x, shown)[u].astype(float).ravel() for x, u in zip(light, useful, strict=True)]) - real
+
+    start = [getattr(spec.response, n) or START[n] if n in START else getattr(spec.camera, n) for n in names]
+    low, high = (np.array([bounds[n][k] for n in names]) for k in (0, 1))
+    fit = least_squares(
+        residual,
+        np.clip(start, low, high),
+        bounds=(low, high),
+        x_scale=0.1 * (high - low),
+        diff_step=0.02,
+        loss="soft_l1",
+        f_scale=10.0,
+        max_nfev=MOST_TRIES,
+    )
+    best = with_values(fit.x)
+    errors = {q: np.mean(np.abs(residual(None, lambda _, q=q: revised(best, response={"jpeg_quality": q})))) for q in QUALITIES}
+    return revised(best, response={"jpeg_quality": min(errors, key=errors.get)}, gel={"haze": spec.gel.haze})
+
+
+def sharpness(spec: SensorSpec, frames: list[Aligned], rendered: list[np.ndarray], bins: int = 5) -> Sharpness:
+    """Edge widths of caps in real and rendered frames against their distance from the pupil as light counts it (apparent, in air)."""
+    distance, real, ours = [], [], []
+    for frame, image in zip(frames, rendered, strict=True):
+        distance.append(apparent_mm(spec, frame.state.cap_mm[:, 2]))
+        real.append(measure_caps(gray_levels(frame.image), frame.pins_px).edge_px)
+        ours.append(measure_caps(gray_levels(image), project(spec, frame.state.cap_mm)).edge_px)
+    distance, real, ours = map(np.concatenate, (distance, real, ours))
+    good = np.isfinite(real) & np.isfinite(ours)
+    edges = np.quantile(distance[good], np.linspace(0, 1, bins + 1))
+    which = np.clip(np.searchsorted(edges, distance, side="right") - 1, 0, bins - 1)
+    parts = [good & (which == k) for k in range(bins)]
+    return Sharpness(*(np.array([np.median(values[p]) for p in parts]) for values in (distance, real, ours)))
+
+
+def fit_aperture(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
+    """Aperture and focus whose defocus explains how the edges' width changes with distance.
+
+    The circle of confusion of a point at d with focus at d0 is ``f a |1/d - 1/d0|`` px; squares of widths add. Both
+    are found on a grid, with the evenly spread rest left to the blur.
+    """
+    before = defocus_px(spec.camera.fx_px, spec.camera.aperture_mm, spec.camera.focus_mm, seen.distance_mm)
+    wanted = seen.real_px**2 - seen.rendered_px**2 + (DISC_WIDTH * before) ** 2
+    best = (np.inf, 0.0, spec.camera.focus_mm)
+    for focus in np.linspace(0.85 * seen.distance_mm.min(), 1.15 * seen.distance_mm.max(), 31):
+        for aperture in np.linspace(0, MOST_APERTURE_MM, 61):
+            grown = (DISC_WIDTH * defocus_px(spec.camera.fx_px, aperture, focus, seen.distance_mm)) ** 2
+            miss = float(np.var(wanted - grown))
+            if miss < best[0]:
+                best = miss, aperture, focus
+    return revised(spec, camera={"aperture_mm": round(best[1], 3), "focus_mm": round(float(best[2]), 2)})
+
+
+def defocus_px(focal_px: float, aperture_mm: float, focus_mm: float, distance_mm: np.ndarray) -> np.ndarray:
+    """Diameter of the circle of confusion."""
+    return focal_px * aperture_mm * np.abs(1 / distance_mm - 1 / focus_mm)
+
+
+def apparent_mm(spec: SensorSpec, z_mm: np.ndarray) -> np.ndarray:
+    """Distance in air at which what lies at z in the gel seems to be, near the axis."""
+    lens = spec.lens
+    return (
+        lens.back_mm + spec.camera.distance_mm + lens.thickness_mm / lens.refractive_index + (z_mm - lens.z_mm) / spec.gel.refractive_index
+    )
+
+
+def noise_level(gray: np.ndarray, inside: np.ndarray) -> float:
+    """Sd of the noise in flat places of a frame (H, W) uint8 (Immerkaer 1996), gray levels."""
+    levels = gray.astype(np.float32)
+    spread = np.sqrt(np.maximum(cv2.blur(levels**2, (5, 5)) - cv2.blur(levels, (5, 5)) ** 2, 0))
+    flat = inside & (spread < FLAT_LEVELS)
+    if not flat.any():
+        return float("nan")
+    return float(np.sqrt(np.pi / 2) * np.mean(np.abs(cv2.filter2D(levels, -1, NOISE_KERNEL))[flat]))
+
+
+def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], inside: np.ndarray, rounds: int = 3) -> SensorSpec:
+    """Scale the noise until flat places of renders are as rough as the real frames'."""
+    real = np.median([noise_level(gray_levels(f.image), inside) for f in frames])
+    scale = 1.0
+    for _ in range(rounds):
+        trial = _noisier(spec, scale)
+        ours = np.median([noise_level(gray_levels(expose(x, trial, np.random.default_rng(k))), inside) for k, x in enumerate(light)])
+        still = np.median([noise_level(gray_levels(expose(x, trial)), inside) for x in light])
+        grown = max(ours**2 - still**2, 1e-4)
+        scale *= float(np.sqrt(max(real**2 - still**2, 0.01 * grown) / grown))
+    return _noisier(spec, scale)
+
+
+def _noisier(spec: SensorSpec, scale: float) -> SensorSpec:
+    """Noise sd times ``scale``."""
+    response = spec.response
+    return revised(spec, response={"read_noise": response.read_noise * scale, "shot_noise": response.shot_noise * scale**2})

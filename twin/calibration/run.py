@@ -1,0 +1,175 @@
+"""The calibration's stages in their order; each one's result is kept, so that an interrupted run goes on where it was."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.calibration.aligned import Aligned, align, read_frames, revised
+from twin.calibration.caps import fit_caps
+from twin.calibration.photometry import fit_photometry
+from twin.calibration.response import fit_aperture, fit_noise, fit_response, sharpness
+from twin.calibration.surroundings import fit_surroundings
+from twin.camera import expose
+from twin.geometry.skin_fit import FittedPins
+from twin.optics.render import Renderer
+from twin.realism.disc import lens_disc
+from twin.realism.images import compare_images
+
+FRAMES = 6  # that are fitted, evenly spread over the folder
+SAMPLES = 16  # per pixel
+CAP_ROUNDS = 2
+HAZE_SIGMA_PX = 40.0  # start of the haze, where the specification has none
+
+Bar = Callable  # bar(title) is a context manager that yields progress(done, total)
+
+
+@dataclass
+class Calibration:
+    """What a run found.
+
+    Attributes
+    ----------
+    spec : SensorSpec
+    before, after : dict of str to float
+        Image figures over the disc, mean of the frames: ``psnr``, ``ssim`` (colour) and so on.
+    notes : list of str
+        Warnings: what the frames do not determine, what was left out.
+    frames : list of Aligned
+    first, last : list of (H, W[, 3]) uint8
+        Renders under the specification at the start and at the end.
+    """
+
+    spec: SensorSpec
+    before: dict
+    after: dict
+    notes: list[str] = field(default_factory=list)
+    frames: list[Aligned] = field(default_factory=list)
+    first: list[np.ndarray] = field(default_factory=list)
+    last: list[np.ndarray] = field(default_factory=list)
+
+
+class Studio:
+    """Renders frames' states under a changing specification."""
+
+    def __init__(self, bar: Bar, samples: int = SAMPLES):
+        self._bar, self._samples = bar, samples
+
+    def light(self, spec: SensorSpec, frames: list[Aligned], title: str) -> list[np.ndarray]:
+        """Linear light of every frame's state."""
+        renderer, light = Renderer(spec, spp=self._samples), []
+        with self._bar(title) as progress:
+            for done, frame in enumerate(frames):
+                light.append(renderer.render(frame.state, seed=done))
+                progress(done + 1, len(frames))
+        return light
+
+    def shots(self, spec: SensorSpec, frames: list[Aligned], title: str) -> list[np.ndarray]:
+        """Captured frames without noise."""
+        return [expose(light, spec) for light in self.light(spec, frames, title)]
+
+
+def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES) -> Calibration:
+    """Fit a specification to raw frames of a sensor in contact.
+
+    Parameters
+    ----------
+    folder : Path
+        Raw frames.
+    spec : SensorSpec
+        Where it starts: geometry and camera of the same kind of sensor.
+    work : Path
+        Folder for what each stage has found; a second run with the same frames and start goes on from there.
+    bar : callable
+    limit : int
+        Frames to fit.
+
+    Raises
+    ------
+    FrameError
+        No frame can be used, or their sizes differ.
+    RenderError
+        Nothing can be rendered, or differentiated, here.
+    """
+    with bar("read the frames, find their pins") as progress:
+        raw = read_frames(folder, spec, limit, progress)
+    log = _Log(work, spec, raw)
+    with bar("fit the skin to the pins") as progress:
+        frames = log.aligned(spec, raw, progress)
+    inside, studio, notes = lens_disc(spec).inside, Studio(bar), []
+    first = studio.shots(spec, frames, "render the start")
+
+    def surroundings(spec):
+        with bar("fit the ring, the reflections, the specks") as progress:
+            found = fit_surroundings(spec, np.stack([f.image for f in frames]), np.stack([f.pins_px for f in frames]), progress=progress)
+        return found if found.gel.haze else revised(found, gel={"haze_sigma_px": HAZE_SIGMA_PX})
+
+    def photometry(spec):
+        with bar("fit lights and colours") as progress:
+            return fit_photometry(spec, frames, progress).spec
+
+    def defocus(spec):
+        shots = studio.shots(spec, frames, "render for the sharpness")
+        return fit_aperture(spec, sharpness(spec, frames, shots))
+
+    def response(spec):
+        return fit_response(spec, frames, studio.light(spec, frames, "render for the response"), inside)
+
+    def caps(spec):
+        return fit_caps(spec, frames, lambda s, f: studio.shots(s, f, "render for the caps"))
+
+    def noise(spec):
+        return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"), inside)
+
+    stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), photometry, caps, noise]
+    for number, stage in enumerate(stages):
+        spec = log.stage(f"{number:02d}-{stage.__name__}", stage, spec)
+    last = studio.shots(spec, frames, "render the result")
+    figures = [[compare_images(f.image, image, inside) for f, image in zip(frames, shots, strict=True)] for shots in (first, last)]
+    before, after = ({name: float(np.mean([getattr(x, name) for x in part])) for name in vars(part[0])} for part in figures)
+    return Calibration(spec, before, after, notes, frames, first, last)
+
+
+class _Log:
+    """Results of the stages on disk, under a name made of the start and the frames."""
+
+    def __init__(self, work: Path, spec: SensorSpec, raw: list):
+        digest = hashlib.sha256(spec.model_dump_json().encode())
+        for name, image, _ in raw:
+            digest.update(name.encode() + image.tobytes())
+        self._folder = work / digest.hexdigest()[:16]
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def aligned(self, spec: SensorSpec, raw: list, progress) -> list[Aligned]:
+        """Frames with their fitted skin, from disk where they are there."""
+        frames = []
+        for done, (name, image, pins_px) in enumerate(raw):
+            path = self._folder / f"{Path(name).stem}.npz"
+            if path.exists():
+                with np.load(path) as kept:
+                    frames.append(Aligned(name, image, pins_px, FittedPins(**kept)))
+            else:
+                frames += align(spec, [(name, image, pins_px)], lambda *_: None)
+                _write(path, lambda file, state=frames[-1].state: np.savez(file, **vars(state)))
+            progress(done + 1, len(raw))
+        return frames
+
+    def stage(self, name: str, run: Callable, spec: SensorSpec) -> SensorSpec:
+        """The stage's result, from disk where it is there."""
+        path = self._folder / f"{name}.json"
+        if path.exists():
+            return SensorSpec.model_validate(json.loads(path.read_text()))
+        found = run(spec)
+        _write(path, lambda file: file.write(found.model_dump_json().encode()))
+        return found
+
+
+def _write(path: Path, fill: Callable) -> None:
+    partial = path.with_suffix(".partial")
+    with partial.open("wb") as file:
+        fill(file)
+    partial.replace(path)

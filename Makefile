@@ -28,6 +28,7 @@ bench: setup     ## speed, as ratios to named baselines in the same run
 	@$(BIN)/python tests/bench/bench_pipeline.py --sensor mg400-331
 	@$(BIN)/python tests/bench/bench_pipeline.py --sensor mg400-127
 	@$(BIN)/python tests/bench/bench_mechanics.py
+	@$(BIN)/python tests/bench/bench_render.py
 
 validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests

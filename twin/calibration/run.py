@@ -10,18 +10,23 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.calibration.aligned import Aligned, align, read_frames, revised
+from twin.calibration.camera_pose import fit_camera
 from twin.calibration.caps import fit_caps
 from twin.calibration.photometry import fit_photometry
 from twin.calibration.response import fit_aperture, fit_noise, fit_response, sharpness
 from twin.calibration.surroundings import fit_surroundings
 from twin.camera import expose
+from twin.errors import FrameError
 from twin.geometry.skin_fit import FittedPins
 from twin.optics.render import Renderer
+from twin.preprocess.pipeline import Pipeline
 from twin.realism.disc import lens_disc
 from twin.realism.images import compare_images
+from twin.recordings.images import read_image
+from twin.types import Form, Frame
 
 FRAMES = 6  # that are fitted, evenly spread over the folder
-SAMPLES = 16  # per pixel
+SAMPLES = 8  # per pixel
 CAP_ROUNDS = 2
 HAZE_SIGMA_PX = 40.0  # start of the haze, where the specification has none
 
@@ -53,6 +58,13 @@ class Calibration:
     last: list[np.ndarray] = field(default_factory=list)
 
 
+ALWAYS = (
+    "the response curve (gamma, black level): held; photograph a gray card at several exposures to know it",
+    "LED power, exposure and reflectance: only their product is seen; the caps' brightest channel is taken as white resin",
+    "the window's thickness and index, and the skin's thickness: held",
+)
+
+
 class Studio:
     """Renders frames' states under a changing specification."""
 
@@ -73,7 +85,7 @@ class Studio:
         return [expose(light, spec) for light in self.light(spec, frames, title)]
 
 
-def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES) -> Calibration:
+def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES, no_contact: Path | None = None) -> Calibration:
     """Fit a specification to raw frames of a sensor in contact.
 
     Parameters
@@ -87,6 +99,8 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
     bar : callable
     limit : int
         Frames to fit.
+    no_contact : Path, optional
+        A raw frame without contact, to which the camera is fitted first.
 
     Raises
     ------
@@ -95,12 +109,16 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
     RenderError
         Nothing can be rendered, or differentiated, here.
     """
+    notes = list(ALWAYS)
+    if no_contact is not None:
+        spec, report = fit_camera(spec, _pins_at_rest(no_contact, spec))
+        notes += [f"camera fitted to {report.pins} pins, {report.rms_px:.2f} px rms", *report.held.values()]
     with bar("read the frames, find their pins") as progress:
         raw = read_frames(folder, spec, limit, progress)
     log = _Log(work, spec, raw)
     with bar("fit the skin to the pins") as progress:
         frames = log.aligned(spec, raw, progress)
-    inside, studio, notes = lens_disc(spec).inside, Studio(bar), []
+    inside, studio = lens_disc(spec).inside, Studio(bar)
     first = studio.shots(spec, frames, "render the start")
 
     def surroundings(spec):
@@ -125,13 +143,24 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
     def noise(spec):
         return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"), inside)
 
-    stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), photometry, caps, noise]
+    stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), noise]
     for number, stage in enumerate(stages):
         spec = log.stage(f"{number:02d}-{stage.__name__}", stage, spec)
     last = studio.shots(spec, frames, "render the result")
     figures = [[compare_images(f.image, image, inside) for f, image in zip(frames, shots, strict=True)] for shots in (first, last)]
     before, after = ({name: float(np.mean([getattr(x, name) for x in part])) for name in vars(part[0])} for part in figures)
     return Calibration(spec, before, after, notes, frames, first, last)
+
+
+def _pins_at_rest(path: Path, spec: SensorSpec) -> np.ndarray:
+    """Pins (N, 2) of a raw frame without contact."""
+    if not path.is_file():
+        raise FrameError(f"{path}: no such frame")
+    image, _ = read_image(path)
+    observation = Pipeline(spec, Form.RAW)(Frame(image, Form.RAW, path.name))
+    if not observation.valid:
+        raise FrameError(f"{path.name}: {observation.reason}; give a raw frame without contact that shows every pin")
+    return observation.pins_px
 
 
 class _Log:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
+from threadpoolctl import ThreadpoolController
 
 from scenes.sensor import SensorSpec
 from twin.geometry.soft_body import SoftBody
@@ -107,6 +108,7 @@ class SkinFit:
 
     def __init__(self, spec: SensorSpec, *, prior: Prior | None = None):
         self.spec, self.prior = spec, prior or Prior()
+        self._blas = ThreadpoolController()
         self._body = SoftBody(spec)
         solid = self._solid = self._body.solid
         at, weights = (a.ravel() for a in solid.basis.gauss(2))
@@ -143,14 +145,15 @@ class SkinFit:
         if 2 * seen.sum() < count:
             raise ValueError(f"{seen.sum()} of {count} pins are too few to fit a skin to; at least half are needed")
         control, traction = self._solid.control_mm.copy(), np.zeros(self._area_mm2.shape + (3,))
-        for step in range(STEPS):
-            target_px = pins_px - self._offset_px(control) * centroids
-            move, traction = self._step(control, target_px, seen, traction, even=step < EVEN_STEPS)
-            largest = np.abs(move).max()
-            control = self._body.moved(control, move * min(1.0, LARGEST_MOVE_MM / largest))
-            if step >= EVEN_STEPS and largest < SETTLED_MM:
-                break
-        pins = self._on_rays(control, pins_px - self._offset_px(control) * centroids, seen)
+        with self._blas.limit(limits=1, user_api="blas"):  # many threads are slower on matrices this small
+            for step in range(STEPS):
+                target_px = pins_px - self._offset_px(control) * centroids
+                move, traction = self._step(control, target_px, seen, traction, even=step < EVEN_STEPS)
+                largest = np.abs(move).max()
+                control = self._body.moved(control, move * min(1.0, LARGEST_MOVE_MM / largest))
+                if step >= EVEN_STEPS and largest < SETTLED_MM:
+                    break
+            pins = self._on_rays(control, pins_px - self._offset_px(control) * centroids, seen)
         return replace(pins, force_n=self._area_mm2 @ traction)
 
     def _offset_px(self, control: np.ndarray) -> np.ndarray:

@@ -74,16 +74,7 @@ class LightModel:
         emitters = self._view.tracer.emitters
         self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
         self._radiance = [mi.Spectrum(r) for r in emitters.radiance]
-        self._channels = len(self._radiance[0])
-        names = {
-            key.split(".")[0]: key
-            for key in sorted(self._view.params.keys())
-            if key.endswith("reflectance.value") and "specular" not in key
-        }
-        self._flat = {
-            part: (names[part], type(self._view.params[names[part]])(self._view.params[names[part]])) for part in ("skin", "stems")
-        }
-        self._paint = mi.Float(self._view.params["caps.vertex_paint"])
+        self._shapes = {shape.id(): mi.ShapePtr(shape) for shape in self._view.tracer.scene.shapes()}
 
     @property
     def led_count(self) -> int:
@@ -117,18 +108,17 @@ class LightModel:
 
     def _turn(self, knobs: Knobs, steps: dict) -> None:
         """Set the knobs, each with its step (zero, but with a gradient) in its logarithm."""
-        mi, params = self._mi, self._view.params
+        mi, dr, tracer = self._mi, self._dr, self._view.tracer
 
         def factor(knob, value):
             return value * (1 + steps[knob]) if knob in steps else value
 
         leds = [*((f"led{k}", float(v)) for k, v in enumerate(knobs.leds)), ("fill", float(knobs.fill))]
-        emitters = self._view.tracer.emitters
-        emitters.radiance[:] = [base * factor(knob, v) for base, (knob, v) in zip(self._radiance, leds, strict=False)]
-        for part, (key, base) in self._flat.items():
-            params[key] = base * factor(part, spectrum(mi, getattr(knobs, part)))
-        tint = spectrum(mi, knobs.caps)
-        each = mi.Float([float(c[0]) for c in tint])
-        number = self._dr.arange(mi.UInt32, len(self._paint)) % self._channels
-        params["caps.vertex_paint"] = self._paint * factor("caps", self._dr.gather(mi.Float, each, number))
-        params.update()
+        tracer.emitters.radiance[:] = [
+            base * factor(knob, dr.opaque(mi.Float, v)) for base, (knob, v) in zip(self._radiance, leds, strict=False)
+        ]
+        tracer.tints[:] = []
+        for part, shape in self._shapes.items():
+            tint = spectrum(mi, getattr(knobs, part))
+            dr.make_opaque(tint)
+            tracer.tints.append((shape, factor(part, tint)))

@@ -5,7 +5,7 @@ of them, drawn in proportion to what it would give, is tested for a shadow: wher
 from the choice. Paths that leave towards the window are reflected by it (with total reflection) or lost in the housing.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,6 +41,8 @@ class GelTracer:
         Scatterings of a path after its first vertex.
     bump : float
         ``AppearanceSpec.cap_bump`` of the shape ``caps``.
+    tints : list of (mi.ShapePtr, mi.Spectrum)
+        Factors on what shapes reflect, which can carry gradients.
     """
 
     scene: object
@@ -50,6 +52,7 @@ class GelTracer:
     bounces: int
     bump: float
     caps: object
+    tints: list = field(default_factory=list)
 
     @classmethod
     def of(cls, mi, spec: SensorSpec, scene, bounces: int) -> "GelTracer":
@@ -89,7 +92,7 @@ class GelTracer:
             if bounce == self.bounces:
                 break
             out, value = bsdf.sample(mi.BSDFContext(), hit, random.next_1d(), random.next_2d(), active)
-            weight *= value
+            weight *= value * self._tint(mi, dr, hit)
             survival = dr.clip(SURVIVAL_GAIN * dr.detach(dr.max(weight)), 0.0, 1.0)
             active &= random.next_1d() < survival
             weight /= dr.maximum(survival, NEVER)
@@ -145,8 +148,14 @@ class GelTracer:
         lit &= ~self.scene.ray_test(shadow, coherent=False, active=lit)
         local = hit.to_local(toward)
         reflected = bsdf.eval(mi.BSDFContext(), hit, local, lit) * (_taken(dr, local.z, bump) / dr.maximum(local.z, NEVER))
-        arriving *= self._absorbed(mi, dr, length, lit)
+        arriving *= self._absorbed(mi, dr, length, lit) * self._tint(mi, dr, hit)
         return dr.select(lit, reflected * arriving * (total / dr.maximum(share, NEVER)), 0.0)
+
+    def _tint(self, mi, dr, hit):
+        factor = mi.Spectrum(1.0)
+        for shape, tint in self.tints:
+            factor = dr.select(hit.shape == shape, tint, factor)
+        return factor
 
     def _absorbed(self, mi, dr, length, active):
         if not any(self.absorption):

@@ -119,7 +119,8 @@ class CameraSpec(Section):
     (Kannala and Brandt 2006) with theta (1 + k1 theta^2 + k2 theta^4). ``aperture_mm`` is the pupil's diameter (0:
     everything is sharp), ``focus_mm`` the distance in air, from the pupil, of what is sharp. ``vignetting`` is the
     share of light lost at the corners, rising with the square of the distance from the image's middle.
-    ``red_scale`` and ``blue_scale``: size of these colours' images about (cx, cy) against green's.
+    ``red_scale`` and ``blue_scale``: size of these colours' images about (cx, cy) against green's; ``red_shift_px`` and
+    ``blue_shift_px``: how far they are shifted.
     """
 
     width_px: Annotated[int, Field(ge=16, le=8192)]
@@ -142,6 +143,8 @@ class CameraSpec(Section):
     vignetting: Fraction = 0.0
     red_scale: NearOne = 1.0
     blue_scale: NearOne = 1.0
+    red_shift_px: tuple[float, float] = (0.0, 0.0)
+    blue_shift_px: tuple[float, float] = (0.0, 0.0)
 
     @model_validator(mode="after")
     def _check(self):
@@ -155,8 +158,8 @@ class LedRingSpec(Section):
 
     Each is a square of ``size_mm`` at ``radius_mm`` from the axis in the plane ``z_mm``, turned to face the axis.
     ``power`` is the light of one LED (independent of its size), ``balance`` each one's share of it (empty: all 1),
-    ``off`` lists indices of dead ones. ``core_share`` of an LED's light comes from its middle (a Gaussian of sd
-    ``core_mm``): it shows in the LED's reflection in the window only.
+    ``off`` lists indices of dead ones. In the LED's reflection in the window ``mirror_share`` of its light shows (the rest
+    is hidden from there by the housing), ``core_share`` of it in the middle (a Gaussian of sd ``core_mm``).
     """
 
     azimuth_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=64)]
@@ -167,6 +170,7 @@ class LedRingSpec(Section):
     balance: tuple[NonNegative, ...] = ()
     color: Rgb = (1.0, 1.0, 1.0)
     off: tuple[int, ...] = ()
+    mirror_share: Fraction = 1.0
     core_share: Fraction = 0.0
     core_mm: Positive = 0.3
 

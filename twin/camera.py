@@ -52,15 +52,15 @@ def hazed(light: np.ndarray, gel: GelSpec) -> np.ndarray:
 
 
 def dispersed(light: np.ndarray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """Red and blue images at their own scale about the principal point: ``red'(c + scale (p - c)) = red(p)``."""
-    scales = {0: camera.red_scale, 2: camera.blue_scale}
-    if light.ndim == 2 or set(scales.values()) == {1.0}:
+    """Red and blue images of their own size and place: ``red'(c + scale (p - c) + shift) = red(p)``, c the principal point."""
+    own = {0: (camera.red_scale, camera.red_shift_px), 2: (camera.blue_scale, camera.blue_shift_px)}
+    if light.ndim == 2 or all(scale == 1 and not any(shift) for scale, shift in own.values()):
         return light
     light = light.copy()
-    for channel, scale in scales.items():
-        if scale != 1:
-            across = _scaled(np.ascontiguousarray(light[..., channel].T), scale, camera.cx_px - origin_px[0])
-            light[..., channel] = _scaled(np.ascontiguousarray(across.T), scale, camera.cy_px - origin_px[1])
+    for channel, (scale, shift) in own.items():
+        if scale != 1 or any(shift):
+            across = _scaled(np.ascontiguousarray(light[..., channel].T), scale, camera.cx_px - origin_px[0], shift[0])
+            light[..., channel] = _scaled(np.ascontiguousarray(across.T), scale, camera.cy_px - origin_px[1], shift[1])
     return light
 
 
@@ -153,9 +153,9 @@ def record(raw: np.ndarray, recording: RecordingSpec, *, origin_px: tuple[int, i
     return binary if binary.shape[::-1] == size else cv2.resize(binary, size, interpolation=cv2.INTER_AREA)
 
 
-def _scaled(plane: np.ndarray, scale: float, centre: float) -> np.ndarray:
-    """Rows of a plane (n, m) drawn apart about row ``centre``: cubic convolution (Keys 1981), which keeps centroids exactly."""
-    place = centre + (np.arange(len(plane)) - centre) / scale
+def _scaled(plane: np.ndarray, scale: float, centre: float, shift: float) -> np.ndarray:
+    """Rows of a plane (n, m) drawn apart about row ``centre`` and shifted: cubic convolution (Keys 1981), which keeps centroids exactly."""
+    place = centre + (np.arange(len(plane)) - shift - centre) / scale
     first = np.floor(place).astype(int)
     t = (place - first)[:, None].astype(np.float32)
     taps = (((2 - t) * t - 1) * t / 2, ((3 * t - 5) * t * t + 2) / 2, ((4 - 3 * t) * t + 1) * t / 2, (t - 1) * t * t / 2)

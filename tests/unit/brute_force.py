@@ -1,9 +1,9 @@
 """The same scene with its real interfaces, for Mitsuba's own path tracer: slow to converge, and nothing of ours but the meshes."""
 
 import numpy as np
+from plain_sensor import plain
 from scipy import stats
 
-from scenes import load_sensor
 from scenes.sensor import SensorSpec
 from twin.optics.lights import lights
 from twin.optics.scene import build_pinhole_camera, build_scene, mesh
@@ -26,7 +26,7 @@ def laboratory(size_px: int) -> SensorSpec:
     focal = size_px / 2 / HALF_FIELD
     ideal = dict.fromkeys(("tilt_x_deg", "tilt_y_deg", "k1", "k2", "p1", "p2", "aperture_mm"), 0.0)
     return changed(
-        load_sensor("ur5-331"),
+        plain(),
         pins={"rings": 2, "cap_diameter_mm": 5.0, "cap_height_mm": 0.6, "max_polar_deg": 40.0},
         gel={"absorption_per_mm": (0.0, 0.0, 0.0)},
         camera=ideal | {

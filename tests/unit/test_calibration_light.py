@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plain_sensor import plain
 
-from scenes import load_sensor
 from twin.calibration.aligned import Aligned, levels_slope, revised, to_levels, to_light
 from twin.calibration.caps import cap_edges, fit_caps, harmonics
 from twin.calibration.photometry import fit_photometry
@@ -24,7 +24,7 @@ SPP = 64
 def known():
     """37 large caps on a 200 x 160 px film, evenly printed, LEDs of differing power; nothing but the gel in sight."""
     return revised(
-        load_sensor("ur5-331"),
+        plain(),
         pins={"rings": 3, "cap_diameter_mm": 2.6, "max_polar_deg": 45.0},
         camera={"width_px": 200, "height_px": 160, "fx_px": 200.0, "fy_px": 200.0, "cx_px": 99.0, "cy_px": 80.0, "k1": 0.0},
         housing={"aperture_radius_mm": 1000.0, "outer_radius_mm": 1001.0},
@@ -35,7 +35,7 @@ def known():
         },
         gel={"haze": 0.03, "haze_sigma_px": 30.0},
         response={"blur_sigma_px": 0.8, "sharpening": 0.0, "jpeg_quality": 0},
-        pipeline={"raw": load_sensor("ur5-331").pipeline.raw.model_copy(update={"mask_center_px": (99.0, 80.0), "mask_radius_px": 70.0})},
+        pipeline={"raw": plain().pipeline.raw.model_copy(update={"mask_center_px": (99.0, 80.0), "mask_radius_px": 70.0})},
     )  # fmt: skip
 
 
@@ -129,13 +129,13 @@ def test_blur_and_sharpening_are_recovered(known, light, frame):
 
 def test_aperture_and_focus_follow_from_edges_that_widen_with_distance(known):
     distance = np.linspace(48.0, 57.0, 5)
-    real = np.sqrt(1.5**2 + (0.69 * defocus_px(known.camera.fx_px, 3.0, 58.0, distance)) ** 2)
+    real = np.sqrt(1.5**2 + (0.69 * defocus_px(known.camera.fx_px, 1.0, 58.0, distance)) ** 2)
     seen = replace(sharpness_of(distance), real_px=real)
     found = fit_aperture(known, seen)
     grown = [
-        0.69 * defocus_px(known.camera.fx_px, *pair, distance) for pair in ((3.0, 58.0), (found.camera.aperture_mm, found.camera.focus_mm))
+        0.69 * defocus_px(known.camera.fx_px, *pair, distance) for pair in ((1.0, 58.0), (found.camera.aperture_mm, found.camera.focus_mm))
     ]
-    assert np.ptp(grown[0] ** 2 - grown[1] ** 2) < 0.05
+    assert np.ptp(grown[0] ** 2 - grown[1] ** 2) < 0.02
 
 
 def sharpness_of(distance):

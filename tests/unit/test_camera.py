@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 import pytest
+from plain_sensor import plain
 
-from scenes import load_sensor
 from scenes.sensor import RecordingSpec, SensorSpec
 from twin.camera import amplified, blurred, compressed, curve, dispersed, expose, hazed, noisy, record, sharpened, vignetted
 from twin.errors import FrameError
@@ -34,7 +34,7 @@ def changed(spec: SensorSpec, **sections) -> SensorSpec:
     return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
 
 
-PLAIN = changed(load_sensor("ur5-331"), **NEUTRAL)
+PLAIN = changed(plain(), **NEUTRAL)
 CURVED = changed(PLAIN, response={"gamma": 2.2, "black_level": 4.0})
 
 
@@ -259,3 +259,14 @@ def test_single_bright_pixels_do_not_survive_the_recorder():
 def test_colour_frames_are_recorded_as_their_gray():
     raw = dots()
     assert (record(np.repeat(raw[..., None], 3, axis=2), RECORDING) == record(raw, RECORDING)).all()
+
+
+def test_shifted_colours_move_alone():
+    """A spot's red moves by the shift, green stays."""
+    spec = plain()
+    camera = spec.camera.model_copy(update={"red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.4, -0.3), "blue_shift_px": (0.0, 0.0)})
+    y, x = np.mgrid[:60, :80]
+    spot = np.exp(-((x - 40.0) ** 2 + (y - 30.0) ** 2) / (2 * 3.0**2)).astype(np.float32)
+    seen = dispersed(np.stack([spot] * 3, axis=-1), camera)
+    moved = [[(c * x).sum() / c.sum() - 40, (c * y).sum() / c.sum() - 30] for c in np.moveaxis(seen, 2, 0)]
+    np.testing.assert_allclose(moved, [[0.4, -0.3], [0, 0], [0, 0]], atol=1e-3)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from plain_sensor import plain
 
-from scenes import load_sensor
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
@@ -28,7 +28,7 @@ def evenly(points_mm, normals):
 def small() -> SensorSpec:
     """19 wide flat caps alone on a 120 x 100 px film, a strongly distorting tilted mono camera."""
     return changed(
-        load_sensor("ur5-331"),
+        plain(),
         pins={"rings": 2, "cap_diameter_mm": 4.0, "cap_height_mm": 0.02, "max_polar_deg": 40.0},
         camera={
             "channels": "mono", "width_px": 120, "height_px": 100, "fx_px": 125.0, "fy_px": 130.0, "cx_px": 61.3, "cy_px": 47.8,
@@ -76,7 +76,7 @@ def moved(rest: PinRest, pin: int, shift) -> PinRest:
 @pytest.mark.parametrize("depth_mm", [2.0, 15.0])
 def test_all_light_that_enters_the_gel_crosses_each_plane_in_it(depth_mm):
     """The irradiance times n^2 over a plane sums to ``L A integral T cos(theta) d omega`` of one LED, with T = 1 for equal indices."""
-    spec = load_sensor("ur5-331")
+    spec = plain()
     spec = changed(
         spec, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.4}, leds={"off": (1, 2, 3, 4, 5)}, housing={"fill": 0.0}
     )
@@ -217,9 +217,7 @@ def test_a_nearer_cap_hides_a_farther_one(small, towards_mm, seen):
 @pytest.mark.parametrize("channels", ["mono", "color"])
 def test_calibration_finds_the_shading_of_a_frame(channels):
     """A frame drawn with a known shading gives that shading back."""
-    spec = changed(
-        load_sensor("ur5-331"), pins={"rings": 4}, camera={"channels": channels}, appearance={"cap_levels": (), "cap_shapes": ()}
-    )
+    spec = changed(plain(), pins={"rings": 4}, camera={"channels": channels}, appearance={"cap_levels": (), "cap_shapes": ()})
     rng, window, size = np.random.default_rng(2), (90, 40, 530, 460), 1 if channels == "mono" else 3
     known = Shading(rng.uniform(0.7, 1.3, (4, size)), rng.uniform(0.0, 0.2, (4, size)))
     preview = Preview(spec, window_px=window, static=NOTHING)
@@ -233,7 +231,7 @@ def test_calibration_finds_the_shading_of_a_frame(channels):
 
 
 def test_calibration_finds_where_the_skin_is_shaded():
-    spec = changed(load_sensor("ur5-331"), pins={"rings": 4}, appearance={"cap_levels": (), "cap_shapes": ()})
+    spec = changed(plain(), pins={"rings": 4}, appearance={"cap_levels": (), "cap_shapes": ()})
     preview, feet = Preview(spec, static=NOTHING), rest_pins(spec).base_mm
     shade = np.ones_like(preview.calibrate(preview).skin)
     shade[: len(feet), 0] = 1 - 0.3 * np.exp(-np.sum((feet[:, :2] - [6.0, 2.0]) ** 2, axis=1) / (2 * 6.0**2))

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from plain_sensor import plain
 
-from scenes import load_sensor
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
@@ -20,7 +20,7 @@ def changed(spec: SensorSpec, **sections) -> SensorSpec:
 def small() -> SensorSpec:
     """19 wide flat caps on a 120 x 100 px film, a strongly distorting tilted mono camera."""
     return changed(
-        load_sensor("ur5-331"),
+        plain(),
         pins={"rings": 2, "cap_diameter_mm": 4.0, "cap_height_mm": 0.02, "max_polar_deg": 40.0},
         camera={
             "channels": "mono", "width_px": 120, "height_px": 100, "fx_px": 115.0, "fy_px": 122.0, "cx_px": 61.3, "cy_px": 47.8,

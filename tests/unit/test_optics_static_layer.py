@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from plain_sensor import plain
 
-from scenes import load_sensor
 from scenes.sensor import SensorSpec, SpeckSpec
 from twin.optics.lights import led_patches
 from twin.optics.static_layer import ACROSS, static_layer
@@ -23,7 +23,7 @@ def changed(spec: SensorSpec, **sections) -> SensorSpec:
 def bare() -> SensorSpec:
     """LEDs and window alone, seen by a tilted, distorting camera: the housing is out of sight."""
     return changed(
-        load_sensor("ur5-331"),
+        plain(),
         camera=HALF | {"tilt_x_deg": 3.0, "tilt_y_deg": -2.0, "k1": 0.4, "p1": 0.01},
         leds={"radius_mm": 12.0, "z_mm": -10.0, "size_mm": 2.0, "core_share": 0.0, "balance": (), "off": ()},
         housing={"aperture_radius_mm": 1000.0, "outer_radius_mm": 2000.0},
@@ -87,7 +87,7 @@ def test_the_image_in_the_front_face_lies_between_its_place_in_air_and_none(bare
 
 
 def test_a_dead_led_has_neither_glow_nor_glint():
-    spec = changed(load_sensor("ur5-331"), camera=HALF, housing={"ambient": 0.0})
+    spec = changed(plain(), camera=HALF, housing={"ambient": 0.0})
     lit, dead = static_layer(spec, WINDOW)[0], static_layer(changed(spec, leds={"off": (2,)}), WINDOW)[0]
     without = static_layer(changed(spec, leds={"azimuth_deg": spec.leds.azimuth_deg[:2] + spec.leds.azimuth_deg[3:]}), WINDOW)[0]
     assert dead == pytest.approx(without, abs=1e-6)

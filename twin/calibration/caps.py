@@ -43,7 +43,7 @@ def fit_caps(spec: SensorSpec, frames: list[Aligned], shoot: Shoot) -> SensorSpe
     rendered = shoot(spec, frames)
     level = np.array([_levels(spec, f, f.image) / _levels(spec, f, r) for f, r in zip(frames, rendered, strict=True)])
     edge = np.array([cap_edges(spec, f, f.image) / cap_edges(spec, f, r) for f, r in zip(frames, rendered, strict=True)])
-    level, edge = (np.nan_to_num(_median(values), nan=1.0) for values in (level, edge))
+    level, edge = np.nan_to_num(_median(level), nan=1.0), _reliable(edge)
     before = np.array(spec.appearance.cap_levels or np.ones(spec.pins.count))
     levels = np.clip(before * level**DAMPING, *LEVEL_BOUNDS)
     outline = cap_outlines(spec, DIRECTIONS)
@@ -55,6 +55,24 @@ def fit_caps(spec: SensorSpec, frames: list[Aligned], shoot: Shoot) -> SensorSpe
             "cap_shapes": tuple(map(tuple, harmonics(outline * edge**DAMPING).round(3).tolist())),
         },
     )
+
+
+def _reliable(edge: np.ndarray) -> np.ndarray:
+    """Outline ratios (N, DIRECTIONS) of frames (M, N, DIRECTIONS), each harmonic shrunk by what of it differs from frame to frame.
+
+    A cap's print is the same in all frames; noise, and an edge seen too flat, is not: a coefficient counts
+    ``signal / (signal + noise / M)``, its variance over the caps of like harmonics against that over the frames.
+    """
+    middle = _median(edge)
+    each = np.array([harmonics(np.where(np.isfinite(one), one, np.nan_to_num(middle, nan=1.0))) for one in edge])
+    mean = np.median(each, axis=0)
+    if len(edge) > 1:
+        noise = 1.57 * np.var(each, axis=0, ddof=1) / len(edge)  # of a median
+        signal = np.maximum(np.mean(mean**2, axis=0) - noise.mean(axis=0), 0)
+        mean = mean * signal / (signal + noise + 1e-12)
+    turn = np.arange(edge.shape[2]) * 2 * np.pi / edge.shape[2]
+    orders = np.arange(2, ORDERS + 1)[:, None]
+    return 1 + mean[:, :1] + mean[:, 1::2] @ np.cos(orders * turn) + mean[:, 2::2] @ np.sin(orders * turn)
 
 
 def harmonics(outline: np.ndarray) -> np.ndarray:

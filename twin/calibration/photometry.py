@@ -12,7 +12,9 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.calibration.aligned import SATURATED, Aligned, levels_slope, revised, to_levels, to_light
+from twin.camera import blurred
 from twin.optics.light_model import Knobs, LightModel
+from twin.optics.render import Renderer
 
 CAP_ALBEDO = 0.8  # of the caps' brightest channel: white resin
 SKIN_SAMPLES = 250  # pixels of bare skin a frame
@@ -45,12 +47,17 @@ class PhotometryFit:
     uncertain: dict[str, float]
 
 
-def sample_frame(spec: SensorSpec, frame: Aligned, rng: np.random.Generator) -> Samples:
-    """Caps' middles and bare skin of a frame, each the mean of 3 x 3 px."""
+def sample_frame(spec: SensorSpec, frame: Aligned, around: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> Samples:
+    """Caps' middles and bare skin of a frame, each the mean of 3 x 3 px.
+
+    The veil is the frame's own light, blurred; where the static layer covers the gel, and saturates in the frame, it is
+    ``around``: the layer's light (H, W[, 3]) and the share (H, W) of the gel that it lets through.
+    """
     image = frame.image if frame.image.ndim == 3 else frame.image[..., None]
     mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)
-    light = to_light(image, spec.response).astype(np.float32)
-    veil = cv2.GaussianBlur(light, (0, 0), spec.gel.haze_sigma_px, borderType=cv2.BORDER_REPLICATE).reshape(image.shape)
+    outside, through = around
+    light = np.where(through[..., None] > 0, to_light(image, spec.response), outside.reshape(image.shape)).astype(np.float32)
+    veil = blurred(light, spec.gel.haze_sigma_px).reshape(image.shape)
     caps = np.rint(frame.pins_px[np.isfinite(frame.pins_px).all(axis=1)]).astype(int)
     blob = spec.pipeline.raw
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
@@ -78,7 +85,8 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> Photome
         ``progress(done, total)``.
     """
     rng = np.random.default_rng(0)
-    samples = [sample_frame(spec, frame, rng) for frame in frames]
+    around = Renderer(spec, spp=1).static
+    samples = [sample_frame(spec, frame, around, rng) for frame in frames]
     width = spec.camera.width_px
     models = [
         LightModel(spec, f.state, s.pixels[:, 1] * width + s.pixels[:, 0], seed)

@@ -13,14 +13,19 @@ from twin.preprocess.forms import gray_levels
 from twin.projection import project
 from twin.realism.caps import measure_caps
 
-START = {"blur_sigma_px": 0.7, "sharpening": 0.3, "sharpening_sigma_px": 1.2}
-BOUNDS = {"blur_sigma_px": (0.05, 4.0), "sharpening": (0.0, 4.0), "sharpening_sigma_px": (0.5, 4.0)}
-FRINGES = {"red_scale": (0.985, 1.015), "blue_scale": (0.985, 1.015)}
+BOUNDS = {  # name: least, largest, unit of a step
+    "blur_sigma_px": (0.05, 4.0, 0.1),
+    "sharpening": (0.0, 4.0, 0.2),
+    "sharpening_sigma_px": (0.5, 4.0, 0.2),
+}
+FRINGES = {"red_scale": (0.985, 1.015, 0.001), "blue_scale": (0.985, 1.015, 0.001)}
+SHIFTS = {f"{colour}_shift_px.{axis}": (-3.0, 3.0, 0.1) for colour in ("red", "blue") for axis in (0, 1)}
+LEAST_SHARPENING = 0.2  # to start from: a mask of no weight has no width
 QUALITIES = (0, 95, 90, 80, 70)
-MOST_TRIES = 30  # of the least squares
+MOST_TRIES = 10  # of the least squares
 MOST_FRAMES = 3  # that the sharpness is fitted to
 EVERY = 3  # pixels that the fit looks at: one in this many, in both directions
-MOST_APERTURE_MM = 6.0
+MOST_APERTURE_MM = 1.2  # more needs more samples a pixel than frames for learning have
 DISC_WIDTH = 0.69  # 10-90 % edge width of a uniform disc relative to its diameter
 FLAT_LEVELS = 6.0  # spread in 5 x 5 px below which a place is flat
 NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6  # sd 1 for white noise (Immerkaer 1996)
@@ -47,8 +52,7 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     inside : (H, W) bool
         The disc.
     """
-    colour = spec.camera.channels == "color"
-    bounds = BOUNDS | (FRINGES if colour else {})
+    bounds = BOUNDS | (FRINGES | SHIFTS if spec.camera.channels == "color" else {})
     names = list(bounds)
     pick = np.zeros_like(inside)
     pick[::EVERY, ::EVERY] = True
@@ -58,29 +62,40 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     flat = revised(spec, response={"jpeg_quality": 0}, gel={"haze": 0.0})  # the light is hazed already
 
     def with_values(values) -> SensorSpec:
-        found = dict(zip(names, map(float, values), strict=True))
-        camera = {name: found.pop(name) for name in list(found) if name in FRINGES}
-        return revised(flat, response=found, camera=camera)
+        return _changed(flat, dict(zip(names, map(float, values), strict=True)))
 
     def residual(values, spec_of=with_values):
         shown = spec_of(values)
         return np.concatenate([expose(x, shown)[u].astype(float).ravel() for x, u in zip(light, useful, strict=True)]) - real
 
-    start = [getattr(spec.response, n) or START[n] if n in START else getattr(spec.camera, n) for n in names]
-    low, high = (np.array([bounds[n][k] for n in names]) for k in (0, 1))
-    fit = least_squares(
-        residual,
-        np.clip(start, low, high),
-        bounds=(low, high),
-        x_scale=0.1 * (high - low),
-        diff_step=0.02,
-        loss="soft_l1",
-        f_scale=10.0,
-        max_nfev=MOST_TRIES,
-    )
+    low, high, unit = np.array([bounds[name] for name in names]).T
+    start = np.clip([_value(spec, name) for name in names], low + 1e-6, high - 1e-6)
+    start[names.index("sharpening")] = max(spec.response.sharpening, LEAST_SHARPENING)
+
+    def slopes(values):
+        at = residual(values)
+        steps = np.where(values + unit <= high, unit, -unit)
+        return np.stack([(residual(values + step * row) - at) / step for step, row in zip(steps, np.eye(len(names)), strict=True)], axis=1)
+
+    fit = least_squares(residual, start, slopes, bounds=(low, high), x_scale=unit, loss="soft_l1", f_scale=10.0, max_nfev=MOST_TRIES)
     best = with_values(fit.x)
     errors = {q: np.mean(np.abs(residual(None, lambda _, q=q: revised(best, response={"jpeg_quality": q})))) for q in QUALITIES}
     return revised(best, response={"jpeg_quality": min(errors, key=errors.get)}, gel={"haze": spec.gel.haze})
+
+
+def _value(spec: SensorSpec, name: str) -> float:
+    field, _, index = name.partition(".")
+    value = getattr(spec.response if field in BOUNDS else spec.camera, field)
+    return value[int(index)] if index else value
+
+
+def _changed(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
+    response = {name: value for name, value in values.items() if name in BOUNDS}
+    camera = {name: value for name, value in values.items() if name in FRINGES}
+    for name in values.keys() & SHIFTS.keys():
+        field = name.partition(".")[0]
+        camera[field] = (values[f"{field}.0"], values[f"{field}.1"])
+    return revised(spec, response=response, camera=camera)
 
 
 def sharpness(spec: SensorSpec, frames: list[Aligned], rendered: list[np.ndarray], bins: int = 5) -> Sharpness:
@@ -108,7 +123,7 @@ def fit_aperture(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
     wanted = seen.real_px**2 - seen.rendered_px**2 + (DISC_WIDTH * before) ** 2
     best = (np.inf, 0.0, spec.camera.focus_mm)
     for focus in np.linspace(0.85 * seen.distance_mm.min(), 1.15 * seen.distance_mm.max(), 31):
-        for aperture in np.linspace(0, MOST_APERTURE_MM, 61):
+        for aperture in np.linspace(0, MOST_APERTURE_MM, 25):
             grown = (DISC_WIDTH * defocus_px(spec.camera.fx_px, aperture, focus, seen.distance_mm)) ** 2
             miss = float(np.var(wanted - grown))
             if miss < best[0]:

@@ -26,7 +26,7 @@ from twin.recordings.images import read_image
 from twin.types import Form, Frame
 
 FRAMES = 6  # that are fitted, evenly spread over the folder
-SAMPLES = 8  # per pixel
+SAMPLES = 16  # per pixel
 CAP_ROUNDS = 2
 HAZE_SIGMA_PX = 40.0  # start of the haze, where the specification has none
 

@@ -100,7 +100,7 @@ def _profile(spec: SensorSpec, patch, at_mm: np.ndarray) -> np.ndarray:
     within = np.all(np.abs(at_mm @ np.linalg.inv(patch.half_mm)) <= 1, axis=-1)
     share, sd = spec.leds.core_share, spec.leds.core_mm
     core = patch.area_mm2 / (2 * np.pi * sd**2) * np.exp(-np.sum(at_mm**2, axis=-1) / (2 * sd**2)) if share else 0.0
-    return (1 - share) * within + share * core
+    return spec.leds.mirror_share * ((1 - share) * within + share * core)
 
 
 def _specks(spec: SensorSpec, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

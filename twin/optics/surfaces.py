@@ -11,10 +11,10 @@ from scipy.interpolate import RBFInterpolator
 
 from scenes.sensor import SensorSpec
 
-SKIN_POLAR_STEPS = 64
-SKIN_AZIMUTH_STEPS = 128
-STEM_SIDES = 12
-CAP_SIDES = 24
+SKIN_POLAR_STEPS = 40
+SKIN_AZIMUTH_STEPS = 80
+STEM_SIDES = 8
+CAP_SIDES = 16
 CAP_BEVEL = 0.25  # of the cap's height: printed edges are never sharp
 STEM_ROOT_MM = 0.3  # stems start inside the skin, so that no gap opens where it bends
 MOST_CONTROL_POINTS = 1200  # displacement interpolation solves a dense system of this size once
@@ -66,7 +66,7 @@ class SkinSurface:
     def vertices(self, control_mm: np.ndarray) -> np.ndarray:
         """Fine grid (v, 3) when the control points have moved to ``control_mm`` (n, 3)."""
         moved = (control_mm - self.control_mm)[self._keep]
-        return self.rest_mm + self._weights @ moved
+        return self.rest_mm + self._weights @ moved.astype(np.float32)
 
 
 def stems(spec: SensorSpec, base_mm: np.ndarray, axis: np.ndarray) -> Surface:
@@ -80,6 +80,7 @@ def caps(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> Surface:
     """All caps, one surface: bevelled discs, or of their own outlines, about their centres."""
     radius, half = 0.5 * spec.pins.cap_diameter_mm, 0.5 * spec.pins.cap_height_mm
     bevel = min(CAP_BEVEL * spec.pins.cap_height_mm, 0.5 * radius)
+    radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
     profile = np.array([[0, -half], [radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
     body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(spec, CAP_SIDES))
     return Surface(body.vertices_mm, body.faces, np.repeat(cap_albedo(spec), len(body.vertices_mm) // len(caps_mm), axis=0))
@@ -140,6 +141,8 @@ def _lathe(profile: np.ndarray, origin_mm: np.ndarray, axis: np.ndarray, sides: 
     body = profile[None, :, None, :1] * circle[:, None] + profile[None, :, None, 1:] * axis[:, None, None]
     vertices = origin_mm[:, None, None] + body
     each = len(profile) * sides
-    one = _ring_grid(len(profile) - 1, sides)  # v runs against u x axis: the turn is clockwise seen along the axis
+    one = _ring_grid(len(profile) - 1, sides)
+    corners = profile[one // sides, 0] == 0
+    one = one[corners.sum(axis=1) < 2]  # at a point each quad is one triangle; v runs against u x axis: the turn is clockwise
     faces = (np.arange(len(origin_mm))[:, None, None] * each + one[None]).reshape(-1, 3)
     return Surface(vertices.reshape(-1, 3), faces)

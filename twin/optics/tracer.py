@@ -13,7 +13,7 @@ from scenes.sensor import SensorSpec
 from twin.optics.lights import Patch, lights
 from twin.optics.window import Window
 
-SURVIVAL_GAIN = 0.7  # a path goes on with a probability of this times its weight
+SURVIVAL_GAIN, LEAST_SURVIVAL = 4.0, 0.05  # a path goes on with a probability of this times its weight, but no less
 NEVER = 1e-12
 
 
@@ -93,9 +93,9 @@ class GelTracer:
                 break
             out, value = bsdf.sample(mi.BSDFContext(), hit, random.next_1d(), random.next_2d(), active)
             weight *= value * self._tint(mi, dr, hit)
-            survival = dr.clip(SURVIVAL_GAIN * dr.detach(dr.max(weight)), 0.0, 1.0)
-            active &= random.next_1d() < survival
-            weight /= dr.maximum(survival, NEVER)
+            survival = dr.clip(SURVIVAL_GAIN * dr.detach(dr.max(weight)), LEAST_SURVIVAL, 1.0)
+            active &= (random.next_1d() < survival) & (dr.max(weight) > 0)
+            weight /= survival
             ray = hit.spawn_ray(hit.to_world(out.wo))
             dr.eval(active, ray.o, ray.d, weight, result)
             alive = dr.compress(active)

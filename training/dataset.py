@@ -123,7 +123,8 @@ def load_dataset(
 def split_rows(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Training and validation rows: a random fifth is held out (rows are sorted by label, so never by position)."""
     shuffled = np.random.default_rng(seed).permutation(count)
-    return np.sort(shuffled[count // HELD_OUT :]), shuffled[: count // HELD_OUT]
+    held = -(-count // HELD_OUT)
+    return np.sort(shuffled[held:]), shuffled[:held]
 
 
 def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progress: Callable | None = None) -> PinTable:

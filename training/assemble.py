@@ -56,6 +56,7 @@ class Ensemble:
             network.load_state_dict(weights)
             self.networks.append(network.eval())
         self.kernel = KernelHead(**content["kernel"]) if content["kernel"] else None
+        self.kernel_labels = list(content["kernel_labels"])
         self.blend, self.quantile = np.asarray(content["blend"]), np.asarray(content["quantile"])
 
     def outputs(self, inputs, rows: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,7 +64,9 @@ class Ensemble:
         outs = [predict_rows(network, inputs, rows) for network in self.networks]
         mean = np.mean([out["mean"].double().numpy() for out in outs], axis=0)
         if self.kernel is not None:
-            mean = self.blend * self.kernel(kernel_inputs(self.networks[0], inputs, rows)).numpy() + (1 - self.blend) * mean
+            chosen = self.kernel_labels
+            also = self.kernel(kernel_inputs(self.networks[0], inputs, rows)).numpy()
+            mean[:, chosen] = self.blend[chosen] * also + (1 - self.blend[chosen]) * mean[:, chosen]
         return mean, *_scale_and_move(outs)
 
     def __call__(self, inputs, rows: torch.Tensor) -> Prediction:
@@ -126,16 +129,17 @@ def calibrate(config, data, inputs, train: np.ndarray, networks: list, scaling: 
     y = (labels - shift) / scale
     k = y.shape[1]
     content = {"networks": [network["weights"] for network in networks], "kernel": None, "shift": shift, "scale": scale}
-    content |= {"blend": np.zeros(k), "quantile": np.ones(k)}
+    main = [j for j, name in enumerate(data.targets.names) if name not in config.helpers]  # the kernel head's labels
+    content |= {"blend": np.zeros(k), "quantile": np.ones(k), "kernel_labels": main}
     single = [
         Ensemble(config.model, data.pins.reference, content | {"networks": [weights]}, config.size) for weights in content["networks"]
     ]
     left_out = np.full(y.shape, np.nan)
     if config.recipe.kernel:
-        held_kernel, left = fit_kernel(
-            kernel_inputs(single[0].networks[0], inputs, torch.from_numpy(train)), torch.from_numpy(y[train]), seed=config.seed
-        )
-        content["kernel"], left_out[train] = held_kernel.arrays(), left.numpy()
+        amplitudes = kernel_inputs(single[0].networks[0], inputs, torch.from_numpy(train))
+        kernel, left = fit_kernel(amplitudes, torch.from_numpy(y[np.ix_(train, main)]), seed=config.seed)
+        content["kernel"] = kernel.arrays()
+        left_out[np.ix_(train, main)] = left.numpy()
     means, scales, truths, kernels = [], [], [], []
     for ensemble, network in zip(single, networks, strict=True):
         held = network["held"]
@@ -147,8 +151,8 @@ def calibrate(config, data, inputs, train: np.ndarray, networks: list, scaling: 
     if config.recipe.kernel:
         kernel = np.concatenate(kernels)
         errors = [np.abs(b * kernel + (1 - b) * mean - truth).mean(axis=0) for b in BLENDS]
-        content["blend"] = BLENDS[np.argmin(errors, axis=0)]
-        mean = content["blend"] * kernel + (1 - content["blend"]) * mean
+        content["blend"][main] = BLENDS[np.argmin(errors, axis=0)][main]
+        mean = np.where(content["blend"] > 0, content["blend"] * kernel + (1 - content["blend"]) * mean, mean)
     content["quantile"] = conformal_quantile(np.abs(mean - truth) / spread)
     return content
 

@@ -38,7 +38,7 @@ class Recipe:
     """
 
     inputs: str = "pins"
-    epochs: int = 250
+    epochs: int = 180
     batch: int = 256
     rate: float = 2e-3
     schedule: str = "cosine"
@@ -47,7 +47,7 @@ class Recipe:
     average: float = 0.995
     loss: str = "l1"
     scaling: str = "standard"
-    members: int = 3
+    members: int = 2
     kernel: bool = True
 
 

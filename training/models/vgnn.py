@@ -26,7 +26,7 @@ class VgnnSize:
     """Sizes of the network; ``layers`` 0 leaves the graph branch out, ``modes`` 0 the other."""
 
     channels: int = 6
-    layers: int = 2
+    layers: int = 1
     frequencies: int = 12
     modes: int = 40
     area_modes: int = 12

@@ -50,7 +50,8 @@ def parameter_count(network: nn.Module) -> int:
 
 def predict_rows(network: nn.Module, inputs, rows: torch.Tensor, batch: int = 256) -> dict[str, torch.Tensor]:
     """The network's outputs for some rows, in evaluation mode."""
-    network.eval()
+    if network.training:
+        network.eval()
     parts: list[dict] = []
     with torch.no_grad():
         for chosen in rows.split(batch):

@@ -51,6 +51,7 @@ class Vgnn(nn.Module):
         super().__init__()
         self.size = size = size or VgnnSize()
         self.pins, self.outputs = pins, outputs
+        self._weights: torch.Tensor | None = None
         adjacency = torch.zeros(pins, pins)
         adjacency[edges[:, 1], edges[:, 0]] = 1.0
         self.register_buffer("adjacency", adjacency)
@@ -129,13 +130,27 @@ class Vgnn(nn.Module):
 
     def graph(self, x: torch.Tensor) -> torch.Tensor:
         """Node states (N, B, C) after all graph layers; nodes come first, so that averaging is one matrix product."""
-        weights = torch.softmax(self.attention.masked_fill(self.adjacency == 0, -torch.inf), dim=1)
+        weights = self.neighbour_weights()
         h = x.transpose(0, 1).contiguous()
         for k, (layer, embedding) in enumerate(zip(self.layers, self.embedding, strict=True)):
             around = (weights @ h.flatten(1)).view(h.shape)
             new = torch.nn.functional.silu(layer(torch.cat([h, around], dim=2)) + embedding[:, None])
             h = h + new if k else new
         return h
+
+    def neighbour_weights(self) -> torch.Tensor:
+        """Attention (N, N) of each pin on its neighbours, rows summing to 1; computed once while nothing is learnt."""
+        if self.training or self._weights is None:
+            weights = torch.softmax(self.attention.masked_fill(self.adjacency == 0, -torch.inf), dim=1)
+            if self.training:
+                return weights
+            self._weights = weights.detach()
+        return self._weights
+
+    def train(self, mode: bool = True) -> "Vgnn":
+        """Switch between training and evaluation."""
+        self._weights = None
+        return super().train(mode)
 
     def configuration(self) -> dict:
         """What builds the same network again, beside its edges."""

@@ -22,7 +22,7 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; an error meant for the user is one line on stderr and exit code 1."""
-    from twin.cli import catalog, demo, doctor, evaluate, graph, predict, preprocess, render, train  # noqa: F401  (each registers its commands)
+    from twin.cli import audit, catalog, demo, doctor, evaluate, graph, predict, preprocess, render, train  # noqa: F401  (each registers its commands)
 
     try:
         app()

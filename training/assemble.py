@@ -14,6 +14,7 @@ from training.inputs import PinInputs, graph_inputs, image_inputs, pin_features
 from training.kernel import KernelHead, fit_kernel
 from training.networks import build_network, predict_rows
 from training.registration import Registration, fit_registration
+from twin.preprocess import make_graph
 from twin.preprocess.forms import frame_size
 from twin.preprocess.reference import Reference
 
@@ -110,9 +111,13 @@ def frame_width(pins) -> int:
     return frame_size(pins.sensor, pins.form)[0]
 
 
-def pin_inputs(registration: Registration, nodes_px, area_px2, lost, reference: Reference) -> PinInputs:
-    """Dense features of frames whose camera displacement is taken out."""
-    nodes, area, _ = registration(nodes_px, area_px2)
+def pin_inputs(registration: Registration, nodes_px, area_px2, lost, reference: Reference, *, together: bool = False) -> PinInputs:
+    """Dense features of frames whose camera displacement is taken out; lost pins are put where the others' modes say."""
+    nodes_px, area_px2 = nodes_px.copy(), area_px2.copy()
+    for k in np.flatnonzero(lost.any(axis=1)):
+        nodes_px[k] = registration.fill(nodes_px[k], lost[k])
+        area_px2[k] = make_graph("voronoi", nodes_px[k], outmost=reference.outmost).area_px2
+    nodes, area, _ = registration(nodes_px, area_px2, together=together)
     return PinInputs(pin_features(nodes, area, reference), lost)
 
 

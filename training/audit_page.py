@@ -94,8 +94,8 @@ def _page(summary: dict, data: Dataset) -> str:
         "<style>body{font:15px sans-serif;max-width:70em;margin:2em auto}th{text-align:left;vertical-align:top;padding-right:2em}"
         "img{width:100%}</style>"
         f"<h1>Audit of {escape(data.folder.name)}</h1><p>From pins and labels alone. Each frame is asked whether its pins fit "
-        "the label with the shear move executed, or the state before it; labels_corrected.csv holds the answer. Laid beside the recording's "
-        "targets.csv, it is what training with corrected labels uses.</p>"
+        "the label with the shear move executed, or the state before it; labels_corrected.csv holds the answer. Laid beside "
+        "the recording's targets.csv, it is what training with corrected labels uses.</p>"
         f"<table>{rows}</table><img src='audit.png' alt='evidence'>"
     )
 

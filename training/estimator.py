@@ -130,7 +130,7 @@ class PoseEstimator:
         return self._estimate(self._of_pins(seen.graph.nodes_px[None], seen.graph.area_px2[None], lost, frame.name), started)
 
     def predict_table(self, pins: PinTable) -> Prediction:
-        """Labels of many valid frames at once.
+        """Labels of many valid frames of one camera at once; where it sits otherwise than in training, their median tells.
 
         Raises
         ------
@@ -138,12 +138,12 @@ class PoseEstimator:
             The frames are of another sensor or form.
         """
         self.check(pins.sensor, pins.form)
-        return self._of_pins(pins.nodes_px, pins.area_px2, pins.lost, "")
+        return self._of_pins(pins.nodes_px, pins.area_px2, pins.lost, "", together=True)
 
-    def _of_pins(self, nodes_px: np.ndarray, area_px2: np.ndarray, lost: np.ndarray, name: str) -> Prediction:
+    def _of_pins(self, nodes_px: np.ndarray, area_px2: np.ndarray, lost: np.ndarray, name: str, *, together: bool = False) -> Prediction:
         reference = self.pipeline.reference
         if self.model == "vgnn":
-            inputs = pin_inputs(self.registration, nodes_px, area_px2, lost, reference)
+            inputs = pin_inputs(self.registration, nodes_px, area_px2, lost, reference, together=together)
         else:
             count = len(nodes_px)
             table = PinTable(self.sensor, self.form, reference, np.full(count, name), nodes_px, area_px2, lost, np.ones(count, bool))

@@ -2,15 +2,18 @@
 
 Contact moves the pins too, but not freely: what is left of the pins after the best similarity (shift, turn, scale) has
 been taken out tells how large that similarity has to be. Where the one observed differs from the one expected by far more
-than it ever does in training, the difference is the camera's, and it is taken out of the frame.
+than it ever does in training, the difference is the camera's, and it is taken out of the frame. Frames of one recording
+share a camera: there the median over many frames tells its displacement far better than one frame can.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-MODES = 20
-RIDGE = 1.0
+MODES, SQUARED = 40, 20  # modes taken linearly, and those of them whose products are taken too
+RIDGE = 0.1
+FILL_RIDGE, FILL_ROUNDS = 1e-3, 3
+MANY, COMMON = 30, 1.5  # frames whose median difference, if larger than that usual size, is their one camera's
 FREE, FULL = 6.0, 9.0  # differences, in their usual size, up to which nothing and from which everything is taken out
 
 
@@ -35,13 +38,15 @@ class Registration:
     weight: np.ndarray
     usual: np.ndarray
 
-    def __call__(self, nodes_px: np.ndarray, area_px2: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def __call__(self, nodes_px: np.ndarray, area_px2: np.ndarray, *, together: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Frames with the camera's part taken out.
 
         Parameters
         ----------
         nodes_px : (M, N, 2) float
         area_px2 : (M, N) float
+        together : bool
+            Whether the frames are of one camera that did not move between them.
 
         Returns
         -------
@@ -50,16 +55,37 @@ class Registration:
         taken : (M, 4) float
             Log scale, turn (rad), shift (px) taken out.
         """
-        aligned, observed = align(nodes_px, self.rest_px)
-        difference = observed - _quadratic(self._modes(aligned)) @ self.weight
-        far = np.abs(difference / self.usual).max(axis=1)
+        difference = self._difference(nodes_px)
+        common = np.zeros(4)
+        if together and len(nodes_px) >= MANY:
+            middle = np.median(difference, axis=0)
+            common = middle * (np.abs(middle / self.usual).max() > COMMON)
+        far = np.abs((difference - common) / self.usual).max(axis=1)
         share = np.clip((far - FREE) / (FULL - FREE), 0, 1)
-        taken = difference * share[:, None]
+        taken = common + (difference - common) * share[:, None]
         middle = self.rest_px.mean(axis=0)
-        factor = np.exp(-taken[:, 0] - 1j * taken[:, 1])
         z = (nodes_px - middle - taken[:, None, 2:]) @ [1, 1j]
-        z = z * factor[:, None]
+        z = z * np.exp(-taken[:, :1] - 1j * taken[:, 1:2])
         return np.stack([z.real, z.imag], axis=-1) + middle, area_px2 * np.exp(-2 * taken[:, :1]), taken
+
+    def fill(self, nodes_px: np.ndarray, lost: np.ndarray) -> np.ndarray:
+        """One frame's pins (N, 2) with the lost ones (N,) where the modes that the others show put them."""
+        directions = self.components / np.maximum(np.linalg.norm(self.components, axis=0), 1e-12)
+        known = np.repeat(~lost, 2)
+        normal = directions[known].T @ directions[known] + FILL_RIDGE * np.eye(directions.shape[1])
+        middle = self.rest_px.mean(axis=0)
+        for _ in range(FILL_ROUNDS):  # the similarity sees the pins that were filled in before
+            aligned, similarity = align(nodes_px[None], self.rest_px)
+            away = aligned.ravel() - self.mean
+            found = self.mean + directions @ np.linalg.solve(normal, directions[known].T @ away[known])
+            z = (self.rest_px - middle + found.reshape(-1, 2)) @ [1, 1j] * np.exp(similarity[0, 0] + 1j * similarity[0, 1])
+            filled = np.stack([z.real, z.imag], axis=-1) + middle + similarity[0, 2:]
+            nodes_px = np.where(lost[:, None], filled, nodes_px)
+        return nodes_px
+
+    def _difference(self, nodes_px: np.ndarray) -> np.ndarray:
+        aligned, observed = align(nodes_px, self.rest_px)
+        return observed - _terms(self._modes(aligned)) @ self.weight
 
     def _modes(self, aligned: np.ndarray) -> np.ndarray:
         return (aligned.reshape(len(aligned), -1) - self.mean) @ self.components
@@ -77,7 +103,7 @@ def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> Registration:
     _, sizes, directions = np.linalg.svd(flat - mean, full_matrices=False)
     keep = min(MODES, len(sizes))
     components = directions[:keep].T / np.maximum(sizes[:keep] / np.sqrt(len(flat)), 1e-9)
-    terms = _quadratic((flat - mean) @ components)
+    terms = _terms((flat - mean) @ components)
     inverse = np.linalg.inv(terms.T @ terms + RIDGE * np.eye(terms.shape[1]))
     weight = inverse @ terms.T @ observed
     leverage = np.einsum("mi,ij,mj->m", terms, inverse, terms, optimize=True)
@@ -110,6 +136,7 @@ def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.stack([left.real, left.imag], axis=-1), np.column_stack([np.log(np.abs(factor)), np.angle(factor), shift])
 
 
-def _quadratic(modes: np.ndarray) -> np.ndarray:
-    i, j = np.triu_indices(modes.shape[1])
-    return np.concatenate([np.ones((len(modes), 1)), modes, modes[:, i] * modes[:, j]], axis=1)
+def _terms(modes: np.ndarray) -> np.ndarray:
+    few = modes[:, :SQUARED]
+    i, j = np.triu_indices(few.shape[1])
+    return np.concatenate([np.ones((len(modes), 1)), modes, few[:, i] * few[:, j]], axis=1)

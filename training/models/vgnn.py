@@ -19,6 +19,7 @@ import torch
 from torch import nn
 
 FEATURES = 3  # dx, dy, log area ratio
+FILL_RIDGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -117,8 +118,24 @@ class Vgnn(nn.Module):
         return {"mean": out[:, :k] + self.linear(z), "log_scale": out[:, k : 2 * k], "executed": out[:, 2 * k], "embedding": h}
 
     def known(self, x: torch.Tensor, lost: torch.Tensor | None) -> torch.Tensor:
-        """Features with those of lost pins filled in from their neighbours."""
-        return x if lost is None or not bool(lost.any()) else fill_lost(x, lost, self.adjacency)
+        """Features with those of lost pins filled in: displacement from the modes that the other pins show, area from neighbours."""
+        if lost is None or not bool(lost.any()):
+            return x
+        x = fill_lost(x, lost, self.adjacency)
+        for k in torch.nonzero(lost.any(dim=1))[:, 0] if self.size.modes else ():
+            x[k, :, :2] = self._fill_by_modes(x[k, :, :2], lost[k])
+        return x
+
+    def _fill_by_modes(self, moved: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
+        """Displacements (N, 2) whose lost rows continue the known ones' least-squares modes."""
+        length = self.components.norm(dim=0)
+        directions = self.components[:, length > 0] / length[length > 0]
+        away = moved.flatten() / self.scale[0] - self.mode_mean
+        gone = lost.repeat_interleave(2)
+        known = directions[~gone]
+        normal = known.T @ known + FILL_RIDGE * torch.eye(known.shape[1])
+        found = self.mode_mean + directions @ torch.linalg.solve(normal, known.T @ away[~gone])
+        return torch.where(lost[:, None], (found * self.scale[0]).view(-1, 2), moved)
 
     def amplitudes(self, x: torch.Tensor) -> torch.Tensor:
         """Amplitudes (B, modes + area_modes) of the principal components of displacements and of smoothed areas."""

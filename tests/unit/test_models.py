@@ -169,3 +169,30 @@ def test_the_cameras_own_motion_is_taken_out_and_contact_is_left():
     back, shrunk, taken = registration(moved, 1.01**2 * area[300:])
     assert np.abs(back - frames[300:]).max() < 0.4 and np.abs(moved - frames[300:]).mean() > 1.5
     assert np.allclose(shrunk, 1, atol=0.01)
+
+
+def test_lost_pins_continue_what_the_others_do():
+    rng = np.random.default_rng(8)
+    rest = rng.uniform(-100, 100, (60, 2)) + 128
+    waves = np.stack([np.sin((rest - 128) / 50), np.cos((rest[:, ::-1] - 128) / 70)])
+    frames = rest + np.einsum("mk,knd->mnd", rng.normal(0, 3, (300, 2)), waves)
+    registration = fit_registration(frames[:250], rest)
+    lost = np.zeros(60, bool)
+    lost[[4, 17, 30]] = True
+    spoilt = np.where(lost[:, None], frames[270] + 5, frames[270])
+    filled = registration.fill(spoilt, lost)
+    assert np.array_equal(filled[~lost], frames[270][~lost]) and np.abs(filled - frames[270]).max() < 0.3
+
+
+def test_frames_of_one_camera_tell_its_displacement_together():
+    rng = np.random.default_rng(9)
+    rest = rng.uniform(-100, 100, (60, 2)) + 128
+    bump = np.exp(-(((rest - 128) / 60) ** 2).sum(axis=1))[:, None] * [3.0, 1.0]
+    frames = rest + rng.uniform(-1, 1, (400, 1, 1)) * bump + rng.normal(0, 0.05, (400, 60, 2))
+    registration = fit_registration(frames[:300], rest)
+    small = frames[300:] + 4 * registration.usual[2] * np.array([1.0, 0.0])  # too little to be told from one frame
+    alone = registration(small, np.ones((100, 60)))[2]
+    together = registration(small, np.ones((100, 60)), together=True)[2]
+    assert (alone[:, 2] == 0).mean() > 0.8
+    assert abs(np.median(together[:, 2]) / (4 * registration.usual[2]) - 1) < 0.3
+    assert (registration(frames[300:], np.ones((100, 60)), together=True)[2] == 0).all(axis=1).mean() > 0.9

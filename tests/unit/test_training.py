@@ -30,7 +30,9 @@ def drawn_pins(labels, reference):
     middle = np.stack([0.2 * angle, 0 * angle], axis=-1)
     bump = np.exp(-4 * ((r - middle) ** 2).sum(axis=2))[..., None]
     spun = np.stack([-r[:, 1], r[:, 0]], axis=1)
-    moved = 5 * (1.2 + depth)[..., None] * bump * (6 * (r - middle) + 4 * np.stack([shear, 0.1 * shear], axis=-1) + 3 * turn[..., None] * spun)
+    moved = (
+        5 * (1.2 + depth)[..., None] * bump * (6 * (r - middle) + 4 * np.stack([shear, 0.1 * shear], axis=-1) + 3 * turn[..., None] * spun)
+    )
     return rest + moved
 
 

@@ -147,9 +147,10 @@ def calibrate(config, data, inputs, train: np.ndarray, networks: list, scaling: 
         left_out[np.ix_(train, main)] = left.numpy()
     means, scales, truths, kernels = [], [], [], []
     for ensemble, network in zip(single, networks, strict=True):
-        held = network["held"]
-        mean, spread, _ = ensemble.outputs(inputs, torch.from_numpy(held))
-        means.append(mean), scales.append(spread), truths.append(y[held]), kernels.append(left_out[held])
+        mean, spread, _ = ensemble.outputs(inputs, network["held"])
+        held = network["held"].numpy()
+        for parts, part in zip((means, scales, truths, kernels), (mean, spread, y[held], left_out[held]), strict=True):
+            parts.append(part)
     mean, spread, truth = np.concatenate(means), np.concatenate(scales), np.concatenate(truths)
     if not len(mean):
         return content

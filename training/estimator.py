@@ -70,7 +70,7 @@ class PoseEstimator:
         self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
         self.ensemble = Ensemble(self.model, reference, content, config["size"])
         aside = content["aside"]
-        self.registration = Registration(**aside["registration"]) if aside else None
+        self.registration = Registration(**{key: value.numpy() for key, value in aside["registration"].items()}) if aside else None
 
     @classmethod
     def load(cls, run: str | Path) -> "PoseEstimator":
@@ -91,7 +91,7 @@ class PoseEstimator:
             raise TrainingError(f"{run}: holds no trained model: {hint}")
         try:
             config = json.loads((run / "config.json").read_text())
-            content = torch.load(run / "weights.pt", weights_only=False)
+            content = torch.load(run / "weights.pt", weights_only=True)
             return cls(config, content)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             raise TrainingError(f"{run}: not a run of this version, or a damaged one ({error}); train again") from error

@@ -9,7 +9,7 @@ import io
 import json
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
 
@@ -56,9 +56,7 @@ class RunConfig:
     size: dict = field(default_factory=dict)
 
 
-def train_run(
-    config: RunConfig, data: Dataset, out: Path, *, max_minutes: float | None = None, progress: Callable | None = None, device: str = "cpu"
-) -> bool:
+def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float | None = None, progress: Callable | None = None) -> bool:
     """Train, or continue what ``out`` holds.
 
     Parameters
@@ -169,15 +167,14 @@ def fold_rows(train: np.ndarray, seed: int, member: int) -> tuple[np.ndarray, np
 
 def _finished(loop: Loop) -> dict:
     network = loop.result()
-    held = loop.rows.held.numpy()
-    return {"weights": {key: value.clone() for key, value in network.state_dict().items()}, "held": held, "curves": loop.curves}
+    return {"weights": {key: value.clone() for key, value in network.state_dict().items()}, "held": loop.rows.held, "curves": loop.curves}
 
 
 def _assemble(
     out: Path, resolved: dict, config: RunConfig, data: Dataset, inputs, aside: dict, train, networks: list, scaling: tuple
 ) -> None:
     content = calibrate(config, data, inputs, train, networks, scaling)
-    content |= {"aside": aside, "reference_px": torch.from_numpy(data.pins.reference.pins_px)}
+    content |= {"aside": aside, "reference_px": data.pins.reference.pins_px}
     content["parameters"] = parameter_count(build_network(config.model, data.pins.reference, len(data.targets.names), config.size))
     _write(out / "weights.pt", content)
     _write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
@@ -197,7 +194,7 @@ def _opened(out: Path, resolved: dict) -> dict | None:
             raise TrainingError(f"{out}: holds a finished run; give another --out")
         _write_text(out / "config.json", json.dumps(resolved, indent=1) + "\n")
         return None
-    state = torch.load(path, weights_only=False)
+    state = torch.load(path, weights_only=True)
     if state["identity"] != _identity(resolved):
         raise TrainingError(
             f"{out}: holds a run with other settings or data, begun and not finished; give another --out, or the same settings"
@@ -211,8 +208,17 @@ def _identity(resolved: dict) -> str:
 
 def _write(path: Path, content: dict) -> None:
     part = path.with_name(f".{path.name}.part")
-    torch.save(content, part)
+    torch.save(_as_tensors(content), part)
     os.replace(part, path)
+
+
+def _as_tensors(value):
+    """The same with arrays as tensors, which are read back without running anything that a file may hold."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value)
+    if isinstance(value, dict):
+        return {key: _as_tensors(part) for key, part in value.items()}
+    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -228,8 +234,3 @@ def _write_curves(out: Path, curves: list) -> None:
     for k, points in enumerate(curves):
         writer.writerows([k, *point.values()] for point in points)
     _write_text(out / "curves.csv", text.getvalue())
-
-
-def config_dict(config: RunConfig) -> dict:
-    """A run's settings as plain values."""
-    return asdict(config)

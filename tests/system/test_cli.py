@@ -190,13 +190,3 @@ def test_doctor_says_what_will_be_used():
     assert done.returncode == 0, done.stderr
     for word in ("LLVM", "GPU", "3D pictures", "camera", "serial"):
         assert word in done.stdout
-
-
-def test_train_evaluate_predict_and_audit_say_what_is_wrong(rendered, tmp_path):
-    out, _ = rendered
-    one_line_error(twin("train", "--model", "vgn", "--sensor", "mg400-127", "--data", out, "--out", tmp_path), "vgn", "choose one of vgnn")
-    common = ("--sensor", "mg400-127", "--data", out, "--out", tmp_path / "run")
-    one_line_error(twin("train", "--model", "vgnn", *common), "no table of labels")
-    one_line_error(twin("evaluate", tmp_path, "--data", out, "--out", tmp_path), "no trained model")
-    one_line_error(twin("predict", tmp_path, out / "frame.png"), "no trained model")
-    one_line_error(twin("audit", out, "--sensor", "mg400-127", "--out", tmp_path), "no table of labels")

@@ -72,10 +72,10 @@ def test_a_run_taken_up_again_ends_as_if_never_ended(data, tmp_path, model):
     for _ in range(20):
         if train_run(config, data, tmp_path / "parts", max_minutes=0):  # one epoch each time
             break
-    whole, parts = (torch.load(tmp_path / name / "weights.pt", weights_only=False) for name in ("whole", "parts"))
+    whole, parts = (torch.load(tmp_path / name / "weights.pt", weights_only=True) for name in ("whole", "parts"))
     for a, b in zip(whole["networks"], parts["networks"], strict=True):
         assert all(torch.equal(a[key], b[key]) for key in a)
-    assert np.array_equal(whole["quantile"], parts["quantile"])
+    assert torch.equal(whole["quantile"], parts["quantile"])
     assert not (tmp_path / "parts" / "checkpoint.pt").exists()
     rows = (tmp_path / "parts" / "curves.csv").read_text().splitlines()
     assert rows[0].startswith("network,epoch,loss") and len(rows) == 1 + 2 * 3

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from time import perf_counter
 
 import numpy as np
@@ -93,7 +94,7 @@ class PoseEstimator:
             config = json.loads((run / "config.json").read_text())
             content = torch.load(run / "weights.pt", weights_only=True)
             return cls(config, content)
-        except (OSError, ValueError, KeyError, RuntimeError) as error:
+        except (OSError, ValueError, KeyError, RuntimeError, UnpicklingError) as error:
             raise TrainingError(f"{run}: not a run of this version, or a damaged one ({error}); train again") from error
 
     def check(self, sensor: SensorSpec, form: Form) -> None:

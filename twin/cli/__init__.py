@@ -22,7 +22,20 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; an error meant for the user is one line on stderr and exit code 1."""
-    from twin.cli import calibrate, catalog, demo, doctor, graph, preprocess, realism, render  # noqa: F401  (each registers its commands)
+    from twin.cli import (  # noqa: F401  (each registers its commands)
+        audit,
+        calibrate,
+        catalog,
+        demo,
+        doctor,
+        evaluate,
+        graph,
+        predict,
+        preprocess,
+        realism,
+        render,
+        train,
+    )
 
     try:
         app()

@@ -23,3 +23,16 @@ def count_bar(title: str):
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total: bar.update(task, total=total, completed=done)
+
+
+@contextmanager
+def epoch_bar(title: str):
+    """A bar over epochs with the error on held-out rows; yields ``progress(done, total, point)``."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(title, total=None)
+
+        def progress(done: int, total: int, point: dict) -> None:
+            bar.update(task, total=total, completed=done, description=f"{title} {point['held_out_error']:.4f}")
+
+        yield progress

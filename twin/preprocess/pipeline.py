@@ -60,7 +60,7 @@ class Pipeline:
         FrameError
             The image isn't one of this sensor's frames: wrong size, type or form.
         """
-        self._check(frame)
+        self.check(frame)
         started = perf_counter()
         ms: dict[str, float] = {}
         blobs = self._detect(frame, self._mask)
@@ -86,7 +86,8 @@ class Pipeline:
         ms["total"], _ = _since(started)
         return Observation(pins_px, predicted_px, int(paired.sum()), not reason, reason, graph, extra_px, ms)
 
-    def _check(self, frame: Frame) -> None:
+    def check(self, frame: Frame) -> None:
+        """Raise ``FrameError`` where a frame is not of this sensor and form: size, type, form."""
         image, (width, height) = frame.image, self.size_px
         where = frame.name or "frame"
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8:

@@ -1,0 +1,98 @@
+"""From a recording on disk to a trained, judged and used model, by the commands a user types (in this process: starting is slow)."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
+from drawn_frames import drawn_frame  # noqa: E402
+from test_training import drawn_pins  # noqa: E402
+
+from scenes import load_sensor  # noqa: E402
+from training.recipes import TrainingError  # noqa: E402
+from twin.cli import app  # noqa: E402
+from twin.errors import FrameError, TwinError  # noqa: E402
+from twin.preprocess import nominal_reference  # noqa: E402
+from twin.types import Form  # noqa: E402
+
+FRAMES = 70
+
+
+def twin(*arguments):
+    from twin.cli import audit, evaluate, predict, train  # noqa: F401  (each registers its command)
+
+    done = CliRunner().invoke(app, [str(a) for a in arguments])
+    if isinstance(done.exception, TwinError):
+        raise done.exception
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recording")
+    spec = load_sensor("mg400-127")
+    reference = nominal_reference(spec, Form.RECORDING)
+    rng = np.random.default_rng(0)
+    labels = np.column_stack([rng.uniform(-4, 0, FRAMES), np.sort(rng.uniform(-20, 20, FRAMES)), rng.uniform(-5, 5, (FRAMES, 2))])
+    (folder / "frames_bw").mkdir()
+    rows = ["image_name,pose_2,pose_6,move_1,move_6"]
+    for k, px in enumerate(drawn_pins(labels, reference)):
+        cv2.imwrite(str(folder / "frames_bw" / f"f_{k}.png"), drawn_frame(spec, Form.RECORDING, px).image)
+        rows.append(f"f_{k}.png," + ",".join(f"{v:.6f}" for v in labels[k]))
+    (folder / "targets.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(recording, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    said = twin("train", "--model", "vgnn", "--sensor", "mg400-127", "--data", recording, "--out", out, "--epochs", 8, "--batch", 8)
+    assert "70 usable frames" in said and "weights.pt" in said
+    return out
+
+
+def test_a_trained_run_is_judged_and_used(recording, run, tmp_path):
+    said = twin("evaluate", run, "--data", recording, "--out", tmp_path)
+    assert "pose_2: mean error" in said and "ms per frame" in said
+    rows = list(csv.DictReader((tmp_path / "predictions.csv").open()))
+    assert len(rows) == FRAMES / 5 and all(float(row["pose_2_lo90"]) < float(row["pose_2_hi90"]) and row["valid"] == "1" for row in rows)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["corrected"]["pose_2"]["mae"] < 0.5 and metrics["without_prediction"] == 0 and metrics["corrected"]["bins"]["depth_mm"]
+    assert (tmp_path / "errors.png").stat().st_size > 0
+    assert "f_3.png: pose_2" in twin("predict", run, recording / "frames_bw" / "f_3.png")
+
+
+@pytest.mark.parametrize("model", ["gnn", "cnn-v2"])
+def test_the_papers_models_take_the_same_way(model, recording, tmp_path):
+    common = ("--data", recording, "--out")
+    twin("train", "--model", model, "--sensor", "mg400-127", *common, tmp_path / "run", "--epochs", 1)
+    twin("evaluate", tmp_path / "run", *common, tmp_path / "judged", "--labels", "raw")
+    assert "pose_6" in twin("predict", tmp_path / "run", recording / "frames_bw" / "f_3.png")
+
+
+def test_an_audit_writes_labels_that_training_reads(recording, tmp_path):
+    from training.targets import read_executed
+
+    said = twin("audit", recording, "--sensor", "mg400-127", "--out", tmp_path)
+    assert "70 frames" in said
+    assert set(json.loads((tmp_path / "audit.json").read_text())) >= {"no_contact", "wrong_sign", "drift"}
+    assert len(read_executed(tmp_path, [])) == FRAMES and "<h1>" in (tmp_path / "audit.html").read_text()
+
+
+def test_mistakes_are_named(recording, run, tmp_path):
+    common = ("--sensor", "mg400-127", "--data", recording, "--out", tmp_path)
+    with pytest.raises(TrainingError, match="no model 'vgn'"):
+        twin("train", "--model", "vgn", *common)
+    with pytest.raises(FrameError, match="column pose_9 is missing"):
+        twin("train", "--model", "vgnn", "--target", "pose_9", *common)
+    with pytest.raises(TrainingError, match="no trained model"):
+        twin("predict", tmp_path, recording / "frames_bw" / "f_3.png")
+    with pytest.raises(TrainingError, match="finished run"):
+        twin("train", "--model", "vgnn", "--sensor", "mg400-127", "--data", recording, "--out", run)

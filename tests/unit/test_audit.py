@@ -1,0 +1,75 @@
+"""The audit finds what was planted."""
+
+import numpy as np
+import pytest
+from test_training import drawn_pins
+
+from scenes import load_sensor
+from training.audit import audit_labels
+from training.dataset import PinTable
+from twin.preprocess import nominal_reference
+from twin.types import Form
+
+FRAMES = 600
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Labels of which some are wrong, pins that tell the truth, and which is which."""
+    spec = load_sensor("mg400-127")
+    reference = nominal_reference(spec, Form.RECORDING)
+    rng = np.random.default_rng(1)
+    labels = np.column_stack([rng.uniform(-3.6, 0, FRAMES), np.sort(rng.uniform(-20, 20, FRAMES)), rng.uniform(-5, 5, (FRAMES, 2))])
+    executed = rng.random(FRAMES) < 0.65
+    true = labels.copy()
+    true[~executed, 1] -= labels[~executed, 3]
+    true[~executed, 2:] = 0
+    true[~executed, 0] += 0.015 * labels[~executed, 2]
+    sign = np.zeros(FRAMES, bool)
+    sign[[40, 250, 520]] = True
+    labels[sign, 1] *= -1
+    nodes = drawn_pins(true, reference) + rng.normal(0, 0.05, (FRAMES, 127, 2))
+    untouched = np.array([100, 300])
+    nodes[untouched] = reference.pins_px + rng.normal(0, 0.05, (2, 127, 2))
+    nodes[411] = nodes[410]
+    names = np.array([f"f_{k}.png" for k in range(FRAMES)])
+    shape = (FRAMES, 127)
+    pins = PinTable(spec, Form.RECORDING, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(FRAMES, bool))
+    return pins, labels, executed, sign, untouched
+
+
+def test_planted_faults_are_found(planted):
+    pins, labels, executed, sign, untouched = planted
+    found = audit_labels(pins, *labels.T)
+    assert np.flatnonzero(found.no_contact).tolist() == untouched.tolist()
+    assert found.twins[411] == 410 and (found.twins == np.arange(FRAMES)).sum() == FRAMES - 1
+    clear = (np.abs(labels[:, 2:]).max(axis=1) > 1) & ~found.no_contact & ~sign
+    clear[411] = False
+    assert ((found.executed > 0.5) == executed)[clear].mean() > 0.97
+    assert set(np.flatnonzero(sign & (np.abs(labels[:, 1]) > 3))) <= set(np.flatnonzero(found.wrong_sign))
+    assert (found.wrong_sign & ~sign).mean() < 0.01
+    assert abs(found.depth_per_move - 0.015) < 0.006
+
+
+def test_a_clean_recording_has_nothing_to_find(planted):
+    pins, labels, _, _, _ = planted
+    reference = pins.reference
+    rng = np.random.default_rng(2)
+    nodes = drawn_pins(labels, reference) + rng.normal(0, 0.05, (FRAMES, 127, 2))
+    clean = PinTable(pins.sensor, pins.form, reference, pins.image_name, nodes, pins.area_px2, pins.lost, pins.valid)
+    found = audit_labels(clean, *labels.T)
+    clear = np.abs(labels[:, 2:]).max(axis=1) > 1
+    assert (found.executed > 0.5)[clear].mean() > 0.98
+    assert not found.no_contact.any() and found.wrong_sign.mean() < 0.01 and found.drift["r2_of_row_number_beyond_labels"] < 0.1
+
+
+def test_drift_is_seen_beyond_what_the_labels_tell(planted):
+    pins, labels, _, _, _ = planted
+    rng = np.random.default_rng(3)
+    time = np.linspace(-0.5, 0.5, FRAMES)[rng.permutation(FRAMES)]  # taken in another order than by angle
+    order = np.argsort(time)
+    nodes = drawn_pins(labels, pins.reference) + rng.normal(0, 0.05, (FRAMES, 127, 2)) + time[:, None, None] * [2.0, 0.0]
+    drifting = PinTable(pins.sensor, pins.form, pins.reference, pins.image_name, nodes, pins.area_px2, pins.lost, pins.valid).rows(order)
+    found = audit_labels(drifting, *labels[order].T)
+    assert found.drift["r2_of_row_number_beyond_labels"] > 0.5
+    assert abs(found.drift["px_first_to_last"]["x"] - 2.0) < 0.6

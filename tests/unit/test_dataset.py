@@ -1,0 +1,99 @@
+"""Recordings as data sets: what is odd in them is said once, and the good rows are used."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from drawn_frames import drawn_frame, smooth_warp
+
+from scenes import load_sensor
+from training.dataset import load_dataset, split_rows
+from training.targets import corrected, unit_of
+from twin.errors import FrameError
+from twin.preprocess import nominal_reference
+from twin.types import Form
+
+SENSOR = "mg400-127"
+HEADER = "image_name,pose_2,pose_6,move_1,move_6"
+
+
+def write_recording(folder, rows, frames, *, table_header=HEADER):
+    spec = load_sensor(SENSOR)
+    rest = nominal_reference(spec, Form.RECORDING).pins_px
+    (folder / "frames_bw").mkdir(parents=True)
+    for name in frames:
+        px = smooth_warp(rest, 4.0, np.random.default_rng(len(name) + sum(map(ord, name))))
+        cv2.imwrite(str(folder / "frames_bw" / name), drawn_frame(spec, Form.RECORDING, px).image)
+    (folder / "targets.csv").write_text("\n".join([table_header, *rows]) + "\n")
+    return spec
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faulty")
+    rows = [
+        r"C:\data\frames_bw\f_0.png,-1,5,1,2",  # a Windows path
+        "f_1.png,-2,nan,1,2",  # no number
+        "f_2.png,-3,7,1,2",
+        "f_2.png,-3,7,1,2",  # twice
+        "f_3.png,oops,8,1,2",  # a word
+        "f_9.png,-3,8,1,2",  # no picture
+    ]
+    spec = write_recording(folder, rows, [f"f_{k}.png" for k in range(5)])  # f_4 has no row
+    (folder / "meta.json").write_text('{"dir": "C:\\data\\x", "z": Infinity}')
+    return load_dataset(folder, spec)
+
+
+def test_good_rows_are_used_and_every_fault_is_said(faulty):
+    assert faulty.pins.image_name.tolist() == ["f_0.png", "f_2.png"]
+    assert faulty.targets.raw.tolist() == [[-1, 5], [-3, 7]]
+    said = "\n".join(faulty.problems)
+    for fault in (
+        "left out (f_2.png)",
+        "without a picture (f_9.png)",
+        "without a row",
+        "invalid JSON",
+        "pose_6: 2 cells",
+        "pose_2: 2 cells",
+    ):
+        assert fault.split(" (")[0] in said, (fault, said)
+    assert "f_1.png" in said and "f_3.png" in said and "f_4.png" in said
+
+
+def test_a_missing_column_names_those_that_are_there(tmp_path):
+    spec = write_recording(tmp_path / "r", ["f_0.png,1"], ["f_0.png"], table_header="image_name,pose_3")
+    with pytest.raises(FrameError, match=r"pose_2, pose_6 is missing; found image_name, pose_3"):
+        load_dataset(tmp_path / "r", spec)
+    assert load_dataset(tmp_path / "r", spec, ("pose_3",)).targets.raw.tolist() == [[1.0]]
+
+
+def test_pins_come_from_the_cache_until_a_frame_changes(tmp_path, monkeypatch):
+    spec = write_recording(tmp_path / "r", ["f_0.png,-1,5,1,2"], ["f_0.png"])
+    first = load_dataset(tmp_path / "r", spec)
+    monkeypatch.setattr("training.dataset.Pipeline", None)  # not callable: a second look would fail
+    again = load_dataset(tmp_path / "r", spec)
+    assert np.array_equal(first.pins.nodes_px, again.pins.nodes_px)
+    (tmp_path / "r" / "meta.json").write_text(json.dumps({"new": 1}))
+    with pytest.raises(TypeError):
+        load_dataset(tmp_path / "r", spec)
+
+
+def test_moves_that_were_not_executed_are_taken_out():
+    names = ("pose_2", "pose_6", "move_1", "move_6")
+    raw = np.array([[-2.0, 10, 3, 4], [-2.0, 10, 3, 4], [-2.0, 10, 3, 4]])
+    out = corrected(names, raw, np.array([1.0, 0.0, np.nan]), raw[:, 2:], 0.01)
+    assert np.allclose(out, [[-2, 10, 3, 4], [-1.97, 6, 0, 0], [-2, 10, 3, 4]])
+
+
+def test_a_fifth_is_held_out_at_random():
+    train, held = split_rows(3763, 1)
+    assert np.array_equal(held, np.random.default_rng(1).permutation(3763)[:753]) and len(train) + len(held) == 3763
+    assert not set(train) & set(held)
+
+
+@pytest.mark.parametrize(
+    "name, unit", [("pose_2", "mm"), ("move_6", "deg"), ("pose_Rx", "deg"), ("shear_y", "mm"), ("force_z", "N"), ("other", "")]
+)
+def test_a_column_tells_its_unit(name, unit):
+    assert unit_of(name) == unit

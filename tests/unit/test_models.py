@@ -1,0 +1,198 @@
+"""Networks obey the laws of what they work on: pins, graphs, rows."""
+
+import numpy as np
+import pytest
+import torch
+
+from training.assemble import conformal_quantile
+from training.inputs import frame_edges
+from training.kernel import fit_kernel
+from training.loop import row_loss
+from training.models.cnn import Cnn
+from training.models.gcn import CHANNELS, Gcn, graph_rows
+from training.models.vgnn import Vgnn, VgnnSize
+from training.registration import fit_registration
+
+PINS, FRAMES = 40, 6
+
+
+@pytest.fixture(scope="module")
+def layout():
+    rng = np.random.default_rng(0)
+    rest = rng.uniform(0, 10, (PINS, 2))
+    return rest, frame_edges("delaunay", rest)
+
+
+def pin_rows(seed=1, frames=FRAMES):
+    return torch.from_numpy(np.random.default_rng(seed).normal(size=(frames, PINS, 3)).astype(np.float32))
+
+
+def prepared(edges, x, **size):
+    torch.manual_seed(0)
+    network = Vgnn(edges, PINS, 2, VgnnSize(width=16, **size))
+    torch.nn.init.normal_(network.linear.weight)
+    network.prepare(x)
+    return network.eval()
+
+
+def test_vgnn_with_pins_in_another_order_says_the_same(layout):
+    _, edges = layout
+    x, order = pin_rows(frames=30), np.random.default_rng(2).permutation(PINS)
+    here = prepared(edges, x, modes=5, area_modes=5)
+    place = np.argsort(order)  # where each pin went
+    there = prepared(place[edges], x[:, order], modes=5, area_modes=5)
+    weights = here.state_dict()
+    for key in weights:  # what belongs to a pin goes with it
+        if key.startswith("embedding") or key in ("waves", "area_components", "area_mean"):
+            weights[key] = weights[key][order]
+        elif key in ("adjacency", "smoothing", "attention"):
+            weights[key] = weights[key][order][:, order]
+        elif key == "components":
+            weights[key] = weights[key].view(PINS, 2, -1)[order].flatten(0, 1)
+        elif key == "mode_mean":
+            weights[key] = weights[key].view(PINS, 2)[order].flatten()
+    there.load_state_dict(weights)
+    assert torch.allclose(here(x)["mean"], there(x[:, order])["mean"], atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["knn", "delaunay"])
+def test_gcn_does_not_know_the_order_of_pins(layout, kind):
+    rest, _ = layout
+    torch.manual_seed(0)
+    network, order = Gcn(3, 2).eval(), np.random.default_rng(3).permutation(PINS)
+    x = pin_rows(frames=1)
+
+    def said(x, nodes):
+        edges = [frame_edges(kind, nodes)]
+        matrices = [graph_rows(edges, PINS, transposed=t).batch(np.array([0])) for t in (False, True)]
+        return network(x, *matrices)["mean"]
+
+    assert torch.allclose(said(x, rest), said(x[:, order], rest[order]), atol=1e-5)
+
+
+def test_a_batch_of_graphs_says_what_each_says_alone(layout):
+    rng = np.random.default_rng(4)
+    edges = [frame_edges("knn", rng.uniform(size=(PINS, 2))) for _ in range(4)]
+    forward, back = graph_rows(edges, PINS), graph_rows(edges, PINS, transposed=True)
+    torch.manual_seed(0)
+    network, x = Gcn(2, 2).eval(), pin_rows(frames=4)[..., :2]
+    rows = np.array([2, 0, 3])
+    together = network(x[rows], forward.batch(rows), back.batch(rows))["mean"]
+    alone = [network(x[k : k + 1], forward.batch(np.array([k])), back.batch(np.array([k])))["mean"] for k in rows]
+    assert torch.allclose(together, torch.cat(alone), atol=1e-5)
+
+
+def test_averaging_is_kipf_and_wellings_with_its_gradient(layout):
+    from training.models.gcn import _Average
+
+    _, edges = layout
+    dense = torch.eye(PINS, dtype=torch.float64)
+    dense[edges[:, 1], edges[:, 0]] = 1
+    root = dense.sum(1).rsqrt()
+    dense = root[:, None] * dense * root
+    matrix = graph_rows([edges], PINS).batch(np.array([0]))
+    back = graph_rows([edges], PINS, transposed=True).batch(np.array([0]))
+    x = torch.randn(PINS, 3, requires_grad=True)
+    out = _Average.apply(matrix, back, x)
+    assert torch.allclose(out.double(), dense @ x.double(), atol=1e-6)
+    pull = torch.randn(PINS, 3)
+    out.backward(pull)
+    assert torch.allclose(x.grad.double(), dense.T @ pull.double(), atol=1e-6)
+
+
+@pytest.mark.parametrize("layers", [0, 2])
+def test_lost_pins_do_not_influence_the_output(layout, layers):
+    _, edges = layout
+    x = pin_rows(frames=30)
+    network = prepared(edges, x, modes=5, area_modes=5, layers=layers)
+    lost = torch.zeros(30, PINS, dtype=torch.bool)
+    lost[:, [3, 7, 20]] = True
+    spoilt = torch.where(lost[..., None], 1e6, x)
+    assert torch.equal(network(x, lost)["mean"], network(spoilt, lost)["mean"])
+    assert not torch.allclose(network(x, lost)["mean"], network(x)["mean"])
+    assert torch.isfinite(network(torch.where(lost[..., None], torch.nan, x), lost)["mean"]).all()
+
+
+def test_duplicated_rows_do_not_change_the_loss():
+    out = {key: torch.randn(5, 2) for key in ("mean", "log_scale")} | {"executed": torch.randn(5)}
+    labels, executed, weight = torch.randn(5, 2), torch.tensor([1.0, 0, 1, 1, 0]), torch.tensor([1.0, 0.3])
+    twice = {key: torch.cat([value, value]) for key, value in out.items()}
+    once = row_loss(out, labels, executed, weight, "l1")
+    assert torch.allclose(once, row_loss(twice, labels.repeat(2, 1), executed.repeat(2), weight, "l1"))
+
+
+def test_layers_are_the_papers():
+    assert CHANNELS == (16, 32, 48, 64, 96)
+    count = {variant: sum(p.numel() for p in Gcn(3, 2, variant).parameters()) for variant in ("paper", "release")}
+    assert count["release"] == 37522  # as the release's network
+    assert count["paper"] < count["release"]
+    filters = [[m.out_channels for m in Cnn(name, 2).convolutions if hasattr(m, "out_channels")] for name in ("cnn-v1", "cnn-v2")]
+    assert filters == [[256] * 5, [48] * 5]
+
+
+def test_intervals_cover_what_they_promise():
+    rng = np.random.default_rng(5)
+    scores = np.abs(rng.standard_t(3, (4000, 2)))
+    quantile = conformal_quantile(scores[:1000])
+    inside = (scores[1000:] <= quantile).mean(axis=0)
+    assert (np.abs(inside - 0.9) < 0.03).all()
+    assert conformal_quantile(scores[:5]).tolist() == scores[:5].max(axis=0).tolist()
+
+
+def test_the_kernel_head_leaves_rows_out_as_fitting_without_them_does():
+    rng = np.random.default_rng(6)
+    x = torch.from_numpy(rng.normal(size=(60, 3)))
+    y = torch.stack([x[:, 0] ** 2, x[:, 1]], dim=1) + 0.05 * torch.from_numpy(rng.normal(size=(60, 2)))
+    head, left_out = fit_kernel(x, y, seed=0)
+    assert float((head(x) - y).abs().mean()) < 0.1
+    keep = torch.arange(60) != 17
+    scaled = x / head.lengths[0]
+    kernel = head.smooth[0] ** 2 * torch.exp(-0.5 * torch.cdist(scaled, scaled) ** 2) + head.linear[0] ** 2 * scaled @ scaled.T
+    noisy = kernel[keep][:, keep] + (head.noise[0] ** 2 + 1e-6) * torch.eye(59)
+    without = kernel[17, keep] @ torch.linalg.solve(noisy, y[keep, 0])
+    assert torch.allclose(without, left_out[17, 0], atol=1e-6)
+
+
+def test_the_cameras_own_motion_is_taken_out_and_contact_is_left():
+    rng = np.random.default_rng(7)
+    rest = rng.uniform(-100, 100, (60, 2)) + 128
+    states = rng.uniform(-1, 1, (400, 2))
+    bump = np.exp(-(((rest - 128) / 60) ** 2).sum(axis=1))[:, None]
+    frames = rest + states[:, :1, None] * 6 * bump + states[:, 1:, None] * 8 * bump * [1, 0.2] + rng.normal(0, 0.05, (400, 60, 2))
+    area = np.ones((400, 60))
+    registration = fit_registration(frames[:300], rest)
+    nodes, _, taken = registration(frames[300:], area[300:])
+    assert (taken == 0).all(axis=1).mean() > 0.95
+    turn = np.exp(1j * np.radians(1.0)) * 1.01
+    z = ((frames[300:] - 128) @ [1, 1j]) * turn + (2 - 1j)
+    moved = np.stack([z.real, z.imag], axis=-1) + 128
+    back, shrunk, taken = registration(moved, 1.01**2 * area[300:])
+    assert np.abs(back - frames[300:]).max() < 0.4 and np.abs(moved - frames[300:]).mean() > 1.5
+    assert np.allclose(shrunk, 1, atol=0.01)
+
+
+def test_lost_pins_continue_what_the_others_do():
+    rng = np.random.default_rng(8)
+    rest = rng.uniform(-100, 100, (60, 2)) + 128
+    waves = np.stack([np.sin((rest - 128) / 50), np.cos((rest[:, ::-1] - 128) / 70)])
+    frames = rest + np.einsum("mk,knd->mnd", rng.normal(0, 3, (300, 2)), waves)
+    registration = fit_registration(frames[:250], rest)
+    lost = np.zeros(60, bool)
+    lost[[4, 17, 30]] = True
+    spoilt = np.where(lost[:, None], frames[270] + 5, frames[270])
+    filled = registration.fill(spoilt, lost)
+    assert np.array_equal(filled[~lost], frames[270][~lost]) and np.abs(filled - frames[270]).max() < 0.3
+
+
+def test_frames_of_one_camera_tell_its_displacement_together():
+    rng = np.random.default_rng(9)
+    rest = rng.uniform(-100, 100, (60, 2)) + 128
+    bump = np.exp(-(((rest - 128) / 60) ** 2).sum(axis=1))[:, None] * [3.0, 1.0]
+    frames = rest + rng.uniform(-1, 1, (400, 1, 1)) * bump + rng.normal(0, 0.05, (400, 60, 2))
+    registration = fit_registration(frames[:300], rest)
+    small = frames[300:] + 4 * registration.usual[2] * np.array([1.0, 0.0])  # too little to be told from one frame
+    alone = registration(small, np.ones((100, 60)))[2]
+    together = registration(small, np.ones((100, 60)), together=True)[2]
+    assert (alone[:, 2] == 0).mean() > 0.8
+    assert abs(np.median(together[:, 2]) / (4 * registration.usual[2]) - 1) < 0.3
+    assert (registration(frames[300:], np.ones((100, 60)), together=True)[2] == 0).all(axis=1).mean() > 0.9

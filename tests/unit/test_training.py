@@ -1,0 +1,171 @@
+"""Runs: kept, continued, judged; and what a trained model refuses."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from drawn_frames import drawn_frame
+
+from scenes import load_sensor
+from training.dataset import Dataset, PinTable
+from training.estimator import PoseEstimator
+from training.evaluate import judge, leak_slope, predict_rows_of, rows_to_judge, write_evaluation
+from training.recipes import TrainingError, recipe_of
+from training.run import RunConfig, fold_rows, train_run
+from training.targets import Targets
+from twin.errors import FrameError
+from twin.preprocess import Pipeline, make_graph, nominal_reference
+from twin.types import Form, Frame
+
+FRAMES = 90
+
+
+def drawn_pins(labels, reference):
+    """Pins (M, N, 2) that follow four labels smoothly: a bump that grows with depth, moves with angle and shear."""
+    rest = reference.pins_px
+    r = (rest - rest.mean(axis=0)) / np.linalg.norm(rest - rest.mean(axis=0), axis=1).max()
+    depth, angle, shear, turn = (labels / [4, 20, 5, 5]).T[:, :, None]
+    middle = np.stack([0.2 * angle, 0 * angle], axis=-1)
+    bump = np.exp(-4 * ((r - middle) ** 2).sum(axis=2))[..., None]
+    spun = np.stack([-r[:, 1], r[:, 0]], axis=1)
+    moved = (
+        5 * (1.2 + depth)[..., None] * bump * (6 * (r - middle) + 4 * np.stack([shear, 0.1 * shear], axis=-1) + 3 * turn[..., None] * spun)
+    )
+    return rest + moved
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    spec = load_sensor("mg400-127")
+    reference = nominal_reference(spec, Form.RECORDING)
+    rng = np.random.default_rng(0)
+    raw = np.column_stack([rng.uniform(-4, 0, FRAMES), rng.uniform(-20, 20, FRAMES), rng.uniform(-5, 5, (FRAMES, 2))])
+    executed = (rng.random(FRAMES) < 0.7).astype(float)
+    true = raw * np.column_stack([np.ones((FRAMES, 2)), executed, executed])
+    true[:, 1] -= (1 - executed) * raw[:, 3]
+    nodes = drawn_pins(true, reference) + rng.normal(0, 0.02, (FRAMES, 127, 2))
+    area = np.stack([make_graph("voronoi", n, outmost=reference.outmost).area_px2 for n in nodes])
+    names = np.array([f"f_{k}.png" for k in range(FRAMES)])
+    pins = PinTable(spec, Form.RECORDING, reference, names, nodes, area, np.zeros((FRAMES, 127), bool), np.ones(FRAMES, bool))
+    targets = Targets(("pose_2", "pose_6"), raw[:, :2], true[:, :2], executed, raw[:, 2:])
+    return Dataset(pins, targets, tmp_path_factory.mktemp("drawn"))
+
+
+def config_of(model, **recipe):
+    size = {"width": 16, "modes": 8, "area_modes": 4, "channels": 2, "frequencies": 3} if model == "vgnn" else {}
+    return RunConfig(model, recipe_of(model, **recipe), size=size)
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    assert train_run(config_of("vgnn", epochs=30, batch=16), data, out)
+    return out
+
+
+@pytest.mark.parametrize("model", ["vgnn", "tac-vgnn"])
+def test_a_run_taken_up_again_ends_as_if_never_ended(data, tmp_path, model):
+    config = config_of(model, epochs=3, batch=32, members=2, kernel=False)
+    train_run(config, data, tmp_path / "whole")
+    for _ in range(20):
+        if train_run(config, data, tmp_path / "parts", max_minutes=0):  # one epoch each time
+            break
+    whole, parts = (torch.load(tmp_path / name / "weights.pt", weights_only=True) for name in ("whole", "parts"))
+    for a, b in zip(whole["networks"], parts["networks"], strict=True):
+        assert all(torch.equal(a[key], b[key]) for key in a)
+    assert torch.equal(whole["quantile"], parts["quantile"])
+    assert not (tmp_path / "parts" / "checkpoint.pt").exists()
+    rows = (tmp_path / "parts" / "curves.csv").read_text().splitlines()
+    assert rows[0].startswith("network,epoch,loss") and len(rows) == 1 + 2 * 3
+
+
+def test_another_run_in_the_same_folder_is_refused(data, trained, tmp_path):
+    with pytest.raises(TrainingError, match="finished run"):
+        train_run(config_of("vgnn", epochs=30, batch=16), data, trained)
+    train_run(config_of("vgnn", epochs=3), data, tmp_path, max_minutes=0)
+    with pytest.raises(TrainingError, match="other settings"):
+        train_run(config_of("vgnn", epochs=4), data, tmp_path)
+
+
+def test_a_run_keeps_all_that_made_it(trained):
+    config = json.loads((trained / "config.json").read_text())
+    assert config["recipe"]["epochs"] == 30 and config["sensor"]["name"] == "mg400-127" and config["pipeline"]["detection"]
+    assert config["columns"] == ["pose_2", "pose_6"] and config["units"] == ["mm", "deg"]
+
+
+def test_a_trained_model_tells_the_pose(data, trained, tmp_path):
+    estimator = PoseEstimator.load(trained)
+    rows = rows_to_judge(estimator, data, "validation")
+    made = predict_rows_of(estimator, data, rows)
+    metrics = judge(made, data, rows)
+    assert metrics["corrected"]["pose_2"]["mae"] < 0.3 and metrics["corrected"]["pose_6"]["mae"] < 5
+    assert metrics["without_prediction"] == 0 and metrics["frames"] == 18
+    written = write_evaluation(tmp_path, made, data, rows, metrics, "corrected")
+    head = written[0].read_text().splitlines()[0].split(",")
+    assert head[:5] == ["image_name", "pose_2_true", "pose_2_pred", "pose_2_lo90", "pose_2_hi90"] and head[-1] == "valid"
+
+
+def test_one_frame_at_a_time_says_what_the_table_says(data, trained):
+    estimator = PoseEstimator.load(trained)
+    frame = drawn_frame(data.pins.sensor, Form.RECORDING, data.pins.nodes_px[3])
+    one = estimator(frame)
+    seen = Pipeline(data.pins.sensor, Form.RECORDING, data.pins.reference)(frame)
+    table = PinTable(
+        data.pins.sensor, Form.RECORDING, data.pins.reference, np.array(["f"]), seen.graph.nodes_px[None], seen.graph.area_px2[None],
+        np.isnan(seen.pins_px[None, :, 0]), np.ones(1, bool),
+    )  # fmt: skip
+    assert one.valid and np.allclose(one.value, estimator.predict_table(table).mean[0], atol=1e-6)
+    assert (one.low < one.value).all() and (one.value < one.high).all()
+
+
+def test_another_sensors_frames_are_refused(data, trained):
+    estimator = PoseEstimator.load(trained)
+    other = load_sensor("mg400-331")
+    pins = replace(data.pins, sensor=other)
+    with pytest.raises(FrameError, match="trained on recording frames of 'mg400-127'.*'mg400-331'"):
+        estimator.predict_table(pins)
+    rest = nominal_reference(other, Form.RECORDING).pins_px
+    with pytest.raises(FrameError, match="expected 256x256"):
+        estimator(drawn_frame(other, Form.RECORDING, rest))
+    with pytest.raises(FrameError, match="expected a recording frame"):
+        estimator(Frame(np.zeros((256, 256), np.uint8), Form.RAW))
+
+
+def test_a_frame_without_pins_is_not_valid_and_says_why(trained):
+    made = PoseEstimator.load(trained)(Frame(np.zeros((256, 256), np.uint8), Form.RECORDING))
+    assert not made.valid and "no pins" in made.reason and np.isnan(made.value).all()
+
+
+def test_rows_a_model_learnt_from_are_not_judged(data, trained):
+    estimator = PoseEstimator.load(trained)
+    assert len(rows_to_judge(estimator, data, "all")) == FRAMES
+    fewer = Dataset(data.pins.rows(np.arange(50)), data.targets.rows(np.arange(50)), data.folder)
+    with pytest.raises(TrainingError, match="trained on part of 90 rows"):
+        rows_to_judge(estimator, fewer, "validation")
+
+
+def test_each_network_watches_rows_of_its_own():
+    train = np.arange(100)
+    folds = [fold_rows(train, 0, member) for member in range(10)]
+    assert sorted(np.concatenate([held for held, _ in folds])) == list(range(100))
+    assert all(not set(held) & set(learnt) for held, learnt in folds)
+
+
+def test_a_model_that_reads_the_clock_is_found_out(data):
+    from training.assemble import Prediction
+
+    undone = data.targets.executed < 0.5
+    honest = Prediction(data.targets.corrected, np.ones((FRAMES, 2)), np.full(FRAMES, np.nan))
+    clock = Prediction(data.targets.corrected + 0.5 * np.column_stack([np.zeros(FRAMES), data.targets.move[:, 1]]), *[None] * 2)
+    assert undone.any() and abs(leak_slope(honest, data.targets)) < 1e-9 and leak_slope(clock, data.targets) == pytest.approx(0.5)
+
+
+def test_unknown_models_and_settings_are_named():
+    with pytest.raises(TrainingError, match="no model 'vgg'; choose one of vgnn"):
+        recipe_of("vgg")
+    with pytest.raises(TrainingError, match="no setting epoch"):
+        recipe_of("vgnn", epoch=3)
+    with pytest.raises(TrainingError, match="no trained model"):
+        PoseEstimator.load("nowhere")

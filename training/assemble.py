@@ -1,0 +1,170 @@
+"""From trained networks to a predictor: the Gaussian process beside them, how they are averaged, and honest intervals.
+
+Intervals are conformal (Vovk et al. 2005; Barber et al. 2021 for ensembles): every training row that some network held out
+gets the prediction it would have without itself, and the 90 % quantile of its error over its expected scale widens or
+narrows the stated intervals. Such a prediction misses the rest of the ensemble, so intervals are rather too wide than too narrow.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from training.inputs import PinInputs, graph_inputs, image_inputs, pin_features
+from training.kernel import KernelHead, fit_kernel
+from training.networks import build_network, predict_rows
+from training.registration import Registration, fit_registration
+from twin.preprocess import make_graph
+from twin.preprocess.forms import frame_size
+from twin.preprocess.reference import Reference
+
+COVERAGE = 0.9
+BLENDS = np.linspace(0, 1, 21)
+KERNEL_MODES = 30  # of the displacement; all modes of the areas
+
+
+@dataclass
+class Prediction:
+    """Labels of B frames.
+
+    Attributes
+    ----------
+    mean, half_width : (B, K) float
+        mm and deg; half of the 90 % interval.
+    executed : (B,) float
+        Probability that the shear move was executed; NaN where the model doesn't tell.
+    """
+
+    mean: np.ndarray
+    half_width: np.ndarray
+    executed: np.ndarray
+
+
+class Ensemble:
+    """Networks, the kernel head, and what turns their outputs into labels and intervals.
+
+    Parameters
+    ----------
+    content : dict
+        As ``calibrate`` gives it and ``weights.pt`` holds it.
+    """
+
+    def __init__(self, model: str, reference: Reference, content: dict, size: dict) -> None:
+        self.shift, self.scale = np.asarray(content["shift"]), np.asarray(content["scale"])
+        self.networks = []
+        for weights in content["networks"]:
+            network = build_network(model, reference, len(self.shift), size)
+            network.load_state_dict(weights)
+            self.networks.append(network.eval())
+        self.kernel = KernelHead(**content["kernel"]) if content["kernel"] else None
+        self.kernel_labels = list(content["kernel_labels"])
+        self.blend, self.quantile = np.asarray(content["blend"]), np.asarray(content["quantile"])
+
+    def outputs(self, inputs, rows: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Standardised mean and scale (B, K) and the probability (B,) of an executed move."""
+        outs = [predict_rows(network, inputs, rows) for network in self.networks]
+        mean = np.mean([out["mean"].double().numpy() for out in outs], axis=0)
+        if self.kernel is not None:
+            chosen = self.kernel_labels
+            also = self.kernel(kernel_inputs(self.networks[0], inputs, rows)).numpy()
+            mean[:, chosen] = self.blend[chosen] * also + (1 - self.blend[chosen]) * mean[:, chosen]
+        return mean, *_scale_and_move(outs)
+
+    def __call__(self, inputs, rows: torch.Tensor) -> Prediction:
+        """Labels of some rows."""
+        mean, scale, executed = self.outputs(inputs, rows)
+        return Prediction(self.shift + self.scale * mean, self.scale * self.quantile * scale, executed)
+
+
+def _scale_and_move(outs: list) -> tuple[np.ndarray, np.ndarray]:
+    shape = outs[0]["mean"].shape
+    scale = np.ones(shape)
+    if "log_scale" in outs[0]:
+        scale = np.exp(np.mean([out["log_scale"].clamp(-8, 4).double().numpy() for out in outs], axis=0))
+    executed = np.full(shape[0], np.nan)
+    if "executed" in outs[0]:
+        executed = np.mean([torch.sigmoid(out["executed"].double()).numpy() for out in outs], axis=0)
+    return scale, executed
+
+
+def kernel_inputs(network, inputs: PinInputs, rows: torch.Tensor) -> torch.Tensor:
+    """What the Gaussian process sees of rows (B, D): the first modes of the displacement and those of the areas."""
+    with torch.no_grad():
+        amplitudes = network.amplitudes(network.known(*inputs.batch(rows)))
+    modes = network.size.modes
+    return torch.cat([amplitudes[:, : min(KERNEL_MODES, modes)], amplitudes[:, modes:]], dim=1).double()
+
+
+def prepared_inputs(model: str, data, train: np.ndarray) -> tuple[object, dict]:
+    """Inputs of all rows for a model, and what of their making was learnt from the training rows."""
+    pins = data.pins
+    if model == "vgnn":
+        registration = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
+        return pin_inputs(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference), {"registration": registration.arrays()}
+    if model in ("cnn-v1", "cnn-v2"):
+        return image_inputs(data), {}
+    return graph_inputs(model, pins, frame_width(pins)), {}
+
+
+def frame_width(pins) -> int:
+    """Width in px of a table's frames."""
+    return frame_size(pins.sensor, pins.form)[0]
+
+
+def pin_inputs(registration: Registration, nodes_px, area_px2, lost, reference: Reference, *, together: bool = False) -> PinInputs:
+    """Dense features of frames whose camera displacement is taken out; lost pins are put where the others' modes say."""
+    nodes_px, area_px2 = nodes_px.copy(), area_px2.copy()
+    for k in np.flatnonzero(lost.any(axis=1)):
+        nodes_px[k] = registration.fill(nodes_px[k], lost[k])
+        area_px2[k] = make_graph("voronoi", nodes_px[k], outmost=reference.outmost).area_px2
+    nodes, area, _ = registration(nodes_px, area_px2, together=together)
+    return PinInputs(pin_features(nodes, area, reference), lost)
+
+
+def calibrate(config, data, inputs, train: np.ndarray, networks: list, scaling: tuple) -> dict:
+    """Fit the kernel head if the recipe has one, the average's weights, and the intervals.
+
+    Returns
+    -------
+    dict
+        ``networks``, ``kernel``, ``shift``, ``scale``, ``blend``, ``quantile``: what ``Ensemble`` takes.
+    """
+    shift, scale = scaling
+    labels = data.targets.corrected if config.labels == "corrected" else data.targets.raw
+    y = (labels - shift) / scale
+    k = y.shape[1]
+    content = {"networks": [network["weights"] for network in networks], "kernel": None, "shift": shift, "scale": scale}
+    main = [j for j, name in enumerate(data.targets.names) if name not in config.helpers]  # the kernel head's labels
+    content |= {"blend": np.zeros(k), "quantile": np.ones(k), "kernel_labels": main}
+    single = [
+        Ensemble(config.model, data.pins.reference, content | {"networks": [weights]}, config.size) for weights in content["networks"]
+    ]
+    left_out = np.full(y.shape, np.nan)
+    if config.recipe.kernel:
+        amplitudes = kernel_inputs(single[0].networks[0], inputs, torch.from_numpy(train))
+        kernel, left = fit_kernel(amplitudes, torch.from_numpy(y[np.ix_(train, main)]), seed=config.seed)
+        content["kernel"] = kernel.arrays()
+        left_out[np.ix_(train, main)] = left.numpy()
+    means, scales, truths, kernels = [], [], [], []
+    for ensemble, network in zip(single, networks, strict=True):
+        mean, spread, _ = ensemble.outputs(inputs, network["held"])
+        held = network["held"].numpy()
+        for parts, part in zip((means, scales, truths, kernels), (mean, spread, y[held], left_out[held]), strict=True):
+            parts.append(part)
+    mean, spread, truth = np.concatenate(means), np.concatenate(scales), np.concatenate(truths)
+    if not len(mean):
+        return content
+    if config.recipe.kernel:
+        kernel = np.concatenate(kernels)
+        errors = [np.abs(b * kernel + (1 - b) * mean - truth).mean(axis=0) for b in BLENDS]
+        content["blend"][main] = BLENDS[np.argmin(errors, axis=0)][main]
+        mean = np.where(content["blend"] > 0, content["blend"] * kernel + (1 - content["blend"]) * mean, mean)
+    content["quantile"] = conformal_quantile(np.abs(mean - truth) / spread)
+    return content
+
+
+def conformal_quantile(scores: np.ndarray, coverage: float = COVERAGE) -> np.ndarray:
+    """The (n + 1) ``coverage``-th smallest of scores (n, K), for each column; the largest where n is too small for it."""
+    n = len(scores)
+    place = min(int(np.ceil((n + 1) * coverage)), n) - 1
+    return np.sort(scores, axis=0)[place]

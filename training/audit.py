@@ -1,0 +1,170 @@
+"""Whether the labels of a flat-surface recording agree with its pins.
+
+The pins follow from what happened: depth d, angle a, and both shears s, t. That map is smooth, so it can be fitted to the
+recording itself (polynomials of the four to the leading modes of the displacement), and every frame can be asked which
+story it fits best:
+
+- executed: ``(pose_2, pose_6, move_1, move_6)``
+- not executed, as the shear move had not been done when the frame was taken: ``(pose_2, pose_6 - move_6, 0, 0)``
+- sign errors: the same with the angle's or the shear's sign turned.
+
+Fit and choice take turns until no frame changes sides. Nothing but pins and ``targets.csv`` is read.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from training.dataset import PinTable
+
+MODES = 14
+DEGREE = 4
+ROUNDS = 30
+MOST_LEFT_OUT = 0.02  # of the frames: the worst, which the fit does without
+FLAG_CHI2 = 60.0  # by which a sign error must fit better than both other stories
+ODD_CHI2 = 12.0  # times the usual chi^2: a frame that fits no story
+STILL = 0.16  # of the usual displacement: no contact (the shallowest taps of the published recordings have 0.19)
+STORIES = ("executed", "not executed", "angle's sign", "shear's sign")
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What the pins say about M rows of labels.
+
+    Attributes
+    ----------
+    executed : (M,) float
+        Probability that the move was executed.
+    chi2 : (M, 4) float
+        Misfit of each frame to each of ``STORIES``; NaN for frames without contact.
+    no_contact, odd, wrong_sign : (M,) bool
+        No pin has moved; the frame fits no story; a sign error fits far better than the label.
+    twins : (M,) int
+        The first frame with the very same pins; its own index where there is none.
+    depth_per_move : float
+        mm of depth that go with each mm of ``move_1`` where it was not executed: the plate's tilt.
+    drift : dict
+        Part of the variance (R^2) of the row number that the pins tell beyond the labels, and the drift in px from first to last row.
+    """
+
+    executed: np.ndarray
+    chi2: np.ndarray
+    no_contact: np.ndarray
+    odd: np.ndarray
+    wrong_sign: np.ndarray
+    twins: np.ndarray
+    depth_per_move: float
+    drift: dict
+
+
+def audit_labels(pins: PinTable, depth_mm, angle_deg, shear_mm, shear_deg) -> Audit:
+    """Ask every frame which story it fits.
+
+    Parameters
+    ----------
+    pins : PinTable
+        M valid frames.
+    depth_mm, angle_deg, shear_mm, shear_deg : (M,) float
+        ``pose_2``, ``pose_6``, ``move_1``, ``move_6`` as in the table.
+    """
+    moved = (pins.nodes_px - pins.reference.pins_px).reshape(len(pins), -1)
+    size = np.linalg.norm(moved, axis=1)
+    no_contact = size < STILL * np.median(size)
+    modes = _modes(moved, ~no_contact)
+    stories = np.stack(
+        [
+            np.column_stack([depth_mm, angle_deg, shear_mm, shear_deg]),
+            np.column_stack([depth_mm, angle_deg - shear_deg, 0 * shear_mm, 0 * shear_deg]),
+            np.column_stack([depth_mm, -angle_deg, shear_mm, shear_deg]),
+            np.column_stack([depth_mm, angle_deg, -shear_mm, -shear_deg]),
+        ]
+    )
+    shift, scale = stories[0].mean(axis=0), np.ptp(stories[0], axis=0) / 2 + 1e-9
+    shift[2:] = 0
+    stories = (stories - shift) / scale
+    done, tilt, used = np.ones(len(pins), bool), 0.0, ~no_contact
+    for _ in range(ROUNDS):
+        terms = np.stack([_polynomials(story) for story in stories])
+        chosen = terms[np.where(done, 0, 1), np.arange(len(pins))]
+        weight = np.linalg.lstsq(chosen[used], modes[used], rcond=None)[0]
+        residual = modes[used] - chosen[used] @ weight
+        precision = np.linalg.inv(np.cov(residual.T) + 1e-9 * np.eye(modes.shape[1]))
+        chi2 = np.stack([_misfit(modes - part @ weight, precision) for part in terms], axis=1)
+        best = chi2[:, :2].min(axis=1)
+        now = chi2[:, 0] <= chi2[:, 1]
+        used = ~no_contact & (best <= np.quantile(best[~no_contact], 1 - MOST_LEFT_OUT))
+        if (now == done).all():
+            break
+        done = now
+    tilt = _depth_per_move(terms[1], modes, weight, precision, stories[1], shear_mm, used & ~done, scale[0])
+    usual = np.median(best[~no_contact])
+    # misfits are of a model that is only nearly right: in the usual misfit's own unit they become odds
+    odds = np.clip((chi2[:, 1] - chi2[:, 0]) / (2 * max(usual / modes.shape[1], 1.0)), -50, 50)
+    chi2[no_contact] = np.nan
+    return Audit(
+        executed=np.where(no_contact, 1.0, 1 / (1 + np.exp(-odds))),
+        chi2=chi2,
+        no_contact=no_contact,
+        odd=~no_contact & (best > ODD_CHI2 * usual),
+        wrong_sign=~no_contact & (np.nan_to_num(chi2[:, 2:], nan=np.inf).min(axis=1) < best - FLAG_CHI2),
+        twins=_twins(pins.nodes_px),
+        depth_per_move=tilt,
+        drift=_drift(pins, terms[np.where(done, 0, 1), np.arange(len(pins))], used),
+    )
+
+
+def _modes(moved: np.ndarray, used: np.ndarray) -> np.ndarray:
+    mean = moved[used].mean(axis=0)
+    _, _, directions = np.linalg.svd(moved[used] - mean, full_matrices=False)
+    return (moved - mean) @ directions[: min(MODES, len(directions))].T
+
+
+def _polynomials(story: np.ndarray) -> np.ndarray:
+    columns = [np.ones(len(story))]
+    for degree in range(1, DEGREE + 1):
+        columns += [story[:, list(which)].prod(axis=1) for which in combinations_with_replacement(range(story.shape[1]), degree)]
+    return np.column_stack(columns)
+
+
+def _misfit(residual: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    return np.einsum("mi,ij,mj->m", residual, precision, residual, optimize=True)
+
+
+def _depth_per_move(terms, modes, weight, precision, story, shear_mm, rows, depth_scale) -> float:
+    """Slope on the move of the depth that the pins show beyond the label, over frames whose move was not executed."""
+    if rows.sum() < 20 or np.ptp(shear_mm[rows]) < 1:
+        return 0.0
+    step = 1e-3
+    nudged = story.copy()
+    nudged[:, 0] += step
+    along = (_polynomials(nudged) - terms) @ weight / step
+    residual = modes - terms @ weight
+    steep = np.einsum("mi,ij,mj->m", along, precision, along, optimize=True)
+    beyond = depth_scale * np.einsum("mi,ij,mj->m", along, precision, residual, optimize=True) / np.maximum(steep, 1e-12)
+    return float(np.polyfit(shear_mm[rows], beyond[rows], 1)[0])
+
+
+def _twins(nodes_px: np.ndarray) -> np.ndarray:
+    first: dict[bytes, int] = {}
+    return np.array([first.setdefault(np.round(frame, 6).tobytes(), k) for k, frame in enumerate(nodes_px)])
+
+
+def _drift(pins: PinTable, terms: np.ndarray, used: np.ndarray) -> dict:
+    """How well the row number is told by what of the outmost pins' middle and spread the labels leave unexplained."""
+    rim = pins.nodes_px[:, pins.reference.outmost]
+    middle = rim.mean(axis=1)
+    spread = np.linalg.norm(rim - middle[:, None], axis=2).mean(axis=1)
+    signals = np.column_stack([middle, spread])
+    left = signals - terms @ np.linalg.lstsq(terms[used], signals[used], rcond=None)[0]
+    row = np.linspace(-0.5, 0.5, len(pins))
+    own = row - terms @ np.linalg.lstsq(terms[used], row[used], rcond=None)[0]
+    slopes = [float(np.polyfit(own[used], left[used, k], 1)[0]) for k in range(3)]
+    told = left[used] @ np.linalg.lstsq(left[used], own[used], rcond=None)[0]
+    return {
+        "r2_of_row_number_beyond_labels": float(1 - np.var(own[used] - told) / max(np.var(own[used]), 1e-300)),
+        "px_first_to_last": dict(zip(("x", "y", "spread"), slopes, strict=True)),
+        "correlation_of_row_with_label": [
+            float(np.corrcoef(row, terms[:, 1 + k])[0, 1]) if np.ptp(terms[:, 1 + k]) else 0.0 for k in range(4)
+        ],
+    }

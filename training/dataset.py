@@ -1,0 +1,191 @@
+"""What the pipeline sees in every frame of a recording, once, with the labels beside it."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+import twin.preprocess
+from scenes.sensor import SensorSpec
+from training.targets import Targets, choose_targets
+from twin.cache import cached_arrays
+from twin.errors import FrameError
+from twin.preprocess import Pipeline, make_reference
+from twin.preprocess.batch import recording_reference
+from twin.preprocess.reference import Reference
+from twin.recordings import Recording, open_recording
+from twin.types import Form
+
+HELD_OUT = 5  # one row in five is the validation part
+
+
+@dataclass(frozen=True)
+class PinTable:
+    """The pipeline's view of M frames of one sensor with N pins.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    form : Form
+    reference : Reference
+        No contact, N pins.
+    image_name : (M,) str
+    nodes_px : (M, N, 2) float
+        Every pin of the valid frames; a lost pin's is its predicted place. NaN where a frame is not valid.
+    area_px2 : (M, N) float
+        Voronoi areas; NaN where a frame is not valid.
+    lost : (M, N) bool
+        Pins without a blob of their own.
+    valid : (M,) bool
+    """
+
+    sensor: SensorSpec
+    form: Form
+    reference: Reference
+    image_name: np.ndarray
+    nodes_px: np.ndarray
+    area_px2: np.ndarray
+    lost: np.ndarray
+    valid: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.image_name)
+
+    def rows(self, index: np.ndarray) -> "PinTable":
+        """The same table with only some rows, or rows in another order."""
+        parts = {key: getattr(self, key)[index] for key in ("image_name", "nodes_px", "area_px2", "lost", "valid")}
+        return PinTable(self.sensor, self.form, self.reference, **parts)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Pins and labels of the usable rows of a recording, in the recording's order.
+
+    Attributes
+    ----------
+    pins : PinTable
+        M valid frames with complete labels.
+    targets : Targets
+        M rows of labels, raw and corrected.
+    folder : Path
+    problems : list of str
+        Everything odd about the recording, one line each, and what was left out for it.
+    """
+
+    pins: PinTable
+    targets: Targets
+    folder: Path
+    problems: list = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.pins)
+
+
+def load_dataset(
+    folder: str | Path, spec: SensorSpec, columns: str | tuple = "surface-2d", *, form: Form | None = None, progress: Callable | None = None
+) -> Dataset:
+    """Read a labelled recording.
+
+    Parameters
+    ----------
+    folder : path
+        Anything ``open_recording`` takes that has a table of labels.
+    columns : str or tuple of str
+        A name of ``training.targets.PRESETS``, or the table's columns themselves.
+    progress : callable, optional
+        Called with (done, total) while the pipeline runs.
+
+    Raises
+    ------
+    FrameError
+        If there is no table, a chosen column is missing, or no row is usable.
+    """
+    recording = open_recording(folder, spec, form)
+    problems: list[str] = []
+    pins = pin_table(recording, spec, problems=problems, progress=progress)
+    row_of = {name: k for k, name in enumerate(recording.names)}
+    rows = np.array([row_of[name] for name in pins.image_name], int)
+    targets = choose_targets(recording, spec, columns, rows, problems)
+    unseen = ~pins.valid
+    if unseen.any():
+        problems.append(f"{_named(pins.image_name[unseen])}: pins not found; left out of training")
+    unlabelled = pins.valid & ~np.isfinite(targets.raw).all(axis=1)
+    if unlabelled.any():
+        problems.append(f"{_named(pins.image_name[unlabelled])}: no number in {', '.join(targets.names)}; left out")
+    good = np.flatnonzero(pins.valid & ~unlabelled)
+    if not len(good):
+        raise FrameError(f"{folder}: no frame has both pins and labels; {'; '.join(problems[:3])}")
+    return Dataset(pins.rows(good), targets.rows(good), Path(folder), list(recording.problems) + problems)
+
+
+def split_rows(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Training and validation rows: a random fifth is held out (rows are sorted by label, so never by position)."""
+    shuffled = np.random.default_rng(seed).permutation(count)
+    held = -(-count // HELD_OUT)
+    return np.sort(shuffled[held:]), shuffled[:held]
+
+
+def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progress: Callable | None = None) -> PinTable:
+    """Run the pipeline over a recording, or take its result from the cache.
+
+    What could not be read is appended to ``problems``.
+    """
+
+    def compute() -> dict[str, np.ndarray]:
+        notes: list[str] = []
+        reference, _ = recording_reference(spec, recording, notes)
+        pipeline = Pipeline(spec, recording.form, reference)
+        n = spec.pins.count
+        names, nodes, areas, lost, valid = [], [], [], [], []
+        for frame in recording:
+            try:
+                seen = pipeline(frame)
+            except FrameError as error:
+                notes.append(str(error))
+                continue
+            names.append(frame.name)
+            valid.append(seen.valid)
+            nodes.append(seen.graph.nodes_px if seen.valid else np.full((n, 2), np.nan))
+            areas.append(seen.graph.area_px2 if seen.valid else np.full(n, np.nan))
+            lost.append(np.isnan(seen.pins_px[:, 0]))
+            if progress:
+                progress(frame.sequence + 1, len(recording))
+        notes += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
+        arrays = {
+            "nodes_px": np.reshape(nodes, (-1, n, 2)),
+            "area_px2": np.reshape(areas, (-1, n)),
+            "lost": np.reshape(lost, (-1, n)).astype(bool),
+            "valid": np.array(valid, bool),
+        }
+        return {"image_name": np.array(names, str), "rest_px": reference.pins_px, "notes": np.array(notes, str)} | arrays
+
+    found = cached_arrays("recorded-pins", _key(recording, spec), compute)
+    problems += found.pop("notes").tolist()
+    reference = make_reference(found.pop("rest_px"), spec.pins.rings)
+    return PinTable(spec, recording.form, reference, **found)
+
+
+def _key(recording: Recording, spec: SensorSpec) -> dict:
+    """All that the pins depend on: files, the specification, and the pipeline's own text."""
+    root = recording.path if recording.path.is_dir() else recording.path.parent
+    states = sorted((str(file.relative_to(root)), *_state(file)) for file in root.rglob("*") if file.is_file())
+    sources = sorted(Path(twin.preprocess.__file__).parent.glob("*.py"))
+    return {
+        "path": str(recording.path.resolve()),
+        "names": recording.names,
+        "files": json.dumps(states),
+        "form": str(recording.form),
+        "sensor": spec.model_dump(mode="json"),
+        "pipeline": b"".join(source.read_bytes() for source in sources),
+    }
+
+
+def _state(file: Path) -> tuple[int, int]:
+    status = file.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def _named(names: np.ndarray) -> str:
+    return f"{len(names)} frames ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"

@@ -1,0 +1,167 @@
+"""How good a trained model is on a recording: errors, intervals, leaks, as numbers, a table and pictures."""
+
+import csv
+import json
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import torch
+
+from training.assemble import Prediction
+from training.dataset import Dataset, split_rows
+from training.estimator import PoseEstimator
+from training.inputs import image_inputs
+from training.recipes import TrainingError
+from twin.recordings import open_recording
+from twin.views.plots import new_figure
+
+DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)
+ANGLE_EDGES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
+SHEAR_EDGES_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+LARGE_MOVE = 1.0  # mm or deg: smaller moves leave the same picture executed or not
+TIMED_FRAMES = 100
+
+
+def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndarray:
+    """Rows of a data set: ``validation``, those kept out of the run's training, or ``all`` (a recording it never saw).
+
+    Raises
+    ------
+    TrainingError
+        If the run kept none out, or the recording is not the one it was trained on.
+    """
+    if rows == "all":
+        return np.arange(len(data))
+    split, trained_on = estimator.config["split"], estimator.config["rows"]["usable"]
+    if split is None:
+        raise TrainingError("the run was trained on all rows; give a recording it has not seen, and --rows all")
+    if trained_on != len(data):
+        raise TrainingError(
+            f"the run was trained on part of {trained_on} rows, this recording has {len(data)}; "
+            "give --rows all for a recording it has not seen"
+        )
+    return split_rows(len(data), split)[1]
+
+
+def predict_rows_of(estimator: PoseEstimator, data: Dataset, rows: np.ndarray) -> Prediction:
+    """The model's labels for some rows of a data set."""
+    estimator.check(data.pins.sensor, data.pins.form)
+    if estimator.model in ("cnn-v1", "cnn-v2"):
+        return estimator.ensemble(image_inputs(data), torch.from_numpy(rows))
+    return estimator.predict_table(data.pins.rows(rows))
+
+
+def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
+    """Errors against raw and corrected labels, overall and binned, the intervals' coverage and the leak check."""
+    targets = data.targets.rows(rows)
+    found: dict = {"frames": len(rows), "without_prediction": int((~np.isfinite(made.mean)).any(axis=1).sum())}
+    for kind in ("raw", "corrected"):
+        error = np.abs(made.mean - getattr(targets, kind))
+        inside = error <= made.half_width
+        found[kind] = {
+            name: {
+                "mae": float(error[:, k].mean()),
+                "median": float(np.median(error[:, k])),
+                "coverage_90": float(inside[:, k].mean()),
+                "half_width_90": float(made.half_width[:, k].mean()),
+            }
+            for k, name in enumerate(targets.names)
+        }
+        found[kind]["bins"] = _bins(error, targets)
+    found["leak_slope"] = leak_slope(made, targets)
+    known = np.isfinite(targets.executed) & np.isfinite(made.executed) & (np.abs(targets.move).max(axis=1) > LARGE_MOVE)
+    if known.any():
+        found["executed_agreement"] = float(((made.executed > 0.5) == (targets.executed > 0.5))[known].mean())
+    return found
+
+
+def leak_slope(made: Prediction, targets) -> float | None:
+    """Slope of (angle predicted - corrected) on ``move_6`` over frames whose move was not executed; None where there are none.
+
+    A model that reads the contact has 0; one that reads the time of the frame, by which the rows are sorted, has not.
+    """
+    undone = targets.executed < 0.5
+    if "pose_6" not in targets.names or undone.sum() < 3:
+        return None
+    k = targets.names.index("pose_6")
+    return float(np.polyfit(targets.move[undone, 1], (made.mean - targets.corrected)[undone, k], 1)[0])
+
+
+def _bins(error: np.ndarray, targets) -> dict:
+    """MAE of each label by depth, angle and shear, as ``{by: [{from, to, frames, label: mae, ...}]}``."""
+    found = {}
+    axes = {"depth_mm": ("pose_2", DEPTH_EDGES_MM, False), "angle_deg": ("pose_6", ANGLE_EDGES_DEG, True)}
+    values = {
+        key: (targets.corrected[:, targets.names.index(name)], edges, size)
+        for key, (name, edges, size) in axes.items()
+        if name in targets.names
+    }
+    if np.isfinite(targets.move).all():
+        done = np.where(np.isnan(targets.executed), 1.0, targets.executed)
+        values["shear_mm"] = (done * targets.move[:, 0], SHEAR_EDGES_MM, True)
+    for key, (value, edges, size) in values.items():
+        where = np.digitize(np.abs(value) if size else value, edges[1:-1])
+        found[key] = []
+        for b in range(len(edges) - 1):
+            inside = where == b
+            means = error[inside].mean(axis=0) if inside.any() else np.full(error.shape[1], np.nan)
+            row = {"from": edges[b], "to": edges[b + 1], "frames": int(inside.sum())}
+            found[key].append(row | {name: None if np.isnan(m) else float(m) for name, m in zip(targets.names, means, strict=True)})
+    return found
+
+
+def time_frames(estimator: PoseEstimator, data: Dataset) -> float:
+    """Median ms from frame to pose, one frame at a time on one thread."""
+    recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        frames = [recording.read(k) for k in np.linspace(0, len(recording) - 1, min(TIMED_FRAMES, len(recording))).astype(int)]
+        estimator(frames[0])
+        taken = []
+        for frame in frames:
+            started = perf_counter()
+            estimator(frame)
+            taken.append(1e3 * (perf_counter() - started))
+    finally:
+        torch.set_num_threads(threads)
+    return float(np.median(taken))
+
+
+def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarray, metrics: dict, labels: str) -> list[Path]:
+    """``predictions.csv``, ``metrics.json`` and ``errors.png``; truth in the table is the chosen label set."""
+    targets = data.targets.rows(rows)
+    truth = getattr(targets, labels)
+    path = out / "predictions.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        parts = [f"{name}_{part}" for name in targets.names for part in ("true", "pred", "lo90", "hi90")]
+        writer.writerow(["image_name", *parts, "executed_probability", "valid"])
+        for m, row in enumerate(rows):
+            cells = [
+                f"{v:.6g}"
+                for k in range(len(targets.names))
+                for v in (truth[m, k], made.mean[m, k], made.mean[m, k] - made.half_width[m, k], made.mean[m, k] + made.half_width[m, k])
+            ]
+            writer.writerow([data.pins.image_name[row], *cells, f"{made.executed[m]:.4g}", int(np.isfinite(made.mean[m]).all())])
+    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    return [path, out / "metrics.json", _draw(out / "errors.png", made, truth, targets, labels)]
+
+
+def _draw(path: Path, made: Prediction, truth: np.ndarray, targets, labels: str) -> Path:
+    """Prediction over truth, and its error, for every label: the paper's test figure."""
+    count = len(targets.names)
+    figure, axes = new_figure(count, 2, panel_inch=3.6)
+    undone = np.nan_to_num(targets.executed, nan=1.0) < 0.5
+    for k, (name, unit) in enumerate(zip(targets.names, targets.units, strict=True)):
+        error = made.mean[:, k] - truth[:, k]
+        for chosen, colour, label in ((~undone, "#1f77b4", "move executed"), (undone, "#ff7f0e", "not executed")):
+            axes[k].plot(truth[chosen, k], made.mean[chosen, k], ".", color=colour, markersize=2, label=label)
+            axes[count + k].plot(truth[chosen, k], error[chosen], ".", color=colour, markersize=2)
+        axes[k].set(title=f"{name}: MAE {np.abs(error).mean():.3g} {unit} ({labels})", ylabel=f"predicted, {unit}")
+        axes[count + k].set(xlabel=f"label, {unit}", ylabel=f"error, {unit}")
+        axes[count + k].axhline(0, color="#888888", linewidth=0.6)
+    axes[0].legend(markerscale=4)
+    figure.savefig(path, dpi=110)
+    return path

@@ -1,0 +1,109 @@
+"""A Gaussian process on the amplitudes of the pins' modes, averaged with the networks.
+
+Kernel: ``s^2 exp(-|a - b|^2 / 2) + l^2 a.b`` with one length for every mode; lengths and sizes maximise the marginal
+likelihood on some of the rows (Rasmussen and Williams 2006, eq. 5.8), the solution then uses all. What each training row
+is predicted as without itself comes in closed form (eq. 5.12).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+FIT_ROWS = 1000
+FIT_STEPS = 60
+JITTER = 1e-6
+
+
+@dataclass
+class KernelHead:
+    """One Gaussian process for each of K labels, on D inputs.
+
+    Attributes
+    ----------
+    inputs : (M, D) float64
+        Training rows.
+    lengths : (K, D) float64
+    smooth, linear, noise : (K,) float64
+        s, l and the noise's standard deviation, of standardised labels.
+    weight : (M, K) float64
+    """
+
+    inputs: torch.Tensor
+    lengths: torch.Tensor
+    smooth: torch.Tensor
+    linear: torch.Tensor
+    noise: torch.Tensor
+    weight: torch.Tensor
+
+    def __post_init__(self) -> None:
+        self._scaled = [self.inputs / lengths for lengths in self.lengths]  # once, not for every frame
+        self._halves = [0.5 * scaled.square().sum(1) for scaled in self._scaled]
+
+    def __call__(self, inputs: torch.Tensor) -> torch.Tensor:
+        """Standardised labels (B, K) for inputs (B, D)."""
+        found = []
+        for k, (scaled, half) in enumerate(zip(self._scaled, self._halves, strict=True)):
+            here = inputs.double() / self.lengths[k]
+            inner = here @ scaled.T
+            closeness = torch.exp((inner - half - 0.5 * here.square().sum(1)[:, None]).clamp(max=0))
+            found.append((self.smooth[k] ** 2 * closeness + self.linear[k] ** 2 * inner) @ self.weight[:, k])
+        return torch.stack(found, dim=1)
+
+    def arrays(self) -> dict[str, torch.Tensor]:
+        """All that makes the same again."""
+        return {key: getattr(self, key) for key in ("inputs", "lengths", "smooth", "linear", "noise", "weight")}
+
+
+def fit_kernel(inputs: torch.Tensor, labels: torch.Tensor, *, seed: int, progress=None) -> tuple[KernelHead, torch.Tensor]:
+    """Fit to inputs (M, D) and standardised labels (M, K).
+
+    Returns
+    -------
+    KernelHead
+    left_out : (M, K) float64
+        What each training row is predicted as when it is left out.
+    """
+    inputs, labels = inputs.double(), labels.double()
+    usual = inputs.std(dim=0).clamp(min=1e-9)
+    chosen = torch.randperm(len(inputs), generator=torch.Generator().manual_seed(seed))[:FIT_ROWS]
+    found, left_out = [], []
+    for k in range(labels.shape[1]):
+        lengths, sizes = _likeliest(inputs[chosen] / usual, labels[chosen, k])
+        lengths = lengths * usual
+        factor = torch.linalg.cholesky(_with_noise(_kernel(inputs / lengths, inputs / lengths, sizes[0], sizes[1]), sizes[2]))
+        weight = torch.cholesky_solve(labels[:, k : k + 1], factor)[:, 0]
+        left_out.append(labels[:, k] - weight / torch.cholesky_inverse(factor).diagonal())
+        found.append((lengths, sizes, weight))
+        if progress:
+            progress(k + 1, labels.shape[1])
+    lengths, sizes, weight = (torch.stack(part) for part in zip(*found, strict=True))
+    return KernelHead(inputs, lengths, sizes[:, 0], sizes[:, 1], sizes[:, 2], weight.T.contiguous()), torch.stack(left_out, dim=1)
+
+
+def _kernel(a: torch.Tensor, b: torch.Tensor, smooth: torch.Tensor, linear: torch.Tensor) -> torch.Tensor:
+    inner = a @ b.T
+    squared = (a.square().sum(1)[:, None] + b.square().sum(1) - 2 * inner).clamp(min=0)
+    return smooth**2 * torch.exp(-0.5 * squared) + linear**2 * inner
+
+
+def _with_noise(kernel: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+    return kernel + (noise**2 + JITTER) * torch.eye(len(kernel), dtype=kernel.dtype)
+
+
+def _likeliest(inputs: torch.Tensor, label: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lengths (D,) and (s, l, noise) of the largest marginal likelihood."""
+    count = inputs.shape[1]
+    start = [np.log(5.0)] * count + [0.0, np.log(0.3), np.log(0.05)]
+    logs = torch.tensor(start, dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.Adam([logs], lr=0.1)
+    for _ in range(FIT_STEPS):
+        optimiser.zero_grad()
+        scaled, sizes = inputs / logs[:count].exp(), logs[count:].exp()
+        factor = torch.linalg.cholesky(_with_noise(_kernel(scaled, scaled, sizes[0], sizes[1]), sizes[2]))
+        weight = torch.cholesky_solve(label[:, None], factor)[:, 0]
+        loss = 0.5 * label @ weight + factor.diagonal().log().sum()
+        loss.backward()
+        optimiser.step()
+    found = logs.detach().exp()
+    return found[:count], found[count:]

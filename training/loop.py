@@ -1,0 +1,166 @@
+"""One network's training, epoch by epoch, in a state that can be kept and taken up again."""
+
+import math
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import torch
+from torch import nn
+
+from training.networks import predict_rows
+from training.recipes import Recipe
+
+RISE_STEPS = 100  # over which the cosine schedule's rate rises to its full size
+PLATEAU_PATIENCE = 3
+SCALE_LOSS, EXECUTED_LOSS = 0.05, 0.05  # beside the labels' own
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What a network learns from.
+
+    Attributes
+    ----------
+    inputs : PinInputs, GraphInputs or ImageInputs
+    labels : (M, K) float32
+        Scaled.
+    weight : (K,) float32
+        Of each label in the loss.
+    executed : (M,) float32
+        1, 0 or NaN.
+    train, held : (m,) int64
+        Rows to learn from, and rows to watch.
+    """
+
+    inputs: object
+    labels: torch.Tensor
+    weight: torch.Tensor
+    executed: torch.Tensor
+    train: torch.Tensor
+    held: torch.Tensor
+
+
+@dataclass
+class Loop:
+    """A network in training. ``epoch()`` runs one; ``state()`` and ``load()`` keep and restore everything that matters."""
+
+    network: nn.Module
+    recipe: Recipe
+    rows: Rows
+    seed: int
+    epochs_done: int = 0
+    best: float = math.inf
+    since_best: int = 0
+    curves: list = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        recipe = self.recipe
+        parameters = list(self.network.parameters())
+        if recipe.decay:
+            self.optimiser = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
+        else:
+            self.optimiser = torch.optim.Adam(parameters, lr=recipe.rate)
+        self.generator = torch.Generator().manual_seed(self.seed)
+        self.averaged = [p.detach().clone() for p in parameters]
+        self.best_weights = {key: value.clone() for key, value in self.network.state_dict().items()}
+        self.steps_of_epoch = max(1, math.ceil(len(self.rows.train) / recipe.batch))
+        self.steps = 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether all epochs are done, or patience is at an end."""
+        return self.epochs_done >= self.recipe.epochs or bool(self.recipe.patience and self.since_best >= self.recipe.patience)
+
+    def epoch(self) -> dict:
+        """Go once through the training rows; returns the row of the learning curve."""
+        started = perf_counter()
+        self.network.train()
+        total = 0.0
+        shuffled = self.rows.train[torch.randperm(len(self.rows.train), generator=self.generator)]
+        for chosen in shuffled.split(self.recipe.batch):
+            total += self._step(chosen) * len(chosen)
+        seconds = perf_counter() - started
+        self.epochs_done += 1
+        held = self._watch()
+        rate = self.optimiser.param_groups[0]["lr"]
+        if held < self.best:
+            self.best, self.since_best = held, 0
+            self.best_weights = {key: value.clone() for key, value in self.network.state_dict().items()}
+        else:
+            self.since_best += 1
+        if self.recipe.schedule == "plateau" and self.since_best and self.since_best % (PLATEAU_PATIENCE + 1) == 0:
+            for group in self.optimiser.param_groups:
+                group["lr"] *= 0.5
+        point = {"epoch": self.epochs_done, "loss": total / len(shuffled), "held_out_error": held, "rate": rate, "seconds": seconds}
+        self.curves.append(point)
+        return point
+
+    def result(self) -> nn.Module:
+        """The network with the weights to keep: averaged, or those that were best on the held-out rows."""
+        if self.recipe.patience:
+            self.network.load_state_dict(self.best_weights)
+        elif self.recipe.average:
+            with torch.no_grad():
+                torch._foreach_copy_(list(self.network.parameters()), self.averaged)
+        return self.network.eval()
+
+    def state(self) -> dict:
+        """Everything that continuing needs."""
+        keys = ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves")
+        return {key: getattr(self, key) for key in keys} | {
+            "network": self.network.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+            "torch": torch.get_rng_state(),
+        }
+
+    def load(self, state: dict) -> None:
+        """Continue from a state."""
+        self.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"])
+        torch.set_rng_state(state["torch"])
+        for key in ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves"):
+            setattr(self, key, state[key])
+
+    def _step(self, chosen: torch.Tensor) -> float:
+        if self.recipe.schedule == "cosine":
+            along = self.steps / (self.recipe.epochs * self.steps_of_epoch)
+            for group in self.optimiser.param_groups:
+                group["lr"] = self.recipe.rate * min(1.0, (self.steps + 1) / RISE_STEPS) * 0.5 * (1 + math.cos(math.pi * along))
+        out = self.network(*self.rows.inputs.batch(chosen))
+        loss = row_loss(out, self.rows.labels[chosen], self.rows.executed[chosen], self.rows.weight, self.recipe.loss)
+        if hasattr(self.network, "penalty"):
+            loss = loss + self.network.penalty()
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.optimiser.step()
+        self.steps += 1
+        if self.recipe.average:
+            share = min(1 - self.recipe.average, 1.0) if self.steps > RISE_STEPS else 1.0
+            with torch.no_grad():
+                torch._foreach_lerp_(self.averaged, [p.detach() for p in self.network.parameters()], share)
+        return float(loss.detach())
+
+    def _watch(self) -> float:
+        """Mean absolute error of the scaled labels on the held-out rows."""
+        if not len(self.rows.held):
+            return math.nan
+        out = predict_rows(self.network, self.rows.inputs, self.rows.held, self.recipe.batch)
+        return float((out["mean"] - self.rows.labels[self.rows.held]).abs().mean())
+
+
+def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: torch.Tensor, kind: str) -> torch.Tensor:
+    """Mean over rows of the labels' weighted error; with the error's scale and the executed move where the network gives them.
+
+    The scale is that of a Laplace distribution around the mean; it does not pull at the mean.
+    """
+    error = out["mean"] - labels
+    loss = ((error.abs() if kind == "l1" else error.square()) * weight).mean()
+    if "log_scale" in out:
+        scale = out["log_scale"]
+        loss = loss + SCALE_LOSS * (error.detach().abs() * torch.exp(-scale) + scale).mean()
+    if "executed" in out and bool((known := torch.isfinite(executed)).any()):
+        cross = nn.functional.binary_cross_entropy_with_logits(out["executed"][known], executed[known])
+        loss = loss + EXECUTED_LOSS * cross
+    return loss

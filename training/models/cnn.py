@@ -1,0 +1,54 @@
+"""The convolutional baselines: PoseNet (Lepora 2020) and the paper's smaller version of it.
+
+Five convolutions 3x3 with ELU, each followed by max-pooling, then dense layers with ELU and a little dropout, on frames
+resized to 128 x 128. ``cnn-v1``: 256 filters, dense 64 and the outputs. ``cnn-v2``: 48 filters and one more dense layer.
+"""
+
+import torch
+from torch import nn
+
+INPUT_PX = 128
+DROPOUT = 0.06
+FILTERS = {"cnn-v1": 256, "cnn-v2": 48}
+DENSE = {"cnn-v1": (64,), "cnn-v2": (64, 64)}
+LAYERS = 5
+L1, L2 = 6e-4, 1e-3  # of the dense weights, as PoseNet
+
+
+class Cnn(nn.Module):
+    """See the module.
+
+    Parameters
+    ----------
+    name : {"cnn-v1", "cnn-v2"}
+    outputs : int
+    """
+
+    def __init__(self, name: str, outputs: int) -> None:
+        super().__init__()
+        self.name, self.outputs = name, outputs
+        filters = FILTERS[name]
+        layers: list[nn.Module] = []
+        for k in range(LAYERS):
+            layers += [nn.Conv2d(1 if k == 0 else filters, filters, 3), nn.ELU(), nn.MaxPool2d(2)]
+        self.convolutions = nn.Sequential(*layers)
+        with torch.no_grad():
+            width = self.convolutions(torch.zeros(1, 1, INPUT_PX, INPUT_PX)).numel()
+        dense: list[nn.Module] = [nn.Dropout(DROPOUT)]
+        for units in DENSE[name]:
+            dense += [nn.Linear(width, units), nn.ELU(), nn.Dropout(DROPOUT)]
+            width = units
+        self.dense = nn.Sequential(*dense, nn.Linear(width, outputs))
+
+    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Labels ``mean`` (B, K) from frames (B, 128, 128) uint8."""
+        return {"mean": self.dense(self.convolutions(images[:, None].float() / 255).flatten(1))}
+
+    def penalty(self) -> torch.Tensor:
+        """The regularisation of the hidden dense weights."""
+        weights = [layer.weight for layer in self.dense[:-1] if isinstance(layer, nn.Linear)]
+        return sum(L1 * w.abs().sum() + L2 * w.square().sum() for w in weights)
+
+    def configuration(self) -> dict:
+        """What builds the same network again."""
+        return {"name": self.name, "outputs": self.outputs}

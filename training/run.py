@@ -1,0 +1,236 @@
+"""Training runs: a folder with configuration, learning curves, weights, and what continuing after a kill needs.
+
+``config.json`` (resolved: model, recipe, sensor, pipeline, labels, rows), ``curves.csv``, ``checkpoint.pt`` while the run
+goes on, ``weights.pt`` when it is done. Every file is written whole or not at all.
+"""
+
+import csv
+import io
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+import torch
+
+from training.assemble import calibrate, prepared_inputs
+from training.dataset import Dataset, split_rows
+from training.loop import Loop, Rows
+from training.networks import build_network, parameter_count
+from training.recipes import Recipe, TrainingError, as_dict
+from twin.preprocess.forms import blob_spec
+
+FOLDS = 10  # each network of an ensemble watches another tenth of the training rows
+KEEP_EVERY_S = 20.0
+EXTRA_WEIGHT = 0.3  # of labels that only help the others
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What a run is told.
+
+    Attributes
+    ----------
+    model : str
+    recipe : Recipe
+    labels : {"corrected", "raw"}
+    seed : int
+        Of weights and order; also shifts which fold is watched.
+    split : int or None
+        Seed of the validation fifth that is kept out of training; None trains on all rows.
+    helpers : tuple of str
+        Further label columns that are learnt beside the data set's own, with less weight.
+    size : dict
+        Fields of ``VgnnSize``.
+    """
+
+    model: str
+    recipe: Recipe
+    labels: str = "corrected"
+    seed: int = 0
+    split: int | None = 0
+    helpers: tuple = ()
+    size: dict = field(default_factory=dict)
+
+
+def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float | None = None, progress: Callable | None = None) -> bool:
+    """Train, or continue what ``out`` holds.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with (epochs done, epochs in all, the curve's last row) over all networks.
+    max_minutes : float, optional
+        Stop at the end of an epoch after that long; what is there by then is assembled all the same.
+
+    Returns
+    -------
+    bool
+        Whether training came to its end.
+
+    Raises
+    ------
+    TrainingError
+        If ``out`` holds another run.
+    """
+    started = monotonic()
+    out.mkdir(parents=True, exist_ok=True)
+    train, _ = (np.arange(len(data)), None) if config.split is None else split_rows(len(data), config.split)
+    resolved = resolve(config, data, train)
+    state = _opened(out, resolved)
+    inputs, aside = prepared_inputs(config.model, data, train)
+    scaled, shift, scale = scaled_labels(data, config, train)
+    done: list = state["done"] if state else []
+    loop = None
+    all_epochs = config.recipe.members * config.recipe.epochs
+    while len(done) < config.recipe.members:
+        member = len(done)
+        loop = _member(config, data, inputs, scaled, train, member)
+        if state and state["loop"] is not None:
+            loop.load(state["loop"])
+        state, kept = None, monotonic()
+        while not loop.finished:
+            point = loop.epoch()
+            if progress:
+                progress(member * config.recipe.epochs + point["epoch"], all_epochs, point)
+            out_of_time = max_minutes is not None and monotonic() - started > 60 * max_minutes
+            if out_of_time or monotonic() - kept > KEEP_EVERY_S:
+                _keep(out, resolved, done, loop)
+                kept = monotonic()
+            if out_of_time and not loop.finished:
+                networks = [*done, _finished(loop)]
+                _assemble(out, resolved, config, data, inputs, aside, train, networks, (shift, scale))
+                return False
+        done.append(_finished(loop))
+        _keep(out, resolved, done, None)
+    _assemble(out, resolved, config, data, inputs, aside, train, done, (shift, scale))
+    (out / "checkpoint.pt").unlink(missing_ok=True)
+    return True
+
+
+def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
+    """The whole configuration as ``config.json`` holds it."""
+    pins = data.pins
+    return {
+        "model": config.model,
+        "recipe": as_dict(config.recipe),
+        "labels": config.labels,
+        "columns": list(data.targets.names),
+        "units": list(data.targets.units),
+        "helpers": list(config.helpers),
+        "seed": config.seed,
+        "split": config.split,
+        "size": config.size,
+        "rows": {"usable": len(data), "train": len(train)},
+        "sensor": pins.sensor.model_dump(mode="json"),
+        "pipeline": {"form": str(pins.form), "graph": "voronoi", "detection": blob_spec(pins.sensor, pins.form).model_dump(mode="json")},
+        "data": str(data.folder),
+        "problems": data.problems,
+    }
+
+
+def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
+    """Labels (M, K) as the network learns them, float32, and shift and scale (K,) back to mm and deg: ``label = shift + scale x``."""
+    labels = data.targets.corrected if config.labels == "corrected" else data.targets.raw
+    known, k = labels[train], labels.shape[1]
+    if config.recipe.scaling == "standard":
+        shift, scale = known.mean(axis=0), known.std(axis=0)
+    elif config.recipe.scaling == "unit":
+        shift, scale = (known.max(axis=0) + known.min(axis=0)) / 2, np.ptp(known, axis=0) / 2
+    else:
+        shift, scale = np.zeros(k), np.ones(k)
+    scale = np.where(scale > 0, scale, 1.0)
+    return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
+
+
+def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, train: np.ndarray, member: int) -> Loop:
+    seed = 1000 * config.seed + member
+    torch.manual_seed(seed)
+    network = build_network(config.model, data.pins.reference, scaled.shape[1], config.size)
+    held, learnt = fold_rows(train, config.seed, member)
+    if hasattr(network, "prepare"):
+        network.prepare(inputs.x[torch.from_numpy(train)])
+    weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
+    executed = torch.from_numpy(data.targets.executed.astype(np.float32))
+    return Loop(network, config.recipe, Rows(inputs, scaled, weight, executed, torch.from_numpy(learnt), torch.from_numpy(held)), seed)
+
+
+def fold_rows(train: np.ndarray, seed: int, member: int) -> tuple[np.ndarray, np.ndarray]:
+    """The tenth of the training rows that a network watches, and those it learns from."""
+    shuffled = np.random.default_rng([seed, 1]).permutation(train)
+    held = shuffled[member % FOLDS :: FOLDS]
+    return np.sort(held), np.setdiff1d(train, held)
+
+
+def _finished(loop: Loop) -> dict:
+    network = loop.result()
+    return {"weights": {key: value.clone() for key, value in network.state_dict().items()}, "held": loop.rows.held, "curves": loop.curves}
+
+
+def _assemble(
+    out: Path, resolved: dict, config: RunConfig, data: Dataset, inputs, aside: dict, train, networks: list, scaling: tuple
+) -> None:
+    content = calibrate(config, data, inputs, train, networks, scaling)
+    content |= {"aside": aside, "reference_px": data.pins.reference.pins_px}
+    content["parameters"] = parameter_count(build_network(config.model, data.pins.reference, len(data.targets.names), config.size))
+    _write(out / "weights.pt", content)
+    _write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
+    _write_curves(out, [network["curves"] for network in networks])
+
+
+def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:
+    _write(out / "checkpoint.pt", {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
+    _write_curves(out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
+
+
+def _opened(out: Path, resolved: dict) -> dict | None:
+    """What an interrupted run of the same configuration left; None where there is nothing to continue."""
+    path = out / "checkpoint.pt"
+    if not path.is_file():
+        if (out / "weights.pt").is_file():
+            raise TrainingError(f"{out}: holds a finished run; give another --out")
+        _write_text(out / "config.json", json.dumps(resolved, indent=1) + "\n")
+        return None
+    state = torch.load(path, weights_only=True)
+    if state["identity"] != _identity(resolved):
+        raise TrainingError(
+            f"{out}: holds a run with other settings or data, begun and not finished; give another --out, or the same settings"
+        )
+    return state
+
+
+def _identity(resolved: dict) -> str:
+    return json.dumps({key: value for key, value in resolved.items() if key not in ("problems", "data")}, sort_keys=True)
+
+
+def _write(path: Path, content: dict) -> None:
+    part = path.with_name(f".{path.name}.part")
+    torch.save(_as_tensors(content), part)
+    os.replace(part, path)
+
+
+def _as_tensors(value):
+    """The same with arrays as tensors, which are read back without running anything that a file may hold."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value)
+    if isinstance(value, dict):
+        return {key: _as_tensors(part) for key, part in value.items()}
+    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
+
+
+def _write_text(path: Path, text: str) -> None:
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text)
+    os.replace(part, path)
+
+
+def _write_curves(out: Path, curves: list) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
+    for k, points in enumerate(curves):
+        writer.writerows([k, *point.values()] for point in points)
+    _write_text(out / "curves.csv", text.getvalue())

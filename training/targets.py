@@ -1,0 +1,155 @@
+"""Which labels a model learns: columns of a recording's table, as published and corrected.
+
+Corrected: in the published Tac-VGNN recordings the shear move had not been executed in about a third of the frames when
+the frame was taken. There both shears are zero, the angle is ``pose_6 - move_6``, and, as the plate is slightly tilted,
+the depth is ``pose_2 + c move_1``.
+"""
+
+import csv
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.recordings import Recording
+
+PRESETS = {
+    "surface-2d": ("pose_2", "pose_6"),
+    "surface-2d-shear": ("pose_2", "pose_6", "move_1", "move_6"),
+    "surface-3d": ("pose_3", "pose_4", "pose_5"),
+    "edge-2d": ("pose_1", "pose_6"),
+    "edge-3d": ("pose_1", "pose_3", "pose_6"),
+}
+UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")  # of pose_1..6 and move_1..6
+DEPTH_PER_MOVE = {"mg400-331": -0.0075, "mg400-127": 0.0151}  # c above, mm/mm; fitted to the Tac-VGNN recordings (Apache-2.0)
+EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")
+EXECUTED_COLUMNS = ("executed", "executed_estimate")
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Labels of M frames, K of them.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The table's columns.
+    raw : (M, K) float
+        As in the table: mm and deg; NaN where a cell holds no number.
+    corrected : (M, K) float
+        The same with moves that were not executed taken out; equal to ``raw`` where nothing is known.
+    executed : (M,) float
+        Whether each move had been executed: 1, 0, or NaN where that isn't known.
+    move : (M, 2) float
+        ``move_1`` (mm) and ``move_6`` (deg) as in the table; NaN without them.
+    """
+
+    names: tuple
+    raw: np.ndarray
+    corrected: np.ndarray
+    executed: np.ndarray
+    move: np.ndarray
+
+    def rows(self, index: np.ndarray) -> "Targets":
+        """The same labels of only some frames."""
+        return replace(self, **{key: getattr(self, key)[index] for key in ("raw", "corrected", "executed", "move")})
+
+    @property
+    def units(self) -> tuple:
+        """Unit of each label: mm, deg, or "" where the column's name doesn't tell."""
+        return tuple(unit_of(name) for name in self.names)
+
+
+def unit_of(name: str) -> str:
+    """Unit of a column: ``pose_1..3`` and ``move_1..3`` mm, ``..4..6`` deg; tactile_data's ``pose_x`` and ``pose_Rx`` likewise."""
+    kind, _, axis = name.partition("_")
+    if kind in ("pose", "move", "shear"):
+        if axis in "123456" and len(axis) == 1:
+            return UNITS[int(axis) - 1]
+        if axis in ("x", "y", "z"):
+            return "mm"
+        if axis in ("Rx", "Ry", "Rz"):
+            return "deg"
+    return {"force": "N", "torque": "Nmm"}.get(kind, "")
+
+
+def choose_targets(recording: Recording, spec: SensorSpec, columns: str | tuple, rows: np.ndarray, problems: list) -> Targets:
+    """Labels of the recording's frames ``rows`` (M,).
+
+    Raises
+    ------
+    FrameError
+        If the recording has no table, or a column is missing.
+    """
+    names = PRESETS.get(columns, (columns,)) if isinstance(columns, str) else tuple(columns)
+    if not recording.labels:
+        raise FrameError(f"{recording.path}: no table of labels; targets.csv with {', '.join(names)} is expected beside the frames")
+    missing = [name for name in names if name not in recording.labels]
+    if missing:
+        raise FrameError(
+            f"{recording.path}: column {', '.join(missing)} is missing; found {', '.join(recording.labels)}; "
+            f"choose columns of these, or one of {', '.join(PRESETS)}"
+        )
+    raw = np.column_stack([_numbers(recording.labels[name], name, problems) for name in names])[rows]
+    both = all(name in recording.labels for name in ("move_1", "move_6"))
+    move = np.full((len(rows), 2), np.nan)
+    if both:
+        move = np.column_stack([_numbers(recording.labels[name], name, []) for name in ("move_1", "move_6")])[rows]
+    executed = np.full(len(rows), np.nan)
+    known = read_executed(recording.path, problems) if both else {}
+    if known:
+        executed = np.array([known.get(recording.names[row], np.nan) for row in rows])
+    return Targets(names, raw, corrected(names, raw, executed, move, DEPTH_PER_MOVE.get(spec.name, 0.0)), executed, move)
+
+
+def corrected(names: tuple, raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float) -> np.ndarray:
+    """Labels (M, K) with the moves (M, 2) that were not executed taken out; an unknown ``executed`` (M,) counts as executed."""
+    undone = 1.0 - np.where(np.isnan(executed), 1.0, executed)
+    out = raw.copy()
+    for k, name in enumerate(names):
+        if name == "pose_6":
+            out[:, k] -= undone * np.nan_to_num(move[:, 1])
+        elif name == "pose_2":
+            out[:, k] += undone * depth_per_move * np.nan_to_num(move[:, 0])
+        elif name in ("move_1", "move_6"):
+            out[:, k] *= 1 - undone
+    return out
+
+
+def read_executed(folder: Path, problems: list) -> dict[str, float]:
+    """Whether each frame's move was executed, by image name, from the file that an audit left beside the table."""
+    for name in EXECUTED_FILES:
+        path = folder / name
+        if not path.is_file():
+            continue
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            column = next((c for c in EXECUTED_COLUMNS if c in (reader.fieldnames or ())), None)
+            if column is None or "image_name" not in reader.fieldnames:
+                problems.append(f"{name}: no columns image_name and {EXECUTED_COLUMNS[0]}; not used")
+                continue
+            found = {}
+            for row in reader:
+                value = _number(row[column])
+                if 0 <= value <= 1:
+                    found[row["image_name"]] = value
+            return found
+    return {}
+
+
+def _numbers(cells: np.ndarray, name: str, problems: list) -> np.ndarray:
+    """A column as floats; what is no finite number becomes NaN and is counted."""
+    values = cells if cells.dtype.kind == "f" else np.array([_number(cell) for cell in cells])
+    bad = ~np.isfinite(values)
+    if bad.any():
+        problems.append(f"column {name}: {bad.sum()} cells hold no finite number")
+    return np.where(bad, np.nan, values)
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except (TypeError, ValueError):
+        return float("nan")

@@ -1,0 +1,76 @@
+"""``twin train``: a model from a labelled recording."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.cli import app
+from twin.cli.options import FormOrAuto, Sensor
+
+HELP = """Train a model that tells the pose from a frame.
+
+\b
+vgnn              ours: Voronoi graph network on matched pins, ensemble, calibrated 90 % intervals
+tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense layers 96, 64
+tac-vgnn-release  the same with the dense layers of the published code: 128, 96
+gnn               the paper's graph network on 6 nearest neighbours, without areas
+cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters on 128 x 128 px
+
+Labels are columns of the recording's table: a preset (surface-2d: pose_2 pose_6; surface-2d-shear: also move_1 move_6;
+surface-3d: pose_3 pose_4 pose_5; edge-2d, edge-3d) or names with commas between. With --labels corrected, moves that
+were not executed are taken out, where move_executed.csv or labels_corrected.csv beside the table tells which.
+
+A random fifth of the rows is kept out of training for 'twin evaluate' (--split S: seed S; --split -1: train on all).
+
+\b
+Writes to --out: config.json (resolved, with the sensor and the pipeline's parameters), curves.csv, weights.pt, and
+while it runs checkpoint.pt: started again with the same options, a run that was ended goes on where it was.
+"""
+
+
+@app.command("train", help=HELP)
+def train(
+    model: Annotated[str, typer.Option("--model", help="vgnn, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
+    sensor: Sensor,
+    data: Annotated[Path, typer.Option("--data", metavar="DIR", help="labelled recording")],
+    out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
+    target: Annotated[str, typer.Option("--target", help="preset, or label columns with commas between")] = "surface-2d",
+    labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
+    seed: Annotated[int, typer.Option("--seed", help="of weights and order")] = 0,
+    split: Annotated[int, typer.Option("--split", help="seed of the fifth kept out of training; -1: none")] = 0,
+    epochs: Annotated[int | None, typer.Option("--epochs", help="instead of the model's own number")] = None,
+    batch: Annotated[int | None, typer.Option("--batch", help="instead of the model's own size")] = None,
+    members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
+    max_minutes: Annotated[float | None, typer.Option("--max-minutes", help="stop after the epoch that passes this time")] = None,
+    threads: Annotated[int | None, typer.Option("--threads", help="CPU threads")] = None,
+    form: FormOrAuto = None,
+) -> None:
+    import torch
+
+    from scenes import load_sensor
+    from training.dataset import load_dataset
+    from training.recipes import TrainingError, recipe_of
+    from training.run import RunConfig, train_run
+    from training.targets import PRESETS
+    from twin.cli.progress import count_bar, epoch_bar
+
+    if labels not in ("corrected", "raw"):
+        raise TrainingError(f"--labels must be corrected or raw, got {labels!r}")
+    recipe = recipe_of(model, epochs=epochs, batch=batch, members=members)
+    if threads:
+        torch.set_num_threads(threads)
+    columns = target if target in PRESETS else tuple(name.strip() for name in target.split(","))
+    with count_bar("frames") as progress:
+        found = load_dataset(data, load_sensor(sensor), columns, form=form, progress=progress)
+    for problem in found.problems:
+        print(f"note: {problem}")
+    helpers = ("move_1", "move_6") if columns == "surface-2d-shear" else ()
+    config = RunConfig(model, recipe, labels, seed, None if split < 0 else split, helpers)
+    print(f"{len(found)} usable frames; labels {', '.join(found.targets.names)} ({labels})")
+    with epoch_bar(model) as progress:
+        finished = train_run(config, found, out, max_minutes=max_minutes, progress=progress)
+    if not finished:
+        print(f"time is up: the weights so far are in {out}; the same command goes on from here")
+    for name in ("config.json", "curves.csv", "weights.pt"):
+        print(f"wrote {out / name}")

@@ -4,13 +4,13 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from scenes.object import ObjectSpec
 from twin.mechanics.path import ContactPose
 from twin.optics.files import write_exr
 from twin.preprocess.pipeline import Pipeline
+from twin.recordings.images import write_image
 from twin.simulator import Shot, Simulator
 from twin.stimulus import build_stimulus
 from twin.types import ContactState
@@ -27,8 +27,7 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
         What was written.
     """
     spec = simulator.spec
-    image = shot.frame.image
-    cv2.imwrite(str(out / "frame.png"), image if image.ndim == 2 else image[..., ::-1])
+    write_image(out / "frame.png", shot.frame.image)
     write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
     np.savez_compressed(out / "truth.npz", **asdict(shot.truth), **contact_arrays(state))
     (out / "truth.json").write_text(json.dumps(contact_record(simulator, stimulus, pose, state, shot), indent=1) + "\n")

@@ -1,7 +1,7 @@
 """The same scene with its real interfaces, for Mitsuba's own path tracer: slow to converge, and nothing of ours but the meshes."""
 
 import numpy as np
-from plain_sensor import plain
+from plain_sensor import changed, plain
 from scipy import stats
 
 from scenes.sensor import SensorSpec
@@ -13,11 +13,6 @@ DEPTH = 24
 RR_DEPTH = 8
 BLOCK_PX = 4
 HALF_FIELD = 0.2  # tangent: the caps fill the film, the LEDs' mirror images stay outside
-
-
-def changed(spec: SensorSpec, **sections) -> SensorSpec:
-    """A copy of the specification with values changed, section by section."""
-    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
 
 
 def laboratory(size_px: int) -> SensorSpec:

@@ -23,7 +23,11 @@ SECTIONS = {
 }  # fmt: skip
 
 
+def changed(spec: SensorSpec, **sections) -> SensorSpec:
+    """A copy of the specification with values changed, section by section."""
+    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
+
+
 def plain() -> SensorSpec:
     """A specification that a new calibration of the shipped one does not change."""
-    spec = load_sensor("ur5-331")
-    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in SECTIONS.items()})
+    return changed(load_sensor("ur5-331"), **SECTIONS)

@@ -51,8 +51,8 @@ def frame(known, light):
 
 def aligned(spec, image) -> Aligned:
     rest = rest_pins(spec)
-    state = FittedPins(rest.base_mm, rest.axis, rest.cap_mm, np.zeros(len(rest.cap_mm)), np.zeros(3))
-    return Aligned("rendered.png", image, project(spec, rest.cap_mm), state)
+    state = FittedPins(rest.base_mm, rest.axis, rest.caps_mm, np.zeros(len(rest.caps_mm)), np.zeros(3))
+    return Aligned("rendered.png", image, project(spec, rest.caps_mm), state)
 
 
 def shoot(spec, frames):
@@ -98,7 +98,7 @@ def test_each_caps_reflectance_and_outline_are_recovered(known):
     printed = revised(known, appearance={"cap_levels": tuple(levels.tolist()), "cap_shapes": tuple(map(tuple, shapes.tolist()))})
     real = [aligned(printed, shoot(printed, [aligned(printed, None)])[0])]
     found = fit_caps(fit_caps(known, real, shoot), real, shoot)
-    seen = np.linalg.norm(rest_pins(known).cap_mm[:, :2], axis=1) < 10.0
+    seen = np.linalg.norm(rest_pins(known).caps_mm[:, :2], axis=1) < 10.0
     np.testing.assert_allclose(np.array(found.appearance.cap_levels)[seen], levels[seen], rtol=0.04)
     left = np.array(found.appearance.cap_shapes)[seen, :3] - shapes[seen, :3]
     assert left.std() < 0.5 * shapes[seen, :3].std()
@@ -145,7 +145,7 @@ def sharpness_of(distance):
 
 
 def test_caps_near_the_rim_are_nearer_to_the_pupil(known):
-    caps = rest_pins(known).cap_mm
+    caps = rest_pins(known).caps_mm
     assert apparent_mm(known, caps[0, 2]) > apparent_mm(known, caps[-1, 2])
     bare = revised(known, gel={"refractive_index": 1.0}, lens={"refractive_index": 1.0})
     assert apparent_mm(bare, 5.0) == pytest.approx(5.0 + known.camera.distance_mm)

@@ -65,7 +65,7 @@ def known():
     spec = revised(start, housing=HOUSING, leds=LEDS, appearance={"specks": SPECKS})
     light, cover = static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))
     rng = np.random.default_rng(5)
-    at_rest = project(spec, rest_pins(spec).cap_mm)
+    at_rest = project(spec, rest_pins(spec).caps_mm)
     images, pins = [], []
     for _ in range(FRAMES):
         pins_px = at_rest + rng.uniform(-MOVE_PX, MOVE_PX, 2)

@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 import pytest
-from plain_sensor import plain
+from plain_sensor import changed, plain
 
-from scenes.sensor import RecordingSpec, SensorSpec
+from scenes.sensor import RecordingSpec
 from twin.camera import amplified, blurred, compressed, curve, dispersed, expose, hazed, noisy, record, sharpened, vignetted
 from twin.errors import FrameError
 
@@ -27,11 +27,6 @@ FULL = {
     "response": {"exposure": 0.8, "white_balance": (1.2, 1.0, 0.9), "gamma": 2.2, "blur_sigma_px": 0.6, "sharpening": 0.5},
 }
 SECTIONS = [(section, key, value) for section, values in FULL.items() for key, value in values.items() if key != "haze_sigma_px"]
-
-
-def changed(spec: SensorSpec, **sections) -> SensorSpec:
-    """A copy of the specification with values changed, section by section."""
-    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
 
 
 PLAIN = changed(plain(), **NEUTRAL)

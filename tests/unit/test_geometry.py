@@ -248,7 +248,7 @@ def test_pins_at_rest_are_the_specification_s(name, focus):
     solid = build_solid(spec, resolution=Resolution(across=16), focus=focus)
     pins = rest_pins(spec)
     base, axis, caps = pin_pose(solid, solid.control_mm)
-    for got, wanted in ((base, pins.base_mm), (axis, pins.axis), (caps, pins.cap_mm)):
+    for got, wanted in ((base, pins.base_mm), (axis, pins.axis), (caps, pins.caps_mm)):
         assert np.abs(got - wanted).max() < ROUNDING_MM
 
 

@@ -2,18 +2,13 @@
 
 import numpy as np
 import pytest
-from plain_sensor import plain
+from plain_sensor import changed, plain
 
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
 from twin.optics.render import Renderer
 from twin.projection import project
-
-
-def changed(spec: SensorSpec, **sections) -> SensorSpec:
-    """A copy of the specification with values changed, section by section."""
-    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +44,7 @@ def centroids(image: np.ndarray, near_px: np.ndarray) -> np.ndarray:
 
 def cap_light(image: np.ndarray, spec: SensorSpec, rest: PinRest) -> np.ndarray:
     """Mean light of each cap (N,), over 5 x 5 px at its projection."""
-    places = np.rint(project(spec, rest.cap_mm)).astype(int)
+    places = np.rint(project(spec, rest.caps_mm)).astype(int)
     return np.array([image[v - 2 : v + 3, u - 2 : u + 3].mean() for u, v in places])
 
 
@@ -57,7 +52,7 @@ def projected_caps(spec: SensorSpec) -> np.ndarray:
     """Centroids (N, 2) of the outlines of the projected cap discs (polygon area formula)."""
     rest, turn = rest_pins(spec), np.linspace(0, 2 * np.pi, 73)[:, None]
     found = []
-    for centre, axis in zip(rest.cap_mm, rest.axis, strict=True):
+    for centre, axis in zip(rest.caps_mm, rest.axis, strict=True):
         u = np.cross(axis, [0.3, 0.9, 0.1])
         u /= np.linalg.norm(u)
         rim = centre + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
@@ -77,7 +72,7 @@ def test_a_rendered_cap_is_where_the_projection_says(small, variant, tolerance_p
     assert np.sqrt(((found - expected) ** 2).sum(axis=1).mean()) < tolerance_px
     assert np.abs((found - expected).mean(axis=0)).max() < tolerance_px / 2, "a systematic shift"
     shape_px = 0.2  # perspective and distortion move the centroid of a disc this little off its projected centre
-    assert np.abs(expected - project(even, rest_pins(even).cap_mm)).max() < shape_px
+    assert np.abs(expected - project(even, rest_pins(even).caps_mm)).max() < shape_px
 
 
 def test_a_window_is_a_part_of_the_whole_frame(small):
@@ -147,7 +142,7 @@ def test_variance_falls_at_least_as_one_over_samples(small):
 def test_moving_the_vertices_equals_building_anew(small):
     rest = rest_pins(small)
     shift = np.array([0.4, -0.3, -0.8]) * (rest.base_mm[:, 2:] / 19.0) ** 4
-    pressed = PinRest(rest.base_mm + shift, rest.axis, rest.cap_mm + shift)
+    pressed = PinRest(rest.base_mm + shift, rest.axis, rest.caps_mm + shift)
     moved = Renderer(small, spp=4)
     at_rest = moved.render(seed=4)
     after, built, back = moved.render(pressed, seed=4), Renderer(small, spp=4).render(pressed, seed=4), moved.render(seed=4)
@@ -175,4 +170,4 @@ def test_what_cannot_be_rendered_is_refused(small):
         Renderer(small, window_px=(0, 0, 121, 100))
     rest = rest_pins(small)
     with pytest.raises(RenderError, match="19"):
-        Renderer(small, spp=1).render(PinRest(rest.base_mm[:5], rest.axis[:5], rest.cap_mm[:5]))
+        Renderer(small, spp=1).render(PinRest(rest.base_mm[:5], rest.axis[:5], rest.caps_mm[:5]))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from plain_sensor import plain
+from plain_sensor import changed, plain
 
 from scenes.sensor import SensorSpec, SpeckSpec
 from twin.optics.lights import led_patches
@@ -12,11 +12,6 @@ from twin.projection import project
 WINDOW = (50, 20, 255, 225)
 HALF = {"width_px": 320, "height_px": 240, "fx_px": 245.0, "fy_px": 245.0, "cx_px": 152.0, "cy_px": 124.0}
 SPOT_PX = 0.05  # centroid of a glint of many pixels, each sampled ACROSS times each way
-
-
-def changed(spec: SensorSpec, **sections) -> SensorSpec:
-    """A copy of the specification with values changed, section by section."""
-    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
 
 
 @pytest.fixture(scope="module")

@@ -19,14 +19,14 @@ def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 def test_caps_are_closed_discs_about_their_centres(sensor):
     sensor = sensor.model_copy(update={"appearance": sensor.appearance.model_copy(update={"cap_shapes": ()})})
     rest, pins = rest_pins(sensor), sensor.pins
-    surface = caps(sensor, rest.cap_mm, rest.axis)
+    surface = caps(sensor, rest.caps_mm, rest.axis)
     disc_mm3 = pins.count * np.pi * (pins.cap_diameter_mm / 2) ** 2 * pins.cap_height_mm
     bevel = 0.05  # relative; the outline has the disc's area
     assert volume(surface.vertices_mm, surface.faces) == pytest.approx(disc_mm3, rel=bevel)
     each = surface.vertices_mm.reshape(pins.count, -1, 3)
-    height = np.einsum("nvk,nk->nv", each - rest.cap_mm[:, None], rest.axis)
+    height = np.einsum("nvk,nk->nv", each - rest.caps_mm[:, None], rest.axis)
     np.testing.assert_allclose([height.min(), height.max()], [-pins.cap_height_mm / 2, pins.cap_height_mm / 2], atol=1e-9)
-    across = np.linalg.norm(each - rest.cap_mm[:, None] - height[..., None] * rest.axis[:, None], axis=2)
+    across = np.linalg.norm(each - rest.caps_mm[:, None] - height[..., None] * rest.axis[:, None], axis=2)
     corner = 0.015  # relative: the outline of 16 corners has the disc's area
     np.testing.assert_allclose(across.max(axis=1), pins.cap_diameter_mm / 2, rtol=corner)
 

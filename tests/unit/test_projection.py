@@ -11,7 +11,7 @@ ROUND_TRIP_MM = 1e-9
 
 
 def test_projection_and_rays_are_inverse(sensor):
-    caps = rest_pins(sensor).cap_mm
+    caps = rest_pins(sensor).caps_mm
     place, direction = pixel_rays(sensor, project(sensor, caps))
     along = (caps[:, 2:] - place[:, 2:]) / direction[:, 2:]
     assert np.abs(place + along * direction - caps).max() < ROUND_TRIP_MM
@@ -34,7 +34,7 @@ def test_rays_obey_snell_at_both_faces_of_the_window(sensor):
 
 def test_the_way_through_the_window_takes_least_time(sensor):
     """Fermat: moving the points of entry does not shorten the optical path from pupil to cap."""
-    caps = rest_pins(sensor).cap_mm[::7]
+    caps = rest_pins(sensor).caps_mm[::7]
     pupil = np.array([0.0, 0.0, -sensor.camera.distance_mm])
     front, direction = pixel_rays(sensor, project(sensor, caps))
     within = direction[:, :2] * sensor.gel.refractive_index / sensor.lens.refractive_index
@@ -88,5 +88,5 @@ def test_caps_hang_inside_the_skin_along_its_normal(sensor):
     pins = rest_pins(sensor)
     assert np.allclose(np.linalg.norm(pins.axis, axis=1), 1)
     assert np.allclose(np.linalg.norm(pins.base_mm, axis=1), sensor.skin.outer_radius_mm - sensor.skin.thickness_mm)
-    reach = np.linalg.norm(pins.cap_mm - pins.base_mm, axis=1)
+    reach = np.linalg.norm(pins.caps_mm - pins.base_mm, axis=1)
     assert np.allclose(reach, sensor.pins.length_mm + sensor.pins.cap_height_mm / 2)

@@ -36,8 +36,8 @@ def states(straight):
     return {name: solver.press(load_object("plane"), pose) for name, pose in POSES.items()}
 
 
-def seen_centroids(spec, cap_mm, axis):
-    return project(spec, cap_mm) + centroid_offset_px(spec, cap_mm, axis)
+def seen_centroids(spec, caps_mm, axis):
+    return project(spec, caps_mm) + centroid_offset_px(spec, caps_mm, axis)
 
 
 def axis_error_deg(found, true):
@@ -46,9 +46,9 @@ def axis_error_deg(found, true):
 
 def test_no_contact_is_found_as_no_contact(straight, fit):
     rest = rest_pins(straight)
-    found = fit(seen_centroids(straight, rest.cap_mm, rest.axis))
+    found = fit(seen_centroids(straight, rest.caps_mm, rest.axis))
     exact_mm = 1e-4  # the spline's normals differ that little from the sphere's
-    np.testing.assert_allclose(found.cap_mm, rest.cap_mm, atol=exact_mm)
+    np.testing.assert_allclose(found.caps_mm, rest.caps_mm, atol=exact_mm)
     np.testing.assert_allclose(found.axis, rest.axis, atol=exact_mm)
     assert np.linalg.norm(found.force_n) < 1e-3
 
@@ -59,12 +59,12 @@ def test_a_pressed_skin_is_recovered_from_its_pins(straight, fit, states, name):
     pressed = states[name]
     pins_px = seen_centroids(straight, pressed.caps_mm, pressed.axis)
     found = fit(pins_px)
-    assert np.abs(seen_centroids(straight, found.cap_mm, found.axis) - pins_px).max() < PIXEL_PX
-    assert np.median(np.linalg.norm(found.cap_mm - pressed.caps_mm, axis=1)) < DEPTH_MM
+    assert np.abs(seen_centroids(straight, found.caps_mm, found.axis) - pins_px).max() < PIXEL_PX
+    assert np.median(np.linalg.norm(found.caps_mm - pressed.caps_mm, axis=1)) < DEPTH_MM
     assert np.median(axis_error_deg(found.axis, pressed.axis)) < AXIS_DEG
     assert np.nanmedian(found.remainder_px) < 0.1
     length = straight.pins.length_mm + straight.pins.cap_height_mm / 2
-    np.testing.assert_allclose(found.cap_mm - found.base_mm, length * found.axis, atol=1e-9)
+    np.testing.assert_allclose(found.caps_mm - found.base_mm, length * found.axis, atol=1e-9)
 
 
 def test_rotated_pins_give_the_rotated_skin(straight, fit, states):
@@ -75,8 +75,8 @@ def test_rotated_pins_give_the_rotated_skin(straight, fit, states):
     first = [1 + 3 * ring * (ring - 1) for ring in range(1, straight.pins.rings + 1)]
     rings = [start + (np.arange(6 * (k + 1)) - (k + 1)) % (6 * (k + 1)) for k, start in enumerate(first)]
     order = np.concatenate([[0], *rings])
-    there = fit(project(straight, state.caps_mm), centroids=False).cap_mm
-    turned = fit(project(straight, (state.caps_mm @ turn.T)[order]), centroids=False).cap_mm
+    there = fit(project(straight, state.caps_mm), centroids=False).caps_mm
+    turned = fit(project(straight, (state.caps_mm @ turn.T)[order]), centroids=False).caps_mm
     grid_mm = 0.05  # the spline's square grid does not turn with the pins
     assert np.linalg.norm(turned - (there @ turn.T)[order], axis=1).mean() < grid_mm
 
@@ -88,7 +88,7 @@ def test_lost_pins_follow_the_skin(straight, fit, states):
     pins_px[lost] = np.nan
     found = fit(pins_px, centroids=False)
     assert np.isnan(found.remainder_px[lost]).all() and np.isfinite(np.delete(found.remainder_px, lost)).all()
-    missed_px = np.linalg.norm(project(straight, found.cap_mm[lost]) - project(straight, state.caps_mm[lost]), axis=1)
+    missed_px = np.linalg.norm(project(straight, found.caps_mm[lost]) - project(straight, state.caps_mm[lost]), axis=1)
     assert np.median(missed_px) < 0.2
 
 

@@ -14,7 +14,7 @@ def state_at(base, axis, caps):
 
 def rest_state(spec):
     pins = rest_pins(spec)
-    return state_at(pins.base_mm, pins.axis, pins.cap_mm)
+    return state_at(pins.base_mm, pins.axis, pins.caps_mm)
 
 
 def test_segment_distance_matches_a_fine_sampling():
@@ -36,7 +36,7 @@ def test_a_pin_between_camera_and_cap_hides_it():
     spec = load_sensor("mg400-127")
     pins = rest_pins(spec)
     eye = np.array([0.0, 0.0, -spec.camera.distance_mm])
-    base, caps = pins.base_mm.copy(), pins.cap_mm.copy()
+    base, caps = pins.base_mm.copy(), pins.caps_mm.copy()
     toward = (eye - caps[0]) / np.linalg.norm(eye - caps[0])
     caps[1] = caps[0] + 3 * toward
     base[1] = caps[1] + [0.5, 0, 0]

@@ -7,7 +7,7 @@ import numpy as np
 
 from scenes.sensor import ResponseSpec, SensorSpec
 from twin.errors import FrameError
-from twin.geometry.skin_fit import FittedPins, SkinFit
+from twin.geometry.skin_fit import FittedPins
 from twin.realism.disc import lens_disc
 from twin.realism.frames import read_real
 
@@ -52,33 +52,30 @@ def read_frames(folder: Path, spec: SensorSpec, limit: int, progress) -> list:
     return [(found.frame.name, found.frame.image, found.pins_px) for found in real.frames]
 
 
-def align(spec: SensorSpec, frames: list, progress) -> list[Aligned]:
-    """Fit the skin to every frame's pins."""
-    fit, aligned = SkinFit(spec), []
-    for done, (name, image, pins_px) in enumerate(frames):
-        aligned.append(Aligned(name, image, pins_px, fit(pins_px)))
-        progress(done + 1, len(frames))
-    return aligned
-
-
 def to_light(levels: np.ndarray, response: ResponseSpec) -> np.ndarray:
     """Light in the renderer's unit from gray levels: the response curve, white balance and exposure undone."""
     share = np.clip((np.asarray(levels, float) - response.black_level) / (255 - response.black_level), 0, 1)
-    gain = response.exposure * (np.array(response.white_balance) if np.ndim(levels) and np.shape(levels)[-1] == 3 else 1.0)
+    gain = _gain(levels, response)
     return share**response.gamma / gain
 
 
 def to_levels(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
     """Gray levels (float, not rounded) from light: the inverse of ``to_light``."""
-    gain = response.exposure * (np.array(response.white_balance) if np.ndim(light) and np.shape(light)[-1] == 3 else 1.0)
+    gain = _gain(light, response)
     return response.black_level + (255 - response.black_level) * np.clip(gain * light, 0, 1) ** (1 / response.gamma)
 
 
 def levels_slope(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
     """Derivative of ``to_levels`` by the light, finite in the dark."""
-    gain = response.exposure * (np.array(response.white_balance) if np.ndim(light) and np.shape(light)[-1] == 3 else 1.0)
+    gain = _gain(light, response)
     share = np.clip(gain * light, 1e-6, 1)
     return (255 - response.black_level) / response.gamma * share ** (1 / response.gamma - 1) * gain
+
+
+def _gain(values: np.ndarray, response: ResponseSpec):
+    """What light is multiplied by before the curve; white balance where the last axis (of 3) is colour."""
+    colour = np.ndim(values) and np.shape(values)[-1] == 3
+    return response.exposure * (np.array(response.white_balance) if colour else 1.0)
 
 
 def revised(spec: SensorSpec, **sections) -> SensorSpec:

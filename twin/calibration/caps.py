@@ -91,7 +91,7 @@ def cap_edges(spec: SensorSpec, frame: Aligned, image: np.ndarray) -> np.ndarray
     v = np.cross(u, frame.state.axis)
     turn = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
     way = np.cos(turn)[:, None, None] * u + np.sin(turn)[:, None, None] * v
-    face = frame.state.cap_mm + 0.5 * spec.pins.cap_height_mm * frame.state.axis
+    face = frame.state.caps_mm + 0.5 * spec.pins.cap_height_mm * frame.state.axis
     radius = 0.5 * spec.pins.cap_diameter_mm
     at = project(spec, face + radius * REACH[:, None, None, None] * way).astype(np.float32)  # (reach, directions, N, 2)
     gray = gray_levels(image).astype(np.float32)

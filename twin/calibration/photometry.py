@@ -15,10 +15,11 @@ from twin.calibration.aligned import SATURATED, Aligned, levels_slope, revised, 
 from twin.camera import blurred
 from twin.optics.light_model import Knobs, LightModel
 from twin.optics.render import Renderer
+from twin.realism.spots import clear_of_pins, pin_spacing_px
 
 CAP_ALBEDO = 0.8  # of the caps' brightest channel: white resin
 SKIN_SAMPLES = 250  # pixels of bare skin a frame
-SKIN_CLEARANCE = 1.8  # cap radii that bare skin keeps from the caps' centres
+SKIN_CLEARANCE = 0.6  # of the pins' spacing: bare skin is farther from every cap's middle
 DISC_SHARE = 0.9  # of the mask's radius: nearer to the rim other light comes in
 STEPS = 6
 SLOPES_EVERY = 2  # the light is nearly linear in the knobs
@@ -39,12 +40,11 @@ class Samples:
 
 @dataclass(frozen=True)
 class PhotometryFit:
-    """What was found: rms in gray levels of caps and skin, first and last, and relative sd of each knob."""
+    """What was found: rms in gray levels of caps and skin, first and last."""
 
     spec: SensorSpec
     caps_rms: tuple[float, float]
     skin_rms: tuple[float, float]
-    uncertain: dict[str, float]
 
 
 def sample_frame(spec: SensorSpec, frame: Aligned, around: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> Samples:
@@ -62,11 +62,8 @@ def sample_frame(spec: SensorSpec, frame: Aligned, around: tuple[np.ndarray, np.
     blob = spec.pipeline.raw
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     bare = np.hypot(x - blob.mask_center_px[0], y - blob.mask_center_px[1]) < DISC_SHARE * blob.mask_radius_px
-    pitch = np.median(np.sort(np.linalg.norm(caps[:, None] - caps[None], axis=2), axis=1)[:, 1])
-    covered = np.zeros(image.shape[:2], np.uint8)
-    for u, v in caps:
-        cv2.circle(covered, (int(u), int(v)), int(round(SKIN_CLEARANCE * pitch / 3)), 1, -1)
-    rows, columns = np.nonzero(bare & (covered == 0))
+    bare &= clear_of_pins(image.shape, caps, round(SKIN_CLEARANCE * pin_spacing_px(caps)))
+    rows, columns = np.nonzero(bare)
     chosen = rng.permutation(len(rows))[:SKIN_SAMPLES]
     pixels = np.concatenate([caps, np.column_stack([columns[chosen], rows[chosen]])])
     at = pixels[:, 1], pixels[:, 0]
@@ -85,11 +82,11 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> Photome
         ``progress(done, total)``.
     """
     rng = np.random.default_rng(0)
-    around = Renderer(spec, spp=1).static
-    samples = [sample_frame(spec, frame, around, rng) for frame in frames]
+    renderer = Renderer(spec)
+    samples = [sample_frame(spec, frame, renderer.static, rng) for frame in frames]
     width = spec.camera.width_px
     models = [
-        LightModel(spec, f.state, s.pixels[:, 1] * width + s.pixels[:, 0], seed)
+        LightModel(renderer, f.state, s.pixels[:, 1] * width + s.pixels[:, 0], seed)
         for seed, (f, s) in enumerate(zip(frames, samples, strict=True))
     ]
     levels, veil, caps = (np.concatenate([getattr(s, name) for s in samples]) for name in ("levels", "veil", "caps"))
@@ -97,7 +94,7 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> Photome
     channels, leds = levels.shape[1], models[0].led_count
     layout = _Layout(leds, channels)
     x = layout.start(spec, models, levels, caps & useful)
-    first, hessian = None, None
+    first = None
     for step in range(STEPS):
         light = np.concatenate([m.light(layout.knobs(x)) for m in models])
         if step % SLOPES_EVERY == 0:
@@ -117,10 +114,7 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> Photome
         rms = tuple(float(np.sqrt(np.mean(residual[part & useful] ** 2))) for part in (caps, ~caps))
         first = first or rms
         progress(step + 1, STEPS)
-    spread = np.sqrt(np.diag(np.linalg.pinv(hessian)) * np.mean(residual**2))
-    return PhotometryFit(
-        layout.applied(spec, x), (first[0], rms[0]), (first[1], rms[1]), dict(zip(layout.names, spread.tolist(), strict=True))
-    )
+    return PhotometryFit(layout.applied(spec, x), (first[0], rms[0]), (first[1], rms[1]))
 
 
 class _Layout:
@@ -128,13 +122,12 @@ class _Layout:
 
     def __init__(self, leds: int, channels: int):
         self.leds, self.channels = leds, channels
-        colours = ["red", "green", "blue"] if channels == 3 else ["gray"]
-        self.names = [*(f"led {k}" for k in range(leds)), *(f"skin {c}" for c in colours), *(f"caps {c}" for c in colours), "haze"]
+        self.count = leds + 2 * channels + 1
         self.skin, self.caps = slice(leds, leds + channels), slice(leds + channels, leds + 2 * channels)
 
     def start(self, spec: SensorSpec, models, levels: np.ndarray, caps: np.ndarray) -> np.ndarray:
         """All neutral but for the caps' light, which is scaled to the frames' medians; the skin goes with it."""
-        x = np.zeros(len(self.names))
+        x = np.zeros(self.count)
         light = np.concatenate([m.light(self.knobs(x)) for m in models])
         ratio = np.median(to_light(levels[caps], spec.response), axis=0) / np.median(light[caps], axis=0)
         x[self.caps] = x[self.skin] = np.log(ratio)
@@ -148,7 +141,7 @@ class _Layout:
 
     def jacobian(self, slopes: dict, light: np.ndarray, veil: np.ndarray, haze: float, curve: np.ndarray) -> np.ndarray:
         """Derivatives (n, channels, unknowns) of the gray levels."""
-        result = np.zeros((*light.shape, len(self.names)))
+        result = np.zeros((*light.shape, self.count))
         for k in range(self.leds):
             result[..., k] = slopes[f"led{k}"]
         for c in range(self.channels):

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-import cv2
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from scenes.sensor import SensorSpec
 from twin.calibration.run import Calibration
 from twin.realism.images import difference_picture
+from twin.recordings.images import write_image
+from twin.views.page import render_page
 
 LONGEST = 12  # numbers of a list that the page shows
 
@@ -22,15 +21,13 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
         row = {"name": frame.name}
         for kind, image in images.items():
             path = pictures / f"{Path(frame.name).stem}-{kind}.png"
-            cv2.imwrite(str(path), image if image.ndim == 2 else image[..., ::-1])
+            write_image(path, image)
             row[kind] = f"{pictures.name}/{path.name}"
         rows.append(row)
-    page = Environment(loader=PackageLoader("twin.calibration", "."), undefined=StrictUndefined, autoescape=True).get_template(
-        "page.html.j2"
-    )
     path = out / "index.html"
     path.write_text(
-        page.render(
+        render_page(
+            "twin.calibration",
             spec=found.spec,
             frames=len(rows),
             source=source,

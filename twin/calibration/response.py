@@ -12,6 +12,8 @@ from twin.camera import expose, hazed
 from twin.preprocess.forms import gray_levels
 from twin.projection import project
 from twin.realism.caps import measure_caps
+from twin.realism.radial import bin_of, equal_count_edges
+from twin.realism.spectra import NOISE_KERNEL
 
 BOUNDS = {  # name: least, largest, unit of a step
     "blur_sigma_px": (0.05, 4.0, 0.1),
@@ -28,7 +30,6 @@ EVERY = 3  # pixels that the fit looks at: one in this many, in both directions
 MOST_APERTURE_MM = 1.2  # more needs more samples a pixel than frames for learning have
 DISC_WIDTH = 0.69  # 10-90 % edge width of a uniform disc relative to its diameter
 FLAT_LEVELS = 6.0  # spread in 5 x 5 px below which a place is flat
-NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6  # sd 1 for white noise (Immerkaer 1996)
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,11 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     def with_values(values) -> SensorSpec:
         return _changed(flat, dict(zip(names, map(float, values), strict=True)))
 
-    def residual(values, spec_of=with_values):
-        shown = spec_of(values)
+    def misfit(shown: SensorSpec) -> np.ndarray:
         return np.concatenate([expose(x, shown)[u].astype(float).ravel() for x, u in zip(light, useful, strict=True)]) - real
+
+    def residual(values) -> np.ndarray:
+        return misfit(with_values(values))
 
     low, high, unit = np.array([bounds[name] for name in names]).T
     start = np.clip([_value(spec, name) for name in names], low + 1e-6, high - 1e-6)
@@ -79,7 +82,7 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
 
     fit = least_squares(residual, start, slopes, bounds=(low, high), x_scale=unit, loss="soft_l1", f_scale=10.0, max_nfev=MOST_TRIES)
     best = with_values(fit.x)
-    errors = {q: np.mean(np.abs(residual(None, lambda _, q=q: revised(best, response={"jpeg_quality": q})))) for q in QUALITIES}
+    errors = {q: np.mean(np.abs(misfit(revised(best, response={"jpeg_quality": q})))) for q in QUALITIES}
     return revised(best, response={"jpeg_quality": min(errors, key=errors.get)}, gel={"haze": spec.gel.haze})
 
 
@@ -102,13 +105,12 @@ def sharpness(spec: SensorSpec, frames: list[Aligned], rendered: list[np.ndarray
     """Edge widths of caps in real and rendered frames against their distance from the pupil as light counts it (apparent, in air)."""
     distance, real, ours = [], [], []
     for frame, image in zip(frames, rendered, strict=True):
-        distance.append(apparent_mm(spec, frame.state.cap_mm[:, 2]))
+        distance.append(apparent_mm(spec, frame.state.caps_mm[:, 2]))
         real.append(measure_caps(gray_levels(frame.image), frame.pins_px).edge_px)
-        ours.append(measure_caps(gray_levels(image), project(spec, frame.state.cap_mm)).edge_px)
+        ours.append(measure_caps(gray_levels(image), project(spec, frame.state.caps_mm)).edge_px)
     distance, real, ours = map(np.concatenate, (distance, real, ours))
     good = np.isfinite(real) & np.isfinite(ours)
-    edges = np.quantile(distance[good], np.linspace(0, 1, bins + 1))
-    which = np.clip(np.searchsorted(edges, distance, side="right") - 1, 0, bins - 1)
+    which = bin_of(distance, equal_count_edges(distance[good], bins))
     parts = [good & (which == k) for k in range(bins)]
     return Sharpness(*(np.array([np.median(values[p]) for p in parts]) for values in (distance, real, ours)))
 

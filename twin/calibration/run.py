@@ -4,12 +4,13 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.calibration.aligned import Aligned, align, read_frames, revised
+from twin.calibration.aligned import Aligned, read_frames, revised
 from twin.calibration.camera_pose import fit_camera
 from twin.calibration.caps import fit_caps
 from twin.calibration.photometry import fit_photometry
@@ -17,7 +18,7 @@ from twin.calibration.response import fit_aperture, fit_noise, fit_response, sha
 from twin.calibration.surroundings import fit_surroundings
 from twin.camera import expose
 from twin.errors import FrameError
-from twin.geometry.skin_fit import FittedPins
+from twin.geometry.skin_fit import FittedPins, SkinFit
 from twin.optics.render import Renderer
 from twin.preprocess.pipeline import Pipeline
 from twin.realism.disc import lens_disc
@@ -175,15 +176,16 @@ class _Log:
 
     def aligned(self, spec: SensorSpec, raw: list, progress) -> list[Aligned]:
         """Frames with their fitted skin, from disk where they are there."""
-        frames = []
+        fit, frames = cache(lambda: SkinFit(spec)), []
         for done, (name, image, pins_px) in enumerate(raw):
             path = self._folder / f"{Path(name).stem}.npz"
             if path.exists():
                 with np.load(path) as kept:
-                    frames.append(Aligned(name, image, pins_px, FittedPins(**kept)))
+                    state = FittedPins(**kept)
             else:
-                frames += align(spec, [(name, image, pins_px)], lambda *_: None)
-                _write(path, lambda file, state=frames[-1].state: np.savez(file, **vars(state)))
+                state = fit()(pins_px)
+                _write(path, lambda file, state=state: np.savez(file, **vars(state)))
+            frames.append(Aligned(name, image, pins_px, state))
             progress(done + 1, len(raw))
         return frames
 

@@ -21,7 +21,7 @@ from twin.optics.static_layer import housing_light, reflections
 from twin.preprocess.forms import gray_levels
 from twin.projection import pixel_rays
 from twin.realism.disc import lens_disc, round_disc
-from twin.realism.spots import clear_of_pins
+from twin.realism.spots import clear_of_pins, pin_spacing_px
 
 MOST_BINARY = 0.6  # share of pixels at exactly 0 or 255 above which frames are thresholded (raw ones saturate on the ring only)
 MOST_FRAMES = 40  # evenly chosen: more do not make the median better
@@ -271,7 +271,7 @@ def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
 def fit_specks(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.ndarray) -> SensorSpec:
     """Bright spots (k) that stay put on the window while pins pass behind them; the most significant ``MOST_SPECKS``."""
     gray = np.array([gray_levels(image) for image in images])
-    spacing = _spacing(pins_px)
+    spacing = pin_spacing_px(pins_px[0])
     clear = np.array([clear_of_pins(gray.shape[1:], pins, PIN_SHARE * spacing) for pins in pins_px])
     size = gray.shape[:0:-1]
     y, x = np.mgrid[: size[1], : size[0]]
@@ -417,13 +417,6 @@ def _robust(residual: Callable, start: np.ndarray, low: np.ndarray, high: np.nda
         ftol=1e-5,
     )
     return low + fit.x * span
-
-
-def _spacing(pins_px: np.ndarray) -> float:
-    """Median distance of a pin (M, N, 2) from its nearest neighbour, px."""
-    pins = pins_px[0][np.isfinite(pins_px[0]).all(axis=1)]
-    apart = np.linalg.norm(pins[:, None] - pins, axis=2)
-    return float(np.median(np.sort(apart, axis=1)[:, 1]))
 
 
 def _circle(points: np.ndarray, start: list[float], scale: float) -> list[float]:

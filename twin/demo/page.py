@@ -3,23 +3,16 @@
 import base64
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from twin.demo.stages import ContactResult
+from twin.recordings.images import write_image
 from twin.types import Form
 from twin.views.panel import Look, area_change_at
 from twin.views.plots import area_surface_figure, draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins, new_figure
 
 DPI = 110
-
-
-def write_image(path: Path, image: np.ndarray) -> Path:
-    """Write a gray or RGB frame as PNG."""
-    cv2.imwrite(str(path), image if image.ndim == 2 else image[..., ::-1])
-    return path
 
 
 def write_figure(path: Path, figure: Figure) -> Path:
@@ -75,9 +68,3 @@ def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple
 def embed(path: Path) -> str:
     """A picture as a data URI."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
-
-
-def render_page(**content) -> str:
-    """The page as HTML; every name the template uses must be given."""
-    environment = Environment(loader=PackageLoader("twin.demo", "."), undefined=StrictUndefined, autoescape=True)
-    return environment.get_template("page.html.j2").render(**content)

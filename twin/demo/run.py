@@ -8,13 +8,14 @@ from time import perf_counter
 import numpy as np
 
 from scenes import load_object, load_sensor
-from twin.demo.page import contact_figures, contact_pictures, embed, motion_figure, render_page, write_figure
+from twin.demo.page import contact_figures, contact_pictures, embed, motion_figure, write_figure
 from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, depth_table, run_contact
 from twin.preprocess.forms import from_raw
 from twin.projection import project
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
 from twin.types import Form
+from twin.views.page import render_page
 from twin.views.skin3d import draw_contact_skin
 
 
@@ -73,6 +74,7 @@ def run_demo(out: Path, bar) -> list[Path]:
     page = out / "index.html"
     page.write_text(
         render_page(
+            "twin.demo",
             machine=machine,
             contacts=contacts,
             motions=embed(motions),

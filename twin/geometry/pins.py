@@ -17,13 +17,13 @@ class PinRest:
         Foot of each pin, on the inside of the skin.
     axis : (N, 3) float
         Unit vector from the foot to the cap (inwards, towards the camera).
-    cap_mm : (N, 3) float
+    caps_mm : (N, 3) float
         Centre of the cap's solid (mid-height), ``base + (length + cap_height / 2) axis``.
     """
 
     base_mm: np.ndarray
     axis: np.ndarray
-    cap_mm: np.ndarray
+    caps_mm: np.ndarray
 
 
 def pin_lattice(layout: str, rings: int) -> np.ndarray:

@@ -60,7 +60,7 @@ class FittedPins:
 
     Attributes
     ----------
-    base_mm, axis, cap_mm : (N, 3) float
+    base_mm, axis, caps_mm : (N, 3) float
         As ``PinRest``.
     remainder_px : (N,) float
         By how much the smooth skin misses each pin in the image; NaN for lost pins.
@@ -70,7 +70,7 @@ class FittedPins:
 
     base_mm: np.ndarray
     axis: np.ndarray
-    cap_mm: np.ndarray
+    caps_mm: np.ndarray
     remainder_px: np.ndarray
     force_n: np.ndarray
 
@@ -86,13 +86,13 @@ def fit_skin(spec: SensorSpec, pins_px: np.ndarray, *, prior: Prior | None = Non
     return SkinFit(spec, prior=prior)(pins_px, centroids=centroids)
 
 
-def centroid_offset_px(spec: SensorSpec, cap_mm: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def centroid_offset_px(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """(N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
     turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS + 1)[:, None, None]
     u = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    rim = cap_mm + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
-    p = project(spec, rim) - project(spec, cap_mm)
+    rim = caps_mm + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
+    p = project(spec, rim) - project(spec, caps_mm)
     twice = p[:-1, :, 0] * p[1:, :, 1] - p[1:, :, 0] * p[:-1, :, 1]
     return ((p[:-1] + p[1:]) * twice[..., None]).sum(axis=0) / (3 * twice.sum(axis=0))[:, None]
 

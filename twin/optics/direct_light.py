@@ -5,10 +5,12 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.optics.lights import lights
+from twin.optics.window import NEWTON_STEPS, fresnel
 
 RING_PLACES = 24  # that stand for an annulus
-NEWTON_STEPS = 5  # from the paraxial start; the sixth changes a direction by less than 1e-5
 ON_AXIS_MM = 1e-4  # closer to the light's vertical than this, a way is straight
+
+_reflectance = numba.njit(cache=True, error_model="numpy")(fresnel)
 
 
 class DirectLight:
@@ -111,11 +113,3 @@ def _way(point, place, window):
     through = (1 - outer) * (1 - inner) / (1 - outer * inner)
     bend = sin_gel / rho if rho > ON_AXIS_MM else 0.0
     return across_x * bend, across_y * bend, -cos_gel, gel / cos_gel, solid * through
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _reflectance(index, cos_here, cos_there):
-    """Unpolarised, of a face with n_here / n_there = ``index`` (Fresnel)."""
-    s = (index * cos_here - cos_there) / (index * cos_here + cos_there)
-    p = (cos_here - index * cos_there) / (cos_here + index * cos_there)
-    return 0.5 * (s * s + p * p)

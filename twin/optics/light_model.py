@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
 from twin.errors import RenderError
-from twin.optics.render import GelView, Renderer
+from twin.optics.render import BOUNCES, GelView, Renderer
 from twin.optics.tracer import spectrum
-from twin.optics.variant import choose_variant, use_variant
+from twin.optics.variant import use_variant
 
 SAMPLES = 32  # per pixel
 
@@ -43,8 +42,8 @@ class LightModel:
 
     Parameters
     ----------
-    spec : SensorSpec
-        The start; its camera must be a colour or mono one with a variant that differentiates.
+    renderer : Renderer
+        Of the specification where the fit starts, the whole frame, with a variant that differentiates.
     state : object
         As ``Renderer.render`` takes it.
     pixels : (n,) int
@@ -57,19 +56,16 @@ class LightModel:
         Where only the scalar variant works.
     """
 
-    def __init__(self, spec: SensorSpec, state, pixels: np.ndarray, seed: int):
-        choice = choose_variant(spec.camera.channels)
-        if choice.backend == "scalar":
+    def __init__(self, renderer: Renderer, state, pixels: np.ndarray, seed: int):
+        if renderer.choice.backend == "scalar":
             raise RenderError(
                 "calibration differentiates the renderer, which the scalar variant can't: run 'twin doctor' for what is missing"
             )
         import drjit as dr
 
-        self._mi, self._dr, self._seed = use_variant(choice), dr, seed
+        self._mi, self._dr, self._seed = use_variant(renderer.choice), dr, seed
         mi = self._mi
-        renderer = Renderer(spec, choice, spp=1)
-        camera = spec.camera
-        self._view = GelView(mi, spec, (0, 0, camera.width_px, camera.height_px), renderer.surfaces(state), bounces=2)
+        self._view = GelView(mi, renderer.spec, renderer.window_px, renderer.surfaces(state), BOUNCES)
         self._pixels = mi.UInt32(np.asarray(pixels, np.uint32))
         emitters = self._view.tracer.emitters
         self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)

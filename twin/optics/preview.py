@@ -105,7 +105,7 @@ class Preview:
         self._belt_mm, self._faces = _belt(spec, self._rest.base_mm)
         self._belt_px = project(spec, self._belt_mm)
         self._belt_light = self._light(self._belt_mm, -_unit(self._belt_mm))
-        self._mean_light = self._cap_light(self._rest.cap_mm, self._rest.axis).mean()
+        self._mean_light = self._cap_light(self._rest.caps_mm, self._rest.axis).mean()
         look = spec.appearance
         self._albedo = np.array([look.skin_albedo]), np.array([look.pin_albedo]), cap_albedo(spec), cap_albedo(spec)
 
@@ -115,7 +115,7 @@ class Preview:
         Parameters
         ----------
         state : ContactState or PinRest, optional
-            Anything with ``base_mm``, ``axis`` and ``caps_mm`` (or ``cap_mm``), (N, 3) each. At rest by default.
+            Anything with ``base_mm``, ``axis`` and ``caps_mm``, (N, 3) each. At rest by default.
 
         Returns
         -------
@@ -177,7 +177,7 @@ class Preview:
         return self._light(places_mm, normals)
 
     def _drawing(self, state) -> _Drawing:
-        base, axis, caps = state.base_mm, state.axis, state.caps_mm if hasattr(state, "caps_mm") else state.cap_mm
+        base, axis, caps = state.base_mm, state.axis, state.caps_mm
         if base.shape != self._rest.base_mm.shape:
             raise RenderError(f"the state has {len(base)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
         pupil = np.array([0.0, 0.0, -self.spec.camera.distance_mm])

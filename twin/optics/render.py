@@ -11,7 +11,7 @@ from twin.geometry.pins import rest_pins
 from twin.optics.camera_rays import CameraRays
 from twin.optics.sampling import PixelSamples
 from twin.optics.scalar import ScalarView
-from twin.optics.scene import build_scene
+from twin.optics.scene import build_scene, move_meshes
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import SkinSurface, Surface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
@@ -87,7 +87,7 @@ class Renderer:
         Parameters
         ----------
         state : ContactState or PinRest, optional
-            Anything with ``base_mm``, ``axis`` and ``caps_mm`` (or ``cap_mm``), (N, 3) each, and, where the renderer
+            Anything with ``base_mm``, ``axis`` and ``caps_mm``, (N, 3) each, and, where the renderer
             has a mesh, ``nodes_mm``. At rest by default.
         seed : int
             The same seed gives the same image.
@@ -116,7 +116,6 @@ class Renderer:
 
     def surfaces(self, state) -> dict[str, Surface]:
         """Skin, stems and caps of a state, by the names of the scene's meshes."""
-        cap_mm = state.caps_mm if hasattr(state, "caps_mm") else state.cap_mm
         if state.base_mm.shape != self._rest.base_mm.shape:
             raise RenderError(f"the state has {len(state.base_mm)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
         nodes = getattr(state, "nodes_mm", None)
@@ -124,7 +123,7 @@ class Renderer:
         return {
             "skin": Surface(self._skin.vertices(control), self._skin.faces),
             "stems": stems(self.spec, state.base_mm, state.axis),
-            "caps": caps(self.spec, cap_mm, state.axis),
+            "caps": caps(self.spec, state.caps_mm, state.axis),
         }
 
 
@@ -153,9 +152,7 @@ class GelView:
 
     def move(self, surfaces: dict[str, Surface]) -> None:
         """Move the meshes' vertices."""
-        for name, surface in surfaces.items():
-            self.params[f"{name}.vertex_positions"] = np.ascontiguousarray(surface.vertices_mm, np.float32).ravel()
-        self.params.update()
+        move_meshes(self.params, surfaces)
 
     def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state=None) -> np.ndarray:
         """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row."""

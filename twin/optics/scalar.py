@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from scenes.sensor import SensorSpec
 from twin.geometry.pins import rest_pins
 from twin.optics.lights import Patch, lights
-from twin.optics.scene import build_pinhole_camera, build_scene, mesh
+from twin.optics.scene import build_pinhole_camera, build_scene, mesh, move_meshes
 from twin.optics.surfaces import Surface
 from twin.projection import pixel_rays, project, window_tangent
 
@@ -29,18 +29,16 @@ class ScalarView:
         integrator = {"type": "path", "max_depth": bounces + 2, "rr_depth": 100}
         self._scene = build_scene(mi, spec, **surfaces, extra=emitters | {"integrator": integrator})
         self._params = mi.traverse(self._scene)
-        place, direction = pixel_rays(spec, project(spec, rest_pins(spec).cap_mm))
+        place, direction = pixel_rays(spec, project(spec, rest_pins(spec).caps_mm))
         self._eye_mm = np.array([0.0, 0.0, nearest_point(place, direction)[2]])
-        across = rest_pins(spec).cap_mm - self._eye_mm
+        across = rest_pins(spec).caps_mm - self._eye_mm
         self._half_field = 1.25 * float(np.abs(across[:, :2] / across[:, 2:]).max())
-        pitch_px = np.ptp(project(spec, rest_pins(spec).cap_mm), axis=0).max()
+        pitch_px = np.ptp(project(spec, rest_pins(spec).caps_mm), axis=0).max()
         self._size = int(OVERSAMPLING * 1.25 * pitch_px)
 
     def move(self, surfaces: dict[str, Surface]) -> None:
         """Move the meshes' vertices."""
-        for name, surface in surfaces.items():
-            self._params[f"{name}.vertex_positions"] = np.ascontiguousarray(surface.vertices_mm, np.float32).ravel()
-        self._params.update()
+        move_meshes(self._params, surfaces)
 
     def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state) -> np.ndarray:
         """Mean light (n, channels) of the given pixels (n,) of the window, numbered row by row."""
@@ -54,7 +52,7 @@ class ScalarView:
 
     def _places(self, state) -> np.ndarray:
         """Where in the ideal image each pixel of the window looks (H W, 2): along its ray to the depth of the caps about it."""
-        caps_mm = state.caps_mm if hasattr(state, "caps_mm") else state.cap_mm
+        caps_mm = state.caps_mm
         x0, y0, x1, y1 = self._window_px
         coarse = [np.arange(lo, hi + COARSE, COARSE) for lo, hi in ((x0, x1), (y0, y1))]
         grid = np.stack(np.meshgrid(*coarse), axis=-1)
@@ -80,9 +78,9 @@ def _refined(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _apparent_lights(mi, spec: SensorSpec) -> dict:
-    """One emitter that holds every LED at the point in the gel from which its light seems to come, as bright there."""
-    caps_mm = rest_pins(spec).cap_mm
-    vertices, faces, made = [], [], {}
+    """An emitter for every LED, at the point in the gel from which its light seems to come, as bright there."""
+    caps_mm = rest_pins(spec).caps_mm
+    made, unseen = {}, mi.load_dict({"type": "null"})
     for k, patch in enumerate(p for p in lights(spec) if p.half_mm.any()):
         place, direction, gain = _seen_from(spec, patch, caps_mm)
         middle = nearest_point(place, direction)
@@ -92,9 +90,8 @@ def _apparent_lights(mi, spec: SensorSpec) -> dict:
         dist2 = np.sum(away**2, axis=1)
         flat = away[:, 2] / np.sqrt(dist2) / dist2  # solid angle per area of the square in the gel
         radiance = patch.radiance * float(np.median(gain / np.maximum(flat, 1e-9)))
-        vertices, faces = corners, np.array([[0, 1, 2], [0, 2, 3]])
         emitter = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": [float(c) for c in radiance]}})
-        made[f"led{k}"] = mesh(mi, f"led{k}", Surface(vertices, faces), mi.load_dict({"type": "null"}), smooth=False, emitter=emitter)
+        made[f"led{k}"] = mesh(mi, f"led{k}", Surface(corners, np.array([[0, 1, 2], [0, 2, 3]])), unseen, smooth=False, emitter=emitter)
     return made
 
 

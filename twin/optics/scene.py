@@ -77,6 +77,13 @@ def mesh(mi, name: str, surface: Surface, bsdf, *, smooth: bool, emitter=None):
     return made
 
 
+def move_meshes(params, surfaces: dict[str, Surface]) -> None:
+    """Move the vertices of a scene's meshes, given its traversed parameters and surfaces by the meshes' ids."""
+    for name, surface in surfaces.items():
+        params[f"{name}.vertex_positions"] = np.ascontiguousarray(surface.vertices_mm, np.float32).ravel()
+    params.update()
+
+
 def _rubber(mi, reflectance: dict, gloss: float, roughness: float, gel_index: float) -> object:
     """Matt, with a rough specular lobe of weight ``gloss`` where it meets the gel."""
     if gloss == 0:

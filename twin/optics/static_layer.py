@@ -9,6 +9,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.optics.lens import ray_table, subpixel_rays
 from twin.optics.lights import led_patches, lights
+from twin.optics.window import fresnel
 from twin.projection import sensor_to_camera
 
 ACROSS = 4  # places in a pixel, each way, where its corners differ
@@ -77,8 +78,8 @@ def reflections(spec: SensorSpec, tangents: np.ndarray) -> np.ndarray:
     sine2 = 1 - cos_air**2
     cos_window = np.sqrt(1 - sine2 / lens.refractive_index**2)
     cos_gel = np.sqrt(np.maximum(1 - sine2 / spec.gel.refractive_index**2, 0))
-    outer = _fresnel(1 / lens.refractive_index, cos_air, cos_window)
-    inner = _fresnel(lens.refractive_index / spec.gel.refractive_index, cos_window, cos_gel)
+    outer = fresnel(1 / lens.refractive_index, cos_air, cos_window)
+    inner = fresnel(lens.refractive_index / spec.gel.refractive_index, cos_window, cos_gel)
     from_front = (1 - outer) ** 2 * inner / (1 - outer * inner)
     # tan(window) / tan(air): the detour through the window and back
     detour = 2 * lens.thickness_mm * cos_air / (lens.refractive_index * cos_window)
@@ -115,10 +116,3 @@ def _specks(spec: SensorSpec, tangents: np.ndarray) -> tuple[np.ndarray, np.ndar
         hidden = 1 - (1 - hidden) * (1 - speck.opacity * disc)
         shine = shine + (disc * speck.light)[..., None]
     return hidden, shine
-
-
-def _fresnel(index: float, cos_here: np.ndarray, cos_there: np.ndarray) -> np.ndarray:
-    """Unpolarised reflectance of a face with n_here / n_there = ``index``."""
-    s = (index * cos_here - cos_there) / (index * cos_here + cos_there)
-    p = (cos_here - index * cos_there) / (cos_here + index * cos_there)
-    return 0.5 * (s * s + p * p)

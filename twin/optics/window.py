@@ -76,7 +76,7 @@ class Window:
 
     def transmittance(self, dr, cos_air, cos_window, cos_gel):
         """Of the slab, unpolarised at each face, with the light that goes to and fro in it."""
-        outer, inner = _fresnel(1 / self.window_index, cos_air, cos_window), self._inner_face(cos_gel, cos_window)
+        outer, inner = fresnel(1 / self.window_index, cos_air, cos_window), self._inner_face(cos_gel, cos_window)
         return (1 - outer) * (1 - inner) / (1 - outer * inner)
 
     def mirror(self, dr, mi, place, direction, choice):
@@ -97,7 +97,7 @@ class Window:
         total = sine2 >= 1
         cos_air = dr.sqrt(dr.maximum(1 - sine2, 0))
         inner = self._inner_face(cos_gel, cos_window)
-        outer = dr.select(total, 1.0, _fresnel(self.window_index, cos_window, cos_air))
+        outer = dr.select(total, 1.0, fresnel(self.window_index, cos_window, cos_air))
         through = (1 - inner) ** 2 * outer / (1 - inner * outer)
         weight = inner + through
         shift = dr.select(choice * weight < inner, 0.0, 2 * (self.front - self.back) / dr.maximum(cos_window, 1e-4))
@@ -106,7 +106,7 @@ class Window:
         return moved, mi.Vector3f(direction.x, direction.y, cos_gel), weight
 
     def _inner_face(self, cos_gel, cos_window):
-        return _fresnel(self.gel_index / self.window_index, cos_gel, cos_window)
+        return fresnel(self.gel_index / self.window_index, cos_gel, cos_window)
 
 
 def _bent(dr, mi, direction, ratio: float):
@@ -123,8 +123,8 @@ def _reach(dr, layers, u):
     return reach, slope
 
 
-def _fresnel(index: float, cos_here, cos_there):
-    """Unpolarised reflectance of a face with n_here / n_there = ``index``."""
+def fresnel(index: float, cos_here, cos_there):
+    """Unpolarised reflectance of a face with n_here / n_there = ``index``, for numbers or arrays of any kind."""
     s = (index * cos_here - cos_there) / (index * cos_here + cos_there)
     p = (cos_here - index * cos_there) / (cos_here + index * cos_there)
     return 0.5 * (s * s + p * p)

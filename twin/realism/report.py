@@ -4,15 +4,15 @@ import csv
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from scenes.sensor import SensorSpec
 from twin.realism.compare import Pair, PoseAligned
 from twin.realism.images import difference_picture
 from twin.realism.statistics import RADIAL_MEASURES, TARGET, TARGET_MEASURES, Statistics
+from twin.recordings.images import write_image
+from twin.views.page import render_page
 
 DPI = 110
 NAMES = {
@@ -38,7 +38,7 @@ def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
         images = {"real": real, kind: pair.image, f"{kind}-difference": difference_picture(real, pair.image)}
         for key, image in images.items():
             path = folder / f"{stem}-{key}.png"
-            cv2.imwrite(str(path), image if image.ndim == 2 else image[..., ::-1])
+            write_image(path, image)
             row[key.removeprefix(f"{kind}-").replace(kind, "rendered")] = f"{folder.name}/{path.name}"
         rows.append(row)
     return rows
@@ -144,8 +144,7 @@ def write_metrics(path: Path, metrics: dict) -> Path:
 
 def write_page(path: Path, spec: SensorSpec, metrics: dict, plots: dict, pairs: list[dict], poses: list[dict], found: Statistics) -> Path:
     """index.html; pictures lie beside it."""
-    environment = Environment(loader=PackageLoader("twin.realism", "."), undefined=StrictUndefined, autoescape=True)
     content = {"spec": spec, "metrics": metrics, "plots": plots, "pairs": pairs, "poses": poses, "radial": found.radial, "names": NAMES}
-    page = environment.get_template("page.html.j2").render(**content, measures=RADIAL_MEASURES, target=TARGET, targets=TARGET_MEASURES)
+    page = render_page("twin.realism", **content, measures=RADIAL_MEASURES, target=TARGET, targets=TARGET_MEASURES)
     path.write_text(page, encoding="utf-8")
     return path

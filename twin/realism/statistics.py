@@ -8,7 +8,7 @@ from twin.realism.caps import Caps, measure_caps
 from twin.realism.disc import Disc
 from twin.realism.radial import RadialRow, equal_count_edges, radial_rows
 from twin.realism.spectra import log_distance_db, noise_sd, radial_spectrum
-from twin.realism.spots import Spots, clear_of_pins, find_spots, pair_spots, steady_spots
+from twin.realism.spots import Spots, clear_of_pins, find_spots, pair_spots, pin_spacing_px, steady_spots
 
 CLEAR_SHARE = 0.55  # of the pins' spacing: skin farther from every pin is bare
 RADIAL_MEASURES = ("level", "contrast", "skin", "diameter_px", "eccentricity", "edge_px")
@@ -79,7 +79,7 @@ class Statistics:
 def measure_frame(gray: np.ndarray, pins_px: np.ndarray, disc: Disc) -> FrameStatistics:
     """Measure a gray frame (H, W) uint8 with pins at (N, 2) px."""
     distance = disc.distance_px(pins_px)
-    spacing = _spacing_px(pins_px)
+    spacing = pin_spacing_px(pins_px)
     among = disc.distance_px(np.stack(np.meshgrid(np.arange(gray.shape[1]), np.arange(gray.shape[0])), axis=2)) < np.nanmax(distance)
     bare = clear_of_pins(gray.shape, pins_px, CLEAR_SHARE * spacing) & disc.inside & among
     frequency, power = radial_spectrum(gray, disc.center_px, disc.radius_px)
@@ -109,11 +109,3 @@ def compare_statistics(real: list[FrameStatistics], rendered: list[FrameStatisti
     names = ("skin_level", "noise_sd")
     scalars = {name: tuple(float(np.nanmean([getattr(f, name) for f in frames])) for frames in (real, rendered)) for name in names}
     return Statistics(rows, scalars, real[0].frequency, *powers, log_distance_db(*powers), *spots, pair_spots(*spots))
-
-
-def _spacing_px(pins_px: np.ndarray) -> float:
-    """Median distance of a pin to its nearest neighbour."""
-    pins = pins_px[np.isfinite(pins_px).all(axis=1)]
-    apart = np.linalg.norm(pins[:, None] - pins[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    return float(np.median(apart.min(axis=1)))

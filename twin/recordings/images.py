@@ -32,6 +32,12 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
     return np.ascontiguousarray(image), note
 
 
+def write_image(path: Path, image: np.ndarray) -> Path:
+    """Write a gray or RGB frame as PNG; the path."""
+    cv2.imwrite(str(path), image if image.ndim == 2 else image[..., ::-1])
+    return path
+
+
 def decode(path: Path) -> np.ndarray:
     """Levels of a picture as stored, (H, W) or (H, W, C) in OpenCV's channel order, uint8 or uint16.
 

@@ -1,0 +1,48 @@
+"""What a loop knows of a camera: a source of frames. Times are ``time.monotonic()`` seconds."""
+
+from typing import Protocol
+
+from twin.types import Form, Frame
+
+
+class FrameSource(Protocol):
+    """A live camera, a stream, a recording or the twin.
+
+    A background reader keeps the newest frame. ``Frame.time_s`` is when the frame was exposed as well as can be known (the
+    kernel's buffer time, else the arrival), ``Frame.sequence`` counts frames of the device, lost ones included where
+    the device tells.
+    """
+
+    name: str
+    form: Form
+    is_live: bool  # a recording waits for its reader, a live source does not
+
+    @property
+    def is_connected(self) -> bool: ...
+
+    @property
+    def dropped(self) -> int:
+        """Frames that arrived and nobody read."""
+
+    def connect(self) -> None: ...
+
+    def disconnect(self) -> None: ...
+
+    def __enter__(self) -> "FrameSource": ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def read(self, *, timeout_s: float = 1.0) -> Frame:
+        """The newest frame that has not been read yet, waiting for one if need be; ``TimeoutError``.
+
+        Raises
+        ------
+        EOFError
+            A recording is at its end.
+        """
+
+    def read_latest(self, *, max_age_s: float = 0.5) -> Frame:
+        """The newest frame, read before or not; ``StaleDataError`` if it is older than ``max_age_s``."""
+
+    def read_after(self, time_s: float, *, timeout_s: float = 2.0) -> Frame:
+        """The first frame exposed after ``time_s``; ``TimeoutError``."""

@@ -1,0 +1,1 @@
+"""Devices emulated on this machine, over real sockets and pseudo-terminals."""

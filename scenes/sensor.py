@@ -181,6 +181,27 @@ class LedRingSpec(Section):
         return self
 
 
+class RimSpec(Section):
+    """Measured light of what no formula has: glue, burrs and glare where the housing meets the window.
+
+    In the plane of the housing, about its centre, between the radii ``inner_mm`` and ``outer_mm``: ``light[j][k]`` is what is
+    added (linear red, green, blue, thousandths of saturation, may be negative) at azimuth 2 pi j / A and the k-th of evenly spaced radii,
+    linear between them.
+    """
+
+    inner_mm: Positive
+    outer_mm: Positive
+    light: Annotated[tuple[tuple[tuple[int, int, int], ...], ...], Field(min_length=3)]
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.outer_mm <= self.inner_mm:
+            raise ValueError("outer_mm must be larger than inner_mm")
+        if len({len(row) for row in self.light}) > 1 or len(self.light[0]) < 2:
+            raise ValueError("light needs the same number of radii, at least two, at every azimuth")
+        return self
+
+
 class HousingSpec(Section):
     """The bright ring and wall around the disc the camera sees, in the air.
 
@@ -189,7 +210,7 @@ class HousingSpec(Section):
     d from its place at ``glow_radius_mm``, with h the ``glow_height_mm`` and n the ``glow_exponent`` (1.5: a
     small source at height h above matt material; higher: a glossy one). Outside a lip of ``lip_width_mm``
     the wall shows only ``wall_fraction`` of this light. ``fill`` is the radiance with which the innermost
-    ``fill_width_mm`` of the ring light the gel.
+    ``fill_width_mm`` of the ring light the gel. ``rim`` is the light measured on top of all that.
     """
 
     aperture_radius_mm: Positive
@@ -207,6 +228,7 @@ class HousingSpec(Section):
     wall_fraction: Fraction = 1.0
     fill: NonNegative = 0.0
     fill_width_mm: Positive = 4.0
+    rim: RimSpec | None = None
 
     @model_validator(mode="after")
     def _check(self):
@@ -257,7 +279,8 @@ class ResponseSpec(Section):
     ``blur_sigma_px`` of the optics; ``exposure`` and ``white_balance``; ``brightness_drift``: relative sd of a gain
     drawn for each frame; noise with variance ``read_noise^2 + shot_noise * light``, light 1 being saturation;
     the curve ``black + (255 - black) light^(1 / gamma)``; ``sharpening``: weight of the unsharp mask of
-    ``sharpening_sigma_px`` that cameras apply; ``jpeg_quality`` of the stream (0: not compressed).
+    ``sharpening_sigma_px`` that cameras apply to the luma; ``chroma_sigma_px``: blur of the colour differences,
+    ``chroma_columns`` neighbours of which share one (2: a 4:2:2 stream); ``jpeg_quality`` of the stream (0: not compressed).
     """
 
     exposure: Positive
@@ -270,6 +293,8 @@ class ResponseSpec(Section):
     shot_noise: NonNegative = 6e-5
     sharpening: NonNegative = 0.0
     sharpening_sigma_px: Positive = 1.5
+    chroma_sigma_px: NonNegative = 0.0
+    chroma_columns: Literal[1, 2] = 1
     jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 0
 
 

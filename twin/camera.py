@@ -7,6 +7,7 @@ from scenes.sensor import CameraSpec, GelSpec, RecordingSpec, ResponseSpec, Sens
 from twin.errors import FrameError
 
 JPEG_BLOCK_PX = 16  # the unit of a JPEG with halved chroma
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 MEDIAN_PX = 5  # the recorder's own despeckling before its threshold
 
 
@@ -16,7 +17,7 @@ def expose(
     """What gel, lens and camera make of the light: a raw frame.
 
     Gel haze, lateral chromatic aberration, blur and vignetting act on light; then come gain, noise, the response curve,
-    sharpening of the gray levels and the stream's compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). A step whose
+    sharpening of the luma, loss of chroma and the stream's compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). A step whose
     parameter is neutral does nothing at all.
 
     Parameters
@@ -40,7 +41,7 @@ def expose(
     light = vignetted(light, spec.camera, origin_px)
     light = amplified(light, response, rng)
     light = noisy(light, response, rng)
-    gray = sharpened(curve(light, response), response)
+    gray = developed(curve(light, response), response, origin_px)
     return compressed(np.clip(np.rint(gray), 0, 255).astype(np.uint8), response.jpeg_quality, origin_px)
 
 
@@ -103,11 +104,30 @@ def curve(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
     return np.float32(response.black_level) + np.float32(255 - response.black_level) * shown
 
 
-def sharpened(gray: np.ndarray, response: ResponseSpec) -> np.ndarray:
-    """Unsharp mask: gray levels pushed away from their blurred ones."""
-    if response.sharpening == 0:
+def developed(gray: np.ndarray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Luma sharpened by an unsharp mask, colour differences blurred and shared by neighbouring columns of the full frame."""
+    colour = gray.ndim == 3 and (response.chroma_sigma_px > 0 or response.chroma_columns > 1)
+    if response.sharpening == 0 and not colour:
         return gray
-    return gray + np.float32(response.sharpening) * (gray - blurred(gray, response.sharpening_sigma_px))
+    luma = gray @ LUMA if gray.ndim == 3 else gray
+    mask = np.float32(response.sharpening) * (luma - blurred(luma, response.sharpening_sigma_px))
+    if gray.ndim == 2:
+        return gray + mask
+    chroma = gray - luma[..., None]
+    if colour:
+        chroma = shared(blurred(chroma, response.chroma_sigma_px), response.chroma_columns, origin_px[0])
+    return chroma + (luma + mask)[..., None]
+
+
+def shared(chroma: np.ndarray, columns: int, left_px: int = 0) -> np.ndarray:
+    """Chroma (H, W, 3) with the mean of every ``columns`` neighbouring columns in all of them; groups begin at the full frame's first."""
+    if columns == 1:
+        return chroma
+    group = (left_px + np.arange(chroma.shape[1])) // columns
+    starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
+    widths = np.diff(starts, append=chroma.shape[1])
+    mean = np.add.reduceat(chroma, starts, axis=1) / widths[:, None].astype(np.float32)
+    return np.repeat(mean, widths, axis=1)
 
 
 def compressed(frame: np.ndarray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:

@@ -10,7 +10,7 @@ SECTIONS = {
         "aperture_mm": 0.0, "vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0),
     },
     "leds": {"size_mm": 1.6, "power": 0.7, "balance": (), "off": (), "mirror_share": 1.0, "core_share": 0.0},
-    "housing": {"ambient": 0.8, "glow": 3.2, "center_mm": (-0.22, 0.27)},
+    "housing": {"ambient": 0.8, "glow": 3.2, "center_mm": (-0.22, 0.27), "rim": None},
     "appearance": {
         "skin_albedo": (0.0048, 0.0066, 0.023), "pin_albedo": (0.006, 0.009, 0.03), "cap_albedo": (0.2, 0.41, 0.8),
         "skin_gloss": 0.0, "cap_gloss": 0.0,
@@ -18,7 +18,7 @@ SECTIONS = {
     },
     "response": {
         "exposure": 1.0, "gamma": 2.2, "black_level": 4.0, "blur_sigma_px": 0.6, "read_noise": 2e-4, "shot_noise": 6e-5, "sharpening": 0.0,
-        "sharpening_sigma_px": 1.5, "jpeg_quality": 0,
+        "sharpening_sigma_px": 1.5, "chroma_sigma_px": 0.0, "chroma_columns": 1, "jpeg_quality": 0,
     },
 }  # fmt: skip
 

@@ -6,7 +6,7 @@ import pytest
 from plain_sensor import changed, plain
 
 from scenes.sensor import RecordingSpec
-from twin.camera import amplified, blurred, compressed, curve, dispersed, expose, hazed, noisy, record, sharpened, vignetted
+from twin.camera import amplified, blurred, compressed, curve, developed, dispersed, expose, hazed, noisy, record, shared, vignetted
 from twin.errors import FrameError
 
 RECORDING = RecordingSpec(crop_px=(20, 10, 140, 110), width_px=120, height_px=100, threshold_block_px=61, threshold_offset=-5.0)
@@ -18,13 +18,22 @@ NEUTRAL = {
     },
     "response": {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "gamma": 1.0, "black_level": 0.0, "blur_sigma_px": 0.0,
-        "brightness_drift": 0.0, "read_noise": 0.0, "shot_noise": 0.0, "sharpening": 0.0, "jpeg_quality": 0,
+        "brightness_drift": 0.0, "read_noise": 0.0, "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0,
+        "chroma_columns": 1, "jpeg_quality": 0,
     },
 }  # fmt: skip
 FULL = {
     "gel": {"haze": 0.1, "haze_sigma_px": 4.0},
     "camera": {"vignetting": 0.3, "red_scale": 1.01, "blue_scale": 0.99},
-    "response": {"exposure": 0.8, "white_balance": (1.2, 1.0, 0.9), "gamma": 2.2, "blur_sigma_px": 0.6, "sharpening": 0.5},
+    "response": {
+        "exposure": 0.8,
+        "white_balance": (1.2, 1.0, 0.9),
+        "gamma": 2.2,
+        "blur_sigma_px": 0.6,
+        "sharpening": 0.5,
+        "chroma_sigma_px": 1.0,
+        "chroma_columns": 2,
+    },
 }
 SECTIONS = [(section, key, value) for section, values in FULL.items() for key, value in values.items() if key != "haze_sigma_px"]
 
@@ -76,7 +85,7 @@ def test_each_step_acts_in_the_chain(section, key, value):
 def test_a_neutral_step_hands_the_very_same_light_on():
     light, frame, rng = picture(), expose(picture(), PLAIN), np.random.default_rng(0)
     optics = hazed(light, PLAIN.gel), dispersed(light, PLAIN.camera), blurred(light, 0.0), vignetted(light, PLAIN.camera)
-    film = amplified(light, PLAIN.response, rng), noisy(light, PLAIN.response, rng), sharpened(light, PLAIN.response)
+    film = amplified(light, PLAIN.response, rng), noisy(light, PLAIN.response, rng), developed(light, PLAIN.response)
     assert all(handed is light for handed in (*optics, *film)) and compressed(frame, 0) is frame
     assert rng.standard_normal() == np.random.default_rng(0).standard_normal(), "a neutral step drew a number"
 
@@ -188,6 +197,32 @@ def test_sharpening_leaves_even_light_and_overshoots_at_an_edge():
     light[:, 20:] = 0.6
     row = expose(light, sharp)[20].astype(int)
     assert row[:20].min() < 51 - 10 and row[20:].max() > 153 + 10 and row[0] == 51 and row[-1] == 153
+
+
+def luma(frame: np.ndarray) -> np.ndarray:
+    return frame @ np.array([0.299, 0.587, 0.114])
+
+
+def test_lost_chroma_leaves_the_luma_as_it_is():
+    gray = 255 * picture()
+    lost = developed(gray, changed(PLAIN, response={"chroma_sigma_px": 2.0, "chroma_columns": 2}).response)
+    assert np.abs(luma(lost) - luma(gray)).max() < 1e-3 and np.abs(lost - gray).max() > 10
+
+
+def test_neighbouring_columns_share_their_mean_chroma():
+    gray = 255 * picture()
+    chroma = gray - luma(gray)[..., None]
+    pairs = shared(chroma, 2)
+    assert (pairs[:, 0::2] == pairs[:, 1::2]).all()
+    assert np.abs(pairs[:, 0::2] - (chroma[:, 0::2] + chroma[:, 1::2]) / 2).max() < 1e-3
+    assert np.abs(shared(chroma[:, 3:], 2, 3)[:, 1:] - pairs[:, 4:]).max() < 1e-3, "a window's pairs are the full frame's"
+
+
+def test_sharpening_leaves_the_colour_differences():
+    gray = 255 * picture()
+    sharp = developed(gray, changed(PLAIN, response={"sharpening": 1.0}).response)
+    change = sharp - gray
+    assert np.abs(change - change[..., :1]).max() < 1e-3 and np.abs(change).max() > 1
 
 
 def test_a_window_of_a_frame_is_exposed_as_the_frame_is():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from plain_sensor import changed, plain
 
-from scenes.sensor import SensorSpec, SpeckSpec
+from scenes.sensor import RimSpec, SensorSpec, SpeckSpec
 from twin.optics.lights import led_patches
 from twin.optics.static_layer import ACROSS, static_layer
 from twin.projection import project
@@ -131,3 +131,21 @@ def test_specks_over_each_other_hide_like_filters(bare):
     speck = SpeckSpec(x_mm=0.0, y_mm=0.0, radius_mm=2.0, opacity=0.5)
     _, cover = static_layer(changed(bare, appearance={"specks": (speck, speck)}), WINDOW)
     assert cover.max() == pytest.approx(0.75, abs=1e-6)
+
+
+def test_the_rims_light_stands_at_its_azimuth_and_radius(bare):
+    """One entry of the table: its light, where its place of the housing's plane is seen, and nothing elsewhere."""
+    azimuths, radii, lit = 12, 5, (2, 3)
+    light = np.zeros((azimuths, radii, 3), int)
+    light[lit] = 100, 200, 300
+    ring = {"aperture_radius_mm": 12.0, "center_mm": (0.5, -0.3), "rim": RimSpec(inner_mm=9.0, outer_mm=11.0, light=light.tolist())}
+    with_rim = changed(bare, housing=ring | {"outer_radius_mm": 2000.0}, leds={"mirror_share": 0.0})
+    without = changed(with_rim, housing={"rim": None})
+    more = static_layer(with_rim, WINDOW)[0] - static_layer(without, WINDOW)[0]
+    angle, radius = 2 * np.pi * lit[0] / azimuths, 9.0 + 2.0 * lit[1] / (radii - 1)
+    place = np.array([0.5 + radius * np.cos(angle), -0.3 + radius * np.sin(angle), bare.housing.z_mm])
+    brightest = np.unravel_index(more[..., 1].argmax(), more.shape[:2])
+    away_px = np.array(brightest[::-1]) + WINDOW[:2] - seen_straight(with_rim, place[None])[0]
+    assert np.linalg.norm(away_px) < 1.5, "the peak is a ridge of pixels"
+    assert more[brightest] == pytest.approx([0.1, 0.2, 0.3], rel=0.1)
+    assert more.min() >= -1e-6 and (more[..., 1] > 1e-6).mean() < 0.05

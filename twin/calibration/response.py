@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from scenes.sensor import SensorSpec
 from twin.calibration.aligned import SATURATED, Aligned, revised
-from twin.camera import expose, hazed
+from twin.camera import LUMA, expose, hazed
 from twin.preprocess.forms import gray_levels
 from twin.projection import project
 from twin.realism.caps import measure_caps
@@ -20,9 +20,11 @@ BOUNDS = {  # name: least, largest, unit of a step
     "sharpening": (0.0, 4.0, 0.2),
     "sharpening_sigma_px": (0.5, 4.0, 0.2),
 }
+CHROMA = {"chroma_sigma_px": (0.05, 4.0, 0.2)}
 FRINGES = {"red_scale": (0.985, 1.015, 0.001), "blue_scale": (0.985, 1.015, 0.001)}
 SHIFTS = {f"{colour}_shift_px.{axis}": (-3.0, 3.0, 0.1) for colour in ("red", "blue") for axis in (0, 1)}
 LEAST_SHARPENING = 0.2  # to start from: a mask of no weight has no width
+SAME_CHROMA = 0.5  # colour step between columns that share it, relative to the step to the next pair
 QUALITIES = (0, 95, 90, 80, 70)
 MOST_TRIES = 10  # of the least squares
 MOST_FRAMES = 3  # that the sharpness is fitted to
@@ -53,14 +55,15 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     inside : (H, W) bool
         The disc.
     """
-    bounds = BOUNDS | (FRINGES | SHIFTS if spec.camera.channels == "color" else {})
+    bounds = BOUNDS | (CHROMA | FRINGES | SHIFTS if spec.camera.channels == "color" else {})
     names = list(bounds)
     pick = np.zeros_like(inside)
     pick[::EVERY, ::EVERY] = True
     frames, light = frames[:MOST_FRAMES], [hazed(np.asarray(x, np.float32), spec.gel) for x in light[:MOST_FRAMES]]
     useful = [inside & pick & (gray_levels(f.image) < SATURATED) for f in frames]
     real = np.concatenate([f.image[u].astype(float).ravel() for f, u in zip(frames, useful, strict=True)])
-    flat = revised(spec, response={"jpeg_quality": 0}, gel={"haze": 0.0})  # the light is hazed already
+    columns = chroma_columns([f.image for f in frames])
+    flat = revised(spec, response={"jpeg_quality": 0, "chroma_columns": columns}, gel={"haze": 0.0})  # the light is hazed already
 
     def with_values(values) -> SensorSpec:
         return _changed(flat, dict(zip(names, map(float, values), strict=True)))
@@ -86,14 +89,26 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     return revised(best, response={"jpeg_quality": min(errors, key=errors.get)}, gel={"haze": spec.gel.haze})
 
 
+def chroma_columns(images: list[np.ndarray]) -> int:
+    """2 if frames (H, W, 3) come from a 4:2:2 stream, in which columns 2k and 2k + 1 share their colour differences; else 1."""
+    steps = np.zeros(2)
+    for image in images:
+        if image.ndim == 3:
+            levels = image.astype(np.float32)
+            chroma = levels - (levels @ LUMA)[..., None]
+            step = np.abs(np.diff(chroma, axis=1)).mean(axis=(0, 2))
+            steps += step[0::2].mean(), step[1::2].mean()
+    return 2 if steps[0] < SAME_CHROMA * steps[1] else 1
+
+
 def _value(spec: SensorSpec, name: str) -> float:
     field, _, index = name.partition(".")
-    value = getattr(spec.response if field in BOUNDS else spec.camera, field)
+    value = getattr(spec.response if field in BOUNDS | CHROMA else spec.camera, field)
     return value[int(index)] if index else value
 
 
 def _changed(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
-    response = {name: value for name, value in values.items() if name in BOUNDS}
+    response = {name: value for name, value in values.items() if name in BOUNDS | CHROMA}
     camera = {name: value for name, value in values.items() if name in FRINGES}
     for name in values.keys() & SHIFTS.keys():
         field = name.partition(".")[0]

@@ -15,6 +15,7 @@ from twin.calibration.camera_pose import fit_camera
 from twin.calibration.caps import fit_caps
 from twin.calibration.photometry import fit_photometry
 from twin.calibration.response import fit_aperture, fit_noise, fit_response, sharpness
+from twin.calibration.rim import fit_rim
 from twin.calibration.surroundings import fit_surroundings
 from twin.camera import expose
 from twin.errors import FrameError
@@ -141,10 +142,13 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
     def caps(spec):
         return fit_caps(spec, frames, lambda s, f: studio.shots(s, f, "render for the caps"))
 
+    def rim(spec):
+        return fit_rim(spec, frames, studio.light(spec, frames, "render for the rim"))
+
     def noise(spec):
         return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"), inside)
 
-    stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), noise]
+    stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim, noise]
     for number, stage in enumerate(stages):
         spec = log.stage(f"{number:02d}-{stage.__name__}", stage, spec)
     last = studio.shots(spec, frames, "render the result")

@@ -5,8 +5,9 @@ Found once, without noise.
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import HousingSpec, SensorSpec
 from twin.optics.lens import ray_table, subpixel_rays
 from twin.optics.lights import led_patches, lights
 from twin.optics.window import fresnel
@@ -14,6 +15,7 @@ from twin.projection import sensor_to_camera
 
 ACROSS = 4  # places in a pixel, each way, where its corners differ
 EVEN = 0.02  # relative difference of the corners below which their mean is the pixel
+RIM_UNIT = 1000.0  # of the numbers in RimSpec.light
 SMALL = 1e-3  # light and cover below this need no relative precision
 
 
@@ -47,7 +49,26 @@ def _seen(spec: SensorSpec, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     wall = np.linalg.norm(at_ring - ring.center_mm, axis=-1) >= ring.aperture_radius_mm
     light = np.where(wall[..., None], housing_light(spec, at_ring), reflections(spec, tangents))
     hidden, shine = _specks(spec, tangents)
-    return np.where(wall[..., None], light, light + shine), np.where(wall, 1.0, hidden)
+    light = np.where(wall[..., None], light, light + shine) + rim_light(ring, at_ring)
+    return light, np.where(wall, 1.0, hidden)
+
+
+def rim_light(ring: HousingSpec, at_mm: np.ndarray) -> np.ndarray:
+    """Light (..., 3) measured on top of the formulas at places (..., 2) of the housing's plane; linear in azimuth and radius."""
+    if ring.rim is None:
+        return np.zeros((*at_mm.shape[:-1], 3))
+    table = np.array(ring.rim.light, np.float32) / RIM_UNIT
+    place = at_mm - ring.center_mm
+    radius = np.linalg.norm(place, axis=-1)
+    turn = np.arctan2(place[..., 1], place[..., 0]) % (2 * np.pi) / (2 * np.pi) * len(table)
+    along = (radius - ring.rim.inner_mm) / (ring.rim.outer_mm - ring.rim.inner_mm) * (table.shape[1] - 1)
+    inside = (along >= 0) & (along <= table.shape[1] - 1)
+    light = np.zeros((*radius.shape, 3))
+    round_table = np.concatenate([table, table[:1]])
+    light[inside] = np.stack(
+        [map_coordinates(round_table[..., k], [turn[inside], along[inside]], order=1, mode="nearest") for k in range(3)], axis=-1
+    )
+    return light
 
 
 def housing_light(spec: SensorSpec, at_mm: np.ndarray) -> np.ndarray:

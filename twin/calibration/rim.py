@@ -1,0 +1,75 @@
+"""The light at the edge of the disc that no formula has: measured, as a table of azimuth and radius."""
+
+import numpy as np
+
+from scenes.sensor import RimSpec, SensorSpec
+from twin.calibration.aligned import SATURATED, Aligned, revised, to_light
+from twin.camera import expose
+from twin.optics.lens import ray_table
+from twin.optics.static_layer import RIM_UNIT, static_layer
+from twin.projection import sensor_to_camera
+
+INSIDE_MM, OUTSIDE_MM = 1.75, 0.4  # of the housing's opening: how far the table reaches; no pin comes so near
+AZIMUTHS, RADII = 360, 20
+ROUNDS = 3  # blur and sharpening lie between the table and the pixels
+GAIN = 0.9  # of a correction
+
+
+def fit_rim(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray]) -> SensorSpec:
+    """``housing.rim`` from what real frames show beyond rendered ones, mean of the frames; saturated pixels ask for no less.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+        Everything else already fitted.
+    frames : list of Aligned
+    light : list of (H, W, 3) or (H, W) float
+        Rendered light of each frame's state.
+    """
+    ring = spec.housing
+    inner, outer = ring.aperture_radius_mm - INSIDE_MM, ring.aperture_radius_mm + OUTSIDE_MM
+    cell, weight, pixels = _cells(spec, inner, outer)
+    window = (0, 0, spec.camera.width_px, spec.camera.height_px)
+    before = static_layer(spec, window)[0]
+    table = np.zeros((AZIMUTHS, RADII, 3))
+    if ring.rim is not None and np.shape(ring.rim.light) == table.shape:
+        table += np.array(ring.rim.light) / RIM_UNIT
+    total = np.maximum(np.bincount(cell.ravel(), weight.ravel(), minlength=AZIMUTHS * RADII), 1e-6)
+    for _ in range(ROUNDS):
+        light_of = RimSpec(inner_mm=inner, outer_mm=outer, light=np.rint(RIM_UNIT * table).astype(int).tolist())
+        spec = revised(spec, housing={"rim": light_of.model_dump()})
+        more = static_layer(spec, window)[0] - before
+        more = more if spec.camera.channels == "color" else more.mean(axis=2)
+        missing = np.mean([_missing(spec, frame, np.maximum(lit + more, 0)) for frame, lit in zip(frames, light, strict=True)], axis=0)
+        for k in range(3):
+            flat = missing.reshape(missing.shape[0] * missing.shape[1], -1)[pixels, k if missing.ndim == 3 else 0]
+            table[..., k] += GAIN * (
+                np.bincount(cell.ravel(), (weight * flat[:, None]).ravel(), minlength=AZIMUTHS * RADII) / total
+            ).reshape(AZIMUTHS, RADII)
+    light_of = RimSpec(inner_mm=inner, outer_mm=outer, light=np.rint(RIM_UNIT * table).astype(int).tolist())
+    return revised(spec, housing={"rim": light_of.model_dump()})
+
+
+def _missing(spec: SensorSpec, frame: Aligned, light: np.ndarray) -> np.ndarray:
+    """Light of a real frame beyond that of a render, in the renderer's unit."""
+    shown = expose(light, spec)
+    lacking = to_light(frame.image, spec.response) - to_light(shown, spec.response)
+    return np.where((frame.image >= SATURATED) & (shown >= SATURATED), 0.0, lacking)
+
+
+def _cells(spec: SensorSpec, inner_mm: float, outer_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The four table entries (n, 4) around each pixel of the band, their bilinear weights (n, 4), and the pixels' flat indices (n,)."""
+    camera, ring = spec.camera, spec.housing
+    corners = ray_table(camera, (0, 0, camera.width_px, camera.height_px)) @ sensor_to_camera(camera)[:3, :3]
+    rays = (corners[:-1, :-1] + corners[1:, 1:]) / 2
+    at = rays[..., :2] / rays[..., 2:] * (ring.z_mm + camera.distance_mm) - ring.center_mm
+    radius = np.linalg.norm(at, axis=-1).ravel()
+    pixels = np.flatnonzero((radius > inner_mm) & (radius < outer_mm))
+    x, y = at.reshape(-1, 2)[pixels].T
+    turn = np.arctan2(y, x) % (2 * np.pi) / (2 * np.pi) * AZIMUTHS
+    along = (radius[pixels] - inner_mm) / (outer_mm - inner_mm) * (RADII - 1)
+    row, column = np.floor(turn).astype(int), np.minimum(np.floor(along).astype(int), RADII - 2)
+    a, b = turn - row, along - column
+    cell = np.stack([(row + j) % AZIMUTHS * RADII + column + k for j in (0, 1) for k in (0, 1)], axis=1)
+    weight = np.stack([(a if j else 1 - a) * (b if k else 1 - b) for j in (0, 1) for k in (0, 1)], axis=1)
+    return cell, weight, pixels

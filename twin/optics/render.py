@@ -9,6 +9,7 @@ from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.optics.camera_rays import CameraRays
+from twin.optics.placement import SKIN_SAVING, near_pins
 from twin.optics.sampling import PixelSamples
 from twin.optics.scalar import ScalarView
 from twin.optics.scene import build_scene, move_meshes
@@ -40,7 +41,7 @@ class Renderer:
     window_px : (x0, y0, x1, y1), optional
         Part of the raw frame to render, end exclusive; the whole frame by default.
     spp : int, optional
-        Samples per pixel instead of the quality's.
+        Samples per pixel instead of the quality's: where pins are; bare skin gets a quarter (`twin.optics.placement`).
     bounces : int
         Scatterings of a path after its first.
     """
@@ -144,7 +145,7 @@ class GelView:
     def __init__(self, mi, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int):
         import drjit as dr
 
-        self._mi, self._dr = mi, dr
+        self._mi, self._dr, self._spec, self._window_px = mi, dr, spec, window_px
         scene = build_scene(mi, spec, **surfaces)
         self.params = mi.traverse(scene)
         self.tracer = GelTracer.of(mi, spec, scene, bounces)
@@ -154,8 +155,16 @@ class GelView:
         """Move the meshes' vertices."""
         move_meshes(self.params, surfaces)
 
-    def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state=None) -> np.ndarray:
-        """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row."""
+    def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state) -> np.ndarray:
+        """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row; fewer samples on bare skin."""
+        pins = near_pins(self._spec, state, self._window_px).ravel()[pixels]
+        light = np.empty((len(pixels), len(self._mi.Spectrum(0.0))), np.float32)
+        for part, samples in ((pins, spp), (~pins, -(-spp // SKIN_SAVING))):
+            if part.any():
+                light[part] = self._mean_light(pixels[part], samples, seed)
+        return light
+
+    def _mean_light(self, pixels: np.ndarray, spp: int, seed: int) -> np.ndarray:
         passes, each = 1, spp
         while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
             passes, each = 2 * passes, -(-each // 2)  # halves: nets of powers of two are even

@@ -115,7 +115,9 @@ class Magician(BaseArm):
         except DeviceError as error:
             raise StaleDataError(f"{error}. Don't trust the last pose") from error
         if time.monotonic() - begun_s > max_age_s:
-            raise StaleDataError(f"{self.name}: the arm took {time.monotonic() - begun_s:.2f} s to tell its state (allowed {max_age_s:g} s)")
+            raise StaleDataError(
+                f"{self.name}: the arm took {time.monotonic() - begun_s:.2f} s to tell its state (allowed {max_age_s:g} s)"
+            )
         pose = np.array([*values[:3], 0.0, 0.0, values[3]])
         return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
 

@@ -38,6 +38,10 @@ class Mg400Ports:
     motion: int = MOTION_PORT
     feedback: tuple[int, ...] = tuple(FEEDBACK_PERIOD_S)[:2]
 
+    def shifted(self, offset: int) -> "Mg400Ports":
+        """All of them, so much higher."""
+        return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
+
 
 class MG400(BaseArm):
     """A Dobot MG400.
@@ -166,7 +170,9 @@ class MG400(BaseArm):
         self._move("JointMovJ", sent, sent, None, wait=wait, timeout_s=timeout_s)
         return sent
 
-    def _move(self, command: str, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
+    def _move(
+        self, command: str, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float
+    ) -> None:
         self._require_connected()
         if not np.isfinite(joints).all():
             raise DeviceError(f"{self.name}: the target {numbers} is not a number; nothing was sent")
@@ -206,10 +212,7 @@ class MG400(BaseArm):
             if state.error:
                 self._forget_sync()
                 raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
-            if state.moving or state.time_s < asked_s:
-                rest_since = None
-            else:
-                rest_since = rest_since or state.time_s
+            rest_since = None if state.moving or state.time_s < asked_s else rest_since or state.time_s
             if self._bare and rest_since is not None and state.time_s - rest_since > RESTED_S:
                 return
             if time.monotonic() > deadline:

@@ -58,7 +58,7 @@ class MagicianController:
         self._queue: list[Queued] = []
         self._running = False
         self._since_s = self._ends_s = -np.inf  # the head can't begin before; the head is done (inf: not begun)
-        self._begun = False
+        self._begun, self._lost_at_s = False, np.inf
         self._issued = self._current = 0
 
     def pose(self, time_s: float | None = None) -> np.ndarray:
@@ -84,6 +84,9 @@ class MagicianController:
         """Do what the queue has to do until now; the time now."""
         now_s = time.monotonic()
         with self.lock:
+            if self._lost_at_s <= now_s:
+                self.alarms.add(LOST_STEPS)
+                self._lost_at_s = np.inf
             while self._running and self._queue and not self.alarms:
                 head = self._queue[0]
                 if not self._begun:
@@ -219,7 +222,7 @@ class MagicianController:
         share = self.faults.value("lost-steps")
         if share is not None and piece.duration_s > 0:
             self.track.stop(piece.start_s + share * piece.duration_s)
-            self.alarms.add(LOST_STEPS)
+            self._lost_at_s = self.track.end_s
         return piece.end_s
 
     def _alarm(self, alarm: int, begins_s: float) -> float:

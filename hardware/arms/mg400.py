@@ -178,6 +178,11 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: the target {numbers} is not a number; nothing was sent")
         if violation := self.kinematics.violation(joints):
             raise DeviceError(f"{self.name}: {violation.text}; nothing was sent. Choose a target within reach and limits")
+        packet, _ = self._feedback.newest(SILENCE_S)  # old firmware would not tell
+        if int(packet["mode"]) == Mode.ERROR:
+            raise DeviceError(f"{self.name}: {self._alarm()}")
+        if not packet["enabled"]:
+            raise DeviceError(f"{self.name}: not enabled; call enable() first")
         begun_s = time.monotonic()
         self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)})")
         if not wait:

@@ -37,7 +37,15 @@ def commands(firmware=(1, 7, 0), faults=(), enabled=True):
 
 def test_packet_has_every_field_where_the_arm_has_it():
     arm, run = commands()
-    for text in ("EnableRobot(0.4,1,2,3)", "SetUser(2,{1,2,3,4})", "User(2)", "SetTool(3,{5,6,7,8})", "Tool(3)", "SpeedFactor(37)", "DO(3,1)"):
+    for text in (
+        "EnableRobot(0.4,1,2,3)",
+        "SetUser(2,{1,2,3,4})",
+        "User(2)",
+        "SetTool(3,{5,6,7,8})",
+        "Tool(3)",
+        "SpeedFactor(37)",
+        "DO(3,1)",
+    ):
         assert run(text) == ""
     data = feedback_packet(arm).tobytes()
     joints = arm.track.joints_deg(0.0)

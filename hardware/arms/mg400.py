@@ -69,6 +69,7 @@ class MG400(BaseArm):
         self._dashboard = CommandPort(self.name, host, ports.dashboard)
         self._motion = CommandPort(self.name, host, ports.motion)
         self._feedback = Feedback(self.name, host, ports.feedback)
+        self._in_use = False  # between connect and disconnect, connections lost or not
         self._bare = False  # old firmware: echoes on the dashboard, nothing on the motion port
         self._alarm_text: str | None = None
 
@@ -78,12 +79,14 @@ class MG400(BaseArm):
 
     def connect(self) -> None:
         self._require_disconnected()
+        self._close()  # what is left of a lost connection
         try:
             self._dashboard.open()
             self._motion.open()
             self._feedback.open()
             self._bare = self._dashboard.request("RobotMode()").error_id is None
             self._ask("RobotMode()")
+            self._in_use = True
         except BaseException:
             self._close()
             raise
@@ -117,6 +120,8 @@ class MG400(BaseArm):
         self._alarm_text = None
 
     def stop(self) -> None:
+        if not self._in_use:
+            self._require_connected()
         if not self._dashboard.is_open:  # lost: the arm may still move, so try once more to reach it
             try:
                 self._dashboard.open()
@@ -271,6 +276,7 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: {why_refused(reply.error_id, request)}")
 
     def _close(self) -> None:
+        self._in_use = False
         self._dashboard.close()
         self._motion.close()
         self._feedback.close()

@@ -164,7 +164,7 @@ class MotionTrack:
     def stop(self, now_s: float) -> None:
         """Stand still from ``now_s`` on and forget what was still to come."""
         with self._lock:
-            kept = [piece for piece in self._pieces if piece.start_s < now_s]
+            kept = [piece for piece in self._pieces if piece.start_s < now_s] or [self._pieces[0]]
             if kept[-1].end_s > now_s:
                 kept[-1] = replace(kept[-1], cut_s=now_s)
             self._pieces = deque(kept, maxlen=HISTORY_N)

@@ -32,7 +32,15 @@ def test_nothing_works_before_connect_and_nothing_moves_before_enable(at):
     arm = at.arm
     before = at.reads()
     assert not arm.is_connected
-    for call in (arm.enable, arm.disable, arm.clear_error, arm.state, lambda: arm.move_linear(at.home), lambda: arm.set_speed(1, 1)):
+    for call in (
+        arm.enable,
+        arm.disable,
+        arm.clear_error,
+        arm.stop,
+        arm.state,
+        lambda: arm.move_linear(at.home),
+        lambda: arm.set_speed(1, 1),
+    ):
         with pytest.raises(DeviceNotConnectedError, match="connect"):
             call()
     arm.connect()
@@ -128,6 +136,20 @@ def test_what_can_not_be_is_refused_before_anything_moves(ready):
             ready.arm.set_speed(*speeds)
     assert np.array_equal(ready.reads(), before)
     ready.arm.move_linear(ready.home + [5, 0, 0, 0, 0, 0])  # no alarm was raised
+
+
+def test_where_it_was_can_be_asked_later(ready):
+    """A camera that is emulated from the arm's pose needs it at the time of exposure."""
+    where = ready.device.track.pose if hasattr(ready.device, "track") else ready.device.pose
+    ready.arm.set_speed(SLOW_MM_S, SLOW_MM_S)
+    ready.arm.move_linear(ready.home + [0, 20, 0, 0, 0, 0], wait=False)
+    times = [time.monotonic() + 0.01 * n for n in range(10)]
+    time.sleep(0.15)
+    asked = [where(t) for t in times]
+    assert np.ptp([pose[1] for pose in asked]) > 0.5
+    ready.arm.stop()
+    ready.arm.move_linear(ready.home)
+    assert np.allclose([where(t) for t in times], asked)
 
 
 def test_speed_is_at_most_what_was_asked(ready):

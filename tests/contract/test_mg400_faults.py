@@ -1,6 +1,7 @@
 """Whatever an MG400 does wrong, the driver recovers, or stops it and says what to do."""
 
 import socket
+import threading
 import time
 from dataclasses import replace
 
@@ -198,6 +199,22 @@ def test_a_lost_arm_can_not_be_stopped_and_that_is_said_loudly():
             arm.enable()
         with pytest.raises(DeviceNotConnectedError, match="Press its emergency stop"):
             arm.stop()
+        arm.disconnect()
+
+
+def test_after_a_lost_connection_it_connects_again_and_reads_once():
+    with emulated(time_scale=4.0) as emulator:
+        arm = mg400_of(emulator)
+        arm.connect()
+        arm.enable()
+        arm._motion.close()
+        assert not arm.is_connected
+        arm.stop()  # the dashboard is still there
+        arm.connect()
+        arm.enable()
+        arm.move_linear(AWAY)
+        readers = [thread for thread in threading.enumerate() if thread.name == "mg400-feedback"]
+        assert len(readers) == 1
         arm.disconnect()
 
 

@@ -27,6 +27,7 @@ from hardware.arms.mg400_wire import (
 from hardware.errors import DeviceError, DeviceNotConnectedError
 
 ENABLE_TIMEOUT_S = 5.0
+SETTLE_S = 0.5  # at least, for feedback to confirm a move: two periods of the slow port
 RESTED_S = 0.05  # without replies (old firmware), at rest for this long counts as done
 
 
@@ -122,12 +123,12 @@ class MG400(BaseArm):
     def stop(self) -> None:
         if not self._in_use:
             self._require_connected()
-        if not self._dashboard.is_open:  # lost: the arm may still move, so try once more to reach it
-            try:
+        try:
+            if not self._dashboard.is_open:  # lost: the arm may still move, so try once more to reach it
                 self._dashboard.open()
-            except DeviceNotConnectedError as error:
-                raise DeviceNotConnectedError(f"{self.name}: can't be told to stop. Press its emergency stop! {error}") from error
-        self._ask("ResetRobot()")
+            self._ask("ResetRobot()")
+        except DeviceNotConnectedError as error:
+            raise DeviceNotConnectedError(f"{self.name}: can't be told to stop. Press its emergency stop! {error}") from error
 
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
         self._require_connected()
@@ -194,7 +195,7 @@ class MG400(BaseArm):
             return
         try:
             self._await_queue(begun_s + timeout_s, timeout_s)
-            left_s = max(begun_s + timeout_s - time.monotonic(), 4 * RESTED_S)
+            left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
             if pose is not None:
                 self.wait_settled(pose, timeout_s=left_s)
             else:

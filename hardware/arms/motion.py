@@ -23,7 +23,10 @@ class Speeds:
     angular_deg_s2: float = np.inf
 
     def scaled(self, factor: float) -> "Speeds":
-        return replace(self, linear_mm_s=self.linear_mm_s * factor, angular_deg_s=self.angular_deg_s * factor)
+        """The same motion in ``1 / factor`` of the time."""
+        return Speeds(
+            self.linear_mm_s * factor, self.angular_deg_s * factor, self.linear_mm_s2 * factor**2, self.angular_deg_s2 * factor**2
+        )
 
 
 def travel_time_s(length: float, speed: float, acceleration: float) -> float:

@@ -162,6 +162,8 @@ class Mg400Emulator:
                     else:
                         client.shutdown(socket.SHUT_RDWR)
             for bound in self._sockets:
+                with contextlib.suppress(OSError):
+                    bound.shutdown(socket.SHUT_RDWR)  # a thread that waits for it would keep it listening
                 bound.close()
             self._clients.clear()
 

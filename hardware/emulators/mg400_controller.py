@@ -249,7 +249,8 @@ class Mg400Controller:
         if isinstance(planned, Violation):
             self._due.append((max(self.track.end_s, time.monotonic()), (planned.code,)))
             return
-        self._orders = [*self._orders[-64:], Order(order.end, order.linear, order.speeds, order.jog, planned.end_s)]
+        waiting = [one for one in self._orders if one.end_s > time.monotonic()]
+        self._orders = [*waiting, Order(order.end, order.linear, order.speeds, order.jog, planned.end_s)]
         if planned.duration_s > 0 and (share := self.faults.value("collision")) is not None:
             self._due.append((planned.start_s + share * planned.duration_s, COLLISIONS))
         if planned.duration_s > 0 and (share := self.faults.value("stall")) is not None:

@@ -145,8 +145,10 @@ def test_too_deep_a_contact_makes_it_retreat_along_the_normal(arm):
 def test_a_frame_that_grows_old_stops_it(arm):
     safe = SafeArm(arm, FREE.model_copy(update={"frame_age_s": 0.05}))
     safe.sense(depth_mm=1.0, frame_time_s=time.monotonic())
+    safe.set_speed(1.0, 1.0)
     safe.move_linear(HOME + [0, 100, 0, 0, 0, 0], wait=False)
     time.sleep(0.06)
+    assert arm.state().moving
     with pytest.raises(RefusedMoveError, match="stale-frame"):
         safe.move_linear(HOME)
     assert not arm.state().moving
@@ -154,12 +156,12 @@ def test_a_frame_that_grows_old_stops_it(arm):
 
 def test_silent_feedback_stops_it(arm):
     safe = SafeArm(arm, FREE.model_copy(update={"feedback_age_s": 0.05}))
-    arm.faults.add(SimulatedFault.SILENT)
+    safe.set_speed(1.0, 1.0)
     arm.move_linear(HOME + [0, 100, 0, 0, 0, 0], wait=False)
-    safe_state = pytest.raises(RefusedMoveError, match="stale-feedback")
-    arm._told_s(time.monotonic())
+    arm.faults.add(SimulatedFault.SILENT)
+    assert arm.state().moving  # the last it tells
     time.sleep(0.06)
-    with safe_state:
+    with pytest.raises(RefusedMoveError, match="stale-feedback"):
         safe.move_linear(HOME)
     arm.faults.clear()
     assert not arm.state().moving

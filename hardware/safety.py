@@ -144,7 +144,8 @@ def decide(
     target = np.asarray(target, float)
     if target.shape != (6,) or not np.isfinite(target).all():
         return Decision(Action.REFUSE, Code.NOT_A_NUMBER, f"the target {target} is not six numbers")
-    pose, shortened = shorten(state.pose, target, limits)
+    unwrapped = kinematics is not None and kinematics.axes == 4
+    pose, shortened = shorten(state.pose, kinematics.nearest_pose(target) if unwrapped else target, limits, unwrapped=unwrapped)
     if refused := _place(pose, state.pose, limits) or (kinematics and _joints(pose, state.pose, limits, kinematics)):
         return refused
     if shortened:
@@ -174,16 +175,17 @@ def decide_joints(
     return Decision(Action.MOVE, Code.OK, "", pose)
 
 
-def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits) -> tuple[np.ndarray, bool]:
-    """The target, or a point as far on the way to it as a step may be; and whether it was shortened."""
-    length, turn = float(np.linalg.norm(target[:3] - start[:3])), turn_between_deg(start, target)
+def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwrapped: bool = False) -> tuple[np.ndarray, bool]:
+    """The target, or a point as far on the way to it as a step may be; and whether it was shortened.
+
+    Turns go the shorter way, but as told where they are ``unwrapped`` (R of an arm of four axes).
+    """
+    way = target - start
+    if not unwrapped:
+        way[3:] = (way[3:] + 180.0) % 360.0 - 180.0
+    length, turn = float(np.linalg.norm(way[:3])), abs(way[5]) if unwrapped else turn_between_deg(start, target)
     shares = [limit / size for limit, size in ((limits.step_mm, length), (limits.step_deg, turn)) if limit is not None and size > limit]
-    if not shares:
-        return target.copy(), False
-    pose = start + min(shares) * (target - start)
-    around = (target[3:] - start[3:] + 180.0) % 360.0 - 180.0  # the shorter way
-    pose[3:] = start[3:] + min(shares) * around
-    return pose, True
+    return (start + min(shares) * way, True) if shares else (target.copy(), False)
 
 
 def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed | None) -> Decision | None:

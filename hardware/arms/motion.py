@@ -79,15 +79,19 @@ class Piece:
 
     def _value(self, time_s: float) -> np.ndarray:
         elapsed = min(time_s, self.cut_s) - self.start_s
-        return between(self.start, self.end, travelled(elapsed / self.duration_s if self.duration_s > 0 else 1.0, self.ramp), self.linear)
+        share = travelled(elapsed / self.duration_s if self.duration_s > 0 else 1.0, self.ramp)
+        return between(self.kinematics, self.start, self.end, share, self.linear)
 
 
-def between(start: np.ndarray, end: np.ndarray, share: float, linear: bool) -> np.ndarray:
-    """The pose (shortest turn) or joints at a share of the way; exactly the ends at 0 and 1."""
+def between(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, share: float, linear: bool) -> np.ndarray:
+    """The pose or joints at a share of the way; exactly the ends at 0 and 1.
+
+    An arm of six axes turns the shortest way; one of four by as many degrees as R differs, which is not wrapped.
+    """
     if share <= 0 or share >= 1:
         return (start if share <= 0 else end).copy()
     value = start + share * (end - start)
-    if linear and np.any(start[3:5] != 0) | np.any(end[3:5] != 0):
+    if linear and kinematics.axes == 6:
         turns = Rotation.from_euler("xyz", [start[3:], end[3:]], degrees=True)
         value[3:] = Slerp([0.0, 1.0], turns)(share).as_euler("xyz", degrees=True)
     return value
@@ -98,7 +102,7 @@ def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Vi
     steps = max(1, int(np.ceil(np.linalg.norm(end[:3] - start[:3]) / LINE_STEP_MM)))
     for n in (steps, *range(1, steps)):
         try:
-            broken = kinematics.violation(kinematics.inverse(between(start, end, n / steps, True)))
+            broken = kinematics.violation(kinematics.inverse(between(kinematics, start, end, n / steps, True)))
         except OutOfReachError as error:
             broken = Violation(NO_INVERSE, str(error))
         if broken and n < steps:
@@ -151,7 +155,7 @@ class MotionTrack:
             broken = check_line(self.kinematics, start, end) if linear else self.kinematics.violation(end)
             if broken:
                 return broken
-            length, turn = _lengths(start, end, linear)
+            length, turn = _lengths(self.kinematics, start, end, linear)
             times = [
                 travel_time_s(length, speeds.linear_mm_s, speeds.linear_mm_s2),
                 travel_time_s(turn, speeds.angular_deg_s, speeds.angular_deg_s2),
@@ -177,11 +181,11 @@ class MotionTrack:
             return next((piece for piece in reversed(self._pieces) if piece.start_s <= time_s), self._pieces[0])
 
 
-def _lengths(start: np.ndarray, end: np.ndarray, linear: bool) -> tuple[float, float]:
+def _lengths(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, linear: bool) -> tuple[float, float]:
     """Way in mm and in deg."""
     if not linear:
         return 0.0, float(np.abs(end - start).max())
-    turn = np.abs(end - start)[3:].max() if not np.any([start[3:5], end[3:5]]) else turn_between_deg(start, end)
+    turn = turn_between_deg(start, end) if kinematics.axes == 6 else abs(end[5] - start[5])
     return float(np.linalg.norm(end[:3] - start[:3])), float(turn)
 
 

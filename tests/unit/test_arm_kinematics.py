@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.arms.kinematics import LINKAGE_ABOVE, MAGICIAN, MG400, MG400_NOMINAL, MG400_REACH_MM, OutOfReachError
+from hardware.arms.kinematics import LINKAGE_ABOVE, MAGICIAN, MG400, MG400_NOMINAL, MG400_REACH_MM, OutOfReachError, StageKinematics
 from hardware.arms.motion import LINE_LEAVES_WORKSPACE, TARGET_LIMIT, MotionTrack, Speeds, check_line
 
 # J1 J2 J3 J4 (deg) and x y z R (mm, deg) that a real MG400 told of itself
@@ -129,3 +129,12 @@ def test_a_stop_keeps_the_arm_where_it_is():
     at = track.pose(0.5)
     track.stop(0.5)
     assert np.allclose(track.pose(99.0), at) and not track.moving(0.6)
+
+
+@pytest.mark.parametrize(("arm", "turned"), [(StageKinematics(), 20.0), (MG400, 340.0)])
+def test_six_axes_turn_the_shortest_way_and_four_as_told(arm, turned):
+    start = np.array([300.0, 0, 0, 0, 0, 170.0])
+    track = MotionTrack(arm, arm.inverse(start))
+    piece = track.move(start - [0, 0, 0, 0, 0, 340.0], Speeds(10.0, 10.0), linear=True, now_s=0.0)
+    assert piece.duration_s == pytest.approx(turned / 10.0)
+    assert np.cos(np.radians(track.pose(piece.end_s / 2)[5])) == pytest.approx(-1.0 if turned == 20.0 else 1.0)

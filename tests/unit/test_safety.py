@@ -86,6 +86,11 @@ def test_a_long_turn_is_shortened_the_short_way_round():
     assert decision.pose[5] == pytest.approx(-3.0)
 
 
+def test_the_turn_of_four_axes_is_not_wrapped():
+    at = np.array([265.0, 299.0, 9.0, 0, 0, 10.0])  # J1 at 48 deg: R = 208 is within J4's range, R = -152 is not
+    assert decided(at + [0, 0, 0, 0, 0, 198.0], LIMITS, at=at).pose[5] == pytest.approx(13.0)
+
+
 def test_joint_moves_are_checked_on_their_way():
     def decided(joints, limits=FREE):
         return decide_joints(np.asarray(joints, float), state(), limits, now_s=NOW_S, kinematics=MG400).code

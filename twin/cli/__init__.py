@@ -28,6 +28,7 @@ def main() -> None:
         catalog,
         demo,
         doctor,
+        emulate,
         evaluate,
         graph,
         predict,

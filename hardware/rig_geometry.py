@@ -129,7 +129,7 @@ class PlacedObject:
         return Touch(depth, float(angle), self._radius_mm - gap, centre - gap * outward)
 
     def outline(self) -> np.ndarray:
-        """The object's section (M, 2) through its origin, x and z of the object frame in mm, from the origin on along x; closed if it closes."""
+        """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x."""
         at, points = np.zeros(3), [np.zeros(2)]
         while len(points) * OUTLINE_STEP_MM < LONGEST_OUTLINE_MM:
             _, gradient, _ = self._field.probe(at[None])

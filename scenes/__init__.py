@@ -1,9 +1,12 @@
-"""Specifications: what exists. Sensors and objects as data, validated where they enter."""
+"""Specifications: what exists. Sensors, objects and experiments as data, validated where they enter."""
 
 from scenes.errors import SpecError
+from scenes.experiment import ExperimentSpec
 from scenes.load import (
+    list_experiments,
     list_objects,
     list_sensors,
+    load_experiment,
     load_object,
     load_sensor,
     user_spec_dir,
@@ -12,11 +15,14 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 
 __all__ = [
+    "ExperimentSpec",
     "ObjectSpec",
     "SensorSpec",
     "SpecError",
+    "list_experiments",
     "list_objects",
     "list_sensors",
+    "load_experiment",
     "load_object",
     "load_sensor",
     "user_spec_dir",

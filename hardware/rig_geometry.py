@@ -128,6 +128,11 @@ class PlacedObject:
         depth = self._radius_mm + self.ahead_mm - tool_gap
         return Touch(depth, float(angle), self._radius_mm - gap, centre - gap * outward)
 
+    def distance_mm(self, place_mm: np.ndarray) -> float:
+        """Of a place (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""
+        local = (place_mm - self.T_base_object[:3, 3]) @ self.T_base_object[:3, :3] * [1, 0, 1]
+        return float(self._field.distance(local[None])[0]) - self._raised_mm
+
     def outline(self) -> np.ndarray:
         """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x."""
         at, points = np.zeros(3), [np.zeros(2)]

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from scenes.errors import SpecError
 from scenes.experiment import ExperimentSpec
 from scenes.object import MeshShape, ObjectSpec
+from scenes.rig import MountingSpec, ServoSpec
 from scenes.sensor import SensorSpec
 
 SHIPPED = Path(__file__).parent
@@ -19,7 +20,7 @@ Spec = TypeVar("Spec", bound=BaseModel)
 
 
 def user_spec_dir() -> Path:
-    """Where a user's own ``sensors/*.toml``, ``objects/*.toml`` and ``experiments/*.toml`` lie.
+    """Where a user's own ``sensors/*.toml``, ``objects/*.toml``, ``experiments/*.toml``, ``mountings/*.toml`` and ``servos/*.toml`` lie.
 
     ``TACTIP_SPECS`` if set, else ``$XDG_CONFIG_HOME/tactip-twin`` (``~/.config``).
     """
@@ -86,6 +87,21 @@ def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
         If there is no such experiment, or its file is wrong: names file, key and remedy.
     """
     return _read(_find(name_or_path, "experiments"), ExperimentSpec)
+
+
+def load_mounting(name_or_path: str | Path) -> MountingSpec:
+    """Load a mounting by name or by the path of its TOML file; ``SpecError`` as the others."""
+    return _read(_find(name_or_path, "mountings"), MountingSpec)
+
+
+def load_servo(name_or_path: str | Path) -> ServoSpec:
+    """Load servo parameters by name or by the path of their TOML file; ``SpecError`` as the others."""
+    return _read(_find(name_or_path, "servos"), ServoSpec)
+
+
+def mounting_of(sensor: SensorSpec) -> MountingSpec:
+    """The mounting that bears the sensor's name; held level where there is none."""
+    return load_mounting(sensor.name if sensor.name in _list("mountings") else "level")
 
 
 def _list(kind: str) -> dict[str, Path]:

@@ -4,6 +4,7 @@ import numpy as np
 
 from hardware.cameras.source import FrameSource
 from hardware.devices import cameras
+from hardware.errors import StaleDataError
 
 WARMUP_S = 5.0
 
@@ -43,8 +44,11 @@ class LeRobotCamera:
         return self._source.read(timeout_s=timeout_ms / 1e3).image
 
     def read_latest(self, max_age_ms: float = 500) -> np.ndarray:
-        """The newest image; ``StaleDataError`` if it is older."""
-        return self._source.read_latest(max_age_s=max_age_ms / 1e3).image
+        """The newest image; ``TimeoutError`` if it is older."""
+        try:
+            return self._source.read_latest(max_age_s=max_age_ms / 1e3).image
+        except StaleDataError as error:
+            raise TimeoutError(str(error)) from error
 
     def disconnect(self) -> None:
         """Let go of it."""

@@ -5,7 +5,6 @@ import pytest
 from scenes import SpecError, list_experiments, list_objects, list_sensors, load_experiment, load_object, load_sensor
 from scenes.load import SHIPPED
 
-
 LOADERS = {"sensors": load_sensor, "objects": load_object, "experiments": load_experiment}
 
 

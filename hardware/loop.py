@@ -1,0 +1,330 @@
+"""The servo loop: frame, pose, law, arm. Knows a frame source, an estimator and an arm, and not what stands behind them."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from hardware.arms.arm import Arm, ArmState
+from hardware.cameras.source import FrameSource
+from hardware.errors import DeviceError, StaleDataError
+from hardware.rig_geometry import moved
+from hardware.servo import Memory, Reading, servo_step, tangent_of
+from hardware.timing import Spread, Timing
+from scenes.rig import MountingSpec, ServoSpec
+from twin.errors import TwinError
+from twin.types import Frame
+
+KEPT_STATES = 256
+WATCH_S = 0.02
+MOVE_TIMEOUT_S = 10.0
+BEHIND_MOVES = 2.0  # largest moves that an arm may lag behind before it is told more
+
+
+class Estimate(Protocol):
+    """What an estimator makes of a frame (``training.estimator.PoseEstimate``)."""
+
+    names: tuple
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    valid: bool
+    reason: str
+
+
+Estimator = Callable[[Frame], Estimate]
+Guard = Callable[[ArmState, np.ndarray], np.ndarray]  # state and target (6,) to what may be sent; raises to refuse
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """One decision.
+
+    Attributes
+    ----------
+    index : int
+    time_s : float
+        ``time.monotonic()`` when the command was given.
+    sequence : int
+        Of the frame behind it, ``frame_s`` its exposure, ``age_s`` its age then, ``fresh`` whether it was not used before.
+    latency_s : float
+        From exposure to command, and ``compute_s`` from having the frame to the command.
+    names : tuple of str
+    value, low, high : (K,) float
+        The estimate and its interval; NaN where not valid.
+    depth_mm, angle_deg : float
+        What they mean for the law.
+    pose, joints_deg : (6,), (J,) float
+        From where it decided (the arm's place, or the end of the move it is on), ``exposed_pose``: at the frame's exposure.
+    sent : (6,) float
+        What the arm was told.
+    """
+
+    index: int
+    time_s: float
+    sequence: int
+    frame_s: float
+    age_s: float
+    fresh: bool
+    latency_s: float
+    compute_s: float
+    names: tuple
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    depth_mm: float
+    angle_deg: float
+    pose: np.ndarray
+    exposed_pose: np.ndarray
+    joints_deg: np.ndarray
+    sent: np.ndarray
+
+    def plain(self) -> dict:
+        """For a session's line."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How the loop runs.
+
+    Attributes
+    ----------
+    steps : int
+    blocking : bool
+        Wait for each move and take a frame exposed after it; else a decision every ``period_s`` on the newest frame.
+    period_s : float
+    max_frame_age_s : float
+        An older frame decides nothing: the arm stops and holds.
+    give_up_s : float
+        After holding for so long the loop ends with an error.
+    """
+
+    steps: int
+    blocking: bool = True
+    period_s: float = 0.1
+    max_frame_age_s: float = 0.5
+    give_up_s: float = 3.0
+
+
+@dataclass
+class ServoLoop:
+    """Runs the law on what a camera shows.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Connected.
+    estimator : Estimator
+    arm : Arm
+        Connected; ``run`` enables and disables it.
+    servo : ServoSpec
+    mounting : MountingSpec
+    settings : LoopSettings
+    guards : list of Guard
+        Asked before every move, in order; each may clamp or refuse.
+    on_step : callable, optional
+        Called with each record, its frame and its estimate, after the command was given.
+    """
+
+    source: FrameSource
+    estimator: Estimator
+    arm: Arm
+    servo: ServoSpec
+    mounting: MountingSpec
+    settings: LoopSettings
+    guards: list = field(default_factory=list)
+    on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
+
+    def __post_init__(self):
+        self.records: list[StepRecord] = []
+        self.notes: list[str] = []  # what went wrong while ending
+        self._states: deque[ArmState] = deque(maxlen=KEPT_STATES)
+        self._started_s = self._ended_s = 0.0
+
+    def run(self, start_pose: np.ndarray) -> Timing:
+        """Approach the start pose (6,), follow the surface for the given steps, retreat.
+
+        Whatever happens, Ctrl-C too, the arm is stopped, retreats along the sensor's axis and is disabled.
+
+        Raises
+        ------
+        DeviceError
+            No usable frame or estimate for ``give_up_s``, or the arm failed.
+        """
+        self.arm.enable()
+        self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
+        touching = False
+        try:
+            self._move(self._away_from(start_pose), wait=True)
+            touching = True
+            self._move(start_pose, wait=True)
+            with self._watched():
+                self._follow()
+        finally:
+            self._ended_s = time.monotonic()
+            self._let_go(retreat=touching)
+        return self.timing()
+
+    def timing(self) -> Timing:
+        """Figures of the steps so far."""
+        fresh = [record for record in self.records if record.fresh]
+        spent_s = max(self._ended_s - self._started_s, 1e-9)
+        return Timing(
+            len(self.records),
+            len(self.records) / spent_s,
+            len(fresh) / spent_s,
+            Spread.of([record.latency_s for record in fresh]),
+            Spread.of([record.age_s for record in self.records]),
+            Spread.of([record.compute_s for record in fresh]),
+            self.source.dropped,
+        )
+
+    def _follow(self) -> None:
+        memory, used, tangent, estimate, reading = Memory(), None, None, None, Reading(np.nan, np.nan)
+        exposed_pose, sent = np.full(6, np.nan), None
+        self._started_s = due_s = good_s = time.monotonic()
+        while len(self.records) < self.settings.steps:
+            if not self.settings.blocking:
+                time.sleep(max(0.0, due_s - time.monotonic()))
+                due_s = max(due_s + self.settings.period_s, time.monotonic())
+            state = self._state()
+            try:
+                frame = self._frame(state)
+            except EOFError:
+                return
+            except (StaleDataError, TimeoutError, DeviceError) as problem:
+                self._hold(str(problem), good_s, problem)
+                continue
+            taken_s = time.monotonic()
+            fresh = used is None or frame.sequence != used.sequence
+            if fresh:
+                estimate, used = self.estimator(frame), frame
+                if estimate.valid:
+                    exposed_pose = self._pose_at(frame.time_s) if self.source.is_live else state.pose
+                    reading = self._reading(estimate)
+                    tangent = tangent_of(self.mounting, exposed_pose, reading)
+            if not estimate.valid:
+                self._hold(estimate.reason, good_s, None)
+                continue
+            from_pose = state.pose if sent is None or not state.moving else sent
+            if np.linalg.norm(from_pose[:3] - state.pose[:3]) > BEHIND_MOVES * self.servo.largest_move_mm:
+                continue  # the arm is still on its way
+            step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
+            memory, good_s = step.memory, time.monotonic()
+            sent = self._move(step.pose, wait=False)
+            now_s = time.monotonic()
+            record = StepRecord(
+                len(self.records),
+                now_s,
+                frame.sequence,
+                frame.time_s,
+                taken_s - frame.time_s,
+                fresh,
+                now_s - frame.time_s,
+                now_s - taken_s,
+                tuple(estimate.names),
+                estimate.value,
+                estimate.low,
+                estimate.high,
+                reading.depth_mm,
+                reading.angle_deg,
+                from_pose,
+                exposed_pose,
+                state.joints_deg,
+                sent,
+            )
+            self.records.append(record)
+            if self.on_step is not None:
+                self.on_step(record, frame, estimate)
+            if self.settings.blocking:
+                self.arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
+
+    def _frame(self, state: ArmState) -> Frame:
+        if not self.source.is_live:
+            return self.source.read()
+        if self.settings.blocking:
+            return self.source.read_after(state.time_s, timeout_s=self.settings.give_up_s)
+        return self.source.read_latest(max_age_s=self.settings.max_frame_age_s)
+
+    def _reading(self, estimate: Estimate) -> Reading:
+        value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
+        try:
+            depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]
+        except KeyError as missing:
+            raise DeviceError(
+                f"the model tells {', '.join(estimate.names)}; following a surface needs {self.mounting.depth_label} and "
+                f"{self.mounting.angle_label} (the mounting's depth_label and angle_label)"
+            ) from missing
+        return Reading(depth + self.mounting.zero_mm, angle - self.mounting.zero_deg)
+
+    def _hold(self, reason: str, good_s: float, problem: Exception | None) -> None:
+        """Stop where the arm is; give up after a while."""
+        self.arm.stop()
+        if not self.notes or self.notes[-1] != f"held: {reason}":
+            self.notes.append(f"held: {reason}")
+        held_s = time.monotonic() - good_s
+        if held_s > self.settings.give_up_s:
+            raise DeviceError(f"no usable frame for {held_s:.1f} s, the arm holds still: {reason}") from problem
+        time.sleep(min(0.05, self.settings.period_s))
+
+    @contextmanager
+    def _watched(self):
+        """While the arm moves as frames are exposed: where it is, many times a step."""
+        end = threading.Event()
+
+        def watch() -> None:
+            while not end.wait(WATCH_S):
+                with suppress(TwinError):  # the loop itself will meet it
+                    self._states.append(self.arm.state())
+
+        thread = threading.Thread(target=watch, name="arm watch", daemon=True)
+        if not self.settings.blocking:
+            thread.start()
+        try:
+            yield
+        finally:
+            end.set()
+            if thread.is_alive():
+                thread.join()
+
+    def _state(self) -> ArmState:
+        state = self.arm.state()
+        if state.error:
+            raise DeviceError(f"{self.arm.name}: {state.error}")
+        self._states.append(state)
+        return state
+
+    def _pose_at(self, time_s: float) -> np.ndarray:
+        """Where the arm was, between the states that were looked at (its turn about z unwrapped)."""
+        states = sorted(self._states.copy(), key=lambda state: state.time_s)
+        times = np.array([state.time_s for state in states])
+        poses = np.array([state.pose for state in states])
+        poses[:, 5] = np.unwrap(poses[:, 5], period=360.0)
+        return np.array([np.interp(time_s, times, column) for column in poses.T])
+
+    def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:
+        state = self._state()
+        for guard in self.guards:
+            target = guard(state, target)
+        return self.arm.move_linear(target, wait=wait, timeout_s=MOVE_TIMEOUT_S)
+
+    def _away_from(self, pose: np.ndarray) -> np.ndarray:
+        return moved(pose, -self.servo.clear_mm * np.array(self.mounting.axis))
+
+    def _let_go(self, *, retreat: bool) -> None:
+        """Stop, retreat, disable; each is tried whatever became of the others."""
+
+        def back() -> None:
+            self.arm.move_linear(self._away_from(self.arm.state().pose), wait=True, timeout_s=MOVE_TIMEOUT_S)
+
+        for name, act in (("stop", self.arm.stop), *((("retreat", back),) if retreat else ()), ("disable", self.arm.disable)):
+            try:
+                act()
+            except TwinError as error:
+                self.notes.append(f"{name} failed: {error}")

@@ -99,8 +99,6 @@ class LoopSettings:
     blocking : bool
         Wait for each move and take a frame exposed after it; else a decision every ``period_s`` on the newest frame.
     period_s : float
-    max_frame_age_s : float
-        An older frame decides nothing: the arm stops and holds.
     give_up_s : float
         After holding for so long the loop ends with an error.
     """
@@ -108,7 +106,6 @@ class LoopSettings:
     steps: int
     blocking: bool = True
     period_s: float = 0.1
-    max_frame_age_s: float = 0.5
     give_up_s: float = 3.0
 
 
@@ -143,7 +140,8 @@ class ServoLoop:
 
     def __post_init__(self):
         self.records: list[StepRecord] = []
-        self.notes: list[str] = []  # what went wrong while ending
+        self.notes: list[str] = []  # what went wrong
+        self._holding = False
         self._states: deque[ArmState] = deque(maxlen=KEPT_STATES)
         self._started_s = self._ended_s = 0.0
 
@@ -188,14 +186,14 @@ class ServoLoop:
     def _follow(self) -> None:
         memory, used, tangent, estimate, reading = Memory(), None, None, None, Reading(np.nan, np.nan)
         exposed_pose, sent = np.full(6, np.nan), None
-        self._started_s = due_s = good_s = time.monotonic()
+        self._started_s = due_s = good_s = arrived_s = time.monotonic()
         while len(self.records) < self.settings.steps:
             if not self.settings.blocking:
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 due_s = max(due_s + self.settings.period_s, time.monotonic())
             state = self._state()
             try:
-                frame = self._frame(state)
+                frame = self._frame(state, arrived_s)
             except EOFError:
                 return
             except (StaleDataError, TimeoutError, DeviceError) as problem:
@@ -216,7 +214,7 @@ class ServoLoop:
             if np.linalg.norm(from_pose[:3] - state.pose[:3]) > BEHIND_MOVES * self.servo.largest_move_mm:
                 continue  # the arm is still on its way
             step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
-            memory, good_s = step.memory, time.monotonic()
+            memory, good_s, self._holding = step.memory, time.monotonic(), False
             sent = self._move(step.pose, wait=False)
             now_s = time.monotonic()
             record = StepRecord(
@@ -245,12 +243,14 @@ class ServoLoop:
             if self.settings.blocking:
                 self.arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
 
-    def _frame(self, state: ArmState) -> Frame:
+    def _frame(self, state: ArmState, arrived_s: float) -> Frame:
         if not self.source.is_live:
             return self.source.read()
         if self.settings.blocking:
             return self.source.read_after(state.time_s, timeout_s=self.settings.give_up_s)
-        return self.source.read_latest(max_age_s=self.settings.max_frame_age_s)
+        if not self.records:  # not one of the approach
+            return self.source.read_after(arrived_s, timeout_s=self.settings.give_up_s)
+        return self.source.read_latest(max_age_s=self.servo.max_frame_age_s)
 
     def _reading(self, estimate: Estimate) -> Reading:
         value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
@@ -266,8 +266,9 @@ class ServoLoop:
     def _hold(self, reason: str, good_s: float, problem: Exception | None) -> None:
         """Stop where the arm is; give up after a while."""
         self.arm.stop()
-        if not self.notes or self.notes[-1] != f"held: {reason}":
-            self.notes.append(f"held: {reason}")
+        if not self._holding:
+            self.notes.append(f"held still before step {len(self.records)}: {reason}")
+        self._holding = True
         held_s = time.monotonic() - good_s
         if held_s > self.settings.give_up_s:
             raise DeviceError(f"no usable frame for {held_s:.1f} s, the arm holds still: {reason}") from problem

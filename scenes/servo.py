@@ -81,6 +81,8 @@ class ServoSpec(Section):
     clear_mm : float
         From where the surface is approached, and to where the arm retreats.
     linear_mm_s, angular_deg_s : float
+    max_frame_age_s : float
+        An older frame decides nothing: the arm stops and holds.
     placement : PlacementSpec
         Where the object stands.
     """

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from scenes.errors import SpecError
 from scenes.experiment import ExperimentSpec
 from scenes.object import MeshShape, ObjectSpec
+from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
 
 SHIPPED = Path(__file__).parent
@@ -19,7 +20,7 @@ Spec = TypeVar("Spec", bound=BaseModel)
 
 
 def user_spec_dir() -> Path:
-    """Where a user's own ``sensors/*.toml``, ``objects/*.toml`` and ``experiments/*.toml`` lie.
+    """Where a user's own ``sensors/*.toml``, ``objects/``, ``experiments/`` and ``randomisations/`` lie.
 
     ``TACTIP_SPECS`` if set, else ``$XDG_CONFIG_HOME/tactip-twin`` (``~/.config``).
     """
@@ -41,6 +42,11 @@ def list_objects() -> dict[str, Path]:
 def list_experiments() -> dict[str, Path]:
     """Experiment names and their files; a user's own file of the same name wins."""
     return _list("experiments")
+
+
+def list_randomisations() -> dict[str, Path]:
+    """Names of randomisations and their files; a user's own file of the same name wins."""
+    return _list("randomisations")
 
 
 def load_sensor(name_or_path: str | Path) -> SensorSpec:
@@ -86,6 +92,17 @@ def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
         If there is no such experiment, or its file is wrong: names file, key and remedy.
     """
     return _read(_find(name_or_path, "experiments"), ExperimentSpec)
+
+
+def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
+    """Load a randomisation by name or by the path of its TOML file.
+
+    Raises
+    ------
+    SpecError
+        If there is no such randomisation, or its file is wrong: names file, key and remedy.
+    """
+    return _read(_find(name_or_path, "randomisations"), RandomisationSpec)
 
 
 def _list(kind: str) -> dict[str, Path]:

@@ -13,10 +13,11 @@ import numpy as np
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
+from hardware.mounting import Mounting
 from hardware.rig_geometry import moved
 from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.timing import Spread, Timing
-from scenes.rig import MountingSpec, ServoSpec
+from scenes.servo import ServoSpec
 from twin.errors import TwinError
 from twin.types import Frame
 
@@ -121,7 +122,7 @@ class ServoLoop:
     arm : Arm
         Connected; ``run`` enables and disables it.
     servo : ServoSpec
-    mounting : MountingSpec
+    mounting : Mounting
     settings : LoopSettings
     guards : list of Guard
         Asked before every move, in order; each may clamp or refuse.
@@ -133,7 +134,7 @@ class ServoLoop:
     estimator: Estimator
     arm: Arm
     servo: ServoSpec
-    mounting: MountingSpec
+    mounting: Mounting
     settings: LoopSettings
     guards: list = field(default_factory=list)
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
@@ -259,9 +260,9 @@ class ServoLoop:
         except KeyError as missing:
             raise DeviceError(
                 f"the model tells {', '.join(estimate.names)}; following a surface needs {self.mounting.depth_label} and "
-                f"{self.mounting.angle_label} (the mounting's depth_label and angle_label)"
+                f"{self.mounting.angle_label} (the experiment's)"
             ) from missing
-        return Reading(depth + self.mounting.zero_mm, angle - self.mounting.zero_deg)
+        return Reading(self.mounting.depth_mm(depth), self.mounting.angle_deg(angle))
 
     def _hold(self, reason: str, good_s: float, problem: Exception | None) -> None:
         """Stop where the arm is; give up after a while."""
@@ -316,7 +317,7 @@ class ServoLoop:
         return self.arm.move_linear(target, wait=wait, timeout_s=MOVE_TIMEOUT_S)
 
     def _away_from(self, pose: np.ndarray) -> np.ndarray:
-        return moved(pose, -self.servo.clear_mm * np.array(self.mounting.axis))
+        return moved(pose, -self.servo.clear_mm * self.mounting.axis)
 
     def _let_go(self, *, retreat: bool) -> None:
         """Stop, retreat, disable; each is tried whatever became of the others."""

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hardware.mounting import Mounting
 from scenes.object import ObjectSpec
-from scenes.rig import MountingSpec, PlacementSpec
+from scenes.servo import PlacementSpec
 from twin.stimulus import build_stimulus
 
 OUTLINE_STEP_MM = 0.5
@@ -35,9 +36,9 @@ def moved(pose: np.ndarray, step_mm: np.ndarray) -> np.ndarray:
     return out
 
 
-def sensor_in_tool(mounting: MountingSpec) -> np.ndarray:
+def sensor_in_tool(mounting: Mounting) -> np.ndarray:
     """``T_tool_sensor`` (4, 4)."""
-    axis, across = np.array(mounting.axis), np.array(mounting.across)
+    axis, across = mounting.axis, mounting.across
     turn = np.radians(mounting.image_turn_deg)
     side = np.cross(axis, across)  # where the sensor's azimuth goes on to, a quarter turn after ``across``
     T = np.eye(4)
@@ -86,19 +87,16 @@ class PlacedObject:
     ----------
     spec : ObjectSpec
     placement : PlacementSpec
-    mounting : MountingSpec
-    radius_mm : float
-        Of the dome.
+    mounting : Mounting
     """
 
-    def __init__(self, spec: ObjectSpec, placement: PlacementSpec, mounting: MountingSpec, radius_mm: float) -> None:
-        self.spec, self.mounting, self._radius_mm = spec, mounting, radius_mm
+    def __init__(self, spec: ObjectSpec, placement: PlacementSpec, mounting: Mounting) -> None:
+        self.spec, self.mounting = spec, mounting
         self.T_base_object = object_in_base(placement)
         self._T_tool_sensor = sensor_in_tool(mounting)
         # the outline without its texture, as far out as that lies
         self._field = build_stimulus(spec.model_copy(update={"texture": None}))
         self._raised_mm = spec.texture.wire_diameter_mm if spec.texture else 0.0
-        self.ahead_mm = float(np.dot(mounting.centre_mm, mounting.axis))  # of the tool, to the dome's centre
 
     def seen_from(self, pose: np.ndarray) -> np.ndarray:
         """``T_sensor_object`` (4, 4) with the arm at a pose (6,)."""
@@ -106,27 +104,27 @@ class PlacedObject:
 
     def start_pose(self, indent_mm: float) -> np.ndarray:
         """The arm's pose (6,) with the sensor normal to the object at its origin, that deep."""
-        x, y, z = self.mounting.across, self.mounting.axis, np.cross(self.mounting.across, self.mounting.axis)
+        x, y, z = self.mounting.across, self.mounting.axis, self.mounting.out_of_plane
         T = np.eye(4)  # the tool's across, axis and plane's normal lie along the object's x, z and -y
         T[:3, :3] = self.T_base_object[:3, [0, 2, 1]] * [1, 1, -1] @ np.stack([x, y, z])
-        out_mm = self._radius_mm + self._raised_mm - indent_mm
+        out_mm = self.mounting.radius_mm + self._raised_mm - indent_mm
         centre = self.T_base_object[:3, 3] - out_mm * self.T_base_object[:3, 2]
-        T[:3, 3] = centre - T[:3, :3] @ np.array(self.mounting.centre_mm)
+        T[:3, 3] = centre - T[:3, :3] @ self.mounting.centre_mm
         return pose_of(T, np.zeros(6))
 
     def touch(self, pose: np.ndarray) -> Touch:
         """What the sensor truly touches with the arm at a pose (6,)."""
         T = matrix_of(pose)
-        centre = T[:3, :3] @ np.array(self.mounting.centre_mm) + T[:3, 3]
+        centre = T[:3, :3] @ self.mounting.centre_mm + T[:3, 3]
         turn = self.T_base_object[:3, :3]
         distance, gradient, _ = self._field.probe(((centre - self.T_base_object[:3, 3]) @ turn)[None])
         gap, outward = float(distance[0]) - self._raised_mm, turn @ gradient[0]
-        axis, across = T[:3, :3] @ np.array(self.mounting.axis), T[:3, :3] @ np.array(self.mounting.across)
+        axis, across = T[:3, :3] @ self.mounting.axis, T[:3, :3] @ self.mounting.across
         inward = -outward
         angle = np.degrees(np.arctan2(inward @ across, inward @ axis))
         tool_gap = gap + float(outward @ (T[:3, 3] - centre))
-        depth = self._radius_mm + self.ahead_mm - tool_gap
-        return Touch(depth, float(angle), self._radius_mm - gap, centre - gap * outward)
+        depth = self.mounting.apex_mm @ self.mounting.axis - tool_gap
+        return Touch(depth, float(angle), self.mounting.radius_mm - gap, centre - gap * outward)
 
     def distance_mm(self, place_mm: np.ndarray) -> float:
         """Of a place (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""

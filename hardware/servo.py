@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hardware.mounting import Mounting
 from hardware.rig_geometry import matrix_of, pose_of
-from scenes.rig import MountingSpec, ServoSpec
+from scenes.servo import ServoSpec
 
 
 @dataclass(frozen=True)
@@ -53,40 +54,40 @@ class Step:
     error_deg: float
 
 
-def tangent_of(mounting: MountingSpec, pose: np.ndarray, reading: Reading) -> np.ndarray:
+def tangent_of(mounting: Mounting, pose: np.ndarray, reading: Reading) -> np.ndarray:
     """``T_base_surface`` (4, 4): a tool there, turned alike, would just touch, normal to the surface.
 
     Parameters
     ----------
-    mounting : MountingSpec
+    mounting : Mounting
     pose : (6,) float
         The arm's pose when the frame was exposed.
     reading : Reading
     """
-    axis, out_of_plane = _directions(mounting)
+    axis, out_of_plane = mounting.axis, mounting.out_of_plane
     T = matrix_of(pose)
     T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(-np.radians(reading.angle_deg) * out_of_plane).as_matrix()
     T[:3, 3] -= reading.depth_mm * (T[:3, :3] @ axis)
     return T
 
 
-def reading_at(mounting: MountingSpec, T_base_surface: np.ndarray, pose: np.ndarray) -> Reading:
+def reading_at(mounting: Mounting, T_base_surface: np.ndarray, pose: np.ndarray) -> Reading:
     """Depth and angle of a tool at a pose (6,) against a tangent (4, 4)."""
-    axis, out_of_plane = _directions(mounting)
+    axis, out_of_plane = mounting.axis, mounting.out_of_plane
     seen = np.linalg.inv(T_base_surface) @ matrix_of(pose)
     turn = Rotation.from_matrix(seen[:3, :3]).as_rotvec(degrees=True)
     return Reading(float(axis @ seen[:3, 3]), float(out_of_plane @ turn))
 
 
 def servo_step(
-    spec: ServoSpec, mounting: MountingSpec, T_base_surface: np.ndarray, pose: np.ndarray, memory: Memory, *, fresh: bool = True
+    spec: ServoSpec, mounting: Mounting, T_base_surface: np.ndarray, pose: np.ndarray, memory: Memory, *, fresh: bool = True
 ) -> Step:
     """The arm's next pose.
 
     Parameters
     ----------
     spec : ServoSpec
-    mounting : MountingSpec
+    mounting : Mounting
     T_base_surface : (4, 4) float
         The surface's tangent, as ``tangent_of`` gives it.
     pose : (6,) float
@@ -95,7 +96,7 @@ def servo_step(
     fresh : bool
         Whether the tangent is from a new frame; an old one adds nothing to the sums.
     """
-    axis, out_of_plane = _directions(mounting)
+    axis, out_of_plane = mounting.axis, mounting.out_of_plane
     now = reading_at(mounting, T_base_surface, pose)
     error_mm, error_deg = spec.indent_mm - now.depth_mm, spec.angle_deg - now.angle_deg
     if fresh:
@@ -106,15 +107,9 @@ def servo_step(
     press_mm = spec.kp_depth * error_mm + spec.ki_depth * memory.depth_mm
     turn_deg = spec.kp_angle * error_deg + spec.ki_angle * memory.angle_deg
     turn_deg = float(np.clip(turn_deg, -spec.largest_turn_deg, spec.largest_turn_deg))
-    step_mm = spec.feed_mm * np.array(mounting.across) + press_mm * axis
+    step_mm = spec.feed_mm * mounting.across + press_mm * axis
     step_mm *= min(1.0, spec.largest_move_mm / max(np.linalg.norm(step_mm), 1e-9))
     T = matrix_of(pose)
     T[:3, :3] = T_base_surface[:3, :3] @ Rotation.from_rotvec(np.radians(now.angle_deg + turn_deg) * out_of_plane).as_matrix()
     T[:3, 3] += T_base_surface[:3, :3] @ step_mm
     return Step(pose_of(T, pose), memory, error_mm, error_deg)
-
-
-def _directions(mounting: MountingSpec) -> tuple[np.ndarray, np.ndarray]:
-    """The sensor's axis, and that about which the tool turns in its plane (tool frame)."""
-    axis = np.array(mounting.axis)
-    return axis, np.cross(mounting.across, axis)

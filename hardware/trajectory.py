@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from hardware.loop import StepRecord
-from hardware.rig_geometry import PlacedObject, moved
+from hardware.mounting import Mounting
+from hardware.rig_geometry import PlacedObject
+from hardware.servo import Reading, tangent_of
 
 LOCAL_N = 9  # points in a window of the local smoothness
 SETTLING_N = 5  # steps after the start that the errors leave out
@@ -81,21 +83,21 @@ class Measures:
     lost_contacts: int
 
 
-def trajectory_of(records: list[StepRecord], placed: PlacedObject | None, *, ahead_mm: float, axis: np.ndarray) -> Trajectory:
+def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedObject | None = None) -> Trajectory:
     """The trajectory of a loop's steps on fresh frames.
 
     Parameters
     ----------
     records : list of StepRecord
+    mounting : Mounting
     placed : PlacedObject, optional
         Tells the truth where it is known.
-    ahead_mm : float
-        From the tool to the dome's apex along the axis (3,): where the surface is felt at depth 0.
     """
     used = [record for record in records if record.fresh]
     poses = np.array([record.exposed_pose for record in used]).reshape(-1, 6)
     depth, angle = (np.array([getattr(record, key) for record in used]) for key in ("depth_mm", "angle_deg"))
-    felt = np.array([_felt(record, ahead_mm, axis) for record in used]).reshape(-1, 3)
+    tangents = [tangent_of(mounting, record.exposed_pose, Reading(record.depth_mm, record.angle_deg)) for record in used]
+    felt = np.array([T[:3, :3] @ mounting.apex_mm + T[:3, 3] for T in tangents]).reshape(-1, 3)
     none = np.full(len(used), np.nan)
     if placed is None:
         return Trajectory(poses[:, :2], felt[:, :2], depth, angle, none, none, none, none, none)
@@ -197,10 +199,3 @@ def write_csv(path: Path, trajectory: Trajectory) -> Path:
         writer.writerow(["step", *columns])
         writer.writerows([k, *(f"{value:.6g}" for value in row)] for k, row in enumerate(zip(*columns.values(), strict=True)))
     return path
-
-
-def _felt(record: StepRecord, ahead_mm: float, axis: np.ndarray) -> np.ndarray:
-    """Where (3,) the estimate puts the surface: at the apex of a sensor turned normal to it, less the depth."""
-    pose = record.exposed_pose.copy()
-    pose[5] -= record.angle_deg
-    return moved(pose, (ahead_mm - record.depth_mm) * axis)[:3]

@@ -11,8 +11,9 @@ from pydantic import BaseModel, ValidationError
 from scenes.errors import SpecError
 from scenes.experiment import ExperimentSpec
 from scenes.object import MeshShape, ObjectSpec
-from scenes.rig import MountingSpec, ServoSpec
+from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
+from scenes.servo import ServoSpec
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
@@ -20,7 +21,7 @@ Spec = TypeVar("Spec", bound=BaseModel)
 
 
 def user_spec_dir() -> Path:
-    """Where a user's own ``sensors/*.toml``, ``objects/*.toml``, ``experiments/*.toml``, ``mountings/*.toml`` and ``servos/*.toml`` lie.
+    """Where a user's own ``sensors/*.toml``, ``objects/``, ``experiments/``, ``randomisations/`` and ``servos/`` lie.
 
     ``TACTIP_SPECS`` if set, else ``$XDG_CONFIG_HOME/tactip-twin`` (``~/.config``).
     """
@@ -42,6 +43,11 @@ def list_objects() -> dict[str, Path]:
 def list_experiments() -> dict[str, Path]:
     """Experiment names and their files; a user's own file of the same name wins."""
     return _list("experiments")
+
+
+def list_randomisations() -> dict[str, Path]:
+    """Names of randomisations and their files; a user's own file of the same name wins."""
+    return _list("randomisations")
 
 
 def load_sensor(name_or_path: str | Path) -> SensorSpec:
@@ -89,19 +95,20 @@ def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
     return _read(_find(name_or_path, "experiments"), ExperimentSpec)
 
 
-def load_mounting(name_or_path: str | Path) -> MountingSpec:
-    """Load a mounting by name or by the path of its TOML file; ``SpecError`` as the others."""
-    return _read(_find(name_or_path, "mountings"), MountingSpec)
+def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
+    """Load a randomisation by name or by the path of its TOML file.
+
+    Raises
+    ------
+    SpecError
+        If there is no such randomisation, or its file is wrong: names file, key and remedy.
+    """
+    return _read(_find(name_or_path, "randomisations"), RandomisationSpec)
 
 
 def load_servo(name_or_path: str | Path) -> ServoSpec:
     """Load servo parameters by name or by the path of their TOML file; ``SpecError`` as the others."""
     return _read(_find(name_or_path, "servos"), ServoSpec)
-
-
-def mounting_of(sensor: SensorSpec) -> MountingSpec:
-    """The mounting that bears the sensor's name; held level where there is none."""
-    return load_mounting(sensor.name if sensor.name in _list("mountings") else "level")
 
 
 def _list(kind: str) -> dict[str, Path]:

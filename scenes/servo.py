@@ -1,56 +1,12 @@
-"""Specifications of the rig: how a sensor is mounted on an arm, and how it follows a surface.
-
-Tool and base frames are the arm's. Following happens in one plane: that of the sensor's axis and of ``across``.
-"""
+"""The specification of following a surface in a plane, and of where the object stands."""
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from scenes.base import NonNegative, Positive, Section
 
 Three = tuple[float, float, float]
-
-
-class MountingSpec(Section):
-    """A sensor on an arm's tool, and what its labels call zero. ``name`` is the file's stem.
-
-    Attributes
-    ----------
-    axis : (x, y, z)
-        The sensor's z (out of the dome's apex) in the tool frame.
-    across : (x, y, z)
-        Direction of the tool frame, across the axis, along which the tool is fed; a positive angle turns it towards the axis.
-    image_turn_deg : float
-        Azimuth of ``across`` in the sensor frame, from image x towards image y.
-    centre_mm : (x, y, z)
-        The dome's centre in the tool frame.
-    depth_label, angle_label : str
-        The labels that tell how deep and how far from the surface's normal the tool is.
-    zero_mm, zero_deg : float
-        Indentation where the depth's label is 0, and what the angle's label is where the sensor stands normal to the surface.
-    """
-
-    name: str
-    description: str
-    source: str = ""
-    axis: Three = (0.0, 1.0, 0.0)
-    across: Three = (1.0, 0.0, 0.0)
-    image_turn_deg: float = 90.0
-    centre_mm: Three = (0.0, -20.0, 0.0)
-    depth_label: str = "pose_2"
-    angle_label: str = "pose_6"
-    zero_mm: float = 5.0
-    zero_deg: float = 0.0
-
-    @model_validator(mode="after")
-    def _check(self):
-        for name, vector in (("axis", self.axis), ("across", self.across)):
-            if abs(sum(v * v for v in vector) - 1) > 1e-6:
-                raise ValueError(f"{name} must have length 1, got {vector}")
-        if abs(sum(a * b for a, b in zip(self.axis, self.across, strict=True))) > 1e-6:
-            raise ValueError("axis and across must be at right angles")
-        return self
 
 
 class PlacementSpec(Section):
@@ -68,6 +24,8 @@ class ServoSpec(Section):
 
     Attributes
     ----------
+    experiment : str
+        The one whose labels the model tells: its approach, and what they call zero.
     indent_mm, angle_deg : float
         The reference: how deep, and how far from the normal.
     feed_mm : float
@@ -90,6 +48,7 @@ class ServoSpec(Section):
     name: str
     description: str
     source: str = ""
+    experiment: str = "surface-2d"
     indent_mm: Positive = 3.0
     angle_deg: float = 0.0
     feed_mm: Positive = 1.0

@@ -39,10 +39,12 @@ class SkinSolver:
     ----------
     spec : SensorSpec
     resolution : Resolution, optional
+    keep : bool
+        Whether what depends on the geometry is kept on disk; not for geometries that are used once.
     """
 
-    def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None):
-        self.spec, self.resolution = spec, resolution or Resolution()
+    def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None, keep: bool = True):
+        self.spec, self.resolution, self._keep = spec, resolution or Resolution(), keep
         self.mesh = build_mesh(spec)
         self._blas = ThreadpoolController()
         self._setting = lru_cache(maxsize=32)(self._set_up)
@@ -150,7 +152,7 @@ class SkinSolver:
 
     def _set_up(self, focus: Focus) -> Setting:
         spec = self.spec
-        solid = build_solid(spec, resolution=self.resolution, focus=focus)
+        solid = build_solid(spec, resolution=self.resolution, focus=focus, keep=self._keep)
         gel = law_coefficients(spec.gel, layer=False)
         kinds = (
             Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True),

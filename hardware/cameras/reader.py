@@ -171,7 +171,7 @@ class LiveSource(ABC):
         while not self._end.is_set():
             try:
                 picture = self._grab()
-                frame = self._frame_of(picture)
+                image = self._finish(picture.image)
             except ReadFailed as failure:
                 self.failed += 1
                 in_a_row += 1
@@ -187,8 +187,10 @@ class LiveSource(ABC):
                 in_a_row = 0
                 with self._new:
                     self._fault = self._look_at(picture)
+                    self._sequence += 1 + picture.lost
                     self._dropped += 1 + picture.lost
-                    self._frame = frame
+                    name = f"frame_{self._sequence:06d}.png"
+                    self._frame = Frame(image, self.form, name, picture.time_s, self._sequence)
                     self._new.notify_all()
 
     def _pause(self) -> None:
@@ -199,11 +201,6 @@ class LiveSource(ABC):
         with self._new:
             self._error = error
             self._new.notify_all()
-
-    def _frame_of(self, picture: Picture) -> Frame:
-        image = self._finish(picture.image)
-        self._sequence += 1 + picture.lost
-        return Frame(image, self.form, f"frame_{self._sequence:06d}.png", picture.time_s, self._sequence)
 
     def _look_at(self, picture: Picture) -> str:
         if picture.image.max(initial=0) < BLACK_LEVEL:

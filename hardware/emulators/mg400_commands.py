@@ -139,9 +139,7 @@ class Mg400Commands:
     def _inverse(self, request: Request) -> str:
         if len(request.values) not in (6, 7, 8):  # two more say near which joints: there is but one solution
             raise RefusedError(ErrorId.PARAMETER_COUNT)
-        *pose, user, tool = read_numbers(
-            Request(request.name, request.values[:6], {}, request.text), (NUMBER,) * 4 + (INDEX,) * 2, (6,)
-        )
+        *pose, user, tool = read_numbers(Request(request.name, request.values[:6], {}, request.text), (NUMBER,) * 4 + (INDEX,) * 2, (6,))
         joints = self.arm.joints_at(self._flange(pose, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
         if self.arm.kinematics.violation(joints):
             raise RefusedError(ErrorId.FAILED)

@@ -12,10 +12,12 @@ ALARMS = {
     **dict(enumerate(_JOINT_ENDS, start=64)),
     72: "the parallelogram is at its end (J3 - J2 too large)",
     73: "the parallelogram is at its end (J3 - J2 too small)",
+    **{79 + joint: f"J{joint} lost steps" for joint in (1, 2, 3, 4)},
     85: "the emergency stop is or was pressed",
     112: "collision",
 }
 _REMEDIES = {
+    **dict.fromkeys(range(80, 84), "free the arm and home it"),
     -2: "free the arm by hand",
     85: "release the emergency stop",
     112: "free the arm by hand",

@@ -90,6 +90,21 @@ def between(start: np.ndarray, end: np.ndarray, share: float, linear: bool) -> n
     return value
 
 
+def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Violation | None:
+    """What a straight line would break: its end first, then the way there."""
+    steps = max(1, int(np.ceil(np.linalg.norm(end[:3] - start[:3]) / LINE_STEP_MM)))
+    for n in (steps, *range(1, steps)):
+        try:
+            broken = kinematics.violation(kinematics.inverse(between(start, end, n / steps, True)))
+        except OutOfReachError as error:
+            broken = Violation(NO_INVERSE, str(error))
+        if broken and n < steps:
+            return Violation(LINE_LEAVES_WORKSPACE, f"the line to it leaves the workspace: {broken.text}")
+        if broken:
+            return broken if broken.code == NO_INVERSE else Violation(TARGET_LIMIT, broken.text)
+    return None
+
+
 class MotionTrack:
     """Where an arm is, was and (as planned) will be. Safe to use from several threads.
 
@@ -130,7 +145,7 @@ class MotionTrack:
             begins_s = max(now_s, last.end_s)
             start = last.pose(begins_s) if linear else last.joints_deg(begins_s)
             end = np.asarray(end, float)
-            broken = self.check_line(start, end) if linear else self.kinematics.violation(end)
+            broken = check_line(self.kinematics, start, end) if linear else self.kinematics.violation(end)
             if broken:
                 return broken
             length, turn = _lengths(start, end, linear)
@@ -153,20 +168,6 @@ class MotionTrack:
             if kept[-1].end_s > now_s:
                 kept[-1] = replace(kept[-1], cut_s=now_s)
             self._pieces = deque(kept, maxlen=HISTORY_N)
-
-    def check_line(self, start: np.ndarray, end: np.ndarray) -> Violation | None:
-        """What a straight line would break: its end first, then the way there."""
-        steps = max(1, int(np.ceil(np.linalg.norm(end[:3] - start[:3]) / LINE_STEP_MM)))
-        for n in (steps, *range(1, steps)):
-            try:
-                broken = self.kinematics.violation(self.kinematics.inverse(between(start, end, n / steps, True)))
-            except OutOfReachError as error:
-                broken = Violation(NO_INVERSE, str(error))
-            if broken and n < steps:
-                return Violation(LINE_LEAVES_WORKSPACE, f"the line to it leaves the workspace: {broken.text}")
-            if broken:
-                return broken if broken.code == NO_INVERSE else Violation(TARGET_LIMIT, broken.text)
-        return None
 
     def _at(self, time_s: float) -> Piece:
         with self._lock:

@@ -90,7 +90,8 @@ class Mg400Emulator:
         self._commands = Mg400Commands(self.arm, version)
         self._bare = version < FIRST_NUMBERED_REPLIES
         self.ports: dict[int, int] = {}
-        self._listeners: dict[socket.socket, int] = {}
+        self._sockets: list[socket.socket] = []  # bound
+        self._listeners: dict[socket.socket, int] = {}  # of them, those that listen
         self._clients: dict[socket.socket, int] = {}
         self._lock, self._ended = Lock(), Event()
         self._threads: list[Thread] = []
@@ -120,7 +121,7 @@ class Mg400Emulator:
         for port in PORTS:
             listener = socket.socket()
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._listeners[listener] = port
+            self._sockets.append(listener)
             try:
                 listener.bind((self.host, 0 if self._port_offset is None else port + self._port_offset))
             except OSError as error:
@@ -132,6 +133,7 @@ class Mg400Emulator:
             self.ports[port] = listener.getsockname()[1]
             if port not in deaf:
                 listener.listen()
+                self._listeners[listener] = port
         self._run(self._accept)
         for name, action in (("emergency-stop", self.arm.press_emergency_stop), ("die", self.kill)):
             if (after_s := self.faults.value(name)) is not None:
@@ -159,8 +161,8 @@ class Mg400Emulator:
                         client.close()
                     else:
                         client.shutdown(socket.SHUT_RDWR)
-            for listener in self._listeners:
-                listener.close()
+            for bound in self._sockets:
+                bound.close()
             self._clients.clear()
 
     def _run(self, target, *arguments) -> None:
@@ -173,7 +175,7 @@ class Mg400Emulator:
             try:
                 ready, _, _ = select.select([one for one in self._listeners if one.fileno() >= 0], [], [], 0.05)
                 accepted = [(listener.accept()[0], self._listeners[listener]) for listener in ready]
-            except (OSError, ValueError):  # closed meanwhile, or a deaf port
+            except (OSError, ValueError):  # closed meanwhile
                 continue
             for client, port in accepted:
                 with self._lock:

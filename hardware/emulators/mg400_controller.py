@@ -8,7 +8,7 @@ import numpy as np
 
 from hardware.arms.kinematics import MG400, OutOfReachError, Violation
 from hardware.arms.mg400_wire import MAX_JOINT_DEG_S, MAX_LINEAR_MM_S, ErrorId, Mode
-from hardware.arms.motion import MotionTrack, Speeds
+from hardware.arms.motion import MotionTrack, Speeds, check_line
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400_grammar import RefusedError
 
@@ -242,7 +242,7 @@ class Mg400Controller:
                 self._due = [(self.track.end_s, (violation.code,))]
 
     def _at_end(self, end: np.ndarray, linear: bool) -> Violation | None:
-        return self.track.check_line(end, end) if linear else self.kinematics.violation(end)
+        return check_line(self.kinematics, end, end) if linear else self.kinematics.violation(end)
 
     def _plan(self, order: Order) -> None:
         planned = self.track.move(order.end, order.speeds, linear=order.linear, now_s=time.monotonic())

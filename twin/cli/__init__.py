@@ -29,6 +29,7 @@ def main() -> None:
         dataset,
         demo,
         doctor,
+        emulate,
         evaluate,
         graph,
         predict,

@@ -14,7 +14,7 @@ from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
 from hardware.mounting import Mounting
-from hardware.rig_geometry import moved
+from hardware.rig_geometry import matrix_of, moved
 from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.timing import Spread, Timing
 from scenes.servo import ServoSpec
@@ -23,6 +23,7 @@ from twin.types import Frame
 
 KEPT_STATES = 256
 WATCH_S = 0.02
+MOST_PIECES, NEAR_MM = 200, 0.5
 MOVE_TIMEOUT_S = 10.0
 BEHIND_MOVES = 2.0  # largest moves that an arm may lag behind before it is told more
 
@@ -126,6 +127,11 @@ class ServoLoop:
     settings : LoopSettings
     guards : list of Guard
         Asked before every move, in order; each may clamp or refuse.
+    sense : callable, optional
+        Told the depth (mm) and the exposure (``time.monotonic()``) of each fresh estimate, before the move.
+    retreat : callable, optional
+        Withdraws the arm, given the direction (3,) away from the object in the base frame; by default a straight move of the
+        servo's ``clear_mm``.
     on_step : callable, optional
         Called with each record, its frame and its estimate, after the command was given.
     """
@@ -137,6 +143,8 @@ class ServoLoop:
     mounting: Mounting
     settings: LoopSettings
     guards: list = field(default_factory=list)
+    sense: Callable[[float, float], None] | None = None
+    retreat: Callable[[np.ndarray], object] | None = None
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
 
     def __post_init__(self):
@@ -208,6 +216,8 @@ class ServoLoop:
                     exposed_pose = self._pose_at(frame.time_s) if self.source.is_live else state.pose
                     reading = self._reading(estimate)
                     tangent = tangent_of(self.mounting, exposed_pose, reading)
+                    if self.sense is not None:
+                        self.sense(reading.depth_mm, frame.time_s)
             if not estimate.valid:
                 self._hold(estimate.reason, good_s, None)
                 continue
@@ -311,10 +321,15 @@ class ServoLoop:
         return np.array([np.interp(time_s, times, column) for column in poses.T])
 
     def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:
-        state = self._state()
-        for guard in self.guards:
-            target = guard(state, target)
-        return self.arm.move_linear(target, wait=wait, timeout_s=MOVE_TIMEOUT_S)
+        """Move, in as many pieces as guards and arm make of it if the end is waited for; what was sent last."""
+        for _ in range(MOST_PIECES if wait else 1):
+            state, allowed = self._state(), target
+            for guard in self.guards:
+                allowed = guard(state, allowed)
+            sent = self.arm.move_linear(allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S)
+            if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM:
+                break
+        return sent
 
     def _away_from(self, pose: np.ndarray) -> np.ndarray:
         return moved(pose, -self.servo.clear_mm * self.mounting.axis)
@@ -323,7 +338,11 @@ class ServoLoop:
         """Stop, retreat, disable; each is tried whatever became of the others."""
 
         def back() -> None:
-            self.arm.move_linear(self._away_from(self.arm.state().pose), wait=True, timeout_s=MOVE_TIMEOUT_S)
+            pose = self.arm.state().pose
+            if self.retreat is not None:
+                self.retreat(-matrix_of(pose)[:3, :3] @ self.mounting.axis)
+            else:
+                self.arm.move_linear(self._away_from(pose), wait=True, timeout_s=MOVE_TIMEOUT_S)
 
         for name, act in (("stop", self.arm.stop), *((("retreat", back),) if retreat else ()), ("disable", self.arm.disable)):
             try:

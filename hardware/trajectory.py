@@ -66,7 +66,7 @@ class Measures:
         Root mean square third difference of the tool's path, mm per step^3.
     completed : float
         Share of the wanted way along the outline.
-    lost_contacts : int
+    lost_contacts : float
         Times that the sensor left the surface.
     """
 
@@ -80,7 +80,7 @@ class Measures:
     hold_angle_deg: float
     jerk: float
     completed: float
-    lost_contacts: int
+    lost_contacts: float
 
 
 def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedObject | None = None) -> Trajectory:
@@ -134,7 +134,7 @@ def measure(path: Trajectory, *, indent_mm: float, angle_deg: float, wanted_mm: 
         mean_abs(path.true_depth_mm - indent_mm),
         mean_abs(path.true_angle_deg - angle_deg),
         jerk(path.tool_mm),
-        float(np.clip(np.nanmax(path.along_mm, initial=0.0) / wanted_mm, 0, 1)) if wanted_mm > 0 else float("nan"),
+        float(np.clip(path.along_mm.max(initial=0.0) / wanted_mm, 0, 1)) if wanted_mm > 0 else float("nan"),
         lost_contacts(path.true_indent_mm),
     )
 
@@ -168,10 +168,12 @@ def jerk(points_mm: np.ndarray) -> float:
     return float(np.sqrt((third**2).sum(axis=1).mean())) if len(third) else float("nan")
 
 
-def lost_contacts(indent_mm: np.ndarray) -> int:
-    """How often the indentation (M,) falls to zero or less; the start counts as touching."""
+def lost_contacts(indent_mm: np.ndarray) -> float:
+    """How often the indentation (M,) falls to zero or less; the start counts as touching. NaN where it isn't known."""
+    if np.isnan(indent_mm).any():
+        return float("nan")
     off = np.concatenate([[False], indent_mm <= 0])
-    return int((off[1:] & ~off[:-1]).sum())
+    return float((off[1:] & ~off[:-1]).sum())
 
 
 def way_along(outline_mm: np.ndarray, points_mm: np.ndarray) -> np.ndarray:

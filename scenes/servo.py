@@ -15,7 +15,7 @@ class PlacementSpec(Section):
     Without a turn the object's outward side looks to -y of the base, its section lies level and its y axis points down.
     """
 
-    position_mm: Three = (300.0, 0.0, 0.0)
+    position_mm: Three = (300.0, 60.0, 0.0)
     turn_deg: float = 0.0
 
 

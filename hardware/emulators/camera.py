@@ -5,16 +5,14 @@ import time
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-import cv2
 import numpy as np
 
 from hardware.cameras.source import FrameSource
 from hardware.emulators.faults import Faults
 from hardware.errors import DeviceError
+from hardware.stream import CONTENT_TYPE, jpeg_of, write_part
 from twin.errors import TwinError
 
-BOUNDARY = "frame"
-JPEG_QUALITY = 95
 CLIENT_WAIT_S = 0.5
 FAULTS = {
     "frozen": (None, "the same picture again and again"),
@@ -143,8 +141,7 @@ class CameraEmulator:
             self.made += 1
             if "silent" in self.faults or self._every("dropped"):
                 continue
-            _, coded = cv2.imencode(".jpg", image if image.ndim == 2 else image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-            jpeg = coded.tobytes()
+            jpeg = jpeg_of(image)
             if self._every("torn"):
                 jpeg = jpeg[: len(jpeg) // 2]
             age_s = time.monotonic() - frame.time_s
@@ -170,7 +167,7 @@ def _handler_of(camera: CameraEmulator) -> type[BaseHTTPRequestHandler]:
                 self.send_error(503, "unplugged")
                 return
             self.send_response(200)
-            self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
+            self.send_header("Content-Type", CONTENT_TYPE)
             self.end_headers()
             number = 0
             while not (camera._end.is_set() or camera.pulled_out):
@@ -178,12 +175,9 @@ def _handler_of(camera: CameraEmulator) -> type[BaseHTTPRequestHandler]:
                 if part is None:
                     continue
                 number = part.number
-                head = (
-                    f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(part.jpeg)}\r\n"
-                    f"X-Timestamp: {part.exposed_unix_s:.6f}\r\nX-Sequence: {part.number}\r\n\r\n"
-                )
+                headers = {"X-Timestamp": f"{part.exposed_unix_s:.6f}", "X-Sequence": part.number}
                 try:
-                    self.wfile.write(head.encode("ascii") + part.jpeg + b"\r\n")
+                    write_part(self.wfile, part.jpeg, headers)
                 except OSError:
                     return
                 camera.sent += 1

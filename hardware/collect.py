@@ -181,6 +181,12 @@ def collect(
         sent = arm.move_linear(target, wait=False, timeout_s=MOVE_TIMEOUT_S)
         return arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
 
+    def stop_at(label: np.ndarray) -> ArmState:
+        """Go there and be seen there: what the skin remembers depends on where the arm has been."""
+        state = go(label)
+        _frame_after(source, state)
+        return state
+
     here = np.zeros(6)
     try:
         state = go(here, CLEAR_MM)
@@ -189,10 +195,10 @@ def collect(
         for index in range(collection.count, count):
             asked = draw_contact(experiment, seed, index)
             before = asked.pose - asked.move + clear
-            go(before, CLEAR_MM if index == 0 else LIFT_MM)
+            go(before, LIFT_MM)
             here = before
-            go(before)
-            go(before + tap)
+            stop_at(before)
+            stop_at(before + tap)
             here = asked.pose + clear + tap
             confirmed = go(here)
             frame = _frame_after(source, confirmed)
@@ -206,7 +212,7 @@ def collect(
                 "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
             }
             collection.keep(index, frame, frame_of.label(confirmed.pose), asked.move, log)
-            go(here, LIFT_MM)
+            _frame_after(source, go(here, LIFT_MM))
             if progress is not None:
                 progress(index + 1, count)
     finally:

@@ -32,7 +32,7 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
         worst = int(np.nanargmax(slopes))
         x, y = path.tool_mm[worst + LOCAL_N // 2]
         zoom.set(xlim=(x - ZOOM_MM, x + ZOOM_MM), ylim=(y - ZOOM_MM, y + ZOOM_MM))
-        zoom.set_title(f"where it is roughest: local smoothness {slopes[worst]:.3f} (mean {measures.local_smoothness:.3f})")
+        zoom.set_title(f"roughest: local S {slopes[worst]:.3f} (mean {measures.local_smoothness:.3f})")
     steps = np.arange(len(path.depth_mm))
     for ax, estimated, true, name in (
         (depth, path.depth_mm, path.true_depth_mm, "depth, mm"),

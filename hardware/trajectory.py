@@ -8,7 +8,7 @@ import numpy as np
 
 from hardware.loop import StepRecord
 from hardware.mounting import Mounting
-from hardware.rig_geometry import PlacedObject
+from hardware.rig_geometry import PlacedObject, matrix_of
 from hardware.servo import Reading, tangent_of
 
 LOCAL_N = 9  # points in a window of the local smoothness
@@ -96,8 +96,7 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
     used = [record for record in records if record.fresh]
     poses = np.array([record.exposed_pose for record in used]).reshape(-1, 6)
     depth, angle = (np.array([getattr(record, key) for record in used]) for key in ("depth_mm", "angle_deg"))
-    tangents = [tangent_of(mounting, record.exposed_pose, Reading(record.depth_mm, record.angle_deg)) for record in used]
-    felt = np.array([T[:3, :3] @ mounting.apex_mm + T[:3, 3] for T in tangents]).reshape(-1, 3)
+    felt = np.array([felt_place(mounting, record) for record in used]).reshape(-1, 3)
     none = np.full(len(used), np.nan)
     if placed is None:
         return Trajectory(poses[:, :2], felt[:, :2], depth, angle, none, none, none, none, none)
@@ -115,6 +114,15 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
         np.array([abs(placed.distance_mm(place)) for place in felt]),
         way_along(outline, local[:, [0, 2]]),
     )
+
+
+def felt_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
+    """Where (3,) an estimate puts the surface: the foot of the dome's centre on the tangent."""
+    tangent = tangent_of(mounting, record.exposed_pose, Reading(record.depth_mm, record.angle_deg))
+    tool = matrix_of(record.exposed_pose)
+    centre, inward = tool[:3, :3] @ mounting.centre_mm + tool[:3, 3], tangent[:3, :3] @ mounting.axis
+    on_tangent = tangent[:3, :3] @ mounting.apex_mm + tangent[:3, 3]
+    return centre + (inward @ (on_tangent - centre)) * inward
 
 
 def measure(path: Trajectory, *, indent_mm: float, angle_deg: float, wanted_mm: float) -> Measures:

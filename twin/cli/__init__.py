@@ -34,6 +34,7 @@ def main() -> None:
         emulate_camera,
         evaluate,
         graph,
+        live,
         predict,
         preprocess,
         realism,

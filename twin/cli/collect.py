@@ -49,7 +49,17 @@ def collect_command(
     stimulus = load_object(object_name or asked.object)
     seed = asked.seed if seed is None else seed
     rig = build_rig(
-        spec, stimulus, servo.placement, asked, camera=camera, arm=arm, form=form, limits=limits, seed=seed, plain_light=plain_light
+        spec,
+        stimulus,
+        servo.placement,
+        asked,
+        camera=camera,
+        arm=arm,
+        form=form,
+        limits=limits,
+        seed=seed,
+        plain_light=plain_light,
+        at_once=True,
     )
     low, high = zip(*asked.ranges().values(), strict=True)
     about = {

@@ -77,6 +77,7 @@ def build_rig(
     limits: str | None = None,
     seed: int = 0,
     plain_light: bool = False,
+    at_once: bool = False,
 ) -> Rig:
     """A rig from what a user writes.
 
@@ -92,11 +93,15 @@ def build_rig(
         Name or file; that of the arm's kind by default.
     plain_light : bool
         Draw the twin's frames with the lamps' direct light alone, without the path-traced frame that sets what comes on top.
+    at_once : bool
+        A simulated arm before the twin's camera takes no time: whoever waits for frames at each stop needs none.
     """
     form = form or (Form.RECORDING if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
     device = open_arm(arm)
     simulated = isinstance(device, SimulatedArm)
+    if simulated and camera == TWIN and at_once:
+        device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
     if not simulated or limits is not None:
         kind = arm.partition(":")[0]
         device = SafeArm(device, load_limits(limits or kind)) if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file() else device

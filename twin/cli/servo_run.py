@@ -94,6 +94,7 @@ def follow(
         limits=run.limits,
         seed=run.seed,
         plain_light=run.plain_light,
+        at_once=run.stream_hz is None,
     )
     round_steps, wanted_mm = steps_round(rig.placed, run.servo, 1.0)
     steps = run.steps or round_steps

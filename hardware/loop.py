@@ -15,6 +15,8 @@ from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
 from hardware.mounting import Mounting
 from hardware.rig_geometry import matrix_of, moved
+from hardware.safe_arm import RefusedMoveError
+from hardware.safety import Code
 from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.timing import Spread, Timing
 from scenes.servo import ServoSpec
@@ -225,9 +227,15 @@ class ServoLoop:
             if np.linalg.norm(from_pose[:3] - state.pose[:3]) > BEHIND_MOVES * self.servo.largest_move_mm:
                 continue  # the arm is still on its way
             step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
-            memory, good_s, self._holding = step.memory, time.monotonic(), False
-            sent = self._move(step.pose, wait=False)
-            now_s = time.monotonic()
+            try:
+                sent = self._move(step.pose, wait=False)
+            except RefusedMoveError as refused:
+                if refused.decision.code is not Code.STALE_FRAME:
+                    raise
+                self._hold(str(refused), good_s, refused)
+                continue
+            memory, self._holding = step.memory, False
+            good_s = now_s = time.monotonic()
             record = StepRecord(
                 len(self.records),
                 now_s,

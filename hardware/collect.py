@@ -152,12 +152,20 @@ def collect(
     count: int,
     *,
     seed: int,
+    speed: tuple[float, float],
     guards: tuple = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Collect up to ``count`` contacts; those that the collection holds already are not made again.
 
     Whatever happens the arm is stopped, withdrawn and disabled.
+
+    Parameters
+    ----------
+    seed : int
+        Of the draws.
+    speed : (float, float)
+        In mm/s and deg/s.
 
     Returns
     -------
@@ -172,6 +180,7 @@ def collect(
     frame_of = WorkFrame(experiment, placed)
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
     arm.enable()
+    arm.set_speed(*speed)
 
     def go(label: np.ndarray, away_mm: float = 0.0) -> ArmState:
         state = arm.state()

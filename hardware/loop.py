@@ -166,10 +166,10 @@ class ServoLoop:
         DeviceError
             No usable frame or estimate for ``give_up_s``, or the arm failed.
         """
-        self.arm.enable()
-        self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
         touching = False
         try:
+            self.arm.enable()
+            self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
             self._move(self._away_from(start_pose), wait=True)
             touching = True
             self._move(start_pose, wait=True)
@@ -195,7 +195,7 @@ class ServoLoop:
         )
 
     def _follow(self) -> None:
-        memory, used, tangent, estimate, reading = Memory(), None, None, None, Reading(np.nan, np.nan)
+        memory, used, tangent, estimate, reading, doubt = Memory(), None, None, None, Reading(np.nan, np.nan), ""
         exposed_pose, sent = np.full(6, np.nan), None
         self._started_s = due_s = good_s = arrived_s = time.monotonic()
         while len(self.records) < self.settings.steps:
@@ -214,18 +214,20 @@ class ServoLoop:
             fresh = used is None or frame.sequence != used.sequence
             if fresh:
                 estimate, used = self.estimator(frame), frame
-                if estimate.valid:
+                reading, doubt = self._reading(estimate)
+                if not doubt:
                     exposed_pose = self._pose_at(frame.time_s) if self.source.is_live else state.pose
-                    reading = self._reading(estimate)
                     tangent = tangent_of(self.mounting, exposed_pose, reading)
                     if self.sense is not None:
                         self.sense(reading.depth_mm, frame.time_s)
-            if not estimate.valid:
-                self._hold(estimate.reason, good_s, None)
+            if doubt:
+                self._hold(doubt, good_s, None)
                 continue
             from_pose = state.pose if sent is None or not state.moving else sent
-            if np.linalg.norm(from_pose[:3] - state.pose[:3]) > BEHIND_MOVES * self.servo.largest_move_mm:
+            if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
                 continue  # the arm is still on its way
+            if not fresh and _apart_mm(from_pose, exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
+                continue  # too far from what was seen last
             step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
             try:
                 sent = self._move(step.pose, wait=False)
@@ -271,7 +273,10 @@ class ServoLoop:
             return self.source.read_after(arrived_s, timeout_s=self.settings.give_up_s)
         return self.source.read_latest(max_age_s=self.servo.max_frame_age_s)
 
-    def _reading(self, estimate: Estimate) -> Reading:
+    def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
+        """What an estimate means, and why it isn't to be believed ("" if it is)."""
+        if not estimate.valid:
+            return Reading(np.nan, np.nan), estimate.reason
         value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
         try:
             depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]
@@ -280,12 +285,19 @@ class ServoLoop:
                 f"the model tells {', '.join(estimate.names)}; following a surface needs {self.mounting.depth_label} and "
                 f"{self.mounting.angle_label} (the experiment's)"
             ) from missing
-        return Reading(self.mounting.depth_mm(depth), self.mounting.angle_deg(angle))
+        reading = Reading(self.mounting.depth_mm(depth), self.mounting.angle_deg(angle))
+        for name, got, (low, high) in (
+            ("mm deep", reading.depth_mm, self.servo.plausible_mm),
+            ("deg from the normal", reading.angle_deg, self.servo.plausible_deg),
+        ):
+            if not low <= got <= high:
+                return reading, f"the model says {got:.1f} {name}, which can't be ([{low:g}, {high:g}]); give another model or sensor"
+        return reading, ""
 
     def _hold(self, reason: str, good_s: float, problem: Exception | None) -> None:
         """Stop where the arm is; give up after a while."""
-        self.arm.stop()
         if not self._holding:
+            self.arm.stop()
             self.notes.append(f"held still before step {len(self.records)}: {reason}")
         self._holding = True
         held_s = time.monotonic() - good_s
@@ -357,3 +369,7 @@ class ServoLoop:
                 act()
             except TwinError as error:
                 self.notes.append(f"{name} failed: {error}")
+
+
+def _apart_mm(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.linalg.norm(one[:3] - other[:3]))

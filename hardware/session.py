@@ -55,7 +55,7 @@ class SessionWriter:
             write_image(self.folder / FRAMES / name, frame.image)
             self._written = {frame.sequence: name}
         about_frame = {"file": name, "name": frame.name, "form": str(frame.form), "time_s": frame.time_s, "sequence": frame.sequence}
-        self._lines.write(json.dumps({"step": self.count, "frame": about_frame, **_plain(step)}) + "\n")
+        self._lines.write(json.dumps({"step": self.count, "frame": about_frame, **plain(step)}) + "\n")
         self._lines.flush()
         self.count += 1
 
@@ -106,12 +106,12 @@ class SessionSource(SequentialSource):
             yield Frame(image, Form(about["form"]), about["name"], about["time_s"], about["sequence"])
 
 
-def _plain(value):
+def plain(value):
     """What JSON can hold: arrays as lists, what is no finite number as null."""
     if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
+        return {key: plain(part) for key, part in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        return [_plain(part) for part in (value.tolist() if isinstance(value, np.ndarray) else value)]
+        return [plain(part) for part in (value.tolist() if isinstance(value, np.ndarray) else value)]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

@@ -39,6 +39,10 @@ class ServoSpec(Section):
     clear_mm : float
         From where the surface is approached, and to where the arm retreats.
     linear_mm_s, angular_deg_s : float
+    plausible_mm, plausible_deg : (lowest, highest)
+        Depths and angles that a sensor in contact can have; a model that tells others is not believed, and the arm holds still.
+    blind_mm : float
+        Without a newer frame the tool goes no farther than this from where the newest one was exposed.
     max_frame_age_s : float
         An older frame decides nothing: the arm stops and holds.
     placement : PlacementSpec
@@ -63,5 +67,8 @@ class ServoSpec(Section):
     clear_mm: Positive = 50.0
     linear_mm_s: Positive = 20.0
     angular_deg_s: Positive = 60.0
+    plausible_mm: tuple[float, float] = (-3.0, 8.0)
+    plausible_deg: tuple[float, float] = (-60.0, 60.0)
+    blind_mm: Positive = 4.0
     max_frame_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     placement: PlacementSpec = PlacementSpec()

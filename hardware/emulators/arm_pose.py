@@ -15,18 +15,23 @@ class FeedbackPose:
 
     Parameters
     ----------
-    spec : str
-        ``mg400:ADDRESS[:DASHBOARD_PORT]``.
+    host : str
+    ports : tuple of int
+        Feedback ports, tried in order.
     """
 
-    def __init__(self, spec: str) -> None:
+    def __init__(self, host: str, ports: tuple[int, ...] = tuple(FEEDBACK_PERIOD_S)) -> None:
+        self._feedback = Feedback(f"arm at {host}", host, ports)
+
+    @classmethod
+    def of(cls, spec: str) -> "FeedbackPose":
+        """From ``mg400:ADDRESS[:DASHBOARD_PORT]``; a shifted dashboard shifts the feedback alike."""
         kind, _, rest = spec.partition(":")
         host, _, port = rest.partition(":")
         if kind != "mg400" or not host or (port and not port.isdecimal()):
             raise DeviceError(f"--arm {spec}: expected mg400:ADDRESS, for example mg400:127.0.0.1 with 'twin emulate mg400' running")
         offset = int(port) - DASHBOARD_PORT if port else 0
-        ports = tuple(number + offset for number in FEEDBACK_PERIOD_S)
-        self._feedback = Feedback(f"arm {spec}", host, ports)
+        return cls(host, tuple(number + offset for number in FEEDBACK_PERIOD_S))
 
     def __enter__(self) -> "FeedbackPose":
         self._feedback.open()

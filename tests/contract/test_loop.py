@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 from noisy_camera import NoisyCamera
-from true_estimator import TrueEstimator
+from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.mjpeg import MjpegCamera
@@ -111,6 +111,9 @@ def test_a_short_fault_is_waited_for(rig):
         timing = loop.run(start(rig))
     assert timing.steps == 60
     assert all(record.age_s <= loop.servo.max_frame_age_s + 0.05 for record in loop.records)
+    blind = [np.linalg.norm(record.sent[:3] - record.exposed_pose[:3]) for record in loop.records if not record.fresh]
+    assert max(blind) <= loop.servo.blind_mm + loop.servo.largest_move_mm
+    assert min(rig[0].touch(record.pose).indent_mm for record in loop.records) > 0
 
 
 def test_the_arm_stands_still_while_it_holds(rig):
@@ -142,6 +145,23 @@ def test_an_estimate_that_is_not_valid_moves_nothing(rig):
             loop.run(start(rig))
         assert_let_go(rig)
     assert len(loop.records) == 6
+
+
+@pytest.mark.parametrize("off", [(300.0, 0.0), (-30.0, 0.0), (0.0, 100.0), (np.nan, 0.0)])
+def test_an_estimate_that_cannot_be_moves_nothing(rig, off):
+    placed, arm = rig
+    true = TrueEstimator(arm, placed)
+
+    def wild(frame):
+        made = true(frame)
+        return made if true.calls <= 5 else TrueEstimate(made.names, made.value + off, made.low, made.high)
+
+    with arm, NoisyCamera() as source:
+        loop = loop_of(rig, source, 10_000, estimator=wild, give_up_s=0.3)
+        with pytest.raises(DeviceError, match="can't be"):
+            loop.run(start(rig))
+        assert_let_go(rig)
+    assert len(loop.records) == 5
 
 
 @pytest.mark.parametrize("fault", [SimulatedFault.COLLIDE, SimulatedFault.SILENT, SimulatedFault.STALL])

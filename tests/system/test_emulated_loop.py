@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from hardware.arms.mg400 import MG400, Mg400Ports
-from hardware.arms.mg400_link import Feedback
 from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.twin import TwinCamera
@@ -40,8 +39,7 @@ def emulated():
     sensor, servo = load_sensor("mg400-331"), load_servo("surface")
     placed = PlacedObject(load_object("can"), servo.placement, Mounting.of(sensor, load_experiment("surface-2d")))
     with Mg400Emulator(port_offset=None, time_scale=4.0) as arm:
-        pose = FeedbackPose("mg400:127.0.0.1")
-        pose._feedback = Feedback("arm", "127.0.0.1", tuple(arm.ports[port] for port in FEEDBACK_PERIOD_S))
+        pose = FeedbackPose("127.0.0.1", tuple(arm.ports[port] for port in FEEDBACK_PERIOD_S))
         with pose, CameraEmulator(TwinCamera(sensor, placed, pose, Form.RAW)) as camera:
             ports = Mg400Ports(arm.ports[DASHBOARD_PORT], arm.ports[MOTION_PORT], tuple(arm.ports[p] for p in list(FEEDBACK_PERIOD_S)[:2]))
             safe = SafeArm(MG400("127.0.0.1", ports=ports), load_limits("mg400"))

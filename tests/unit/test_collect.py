@@ -64,7 +64,9 @@ def run(rig, folder, count, *, late_s=0.0, about=None):
     experiment, placed, arm = rig
     camera = PoseCamera(arm, late_s=late_s)
     with arm, camera:
-        return collect(camera, arm, experiment, placed, Collection(folder, about or {"seed": 1}, Form.RAW), count, seed=1)
+        return collect(
+            camera, arm, experiment, placed, Collection(folder, about or {"seed": 1}, Form.RAW), count, seed=1, speed=(100.0, 100.0)
+        )
 
 
 def rows(folder):

@@ -82,6 +82,6 @@ def collect_command(
     if begun < count:
         with rig, count_bar("contacts") as progress:
             rig.source.read(timeout_s=FIRST_FRAME_S)
-            rig.arm.set_speed(servo.linear_mm_s, servo.angular_deg_s)
-            collect(rig.source, rig.arm, asked, rig.placed, collection, count, seed=seed, progress=progress)
+            speed = (servo.linear_mm_s, servo.angular_deg_s)
+            collect(rig.source, rig.arm, asked, rig.placed, collection, count, seed=seed, speed=speed, progress=progress)
     print(f"{collection.count} contacts in {out} ({collection.count - begun} new)")

@@ -41,7 +41,7 @@ def camera(
     list_faults(fault, FAULTS)
     spec, servo = load_sensor(sensor), load_servo(parameters)
     placed = PlacedObject(load_object(object_name), servo.placement, Mounting.of(spec, load_experiment(servo.experiment)))
-    with FeedbackPose(arm) as pose:
+    with FeedbackPose.of(arm) as pose:
         source = twin_camera(spec, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
         device = CameraEmulator(source, host=host, port=port, faults=tuple(fault))
         run_until_told(device, lambda: f"camera {device.url}")

@@ -17,7 +17,7 @@ In the twin unless told otherwise: the arm is simulated, the frames are drawn fo
 \b
   twin servo --object can --model RUN --out out/servo
   twin emulate mg400 &  twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can --port 8081 &
-  twin servo --object can --model RUN --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1 --stream --out out/live
+  twin servo --object can --model RUN --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1 --stream --steps 60 --out out/live
 
 \b
 Writes to --out: trajectory.csv, trajectory.png, measures.json (smoothness S as the Tac-VGNN paper defines it, path, depth
@@ -45,6 +45,7 @@ def servo(
     limits: Annotated[str | None, typer.Option("--limits", help="safety limits: mg400, magician, or a TOML file")] = None,
     record: Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")] = False,
     seed: Annotated[int, typer.Option("--seed", help="of the twin's noise")] = 0,
+    known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo has it: measure against it")] = False,
     plain_light: PlainLight = False,
 ) -> None:
     from scenes import load_object, load_servo
@@ -67,6 +68,7 @@ def servo(
         record=record,
         seed=seed,
         plain_light=plain_light,
+        known_place=known_place,
     )
     with count_bar(f"following the {object_name}") as progress:
         followed = follow(run, estimator, writable_folder(out), about={"model": str(model)}, progress=progress)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hardware.loop import LoopSettings, ServoLoop
 from hardware.servo_plots import save_figure, trajectory_figure
-from hardware.session import SessionWriter
+from hardware.session import SessionWriter, plain
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_of, write_csv
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
@@ -31,6 +31,8 @@ class ServoRun:
         None: once around the object.
     stream_hz : float or None
         Decisions a second; None: each waits for the move before.
+    known_place : bool
+        The object stands where the servo's placement has it, so that there is a truth to measure against (always so in the twin).
     """
 
     sensor: SensorSpec
@@ -45,6 +47,7 @@ class ServoRun:
     record: bool = False
     seed: int = 0
     plain_light: bool = False
+    known_place: bool = False
 
 
 @dataclass(frozen=True)
@@ -137,7 +140,7 @@ def follow(
 
 
 def _results(run: ServoRun, rig, loop: ServoLoop, wanted_mm: float, failure: str) -> Followed:
-    path = trajectory_of(loop.records, rig.mounting, rig.placed if rig.knows_truth else None)
+    path = trajectory_of(loop.records, rig.mounting, rig.placed if rig.knows_truth or run.known_place else None)
     measures = measure(path, indent_mm=run.servo.indent_mm, angle_deg=run.servo.angle_deg, wanted_mm=wanted_mm)
     flat = rig.placed.outline()
     turn, origin = rig.placed.T_base_object[:2, [0, 2]], rig.placed.T_base_object[:2, 3]
@@ -154,5 +157,5 @@ def _write(out: Path, run: ServoRun, followed: Followed, told: dict) -> list[Pat
         "notes": followed.notes,
     }
     measures = out / "measures.json"
-    measures.write_text(json.dumps(content, indent=1, default=str) + "\n")
+    measures.write_text(json.dumps(plain(content), indent=1) + "\n")
     return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]

@@ -36,6 +36,7 @@ def main() -> None:
         realism,
         render,
         train,
+        validate,
     )
 
     try:

@@ -26,6 +26,8 @@ from twin.recordings import open_recording
 from twin.stimulus import build_stimulus
 from twin.types import Form
 
+_SAME = 1e-9  # of the way: fractions that mean the same pose
+
 
 @dataclass(frozen=True)
 class MeasuredFrames:
@@ -116,11 +118,19 @@ class ContactModel:
         ContactError
             The contact does not converge, or can't be.
         """
+        return self.displacements_px(label, friction)[1]
+
+    def displacements_px(self, label: ArmLabel, friction: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The same after the tap, and at the end: after the move, if it was executed."""
         way = arm_path(self.rig, self.experiment, self.spec, self.stimulus, label)
         if not way.touches and not label.executed:
-            return np.zeros_like(self.rest_px)
-        state = self.solver.press(self.stimulus, way.path, friction=self.rig.friction if friction is None else friction)
-        return self._pixels(state.caps_mm) - self.rest_px
+            return np.zeros_like(self.rest_px), np.zeros_like(self.rest_px)
+        tap_ends = 1 / (len(way.labels) - 1) if way.touches else 0.0
+        tapped_mm = self.solver.rest().caps_mm
+        for fraction, state in self.solver.path(self.stimulus, way.path, friction=self.rig.friction if friction is None else friction):
+            if fraction <= tap_ends + _SAME:
+                tapped_mm = state.caps_mm
+        return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px
 
     def _pixels(self, caps_mm: np.ndarray) -> np.ndarray:
         return from_raw(self.spec, self.form, project(self.spec, caps_mm))

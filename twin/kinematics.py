@@ -21,10 +21,11 @@ from scenes.sensor import SensorSpec
 from twin.errors import ContactError
 from twin.mechanics.path import ContactPath, dome_directions
 
-MOST_TURN_DEG = 2.0  # of a move between two poses of the path: what a straight line misses of the arm's arc is then below 3 um
+MOST_TURN_DEG = 1.0  # of a move between two poses of the path: what straight pieces miss of the arm's arc is then some um
 TOUCH_TOLERANCE_MM = 1e-6
 TOUCH_POINTS = 20_000  # on the sphere: the dome bulges by less than 2 um between them
 MOST_MARCHES = 400
+CLEAR_MM = 10.0  # before the tap: recorded taps of 5 mm begin up to 0.4 mm inside the object
 
 _UNTURNED = {  # columns: the sensor's x (across), y and z (approach) in the work frame
     "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
@@ -108,14 +109,14 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimu
     Raises
     ------
     ContactError
-        The tap begins inside the object.
+        The sensor is inside the object long before the tap.
     """
     radius_mm = sensor.skin.outer_radius_mm
 
     def at(pose):
         return object_pose(rig, experiment, pose, radius_mm)
 
-    tap = np.asarray(experiment.tap)
+    tap = np.asarray(experiment.tap) * (1 + CLEAR_MM / experiment.tap[experiment.axis])
     tapped = np.asarray(label.pose, float) - label.move
     share, touches = _first_touch(stimulus, at(tapped - tap), at(tapped), radius_mm * dome_directions(sensor, TOUCH_POINTS))
     still = np.zeros(6)
@@ -143,7 +144,7 @@ def _first_touch(stimulus, start: np.ndarray, stop: np.ndarray, dome_mm: np.ndar
             return share, True
         if gap_mm < 0:
             if free is None:
-                raise ContactError(f"the tap begins {-gap_mm:.2f} mm inside the object; begin it further away")
+                raise ContactError(f"the object is in the sensor's way {CLEAR_MM:g} mm before the tap; begin it elsewhere")
             share = (share + free) / 2  # a distance was too large (wires, far from a mesh): back half way
             continue
         free = share

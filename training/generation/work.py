@@ -1,6 +1,7 @@
 """Handing out work: in this process, to processes of this machine, or to a cluster's workers (Dask)."""
 
 import hashlib
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -39,14 +40,12 @@ def _client(workers: int, scheduler: str) -> Iterator:
     import dask
     from distributed import Client, LocalCluster
 
-    with dask.config.set({"distributed.comm.timeouts.connect": "10s"}):
+    with dask.config.set({"distributed.comm.timeouts.connect": "10s"}), _silenced():
         if scheduler:
             try:
                 client = Client(scheduler, timeout="10s")
             except (OSError, ValueError) as error:
-                raise DatasetError(
-                    f"--scheduler {scheduler}: no scheduler answers there ({error}); start one with 'dask scheduler'"
-                ) from error
+                raise DatasetError(f"--scheduler {scheduler}: none answers there ({error}); start one with 'dask scheduler'") from error
             try:
                 yield client
             finally:
@@ -57,9 +56,22 @@ def _client(workers: int, scheduler: str) -> Iterator:
             yield client
 
 
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Without Dask's own log, which tells of every lost connection in twenty lines: this program says it in one."""
+    loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
 def _by_cluster(client, make: Callable, text: str, todo: list[int], scheduler: str) -> Iterator:
-    from distributed import FIRST_COMPLETED, CancelledError, KilledWorker, TimeoutError, wait
-    from distributed.comm import CommClosedError
+    from distributed import CancelledError, wait
 
     where = f"scheduler {scheduler}" if scheduler else "the worker processes"
     try:
@@ -67,28 +79,37 @@ def _by_cluster(client, make: Callable, text: str, todo: list[int], scheduler: s
     except TimeoutError as error:
         raise DatasetError(f"{where}: no worker has come within {JOIN_S:g} s; start some with 'dask worker {scheduler}'") from error
     waiting, flying, own = list(reversed(todo)), {}, fingerprint()
-    try:
-        while waiting or flying:
+    while waiting or flying:
+        try:
             room = AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])) - len(flying)
             for _ in range(min(room, len(waiting))):
                 index = waiting.pop()
                 flying[client.submit(_checked, make, text, index, own, pure=False)] = index
-            try:
-                done, _ = wait(list(flying), timeout=LOOK_S, return_when=FIRST_COMPLETED)
-            except TimeoutError:
-                if client.status != "running":
-                    raise CommClosedError("connection lost") from None
-                continue
-            for future in done:
-                outcome = future.result()
-                del flying[future]
-                yield outcome
-    except KilledWorker as error:
-        raise DatasetError(f"{where}: one contact ended its process several times ({error}); is there enough memory? {AGAIN}") from error
-    except (CancelledError, CommClosedError, OSError) as error:
-        if isinstance(error, TwinError):
-            raise
-        raise DatasetError(f"{where}: lost ({str(error) or type(error).__name__}); {AGAIN}") from error
+            done = wait(list(flying), timeout=LOOK_S, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            done = ()
+        except (CancelledError, OSError) as error:
+            raise DatasetError(f"{where}: lost ({type(error).__name__}); {AGAIN}") from error
+        if client.status != "running":
+            raise DatasetError(f"{where}: the connection is lost; {AGAIN}")
+        for future in done:
+            index = flying.pop(future)
+            yield _result(future, index, where)
+
+
+def _result(future, index: int, where: str):
+    from distributed.scheduler import KilledWorker
+
+    if future.status == "finished":
+        return future.result()
+    if future.status != "error":
+        raise DatasetError(f"{where}: lost (contact {index} is {future.status}); {AGAIN}")
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        raise DatasetError(f"{where}: contact {index} ended its process again and again; is there enough memory? {AGAIN}") from error
+    if isinstance(error, TwinError):
+        raise error
+    raise DatasetError(f"{where}: contact {index}: {type(error).__name__}: {error}; {AGAIN}") from error
 
 
 def _checked(make: Callable, text: str, index: int, expected: str):

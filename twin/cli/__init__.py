@@ -42,6 +42,7 @@ def main() -> None:
         servo,
         study,
         train,
+        validate,
     )
 
     try:

@@ -51,6 +51,8 @@ class SafeArm:
     def __init__(
         self, arm: Arm, limits: SafetyLimits, *, normal=(0.0, 0.0, 1.0), log: Callable[[LoggedDecision], None] | None = None
     ) -> None:
+        if limits.joints_deg is not None and len(limits.joints_deg) != arm.axes:
+            raise DeviceError(f"{arm.name} has {arm.axes} joints, the limits are for {len(limits.joints_deg)}; give those of this arm")
         self.arm, self.limits = arm, limits
         self.name, self.axes = arm.name, arm.axes
         self.kinematics = getattr(arm, "kinematics", None)

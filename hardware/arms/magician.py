@@ -2,6 +2,7 @@
 
 import contextlib
 import struct
+import termios
 import time
 from dataclasses import replace
 from threading import RLock
@@ -20,6 +21,7 @@ from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 REPLY_TIMEOUT_S = 0.3  # a reply takes some 10 ms
 TRIES = 4  # what is sent may be sent again: moves are absolute, a second one moves nothing
 HOME_TIMEOUT_S = 60.0
+PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)  # what pyserial raises when a port vanishes
 ACCELERATION = 4.0  # mm/s2 and deg/s2 for each mm/s and deg/s: full speed within a quarter of a second
 
 
@@ -54,7 +56,7 @@ class Magician(BaseArm):
         self._require_disconnected()
         try:
             self._serial = serial.Serial(self._port_name, BAUD, timeout=0.05, write_timeout=REPLY_TIMEOUT_S, exclusive=True)
-        except (serial.SerialException, OSError, ValueError) as error:
+        except PORT_ERRORS as error:
             attached = [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
             raise DeviceNotConnectedError(
                 f"{self.name}: can't open the port ({error}); Magicians attached: {', '.join(attached) or 'none'}. Plug in the USB cable "
@@ -210,7 +212,7 @@ class Magician(BaseArm):
                     self._serial.write(sent)
                     if (reply := self._reply(id, ctrl)) is not None:
                         return reply.params
-                except (serial.SerialException, OSError, TypeError) as error:  # pyserial stumbles over a port that vanishes
+                except PORT_ERRORS as error:
                     self._close()
                     raise DeviceNotConnectedError(
                         f"{self.name}: the port vanished ({error}). The arm goes on with what is queued: switch it off if it moves! "
@@ -234,6 +236,6 @@ class Magician(BaseArm):
 
     def _close(self) -> None:
         if self._serial is not None:
-            with contextlib.suppress(serial.SerialException, OSError):
+            with contextlib.suppress(*PORT_ERRORS):
                 self._serial.close()
         self._serial, self._enabled, self._last_index = None, False, None

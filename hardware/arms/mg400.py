@@ -27,6 +27,7 @@ from hardware.arms.mg400_wire import (
 from hardware.errors import DeviceError, DeviceNotConnectedError
 
 ENABLE_TIMEOUT_S = 5.0
+SETTLE_S = 0.5  # at least, for feedback to confirm a move: two periods of the slow port
 RESTED_S = 0.05  # without replies (old firmware), at rest for this long counts as done
 
 
@@ -69,6 +70,7 @@ class MG400(BaseArm):
         self._dashboard = CommandPort(self.name, host, ports.dashboard)
         self._motion = CommandPort(self.name, host, ports.motion)
         self._feedback = Feedback(self.name, host, ports.feedback)
+        self._in_use = False  # between connect and disconnect, connections lost or not
         self._bare = False  # old firmware: echoes on the dashboard, nothing on the motion port
         self._alarm_text: str | None = None
 
@@ -78,12 +80,14 @@ class MG400(BaseArm):
 
     def connect(self) -> None:
         self._require_disconnected()
+        self._close()  # what is left of a lost connection
         try:
             self._dashboard.open()
             self._motion.open()
             self._feedback.open()
             self._bare = self._dashboard.request("RobotMode()").error_id is None
             self._ask("RobotMode()")
+            self._in_use = True
         except BaseException:
             self._close()
             raise
@@ -117,12 +121,14 @@ class MG400(BaseArm):
         self._alarm_text = None
 
     def stop(self) -> None:
-        if not self._dashboard.is_open:  # lost: the arm may still move, so try once more to reach it
-            try:
+        if not self._in_use:
+            self._require_connected()
+        try:
+            if not self._dashboard.is_open:  # lost: the arm may still move, so try once more to reach it
                 self._dashboard.open()
-            except DeviceNotConnectedError as error:
-                raise DeviceNotConnectedError(f"{self.name}: can't be told to stop. Press its emergency stop! {error}") from error
-        self._ask("ResetRobot()")
+            self._ask("ResetRobot()")
+        except DeviceNotConnectedError as error:
+            raise DeviceNotConnectedError(f"{self.name}: can't be told to stop. Press its emergency stop! {error}") from error
 
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
         self._require_connected()
@@ -178,13 +184,18 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: the target {numbers} is not a number; nothing was sent")
         if violation := self.kinematics.violation(joints):
             raise DeviceError(f"{self.name}: {violation.text}; nothing was sent. Choose a target within reach and limits")
+        packet, _ = self._feedback.newest(SILENCE_S)  # old firmware would not tell
+        if int(packet["mode"]) == Mode.ERROR:
+            raise DeviceError(f"{self.name}: {self._alarm()}")
+        if not packet["enabled"]:
+            raise DeviceError(f"{self.name}: not enabled; call enable() first")
         begun_s = time.monotonic()
         self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)})")
         if not wait:
             return
         try:
             self._await_queue(begun_s + timeout_s, timeout_s)
-            left_s = max(begun_s + timeout_s - time.monotonic(), 4 * RESTED_S)
+            left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
             if pose is not None:
                 self.wait_settled(pose, timeout_s=left_s)
             else:
@@ -266,6 +277,7 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: {why_refused(reply.error_id, request)}")
 
     def _close(self) -> None:
+        self._in_use = False
         self._dashboard.close()
         self._motion.close()
         self._feedback.close()

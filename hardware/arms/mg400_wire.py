@@ -95,6 +95,7 @@ def why_refused(error_id: int, request: str) -> str:
 
 PACKET_BYTES = 1440
 TEST_VALUE = 0x0123456789ABCDEF
+_LENGTH = PACKET_BYTES.to_bytes(2, "little")
 TEST_BYTES = TEST_VALUE.to_bytes(8, "little")
 TEST_OFFSET = 48
 ROBOT_TYPE_MG400 = 1
@@ -150,8 +151,8 @@ PACKET = np.dtype(
 def newest_packet(buffer: bytes) -> tuple[np.void | None, bytes, int]:
     """The newest whole packet in what has arrived.
 
-    A packet counts if its length is 1440, its test value stands where it must, and no other packet begins inside
-    it (as when one was cut short).
+    A packet counts if its length is 1440, its test value stands where it must, no other packet begins inside it and
+    another, or nothing yet, follows it (else it was cut short).
 
     Returns
     -------
@@ -166,7 +167,7 @@ def newest_packet(buffer: bytes) -> tuple[np.void | None, bytes, int]:
     while at >= 0:
         start, following = at - TEST_OFFSET, buffer.find(TEST_BYTES, at + 1)
         whole = start >= 0 and start + PACKET_BYTES <= len(buffer) and not 0 <= following < start + PACKET_BYTES
-        if whole and int.from_bytes(buffer[start : start + 2], "little") == PACKET_BYTES:
+        if whole and buffer.startswith(_LENGTH, start) and _LENGTH.startswith(buffer[start + PACKET_BYTES :][:2]):
             newest, begin = np.frombuffer(buffer[start : start + PACKET_BYTES], PACKET)[0], start
             used += PACKET_BYTES
         at = following

@@ -23,7 +23,10 @@ class Speeds:
     angular_deg_s2: float = np.inf
 
     def scaled(self, factor: float) -> "Speeds":
-        return replace(self, linear_mm_s=self.linear_mm_s * factor, angular_deg_s=self.angular_deg_s * factor)
+        """The same motion in ``1 / factor`` of the time."""
+        return Speeds(
+            self.linear_mm_s * factor, self.angular_deg_s * factor, self.linear_mm_s2 * factor**2, self.angular_deg_s2 * factor**2
+        )
 
 
 def travel_time_s(length: float, speed: float, acceleration: float) -> float:
@@ -164,7 +167,7 @@ class MotionTrack:
     def stop(self, now_s: float) -> None:
         """Stand still from ``now_s`` on and forget what was still to come."""
         with self._lock:
-            kept = [piece for piece in self._pieces if piece.start_s < now_s]
+            kept = [piece for piece in self._pieces if piece.start_s < now_s] or [self._pieces[0]]
             if kept[-1].end_s > now_s:
                 kept[-1] = replace(kept[-1], cut_s=now_s)
             self._pieces = deque(kept, maxlen=HISTORY_N)

@@ -147,13 +147,7 @@ class SimulatedArm(BaseArm):
 
     def _begin(self, end: np.ndarray, linear: bool, now_s: float) -> None:
         factor = self._scale * (SLOW_FACTOR if SimulatedFault.SLOW in self.faults else 1.0)
-        speeds = Speeds(
-            self._speeds.linear_mm_s * factor,
-            self._speeds.angular_deg_s * factor,
-            self._speeds.linear_mm_s2 * factor**2,
-            self._speeds.angular_deg_s2 * factor**2,
-        )
-        piece = self.track.move(end, speeds, linear=linear, now_s=now_s)
+        piece = self.track.move(end, self._speeds.scaled(factor), linear=linear, now_s=now_s)
         if isinstance(piece, Violation):
             raise DeviceError(f"{self.name}: refused (alarm {piece.code}): {piece.text}; choose a target within reach and limits")
         halfway_s = piece.start_s + STALL_AFTER * piece.duration_s

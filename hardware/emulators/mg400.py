@@ -12,7 +12,7 @@ import numpy as np
 from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT, ErrorId
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
-from hardware.emulators.mg400_controller import HOME_JOINTS_DEG, Mg400Controller
+from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller
 from hardware.emulators.mg400_feedback import feedback_packet
 from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
 from twin.errors import TwinError
@@ -77,7 +77,7 @@ class Mg400Emulator:
         port_offset: int | None = 0,
         faults: tuple[str, ...] = (),
         firmware: str = NEW_FIRMWARE,
-        joints_deg=HOME_JOINTS_DEG,
+        joints_deg=START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
         try:
@@ -162,6 +162,8 @@ class Mg400Emulator:
                     else:
                         client.shutdown(socket.SHUT_RDWR)
             for bound in self._sockets:
+                with contextlib.suppress(OSError):
+                    bound.shutdown(socket.SHUT_RDWR)  # a thread that waits for it would keep it listening
                 bound.close()
             self._clients.clear()
 

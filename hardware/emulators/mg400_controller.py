@@ -14,7 +14,7 @@ from hardware.emulators.mg400_grammar import RefusedError
 
 MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0  # of the emulator: those of the arm are not known
 EMERGENCY_STOP, COLLISIONS = 85, (112, -2)
-HOME_JOINTS_DEG = (0.0, 0.0, 60.0, 0.0)
+START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)  # wherever it was left; here far from all limits
 JOG_STEP = 1.0  # mm or deg, in which the end of a jog is looked for
 JOG_REACH = 1000.0
 
@@ -68,7 +68,7 @@ class Mg400Controller:
         How much faster than the real arm it moves.
     """
 
-    def __init__(self, faults: Faults, *, joints_deg=HOME_JOINTS_DEG, time_scale: float = 1.0) -> None:
+    def __init__(self, faults: Faults, *, joints_deg=START_JOINTS_DEG, time_scale: float = 1.0) -> None:
         self.faults, self.kinematics, self._time_scale = faults, MG400, time_scale
         self.track = MotionTrack(MG400, np.asarray(joints_deg, float))
         self.lock = RLock()
@@ -249,7 +249,8 @@ class Mg400Controller:
         if isinstance(planned, Violation):
             self._due.append((max(self.track.end_s, time.monotonic()), (planned.code,)))
             return
-        self._orders = [*self._orders[-64:], Order(order.end, order.linear, order.speeds, order.jog, planned.end_s)]
+        waiting = [one for one in self._orders if one.end_s > time.monotonic()]
+        self._orders = [*waiting, Order(order.end, order.linear, order.speeds, order.jog, planned.end_s)]
         if planned.duration_s > 0 and (share := self.faults.value("collision")) is not None:
             self._due.append((planned.start_s + share * planned.duration_s, COLLISIONS))
         if planned.duration_s > 0 and (share := self.faults.value("stall")) is not None:

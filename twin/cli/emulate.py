@@ -2,7 +2,6 @@
 
 import signal
 from pathlib import Path
-from threading import Event
 from typing import Annotated
 
 import typer
@@ -22,12 +21,14 @@ TimeScale = Annotated[float, typer.Option("--time-scale", help="how much faster 
 
 def run_until_told(device, ready) -> None:
     """Run a device (a context manager) and print ``ready()`` once it listens; end on SIGTERM or Ctrl-C."""
-    told = Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: told.set())
-    with device:
-        print(f"ready {ready()}", flush=True)
-        told.wait()
+    ends = {signal.SIGTERM, signal.SIGINT}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # waited for, not handled: nothing is ever interrupted halfway
+    try:
+        with device:
+            print(f"ready {ready()}", flush=True)
+            signal.sigwait(ends)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def list_faults(faults: list[str], known: dict) -> None:

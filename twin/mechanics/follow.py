@@ -59,7 +59,11 @@ class Follower:
         if gap > 0:
             self._contact, self._state = None, self._free(T)
         elif self._T is None or not np.array_equal(T, self._T) or self._relaxes:
-            self._press(T, time_s)
+            try:
+                self._press(T, time_s)
+            except ContactError:
+                self._contact = self._T = None  # wherever the skin stands now, no pose belongs to it
+                raise
         self._T, self._time_s = T.copy(), time_s
         return self._state
 
@@ -81,7 +85,6 @@ class Follower:
     def _press(self, T: np.ndarray, time_s: float) -> None:
         limit = deepest_mm(self._solver.spec)
         if (deep := -self.gap_mm(T)) > limit:
-            self._contact = None
             raise ContactError(f"the object is {deep:.1f} mm inside the dome, more than {limit:.1f} (half the gel's depth); move away")
         near = self._T is not None and np.linalg.norm(carried(self._dome_mm, self._T, T), axis=1).max() < LARGEST_MOVE_MM
         if near and (self._contact is not None or self.gap_mm(self._T) > 0):

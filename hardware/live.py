@@ -11,8 +11,8 @@ import numpy as np
 
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
-from hardware.loop import Estimate, Estimator
 from hardware.session import SessionWriter
+from hardware.step import Estimate, Estimator
 from hardware.timing import Spread, Timing
 from twin.types import Frame
 

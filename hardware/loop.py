@@ -1,15 +1,13 @@
 """The servo loop: frame, pose, law, arm. Knows a frame source, an estimator and an arm, and not what stands behind them."""
 
-import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
-from typing import Protocol
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from hardware.arm_track import ArmTrack
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
@@ -18,99 +16,15 @@ from hardware.rig_geometry import matrix_of, moved
 from hardware.safe_arm import RefusedMoveError
 from hardware.safety import Code
 from hardware.servo import Memory, Reading, servo_step, tangent_of
+from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
 from hardware.timing import Spread, Timing
 from scenes.servo import ServoSpec
 from twin.errors import TwinError
 from twin.types import Frame
 
-KEPT_STATES = 256
-WATCH_S = 0.02
 MOST_PIECES, NEAR_MM = 200, 0.5
 MOVE_TIMEOUT_S = 10.0
 BEHIND_MOVES = 2.0  # largest moves that an arm may lag behind before it is told more
-
-
-class Estimate(Protocol):
-    """What an estimator makes of a frame (``training.estimator.PoseEstimate``)."""
-
-    names: tuple
-    value: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    valid: bool
-    reason: str
-
-
-Estimator = Callable[[Frame], Estimate]
-Guard = Callable[[ArmState, np.ndarray], np.ndarray]  # state and target (6,) to what may be sent; raises to refuse
-
-
-@dataclass(frozen=True)
-class StepRecord:
-    """One decision.
-
-    Attributes
-    ----------
-    index : int
-    time_s : float
-        ``time.monotonic()`` when the command was given.
-    sequence : int
-        Of the frame behind it, ``frame_s`` its exposure, ``age_s`` its age then, ``fresh`` whether it was not used before.
-    latency_s : float
-        From exposure to command, and ``compute_s`` from having the frame to the command.
-    names : tuple of str
-    value, low, high : (K,) float
-        The estimate and its interval; NaN where not valid.
-    depth_mm, angle_deg : float
-        What they mean for the law.
-    pose, joints_deg : (6,), (J,) float
-        From where it decided (the arm's place, or the end of the move it is on), ``exposed_pose``: at the frame's exposure.
-    sent : (6,) float
-        What the arm was told.
-    """
-
-    index: int
-    time_s: float
-    sequence: int
-    frame_s: float
-    age_s: float
-    fresh: bool
-    latency_s: float
-    compute_s: float
-    names: tuple
-    value: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    depth_mm: float
-    angle_deg: float
-    pose: np.ndarray
-    exposed_pose: np.ndarray
-    joints_deg: np.ndarray
-    sent: np.ndarray
-
-    def plain(self) -> dict:
-        """For a session's line."""
-        return asdict(self)
-
-
-@dataclass(frozen=True)
-class LoopSettings:
-    """How the loop runs.
-
-    Attributes
-    ----------
-    steps : int
-    blocking : bool
-        Wait for each move and take a frame exposed after it; else a decision every ``period_s`` on the newest frame.
-    period_s : float
-    give_up_s : float
-        After holding for so long the loop ends with an error.
-    """
-
-    steps: int
-    blocking: bool = True
-    period_s: float = 0.1
-    give_up_s: float = 3.0
 
 
 @dataclass
@@ -144,7 +58,7 @@ class ServoLoop:
     servo: ServoSpec
     mounting: Mounting
     settings: LoopSettings
-    guards: list = field(default_factory=list)
+    guards: list[Guard] = field(default_factory=list)
     sense: Callable[[float, float], None] | None = None
     retreat: Callable[[np.ndarray], object] | None = None
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
@@ -152,8 +66,8 @@ class ServoLoop:
     def __post_init__(self):
         self.records: list[StepRecord] = []
         self.notes: list[str] = []  # what went wrong
-        self._holding = False
-        self._states: deque[ArmState] = deque(maxlen=KEPT_STATES)
+        self._held_since: float | None = None
+        self._track = ArmTrack(self.arm)
         self._started_s = self._ended_s = 0.0
 
     def run(self, start_pose: np.ndarray) -> Timing:
@@ -173,7 +87,7 @@ class ServoLoop:
             self._move(self._away_from(start_pose), wait=True)
             touching = True
             self._move(start_pose, wait=True)
-            with self._watched():
+            with nullcontext() if self.settings.blocking else self._track.watched():
                 self._follow()
         finally:
             self._ended_s = time.monotonic()
@@ -197,7 +111,7 @@ class ServoLoop:
     def _follow(self) -> None:
         memory, used, tangent, estimate, reading, doubt = Memory(), None, None, None, Reading(np.nan, np.nan), ""
         exposed_pose, sent = np.full(6, np.nan), None
-        self._started_s = due_s = good_s = arrived_s = time.monotonic()
+        self._started_s = due_s = arrived_s = time.monotonic()
         while len(self.records) < self.settings.steps:
             if not self.settings.blocking:
                 time.sleep(max(0.0, due_s - time.monotonic()))
@@ -208,7 +122,7 @@ class ServoLoop:
             except EOFError:
                 return
             except (StaleDataError, TimeoutError, DeviceError) as problem:
-                self._hold(str(problem), good_s, problem)
+                self._hold(str(problem), problem)
                 continue
             taken_s = time.monotonic()
             fresh = used is None or frame.sequence != used.sequence
@@ -216,12 +130,12 @@ class ServoLoop:
                 estimate, used = self.estimator(frame), frame
                 reading, doubt = self._reading(estimate)
                 if not doubt:
-                    exposed_pose = self._pose_at(frame.time_s) if self.source.is_live else state.pose
+                    exposed_pose = self._track.pose_at(frame.time_s) if self.source.is_live else state.pose
                     tangent = tangent_of(self.mounting, exposed_pose, reading)
                     if self.sense is not None:
                         self.sense(reading.depth_mm, frame.time_s)
             if doubt:
-                self._hold(doubt, good_s, None)
+                self._hold(doubt, None)
                 continue
             from_pose = state.pose if sent is None or not state.moving else sent
             if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
@@ -234,10 +148,10 @@ class ServoLoop:
             except RefusedMoveError as refused:
                 if refused.decision.code is not Code.STALE_FRAME:
                     raise
-                self._hold(str(refused), good_s, refused)
+                self._hold(str(refused), refused)
                 continue
-            memory, self._holding = step.memory, False
-            good_s = now_s = time.monotonic()
+            memory, self._held_since = step.memory, None
+            now_s = time.monotonic()
             record = StepRecord(
                 len(self.records),
                 now_s,
@@ -268,9 +182,9 @@ class ServoLoop:
         if not self.source.is_live:
             return self.source.read()
         if self.settings.blocking:
-            return self.source.read_after(state.time_s, timeout_s=self.settings.give_up_s)
+            return self.source.read_after(state.time_s, timeout_s=self.settings.frame_timeout_s)
         if not self.records:  # not one of the approach
-            return self.source.read_after(arrived_s, timeout_s=self.settings.give_up_s)
+            return self.source.read_after(arrived_s, timeout_s=self.settings.frame_timeout_s)
         return self.source.read_latest(max_age_s=self.servo.max_frame_age_s)
 
     def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
@@ -294,51 +208,23 @@ class ServoLoop:
                 return reading, f"the model says {got:.1f} {name}, which can't be ([{low:g}, {high:g}]); give another model or sensor"
         return reading, ""
 
-    def _hold(self, reason: str, good_s: float, problem: Exception | None) -> None:
+    def _hold(self, reason: str, problem: Exception | None) -> None:
         """Stop where the arm is; give up after a while."""
-        if not self._holding:
+        if self._held_since is None:
+            self._held_since = time.monotonic()
             self.arm.stop()
             self.notes.append(f"held still before step {len(self.records)}: {reason}")
-        self._holding = True
-        held_s = time.monotonic() - good_s
+        held_s = time.monotonic() - self._held_since
         if held_s > self.settings.give_up_s:
             raise DeviceError(f"no usable frame for {held_s:.1f} s, the arm holds still: {reason}") from problem
         time.sleep(min(0.05, self.settings.period_s))
-
-    @contextmanager
-    def _watched(self):
-        """While the arm moves as frames are exposed: where it is, many times a step."""
-        end = threading.Event()
-
-        def watch() -> None:
-            while not end.wait(WATCH_S):
-                with suppress(TwinError):  # the loop itself will meet it
-                    self._states.append(self.arm.state())
-
-        thread = threading.Thread(target=watch, name="arm watch", daemon=True)
-        if not self.settings.blocking:
-            thread.start()
-        try:
-            yield
-        finally:
-            end.set()
-            if thread.is_alive():
-                thread.join()
 
     def _state(self) -> ArmState:
         state = self.arm.state()
         if state.error:
             raise DeviceError(f"{self.arm.name}: {state.error}")
-        self._states.append(state)
+        self._track.add(state)
         return state
-
-    def _pose_at(self, time_s: float) -> np.ndarray:
-        """Where the arm was, between the states that were looked at (its turn about z unwrapped)."""
-        states = sorted(self._states.copy(), key=lambda state: state.time_s)
-        times = np.array([state.time_s for state in states])
-        poses = np.array([state.pose for state in states])
-        poses[:, 5] = np.unwrap(poses[:, 5], period=360.0)
-        return np.array([np.interp(time_s, times, column) for column in poses.T])
 
     def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:
         """Move, in as many pieces as guards and arm make of it if the end is waited for; what was sent last."""

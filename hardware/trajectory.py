@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.loop import StepRecord
 from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject, matrix_of
 from hardware.servo import Reading, tangent_of
+from hardware.step import StepRecord
 
 LOCAL_N = 9  # points in a window of the local smoothness
 SETTLING_N = 5  # steps after the start that the errors leave out

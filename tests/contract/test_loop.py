@@ -11,10 +11,11 @@ from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
-from hardware.loop import LoopSettings, ServoLoop
+from hardware.loop import ServoLoop
 from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource, SessionWriter, read_steps
+from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of, write_csv
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 

@@ -16,11 +16,11 @@ from hardware.emulators.arm_pose import FeedbackPose
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
-from hardware.loop import LoopSettings
 from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import load_limits
+from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.cli.rig import Rig, servo_loop
@@ -69,7 +69,7 @@ def test_it_follows_the_can_and_the_frames_show_the_contact(emulated):
         found.append(seen.found)
         assert moved.max() > 4.0  # px: the pins of a sensor that is pressed 3 mm deep
 
-    loop = servo_loop(rig, servo, estimator, LoopSettings(STEPS, give_up_s=10.0), look)
+    loop = servo_loop(rig, servo, estimator, LoopSettings(STEPS, frame_timeout_s=10.0, give_up_s=10.0), look)
     timing = loop.run(rig.placed.start_pose(servo.indent_mm))
     assert timing.steps == STEPS
     assert min(found) > 0.95 * 331

@@ -11,11 +11,12 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
 from hardware.errors import DeviceError
-from hardware.loop import Estimator, LoopSettings, ServoLoop
+from hardware.loop import ServoLoop
 from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SHIPPED_LIMITS, load_limits
+from hardware.step import Estimator, LoopSettings
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
 from twin.cache import cached_arrays

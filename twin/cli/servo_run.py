@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.loop import LoopSettings, ServoLoop
+from hardware.loop import ServoLoop
 from hardware.servo_plots import save_figure, trajectory_figure
 from hardware.session import SessionWriter, plain
+from hardware.step import LoopSettings
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_of, write_csv
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
@@ -19,6 +20,7 @@ from twin.types import Form
 
 FIRST_FRAME_S = 120.0  # kernels may have to be compiled
 GIVE_UP_S = 5.0
+TWIN_FRAME_S = 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,13 @@ def follow(
         **(about or {}),
     }
     session = SessionWriter(out / "session", told) if run.record else None
-    settings = LoopSettings(steps, blocking=run.stream_hz is None, period_s=1.0 / (run.stream_hz or 10.0), give_up_s=GIVE_UP_S)
+    settings = LoopSettings(
+        steps,
+        blocking=run.stream_hz is None,
+        period_s=1.0 / (run.stream_hz or 10.0),
+        frame_timeout_s=TWIN_FRAME_S if rig.knows_truth else GIVE_UP_S,
+        give_up_s=GIVE_UP_S,
+    )
 
     def on_step(record, frame, estimate) -> None:
         if session is not None:

@@ -41,7 +41,7 @@ def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndar
             f"the run was trained on part of {trained_on} rows, this recording has {len(data)}; "
             "give --rows all for a recording it has not seen"
         )
-    return split_rows(len(data), split)[1]
+    return split_rows(len(data), split, data.group)[1]
 
 
 def predict_rows_of(estimator: PoseEstimator, data: Dataset, rows: np.ndarray) -> Prediction:

@@ -78,7 +78,7 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
     """
     started = monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    train, _ = (np.arange(len(data)), None) if config.split is None else split_rows(len(data), config.split)
+    train, _ = (np.arange(len(data)), None) if config.split is None else split_rows(len(data), config.split, data.group)
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     inputs, aside = prepared_inputs(config.model, data, train)
@@ -150,7 +150,7 @@ def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, trai
     seed = 1000 * config.seed + member
     torch.manual_seed(seed)
     network = build_network(config.model, data.pins.reference, scaled.shape[1], config.size)
-    held, learnt = fold_rows(train, config.seed, member)
+    held, learnt = fold_rows(train, config.seed, member, data.group)
     if hasattr(network, "prepare"):
         network.prepare(inputs.x[torch.from_numpy(train)])
     weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
@@ -158,10 +158,12 @@ def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, trai
     return Loop(network, config.recipe, Rows(inputs, scaled, weight, executed, torch.from_numpy(learnt), torch.from_numpy(held)), seed)
 
 
-def fold_rows(train: np.ndarray, seed: int, member: int) -> tuple[np.ndarray, np.ndarray]:
-    """The tenth of the training rows that a network watches, and those it learns from."""
-    shuffled = np.random.default_rng([seed, 1]).permutation(train)
-    held = shuffled[member % FOLDS :: FOLDS]
+def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The tenth of the training rows that a network watches, and those it learns from; ``group`` as in ``Dataset``."""
+    parts = train if group is None else np.unique(group[train])
+    held = np.random.default_rng([seed, 1]).permutation(parts)[member % FOLDS :: FOLDS]
+    if group is not None:
+        held = train[np.isin(group[train], held)]
     return np.sort(held), np.setdiff1d(train, held)
 
 

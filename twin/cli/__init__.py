@@ -26,16 +26,23 @@ def main() -> None:
         audit,
         calibrate,
         catalog,
+        collect,
+        dataset,
         demo,
         doctor,
         emulate,
+        emulate_camera,
         evaluate,
         graph,
+        live,
         predict,
         preprocess,
         realism,
         render,
+        servo,
+        study,
         train,
+        validate,
     )
 
     try:

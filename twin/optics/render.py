@@ -157,28 +157,33 @@ class GelView:
 
     def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state) -> np.ndarray:
         """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row; fewer samples on bare skin."""
+        mi, dr = self._mi, self._dr
         pins = near_pins(self._spec, state, self._window_px).ravel()[pixels]
-        light = np.empty((len(pixels), len(self._mi.Spectrum(0.0))), np.float32)
-        for part, samples in ((pins, spp), (~pins, -(-spp // SKIN_SAVING))):
-            if part.any():
-                light[part] = self._mean_light(pixels[part], samples, seed)
-        return light
-
-    def _mean_light(self, pixels: np.ndarray, spp: int, seed: int) -> np.ndarray:
-        passes, each = 1, spp
+        passes, each, few = 1, spp, -(-spp // SKIN_SAVING)
         while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
-            passes, each = 2 * passes, -(-each // 2)  # halves: nets of powers of two are even
-        total = 0.0
+            passes, each, few = 2 * passes, -(-each // 2), -(-few // 2)  # halves: nets of powers of two are even
+        counts = np.where(pins, each, few)
+        rows = np.repeat(np.arange(len(pixels), dtype=np.uint32), counts)
+        index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        row, total = mi.UInt32(rows), 0.0
+        pixel, number = mi.UInt32(pixels.astype(np.uint32)[rows]), mi.UInt32(index.astype(np.uint32))
         for k in range(passes):
-            total = total + np.array(self.trace(self._mi.UInt32(pixels.astype(np.uint32)), each, (seed * 1009 + k) % 2**32)).T
-        return total / passes
+            light = self._light(pixel, number, each, (seed * 1009 + k) % 2**32)
+            found = dr.zeros(mi.Spectrum, len(pixels))
+            dr.scatter_add(found, light, row)
+            total = total + np.array(found).T
+        return total / (passes * counts[:, None])
 
     def trace(self, pixels, spp: int, seed: int):
-        """The same as a spectrum of Dr.Jit, differentiable in what the tracer and the scene hold."""
+        """Mean light of pixels as a spectrum of Dr.Jit, differentiable in what the tracer and the scene hold."""
         mi, dr = self._mi, self._dr
         number = dr.arange(mi.UInt32, len(pixels) * spp)
-        pixel = dr.gather(mi.UInt32, pixels, number // spp)
-        random = PixelSamples(mi, dr, pixel, number % spp, spp, seed)
-        place, direction, transmittance = self.rays.sample(mi, dr, pixel, random)
-        light = self.tracer.radiance(mi, dr, place, direction, random) * transmittance
+        light = self._light(dr.gather(mi.UInt32, pixels, number // spp), number % spp, spp, seed)
         return mi.Spectrum(*(dr.block_sum(channel, spp) / spp for channel in light))
+
+    def _light(self, pixel, number, spp: int, seed: int):
+        """Light of samples: of the pixel and the number, below ``spp``, of each."""
+        mi, dr = self._mi, self._dr
+        random = PixelSamples(mi, dr, pixel, number, spp, seed)
+        place, direction, transmittance = self.rays.sample(mi, dr, pixel, random)
+        return self.tracer.radiance(mi, dr, place, direction, random) * transmittance

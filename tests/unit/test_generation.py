@@ -15,6 +15,7 @@ from training.dataset import load_dataset, split_rows
 from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
 from training.recorded_contact import read_arm_labels
+from training.run import fold_rows
 from training.targets import read_executed
 from twin.errors import ContactError, RenderError
 from twin.geometry.solid import Resolution
@@ -127,6 +128,8 @@ def test_pins_alone_are_read_like_frames_and_split_by_contact(made):
     assert undone.any() and np.allclose(data.targets.corrected[undone, 2:], 0)
     train, held = split_rows(len(data), 0, data.group)
     assert not set(data.group[train]) & set(data.group[held]) and len(train) + len(held) == len(data)
+    watched, learnt = fold_rows(train, 0, 0, data.group)
+    assert len(watched) and not set(data.group[watched]) & set(data.group[learnt]) and set(watched) | set(learnt) == set(train)
 
 
 def test_a_broken_off_run_ends_with_the_same_bytes(made, tmp_path, monkeypatch):

@@ -197,6 +197,7 @@ def test_other_options_and_foreign_folders_are_refused(made, tmp_path):
     (tmp_path / "photo.txt").write_text("mine")
     with pytest.raises(DatasetError, match="holds something else"):
         generate(tmp_path, config, COUNT)
+    assert [p.name for p in tmp_path.iterdir()] == ["photo.txt"], "and left as they were"
 
 
 def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):

@@ -80,8 +80,9 @@ class Weights:
     variance_px2: float
 
     def cost(self, squared_px2: np.ndarray) -> float:
-        """Of squared errors (M, 2), after tap and move."""
-        each = (1 - self.executed) * squared_px2[:, 0] + self.executed * squared_px2[:, 1]
+        """Of squared errors (M, 2), after tap and move; a failed contact (NaN) costs nothing."""
+        squared = np.nan_to_num(squared_px2)
+        each = (1 - self.executed) * squared[:, 0] + self.executed * squared[:, 1]
         return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
 
 
@@ -105,15 +106,15 @@ def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Callable | 
         slopes = _slopes(setup, measured, value, sign, moved, progress)
         matrix, force = _normal(slopes, target[:, None] - moved, weights)
         step = np.linalg.solve(matrix + np.diag(prior**-2), force + (start - value) / prior**2)
-        now = weights.cost(_squared(moved, target)) + np.sum(((value - start) / prior) ** 2)
+        squared = _squared(moved, target)
+        now, solved = weights.cost(squared) + np.sum(((value - start) / prior) ** 2), np.isfinite(squared).sum()
         length = 1.0
         while length >= SHORTEST:
             tried = value + length * step
             there = simulate(setup, measured, [tried], sign, progress)[0]
             squared = _squared(there, target)
-            if np.isfinite(squared).all(axis=1).sum() >= np.isfinite(_squared(moved, target)).all(axis=1).sum() and (
-                weights.cost(np.nan_to_num(squared)) + np.sum(((tried - start) / prior) ** 2) < now
-            ):
+            cost = weights.cost(squared) + np.sum(((tried - start) / prior) ** 2)
+            if cost < now and np.isfinite(squared).sum() >= solved:
                 value, moved = tried, there
                 break
             length /= 2

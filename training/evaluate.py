@@ -13,6 +13,7 @@ from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
 from training.inputs import image_inputs
 from training.recipes import TrainingError
+from training.simulated import is_pins_only
 from twin.recordings import open_recording
 from twin.views.plots import new_figure
 
@@ -111,8 +112,10 @@ def _bins(error: np.ndarray, targets) -> dict:
     return found
 
 
-def time_frames(estimator: PoseEstimator, data: Dataset) -> float:
-    """Median ms from frame to pose, one frame at a time on one thread."""
+def time_frames(estimator: PoseEstimator, data: Dataset) -> float | None:
+    """Median ms from frame to pose, one frame at a time on one thread; None where there are no pictures."""
+    if is_pins_only(data.folder):
+        return None
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

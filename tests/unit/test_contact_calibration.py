@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_generation import ACROSS, EXPERIMENT, small_config
+from small_generation import EXPERIMENT, small_config
 
 from scenes import load_experiment
 from training.contact_calibration import PARAMETERS, fit_contact
@@ -17,6 +17,7 @@ from twin.types import Form
 FITTED = tuple(p for p in PARAMETERS if p.name in ("rig.contact_offset_mm", "rig.tcp_lateral_mm", "rig.image_turn_deg"))
 TRUTH = {"contact_offset_mm": 0.45, "tcp_lateral_mm": 1.1, "image_turn_deg": 84.0, "turn_sign": -1}
 NOISE_PX, FRAMES = 0.05, 7
+ACROSS = 6  # coarse, for both sides
 
 
 def telling(home):

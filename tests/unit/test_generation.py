@@ -15,6 +15,7 @@ from training.dataset import load_dataset, split_rows
 from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
 from training.recorded_contact import read_arm_labels
+from training.run import fold_rows
 from training.targets import read_executed
 from twin.errors import ContactError, RenderError
 from twin.geometry.solid import Resolution
@@ -127,6 +128,8 @@ def test_pins_alone_are_read_like_frames_and_split_by_contact(made):
     assert undone.any() and np.allclose(data.targets.corrected[undone, 2:], 0)
     train, held = split_rows(len(data), 0, data.group)
     assert not set(data.group[train]) & set(data.group[held]) and len(train) + len(held) == len(data)
+    watched, learnt = fold_rows(train, 0, 0, data.group)
+    assert len(watched) and not set(data.group[watched]) & set(data.group[learnt]) and set(watched) | set(learnt) == set(train)
 
 
 def test_a_broken_off_run_ends_with_the_same_bytes(made, tmp_path, monkeypatch):
@@ -194,6 +197,7 @@ def test_other_options_and_foreign_folders_are_refused(made, tmp_path):
     (tmp_path / "photo.txt").write_text("mine")
     with pytest.raises(DatasetError, match="holds something else"):
         generate(tmp_path, config, COUNT)
+    assert [p.name for p in tmp_path.iterdir()] == ["photo.txt"], "and left as they were"
 
 
 def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):

@@ -57,7 +57,7 @@ def test_pin_counts(sensor_name, pins):
         ("objects/sphere.toml", "radius_mm", "radius", ["shape.sphere.radius", "did you mean 'radius_mm'"]),
         ("objects/sphere.toml", '"sphere"', '"ball"', ["shape", "'ball'"]),
         ("objects/sphere.toml", "friction = 0.5", "friction = -1", ["friction", "greater than or equal to 0"]),
-        ("experiments/surface-2d.toml", "pose_2 = [", "pose_7 = [", ["pose.pose_7", "pose_2"]),
+        ("experiments/surface-2d.toml", "pose_2 = [", "pose_7 = [", ["pose.pose_7", "did you mean 'pose_"]),
         ("experiments/surface-2d.toml", "[-4, 0]", "[0, -4]", ["pose_2", "lower end first"]),
         ("experiments/surface-2d.toml", "[-4, 0]", "[-4, 1]", ["1 mm inside the object"]),
         ("experiments/surface-2d.toml", "[0, 5, 0", "[1, 5, 0", ["tap must go along the approach, y"]),

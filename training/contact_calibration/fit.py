@@ -1,7 +1,7 @@
 """Fitting contacts to labelled frames when it is not known whether each frame's move had been executed.
 
-With d_k1, d_k0 the mean squared pin errors of frame k after the move and after the tap alone, s^2 the mean squared error of
-trusted frames, w the share of executed moves and theta the parameters with their prior,
+With d_k1, d_k0 the mean squared pin errors of frame k after the move and after the tap alone, s^2 the median squared
+error, w the share of executed moves and theta the parameters with their prior,
 
     E-step:  p_k = w exp(-n d_k1 / 2 s^2) / (w exp(-n d_k1 / 2 s^2) + (1 - w) exp(-n d_k0 / 2 s^2))
     M-step:  theta minimises sum_k c_k n (p_k d_k1 + (1 - p_k) d_k0) / s^2 + sum ((theta - theta_0) / prior)^2
@@ -27,7 +27,7 @@ from twin.kinematics import rig_of
 INDEPENDENT = 6.0  # n above: modes of the displacement that carry nearly all of it
 ROUNDS = 3
 SHORTEST = 1 / 8  # of a Gauss-Newton step, before it is given up
-DISTRUST = 9.0  # times the trusted frames' mean squared error: 3 sd
+DISTRUST = 9.0  # times the median squared error: 3 sd
 START_FRAMES = 3  # those with the largest turns, and as many with the largest moves, tell the signs
 TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
 FEWEST = 4
@@ -80,8 +80,9 @@ class Weights:
     variance_px2: float
 
     def cost(self, squared_px2: np.ndarray) -> float:
-        """Of squared errors (M, 2), after tap and move."""
-        each = (1 - self.executed) * squared_px2[:, 0] + self.executed * squared_px2[:, 1]
+        """Of squared errors (M, 2), after tap and move; a failed contact (NaN) costs nothing."""
+        squared = np.nan_to_num(squared_px2)
+        each = (1 - self.executed) * squared[:, 0] + self.executed * squared[:, 1]
         return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
 
 
@@ -105,15 +106,15 @@ def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Callable | 
         slopes = _slopes(setup, measured, value, sign, moved, progress)
         matrix, force = _normal(slopes, target[:, None] - moved, weights)
         step = np.linalg.solve(matrix + np.diag(prior**-2), force + (start - value) / prior**2)
-        now = weights.cost(_squared(moved, target)) + np.sum(((value - start) / prior) ** 2)
+        squared = _squared(moved, target)
+        now, solved = weights.cost(squared) + np.sum(((value - start) / prior) ** 2), np.isfinite(squared).sum()
         length = 1.0
         while length >= SHORTEST:
             tried = value + length * step
             there = simulate(setup, measured, [tried], sign, progress)[0]
             squared = _squared(there, target)
-            if np.isfinite(squared).all(axis=1).sum() >= np.isfinite(_squared(moved, target)).all(axis=1).sum() and (
-                weights.cost(np.nan_to_num(squared)) + np.sum(((tried - start) / prior) ** 2) < now
-            ):
+            cost = weights.cost(squared) + np.sum(((tried - start) / prior) ** 2)
+            if cost < now and np.isfinite(squared).sum() >= solved:
                 value, moved = tried, there
                 break
             length /= 2
@@ -166,11 +167,11 @@ def expect(squared_px2: np.ndarray) -> Weights:
     for _ in range(20):
         odds = INDEPENDENT * (squared[:, 0] - squared[:, 1]) / (2 * variance) + np.log(share / (1 - share))
         executed = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
-        trust = np.where(failed, 0.0, np.minimum(1.0, DISTRUST * variance / np.maximum(best, 1e-12)))
+        trust = np.where(failed, 0.0, np.minimum(1.0, DISTRUST * variance / np.maximum(best, 1e-12)) ** 2)
         each = (1 - executed) * squared[:, 0] + executed * squared[:, 1]
         if trust.sum() == 0:
             break
-        variance = max(float(trust @ np.minimum(each, DISTRUST * variance) / trust.sum()), LEAST_PX2)
+        variance = max(float(np.median(each[~failed])), LEAST_PX2)  # a median: one frame that nothing fits must not widen it
         share = float(np.clip(trust @ executed / trust.sum(), SMALLEST_SHARE, LARGEST_SHARE))
     return Weights(executed, trust, share, variance)
 

@@ -15,7 +15,7 @@ from twin.preprocess.forms import gray_levels
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
 from twin.truth import cap_truth
-from twin.types import ContactState, Form
+from twin.types import ContactState
 
 MOST_ATTEMPTS = 20  # draws for one contact
 REST = -1  # the number that stands for the no-contact frame
@@ -125,10 +125,7 @@ def _config(text: str) -> GenerationConfig:
 @lru_cache(maxsize=1)
 def _nominal(text: str) -> Simulator:
     config = _config(text)
-    config_form = config.form if config.images != "none" else Form.RAW
-    simulator = _simulator(config, config.sensor, keep=True)
-    simulator.check_form(config_form)
-    return simulator
+    return _simulator(config, config.sensor, keep=True)
 
 
 def _simulator(config: GenerationConfig, sensor, *, keep: bool) -> Simulator:

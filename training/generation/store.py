@@ -41,19 +41,21 @@ class Store:
     def __init__(self, folder: Path, config: GenerationConfig) -> None:
         self.folder, self.config = folder, config
         self.pictures = folder / config.image_folder
+        self._check_config()
         try:
-            (folder / RECORDS).mkdir(parents=True, exist_ok=True)
-            if config.images != "none":
-                self.pictures.mkdir(exist_ok=True)
             for part in (*folder.glob(".*.part"), *(folder / RECORDS).glob(".*.part"), *self.pictures.glob(".*.part")):
                 shutil.rmtree(part) if part.is_dir() else part.unlink()
+            (folder / RECORDS).mkdir(exist_ok=True)
+            if config.images != "none":
+                self.pictures.mkdir(exist_ok=True)
         except OSError as error:
             raise DatasetError(f"{folder}: can't be written to ({error.strerror}); give another folder with --out") from error
-        self._check_config()
 
     def finished(self) -> set[int]:
         """Numbers of the contacts that are done; ``REST`` among them where its frame is there, or none is wanted."""
         done = {int(path.stem) for path in (self.folder / RECORDS).glob("*.npz")}
+        if self.config.images != "none":
+            done = {index for index in done if (self.pictures / image_name(index, 0)).is_file()}
         if self.config.images == "none" or (self.folder / "init_0.png").is_file():
             done.add(REST)
         return done
@@ -146,8 +148,12 @@ class Store:
                 other = ", ".join(key for key in now if before.get(key) != now[key])
                 raise DatasetError(f"{self.folder}: holds a data set made otherwise ({other}); repeat its options, or give another --out")
             return
-        strange = [p.name for p in self.folder.iterdir() if p.name != RECORDS and p != self.pictures]
-        if strange or any((self.folder / RECORDS).iterdir()):
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            strange = [p.name for p in self.folder.iterdir() if p.name != f".{CONFIG}.part"]
+        except OSError as error:
+            raise DatasetError(f"{self.folder}: can't be written to ({error.strerror}); give another folder with --out") from error
+        if strange:
             raise DatasetError(f"{self.folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with --out")
         self._write(path, text.encode())
 

@@ -34,7 +34,9 @@ def main() -> None:
         preprocess,
         realism,
         render,
+        robustness,
         train,
+        tune,
     )
 
     try:

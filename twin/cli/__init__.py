@@ -26,6 +26,7 @@ def main() -> None:
         audit,
         calibrate,
         catalog,
+        check,
         demo,
         doctor,
         evaluate,

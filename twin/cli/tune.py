@@ -36,19 +36,16 @@ def tune_command(
     form: FormOrAuto = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 12,
 ) -> None:
-    import numpy as np
-
     from scenes import load_sensor
+    from twin.cli.check import recorded_frames
     from twin.cli.progress import count_bar
     from twin.detectors import tune, write_detector
     from twin.errors import FrameError
-    from twin.recordings import open_recording
 
     if out is not None and out.suffix != ".toml":
         raise FrameError(f"--out {out}: give the name of a .toml file")
     spec = load_sensor(sensor)
-    recording = open_recording(frames, spec, form)
-    chosen = [recording.read(int(k)) for k in np.unique(np.linspace(0, len(recording) - 1, min(limit, len(recording))).round())]
+    chosen = recorded_frames(frames, spec, form, limit)
     with count_bar("tuning") as progress:
         found = tune(chosen, spec, method, progress=progress)
     detector, evidence = found.detector, found.detector.evidence

@@ -13,8 +13,8 @@ from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
 from twin.optics.static_layer import static_layer
 from twin.robustness.condition import Case, View, revised
-from twin.robustness.contacts import Contact, pins_under
-from twin.truth import cap_truth
+from twin.robustness.contacts import Contact, PinState, pins_under
+from twin.truth import CapTruth, cap_truth
 from twin.types import Form, Frame
 
 NEUTRAL = {
@@ -64,13 +64,13 @@ class RenderedSource:
         spec = case.on_spec(self.spec, severity)
         preview = Preview(spec, static=_static(spec))
         view = View.of(spec, np.zeros((spec.pins.count, 2)))
+        geometry = _with_light_of(self.spec, spec)
         shots = []
         for draw, contact in enumerate(self.contacts):
             try:
-                state = pins_under(spec if case.solves else self.spec, contact)
+                state, truth = _pressed(geometry, geometry if case.solves else self.spec, contact)
             except ContactError:
                 continue
-            truth = cap_truth(spec, rest_pins(spec), state, Form.RAW)
             view = replace(view, caps_px=truth.caps_px)
             light = case.on_light(preview.render(state), severity, view, draw)
             image = case.on_frame(expose(light, spec, np.random.default_rng(draw)), severity, view, draw)
@@ -124,6 +124,20 @@ def _shot(name: str, image: np.ndarray, form: Form, case: Case, severity: float,
     caps_px = case.on_points(view.caps_px, severity, view)
     inside = np.all((caps_px >= 0) & (caps_px <= np.array(image.shape[1::-1]) - 1), axis=1)
     return Shot(name, Frame(image, form, name), caps_px, visible & inside & ~case.gone(severity, view))
+
+
+def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
+    """A specification with all that moves no pin on the film as ``base`` has it: equal to ``base`` under most conditions."""
+    gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
+    alike = revised(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
+    return alike.model_copy(update={name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
+
+
+@lru_cache(maxsize=32)
+def _pressed(spec: SensorSpec, mechanics: SensorSpec, contact: Contact) -> tuple[PinState, CapTruth]:
+    """Pins under a contact of the sensor ``mechanics``, and where the camera of ``spec`` sees them."""
+    state = pins_under(mechanics, contact)
+    return state, cap_truth(spec, rest_pins(spec), state, Form.RAW)
 
 
 def _static(spec: SensorSpec) -> tuple:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from twin.preprocess.forms import blob_spec, gray_levels
 from twin.preprocess.mask import circular_mask
 from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import make_reference
-from twin.realism.caps import measure_caps
+from twin.realism.caps import Caps, measure_caps
 from twin.types import Form, Frame, Observation
 
 SATURATED_LEVEL = 250
@@ -155,9 +156,7 @@ def _place(seen: list[Observation], spec: SensorSpec, form: Form) -> list[Findin
 
 def _light(frames: list[Frame], seen: list[Observation], spec: SensorSpec, tuned: SensorSpec) -> list[Finding]:
     """Brightness, evenness, focus and glare of raw frames, against the twin's own frame at rest."""
-    twin = expose(Preview(spec).render(), spec)
-    pins = Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px
-    expected = measure_caps(gray_levels(twin), pins)
+    expected = promised_caps(spec)
     caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in zip(frames, seen, strict=True) if np.isfinite(o.pins_px).any()]
     blob = blob_spec(tuned, Form.RAW)
     mask = circular_mask((spec.camera.width_px, spec.camera.height_px), blob.mask_center_px, blob.mask_radius_px)
@@ -192,6 +191,13 @@ def _light(frames: list[Frame], seen: list[Observation], spec: SensorSpec, tuned
             "shade the sensor; move or dim the LED",
         ),
     ]
+
+
+@lru_cache(maxsize=2)
+def promised_caps(spec: SensorSpec) -> Caps:
+    """The caps of the twin's own frame at rest."""
+    twin = expose(Preview(spec).render(), spec)
+    return measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)
 
 
 def _white(caps: list) -> float:

@@ -21,8 +21,9 @@ MOST_ASPECT = 3.0
 LINK = 1.7  # in median distances of nearest neighbours: blobs nearer than that belong together
 AREA_RATIO = 3.5  # to the median area, either way
 ENOUGH = 0.5  # of the pins: fewer blobs are no layout
-TURNS_DEG = np.arange(-30, 30, 5.0)  # a layout is the same after 60 deg
-SCALES = (0.96, 1.0, 1.05)
+TURNS_DEG = (0.0, -6.0, 6.0, -12.0, 12.0, -18.0, 18.0, -24.0, 24.0, 30.0)  # a layout is the same after 60 deg
+SCALES = (1.0, 0.96, 1.05)
+HOPELESS = 0.4  # score per pin: below it no other size is tried
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,8 @@ def _fit(flat: np.ndarray, rings: int, px: np.ndarray, area: np.ndarray, contras
     (x, y), radius = cv2.minEnclosingCircle(px.astype(np.float32))
     best = None
     for scale in SCALES:
+        if best is not None and best.score < HOPELESS * len(flat):
+            return None
         for turn in np.exp(1j * np.radians(TURNS_DEG)):
             turning = np.array([[turn.real, turn.imag], [-turn.imag, turn.real]])
             reference = make_reference([x, y] + scale * radius * flat @ turning, rings)

@@ -22,6 +22,8 @@ MASK_SPACINGS = 0.85  # beyond the outermost pins seen, in spacings at the rim
 BLOCK_PITCHES = (2.0, 3.0, 4.5)
 STRICTNESS = (0.04, 0.07, 0.1, 0.15, 0.22, 0.3, 0.4, 0.55)  # thresholds, in the caps' contrast
 RECORDER_BLOCKS_PITCHES = (2.0, 4.5)
+GLANCE = 4  # one frame in so many tells which settings are hopeless ...
+HOPELESS = 0.3  # ... in exact rate and found share together
 NEAR = 0.02  # in exact rate: thresholds that lose no more than that belong to the plateau
 LEAST_AREA = 0.2  # of the caps' median area
 CAP_RADII = (0.6, 1.4)  # of the caps' radius, from the smallest to the largest
@@ -66,9 +68,11 @@ def tune(frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, pr
     tried, judged = list(_settings(start, reference, seen, sensor, binary)), frames
     if method in SLOW:
         judged = frames[:: max(len(frames) // SLOW_TUNED_ON, 1)][:SLOW_TUNED_ON]
-    rates = []
+    rates = [_rate(make_detector(sensor, detector), judged[::GLANCE], sensor.pins.count) for detector in tried]
+    hopeful = max(map(sum, rates)) - HOPELESS
     for k, detector in enumerate(tried):
-        rates.append(_rate(make_detector(sensor, detector), judged, sensor.pins.count))
+        if sum(rates[k]) >= hopeful:
+            rates[k] = _rate(make_detector(sensor, detector), judged, sensor.pins.count)
         if progress:
             progress(len(frames) + k + 1, len(frames) + len(tried))
     best = _middle_of_plateau(tried, rates)

@@ -39,7 +39,7 @@ def write_report(
         )
     first = plan.detectors[0].name
     entries.sort(key=lambda entry: entry["envelopes"][first].width)
-    comparisons = [compare(envelopes, first, other.name) for other in plan.detectors[1:]]
+    comparisons = [compare(envelopes, first, other.name) | {"nameless": other.method == "legacy"} for other in plan.detectors[1:]]
     page = out / "index.html"
     page.write_text(
         render_page(

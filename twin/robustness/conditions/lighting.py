@@ -13,11 +13,13 @@ def dimmed(spec, value, rng):
 
 
 def dead(spec, value, rng):
-    """LEDs go out one after the other around the ring."""
-    count = len(spec.leds.azimuth_deg)
-    left = np.clip(1 - (value * count - np.arange(count)), 0, 1)
-    balance = np.array(spec.leds.balance or (1.0,) * count) * left
-    return revised(spec, leds={"balance": tuple(balance.tolist())}) if value else spec
+    """Lit LEDs go out one after the other around the ring."""
+    if not value:
+        return spec
+    balance = np.array(spec.leds.balance or (1.0,) * len(spec.leds.azimuth_deg))
+    lit = np.setdiff1d(np.arange(len(balance)), spec.leds.off)
+    balance[lit] *= np.clip(1 - (value * len(lit) - np.arange(len(lit))), 0, 1)
+    return revised(spec, leds={"balance": tuple(balance.tolist())})
 
 
 def reddened(spec, value, rng):

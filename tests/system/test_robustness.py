@@ -19,7 +19,8 @@ from twin.types import Form
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}
 COMPARED = ("noise", "defocus", "jpeg", "exposure-low", "resolution")
-STEPS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.7, 0.85, 1.0)
+STEPS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 0.95, 1.0)
+FRAMES = 4
 AGREEMENT = 1.25  # ratio of the real and the rendered failing severity
 
 
@@ -83,7 +84,7 @@ def test_tuning_reaches_the_hand_tuned_rates(real_dir, folder):
 @pytest.mark.slow
 def test_real_frames_fail_where_rendered_ones_do(real_dir, tmp_path):
     spec = load_sensor("ur5-331")
-    frames = evenly(open_recording(real_dir / "ur5-331-raw", spec), 6)
+    frames = evenly(open_recording(real_dir / "ur5-331-raw", spec), FRAMES)
     ours = shipped_detector(spec, Form.RAW)
     real, refused = consensus(spec, frames, [ours, tune(frames, spec, "adaptive").detector])
     assert len(refused) <= 1
@@ -93,7 +94,8 @@ def test_real_frames_fail_where_rendered_ones_do(real_dir, tmp_path):
     for kind, source in (("real", real), ("rendered", RenderedSource(spec, CONTACTS))):
         rows = run_sweep(Plan(source, (ours,), cases, STEPS), tmp_path / kind, jobs=2, progress=lambda done, total: None)
         found.append([e.severity for e in envelopes_of(curves_of(rows, cases, pitch_px), cases)])
-    ratio = np.array(found[0]) / np.array(found[1])
+    ends = np.minimum(found, 1.0)  # where neither fails within the range they agree
+    ratio = ends[0] / ends[1]
     for name, *pair in zip(COMPARED, *found, ratio, strict=True):
         print(f"\n{name}: real {pair[0]:.3f}, rendered {pair[1]:.3f}, ratio {pair[2]:.2f}")
-    assert np.isfinite(ratio).all() and (np.maximum(ratio, 1 / ratio) < AGREEMENT).all()
+    assert (ends < 1).all(axis=0).sum() >= 4 and (np.maximum(ratio, 1 / ratio) < AGREEMENT).all()

@@ -1,6 +1,7 @@
 """Measures against planted errors, envelopes against known crossings, and a sweep end to end that goes on where it was."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -166,6 +167,21 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
     assert counts == [(6, 7), (7, 7)] and cells[0].stat().st_mtime_ns == kept
     assert len(rows) == 3 * 3 * 2 * 2
     assert json.loads(cells[1].read_text())
+
+
+def levels_of_light():
+    """A model in a sweep's hands: says how bright the frame is."""
+    return {"meter": lambda frame: (np.array([frame.image.mean()]), ("mm",), True)}
+
+
+def test_models_are_asked_about_every_frame(spec, frames, tmp_path):
+    plan = replace(real_plan(spec, frames), severities=(0.0, 1.0), models=levels_of_light, model_names=("meter",))
+    rows = run_sweep(plan, tmp_path, jobs=1, progress=lambda done, total: None)
+    asked = [row for row in rows if row["pipeline"] == "meter"]
+    assert len(asked) == 3 * 2 * 2
+    curves = curves_of(rows, plan.cases, pitch_px=19.0)
+    brighter = next(c for c in curves if c.pipeline == "meter" and c.case == "hot-pixels" and c.measure.name == "pose_mm")
+    assert brighter.mean[0] == 0 and brighter.mean[1] > 5
 
 
 def test_cells_depend_on_what_they_were_computed_from(spec, frames):

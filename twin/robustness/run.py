@@ -1,5 +1,6 @@
 """A whole robustness study into one folder."""
 
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,10 +31,10 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
         A name is neither a method nor a file.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    chosen = []
+    chosen, digest = [], zlib.crc32(b"".join(frame.image.tobytes() for frame in frames))
     for k, name in enumerate(names):
         progress(k, len(names))
-        kept = folder / f"{name}-{spec.name}-{frames[0].form}.toml"
+        kept = folder / f"{name}-{spec.name}-{digest:08x}.toml"
         if name == "twin":
             chosen.append(shipped_detector(spec, frames[0].form))
         elif name in METHODS:

@@ -24,6 +24,7 @@ from twin.types import Form, Frame, Observation
 SATURATED_LEVEL = 250
 STEADY = 0.5  # of the frames: a pin lost, or a spot seen, in so many is a fault of the sensor, not of a contact
 SAME_SPOT = 0.3  # pitches
+CAPS_MEASURED = 3  # frames at most, evenly spread: light and focus hardly differ between them
 LISTED = 8  # numbers of pins in a sentence
 
 
@@ -157,7 +158,8 @@ def _place(seen: list[Observation], spec: SensorSpec, form: Form) -> list[Findin
 def _light(frames: list[Frame], seen: list[Observation], spec: SensorSpec, tuned: SensorSpec) -> list[Finding]:
     """Brightness, evenness, focus and glare of raw frames, against the twin's own frame at rest."""
     expected = promised_caps(spec)
-    caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in zip(frames, seen, strict=True) if np.isfinite(o.pins_px).any()]
+    looked = list(zip(frames, seen, strict=True))[:: -(-len(frames) // CAPS_MEASURED)]
+    caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in looked if np.isfinite(o.pins_px).any()]
     blob = blob_spec(tuned, Form.RAW)
     mask = circular_mask((spec.camera.width_px, spec.camera.height_px), blob.mask_center_px, blob.mask_radius_px)
     windows = [gray_levels(np.ascontiguousarray(f.image[mask.window])) for f in frames]

@@ -26,6 +26,7 @@ def main() -> None:
         audit,
         calibrate,
         catalog,
+        check,
         collect,
         dataset,
         demo,
@@ -39,9 +40,11 @@ def main() -> None:
         preprocess,
         realism,
         render,
+        robustness,
         servo,
         study,
         train,
+        tune,
         validate,
     )
 

@@ -1,5 +1,7 @@
 """Which way each place of the film looks, as a table: exact for any distortion, and cheap to look up."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from scenes.sensor import CameraSpec
@@ -25,8 +27,13 @@ def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.nd
     """Unit directions (H + 1, W + 1, 3) in the camera frame, in air, at the corners of a window's pixels.
 
     ``window_px`` = (x0, y0, x1, y1), end exclusive; corner (j, i) is at pixel (x0 + i - 0.5, y0 + j - 0.5).
-    Beyond the distortion's valid field the tangents continue linearly outwards.
+    Beyond the distortion's valid field the tangents continue linearly outwards. The array is shared: it can't be written to.
     """
+    return _ray_table(camera, tuple(window_px))
+
+
+@lru_cache(maxsize=4)
+def _ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.ndarray:
     x0, y0, x1, y1 = window_px
     x, y = np.meshgrid(np.arange(x0, x1 + 1) - 0.5, np.arange(y0, y1 + 1) - 0.5)
     seen = np.stack([(x - camera.cx_px) / camera.fx_px, (y - camera.cy_px) / camera.fy_px], axis=-1)
@@ -40,7 +47,9 @@ def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.nd
     guess = inside * np.interp(seen_radius / beyond, image, tangent) / np.maximum(seen_radius / beyond, 1e-12)
     ideal = beyond * undistort(camera, inside, guess=guess)
     rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays.flags.writeable = False
+    return rays
 
 
 def subpixel_rays(corners: np.ndarray, across: int) -> np.ndarray:

@@ -1,0 +1,101 @@
+"""The lab's commands, and real frames beside rendered ones."""
+
+import numpy as np
+import pytest
+
+from scenes import load_sensor
+from twin.detectors import make_detector, shipped_detector, tune
+from twin.preprocess.reference import nominal_reference
+from twin.recordings import open_recording
+from twin.recordings.images import write_image
+from twin.robustness.condition import Case
+from twin.robustness.conditions import CONDITIONS
+from twin.robustness.contacts import CONTACTS
+from twin.robustness.envelope import curves_of, envelopes_of
+from twin.robustness.real import consensus
+from twin.robustness.shots import RenderedSource
+from twin.robustness.sweep import Plan, run_sweep
+from twin.types import Form
+
+SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}
+COMPARED = ("noise", "defocus", "jpeg", "exposure-low", "resolution")
+STEPS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 0.95, 1.0)
+FRAMES = 4
+AGREEMENT = 1.25  # ratio of the real and the rendered failing severity
+
+
+def run(*arguments):
+    import subprocess
+    import sys
+
+    code = "from twin.cli import main; main()"
+    return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, timeout=600)
+
+
+def evenly(recording, count):
+    return [recording.read(int(k)) for k in np.linspace(0, len(recording) - 1, count)]
+
+
+def test_tune_check_and_robustness_from_the_command_line(tmp_path):
+    spec = load_sensor("mg400-127")
+    source = RenderedSource(spec, CONTACTS[:1])
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for k, name in enumerate(("noise", "defocus", "motion-blur")):
+        shot = source.shoot(Case((CONDITIONS[name],)), 0.01)[0]
+        write_image(frames / f"{k}.png", shot.frame.image)
+    tuned = run("tune", "--sensor", "mg400-127", "--frames", frames, "--out", tmp_path / "mine.toml")
+    assert tuned.returncode == 0, tuned.stderr
+    assert "all 127 pins in 100 %" in tuned.stdout and (tmp_path / "mine.toml").is_file()
+    checked = run("check", frames, "--sensor", "mg400-127", "--pipeline", tmp_path / "mine.toml")
+    assert checked.returncode == 0 and "GOOD" in checked.stdout, checked.stdout + checked.stderr
+    plan = tmp_path / "plan.toml"
+    plan.write_text('steps = [0.5, 1.0]\n[[condition]]\nname = "hot-pixels"\n[[condition]]\nname = "caps-faded"\n')
+    pipelines = ("--pipeline", "twin", "--pipeline", tmp_path / "mine.toml", "--conditions", plan, "--jobs", "2", "--limit", "2")
+    swept = run("robustness", "--sensor", "mg400-127", "--frames", frames, "--out", tmp_path / "out", *pipelines)
+    assert swept.returncode == 0, swept.stderr
+    assert "hot-pixels" in swept.stdout and "caps-faded" in (tmp_path / "out" / "index.html").read_text()  # named as left out
+    assert (tmp_path / "out" / "envelope.csv").read_text().count("hot-pixels") == 2
+
+
+def test_errors_are_one_line_and_say_what_to_do(tmp_path):
+    unknown = run("robustness", "--sensor", "mg400-127", "--pipeline", "magic", "--frames", tmp_path, "--out", tmp_path / "out")
+    assert unknown.returncode == 1 and unknown.stderr.count("\n") <= 2 and "error" in unknown.stderr
+    listed = run("robustness", "--sensor", "mg400-127", "--list", "--out", tmp_path / "out")
+    assert listed.returncode == 0 and all(name in listed.stdout for name in CONDITIONS)
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", SETS)
+def test_tuning_reaches_the_hand_tuned_rates(real_dir, folder):
+    spec = load_sensor(SETS[folder])
+    recording = open_recording(real_dir / folder, spec)
+    frames = evenly(recording, 20)
+    rates = []
+    for detector in (tune(frames, spec).detector, shipped_detector(spec, recording.form)):
+        find = make_detector(spec, detector)
+        rates.append(np.mean([len(find(frame).claims_px) == spec.pins.count for frame in frames]))
+    print(f"\n{folder}: tuned {rates[0]:.2f}, by hand {rates[1]:.2f}")
+    assert rates[0] >= rates[1]
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_real_frames_fail_where_rendered_ones_do(real_dir, tmp_path):
+    spec = load_sensor("ur5-331")
+    frames = evenly(open_recording(real_dir / "ur5-331-raw", spec), FRAMES)
+    ours = shipped_detector(spec, Form.RAW)
+    real, refused = consensus(spec, frames, [ours, tune(frames, spec, "adaptive").detector])
+    assert len(refused) <= 1
+    cases = tuple(Case((CONDITIONS[name],)) for name in COMPARED)
+    pitch_px = float(nominal_reference(spec, Form.RAW).spacing_px.mean())
+    found = []
+    for kind, source in (("real", real), ("rendered", RenderedSource(spec, CONTACTS))):
+        rows = run_sweep(Plan(source, (ours,), cases, STEPS), tmp_path / kind, jobs=2, progress=lambda done, total: None)
+        found.append([e.severity for e in envelopes_of(curves_of(rows, cases, pitch_px), cases)])
+    ends = np.minimum(found, 1.0)  # where neither fails within the range they agree
+    ratio = ends[0] / ends[1]
+    for name, *pair in zip(COMPARED, *found, ratio, strict=True):
+        print(f"\n{name}: real {pair[0]:.3f}, rendered {pair[1]:.3f}, ratio {pair[2]:.2f}")
+    assert (ends < 1).all(axis=0).sum() >= 4 and (np.maximum(ratio, 1 / ratio) < AGREEMENT).all()

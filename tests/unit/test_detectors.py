@@ -1,0 +1,114 @@
+"""Every detector finds the pins of an easy frame; tuning needs no knowledge but the layout, and its file says it all."""
+
+import cv2
+import numpy as np
+import pytest
+from drawn_frames import draw_discs, drawn_frame, smooth_warp
+
+from scenes import load_sensor
+from twin.detectors import METHODS, load_detector, make_detector, shipped_detector, tune, write_detector
+from twin.detectors.layout import flat_layout, see_layout
+from twin.errors import FrameError
+from twin.preprocess.reference import nominal_reference
+from twin.types import Form, Frame
+
+# scale spaces give whole pixels; DoH, from an integral image, is off by about one
+CENTROID_PX = {"twin": 0.1, "legacy": 0.6, "adaptive": 0.6, "fixed": 0.6, "simple": 0.6, "log": 1.0, "dog": 1.0, "doh": 1.8}
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return load_sensor("mg400-127")
+
+
+@pytest.fixture(scope="module")
+def foreign(spec):
+    """Frames of a sensor like ours whose camera nobody knows: larger, displaced, turned, brighter ring around; and their pins."""
+    flat = flat_layout(spec)
+    turn = np.radians(8.0)
+    turning = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    center, frames, truths = np.array([300.0, 255.0]), [], []
+    for k in range(4):
+        rest = center + 165.0 * (flat @ turning) * (1 - 0.08 * np.linalg.norm(flat, axis=1, keepdims=True))
+        truth = smooth_warp(rest, 6.0, np.random.default_rng(k))
+        image = draw_discs((640, 480), truth, 6.0, level=(20, 120), blur_px=0.8, noise_sd=1.0, rng=np.random.default_rng(k))
+        cv2.circle(image, (300, 255), 205, 180, 14)
+        frames.append(Frame(image, Form.RAW, f"foreign-{k}"))
+        truths.append(truth)
+    return frames, truths
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_tunes_itself_and_finds_the_pins(spec, foreign, method):
+    frames, truths = foreign
+    detector = tune(frames, spec, method).detector
+    find = make_detector(spec, detector)
+    for frame, truth in zip(frames, truths, strict=True):
+        found = find(frame)
+        assert len(found.claims_px) == spec.pins.count, (method, len(found.claims_px), detector)
+        nearest = np.linalg.norm(found.claims_px - truth[:, None], axis=2).min(axis=1)
+        assert np.sqrt(np.mean(nearest**2)) < CENTROID_PX[method]
+        assert found.valid and (method == "legacy" or found.graph.nodes_px.shape == truth.shape)
+    assert detector.evidence.exact_rate == 1.0
+
+
+def test_names_are_those_of_the_layout(spec, foreign):
+    frames, truths = foreign
+    found = make_detector(spec, tune(frames, spec).detector)(frames[0])
+    assert np.linalg.norm(found.pins_px - truths[0], axis=1).max() < 1.0
+
+
+def test_a_tuning_says_when_it_is_unsure(spec, foreign):
+    frames, _ = foreign
+    rng = np.random.default_rng(0)
+    noisy = [Frame(np.clip(f.image + rng.normal(0, 60, f.image.shape), 0, 255).astype(np.uint8), f.form, f.name) for f in frames[:1]]
+    sure = tune(frames, spec)
+    try:
+        doubtful = tune(noisy, spec)
+    except FrameError as error:
+        assert "shows 127 pins" in str(error)
+    else:
+        assert doubtful.detector.evidence.sure != "sure" and doubtful.notes
+    assert sure.detector.evidence.threshold_slack > 1 and sure.detector.evidence.mask_slack_px > 5
+
+
+def test_a_tuning_survives_its_file(spec, foreign, tmp_path):
+    detector = tune(foreign[0], spec).detector
+    path = tmp_path / "mine.toml"
+    write_detector(path, detector, "two\nlines")
+    assert load_detector(path) == detector.model_copy(update={"name": "mine"})
+
+
+def test_frames_without_a_layout_are_refused(spec):
+    black = Frame(np.zeros((480, 640), np.uint8), Form.RAW)
+    with pytest.raises(FrameError, match="none of 1 frames shows 127 pins"):
+        tune([black], spec)
+    assert see_layout(black.image, spec, binary=False) is None
+
+
+def test_recordings_are_tuned_without_a_crop(spec):
+    rest = nominal_reference(spec, Form.RECORDING).pins_px
+    frames = [drawn_frame(spec, Form.RECORDING, smooth_warp(rest, 4.0, np.random.default_rng(k))) for k in range(2)]
+    detector = tune(frames, spec).detector
+    assert detector.form == Form.RECORDING and detector.recording is None and detector.blob.threshold_block_px == 0
+    assert all(make_detector(spec, detector)(frame).valid for frame in frames)
+    assert make_detector(spec, shipped_detector(spec, Form.RECORDING, "legacy"))(frames[0]).pins_px is None
+
+
+def test_stricter_raises_the_bar(spec, foreign):
+    frame = foreign[0][0]
+    for method in ("twin", "fixed", "legacy"):
+        detector = tune([frame], spec, method).detector
+        counts = [len(make_detector(spec, detector.stricter(levels))(frame).claims_px) for levels in (0.0, 250.0)]
+        assert counts[1] < 0.5 * counts[0], method
+        assert detector.stricter(0.0) == detector
+
+
+def test_wrong_files_are_refused_by_name(spec, tmp_path):
+    path = tmp_path / "bad.toml"
+    path.write_text('method = "twim"\n')
+    with pytest.raises(FrameError, match="bad.toml"):
+        load_detector(path)
+    tuned = shipped_detector(spec, Form.RAW).model_copy(update={"pins_px": ((0.0, 0.0),)})
+    with pytest.raises(FrameError, match="tuned for 1 pins"):
+        make_detector(spec, tuned)

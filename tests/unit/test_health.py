@@ -1,0 +1,74 @@
+"""A well sensor is well; each planted fault is named."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from plain_sensor import changed, plain
+
+from twin.health import Verdict, examine
+from twin.health.drift import drift_of
+from twin.mechanics.path import ContactPose
+from twin.preprocess.reference import nominal_reference
+from twin.robustness.condition import Case
+from twin.robustness.conditions import CONDITIONS
+from twin.robustness.contacts import Contact
+from twin.robustness.shots import RenderedSource
+from twin.types import Form, Frame
+
+
+@lru_cache(maxsize=1)
+def sensor():
+    return changed(plain(), camera={"channels": "mono"})
+
+
+def frames(name, severity):
+    source = RenderedSource(sensor(), (Contact("none", "plane", ContactPose(0.0)),))
+    return [shot.frame for shot in source.shoot(Case((CONDITIONS[name],)), severity)]
+
+
+def verdicts(shown):
+    return {found.name: found for found in examine(shown, sensor())}
+
+
+def test_a_well_sensor_is_well():
+    found = verdicts(frames("noise", 0.0))
+    assert {f.verdict for f in found.values()} == {Verdict.GOOD}, found
+    assert set(found) == {"brightness", "saturation", "focus", "glare", "pins", "specks", "shift", "turn", "scale"}
+
+
+@pytest.mark.parametrize(
+    ("name", "severity", "finding"),
+    [
+        ("exposure-low", 0.35, "brightness"),
+        ("exposure-high", 0.4, "saturation"),
+        ("defocus", 0.15, "focus"),
+        ("glare", 0.4, "glare"),
+        ("caps-missing", 0.1, "pins"),
+        ("camera-shifted", 0.1, "shift"),
+        ("camera-rolled", 0.08, "turn"),
+        ("camera-zoomed", 0.2, "scale"),
+    ],
+)
+def test_a_planted_fault_is_named(name, severity, finding):
+    found = verdicts(frames(name, severity))
+    assert found[finding].verdict is not Verdict.GOOD and found[finding].remedy, found
+
+
+def test_a_black_frame_is_bad_and_nothing_crashes():
+    found = verdicts([Frame(np.zeros((480, 640), np.uint8), Form.RAW)])
+    assert found["pins"].verdict is Verdict.BAD and found["brightness"].verdict is Verdict.BAD and "place" in found
+
+
+def test_drift_is_the_planted_similarity():
+    reference = nominal_reference(sensor(), Form.RAW)
+    rest, rim = reference.pins_px, reference.outmost
+    center = rest[rim].mean(axis=0)
+    turn = np.radians(3.0)
+    turning = 1.05 * np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    pins = (rest - center) @ turning + center + [4.0, -2.0]
+    pins[rim[:10]] = np.nan
+    drift = drift_of(pins, rest, rim)
+    assert drift.shift_px == pytest.approx([4.0, -2.0]) and drift.turn_deg == pytest.approx(3.0) and drift.scale == pytest.approx(1.05)
+    pins[rim[: len(rim) // 2 + 1]] = np.nan
+    assert drift_of(pins, rest, rim) is None

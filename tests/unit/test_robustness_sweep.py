@@ -1,0 +1,215 @@
+"""Measures against planted errors, envelopes against known crossings, and a sweep end to end that goes on where it was."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drawn_frames import drawn_frame, smooth_warp
+
+from scenes import load_sensor
+from twin.detectors import Found, make_detector, shipped_detector
+from twin.errors import TwinError
+from twin.preprocess.reference import nominal_reference
+from twin.robustness.condition import Case
+from twin.robustness.conditions import CONDITIONS
+from twin.robustness.envelope import crossing, curves_of, envelopes_of
+from twin.robustness.measures import MEASURES, judge
+from twin.robustness.plan import SweepPlan, load_plan
+from twin.robustness.real import consensus
+from twin.robustness.report import compare
+from twin.robustness.run import study
+from twin.robustness.shots import RealSource, Shot
+from twin.robustness.sweep import Plan, cells_of, run_sweep
+from twin.types import Form, Frame
+
+RECALL = next(m for m in MEASURES if m.name == "recall")
+CENTROID = next(m for m in MEASURES if m.name == "centroid_px")
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return load_sensor("mg400-127")
+
+
+@pytest.fixture(scope="module")
+def rest(spec):
+    return nominal_reference(spec, Form.RAW).pins_px
+
+
+@pytest.fixture(scope="module")
+def detector(spec):
+    return make_detector(spec, shipped_detector(spec, Form.RAW))
+
+
+def shot_of(rest, gone=()):
+    visible = np.ones(len(rest), bool)
+    visible[list(gone)] = False
+    return Shot("planted", Frame(np.zeros((480, 640), np.uint8), Form.RAW), rest, visible)
+
+
+def found_of(detector, pins_px, extra=()):
+    claims = np.concatenate([pins_px[np.isfinite(pins_px[:, 0])], np.reshape(extra, (-1, 2))])
+    return Found(claims, pins_px, detector.graph_of(pins_px) if np.isfinite(pins_px).all() else None, True)
+
+
+def test_a_perfect_answer_is_perfect(detector, rest):
+    assert judge(detector, found_of(detector, rest), shot_of(rest)) == {
+        "valid": 1.0, "recall": 1.0, "precision": 1.0, "centroid_px": 0.0, "swaps": 0.0, "area_error": 0.0, "edges": 1.0,
+    }  # fmt: skip
+
+
+def test_planted_errors_are_counted(detector, rest):
+    n = len(rest)
+    pins = rest.copy()
+    pins[:5] = np.nan
+    lost = judge(detector, found_of(detector, pins), shot_of(rest))
+    assert lost["recall"] == pytest.approx(1 - 5 / n) and lost["precision"] == 1 and np.isnan(lost["area_error"])
+    extra = judge(detector, found_of(detector, rest, extra=[[5.0, 5.0], [9.0, 400.0]]), shot_of(rest))
+    assert extra["precision"] == pytest.approx(n / (n + 2)) and extra["recall"] == 1
+    moved = judge(detector, found_of(detector, rest + [0.3, 0.4]), shot_of(rest))
+    assert moved["centroid_px"] == pytest.approx(0.5) and moved["area_error"] < 1e-9
+    pins = rest.copy()
+    pins[[10, 11]] = pins[[11, 10]]
+    swapped = judge(detector, found_of(detector, pins), shot_of(rest))
+    assert swapped["swaps"] == pytest.approx(2 / n) and swapped["recall"] == 1
+
+
+def test_a_pin_that_is_gone_is_not_missed(detector, rest):
+    pins = rest.copy()
+    pins[[3, 4]] = np.nan
+    measured = judge(detector, found_of(detector, pins), shot_of(rest, gone=[3, 4]))
+    assert measured["recall"] == 1 and measured["precision"] == 1
+
+
+def test_crossings_lie_between_the_steps():
+    severity = np.array([0.0, 0.2, 0.4, 1.0])
+    assert crossing(RECALL, 0.97, severity, np.array([1.0, 0.99, 0.95, 0.1])) == pytest.approx(0.3)
+    assert crossing(CENTROID, 0.5, severity, np.array([0.1, 0.4, 0.6, np.nan])) == pytest.approx(0.3)
+    assert crossing(RECALL, 0.97, severity, np.array([1.0, 1.0, 0.98, 0.97])) == np.inf
+    assert crossing(RECALL, 0.97, severity, np.array([0.5, 1.0, 1.0, 1.0])) == 0.0
+
+
+def test_curves_envelopes_and_their_comparison():
+    case = Case((CONDITIONS["noise"],))
+    rows = [
+        {"case": "noise", "severity": s, "pipeline": p, "frame": f, **dict.fromkeys(("valid", "precision", "edges"), 1.0)}
+        | {"recall": r, "centroid_px": 0.1, "swaps": 0.0, "area_error": 0.0}
+        for p, recalls in (("a", (1.0, 1.0, 0.94)), ("b", (1.0, 0.94, 0.5)))
+        for s, r in zip((0.0, 0.5, 1.0), recalls, strict=True)
+        for f in ("x", "y")
+    ]
+    curves = curves_of(rows, (case,), pitch_px=10.0)
+    envelopes = envelopes_of(curves, (case,))
+    assert [round(e.severity, 6) for e in envelopes] == [0.75, 0.25] and {e.measure for e in envelopes} == {"recall"}
+    assert compare(envelopes, "a", "b") == {"ours": "a", "theirs": "b", "cases": 1, "as_wide": 1, "twice": 1, "narrower": []}
+    assert compare(envelopes, "b", "a")["narrower"] == ["noise"]
+    band = next(c for c in curves if c.pipeline == "a" and c.measure is RECALL)
+    assert (band.low <= band.mean + 1e-12).all() and (band.mean <= band.high + 1e-12).all()
+
+
+def test_poses_are_judged_against_the_undegraded_frame():
+    case = Case((CONDITIONS["noise"],))
+    rows = [
+        {
+            "case": "noise",
+            "severity": s,
+            "pipeline": "run",
+            "frame": "x",
+            "pose": {"values": [v, 5.0], "units": ["mm", "deg"], "valid": s < 1},
+        }
+        for s, v in ((0.0, 1.0), (0.5, 1.3), (1.0, np.nan))
+    ]
+    curves = {c.measure.name: c for c in curves_of(rows, (case,), pitch_px=10.0)}
+    assert curves["pose_mm"].mean[:2] == pytest.approx([0.0, 0.3]) and np.isnan(curves["pose_mm"].mean[2])
+    assert curves["pose_deg"].mean[1] == 0 and curves["pose_valid"].mean.tolist() == [1.0, 1.0, 0.0]
+
+
+@pytest.fixture(scope="module")
+def frames(spec, rest):
+    return [drawn_frame(spec, Form.RAW, smooth_warp(rest, 4.0, np.random.default_rng(k)), name=f"drawn-{k}") for k in range(2)]
+
+
+def real_plan(spec, frames):
+    detectors = (shipped_detector(spec, Form.RAW), shipped_detector(spec, Form.RAW, "adaptive"))
+    source, refused = consensus(spec, frames, list(detectors))
+    assert not refused
+    cases = tuple(Case((CONDITIONS[name],)) for name in ("hot-pixels", "wrong-crop")) + (Case((CONDITIONS["noise"], CONDITIONS["jpeg"])),)
+    return Plan(source, detectors, cases, (0.0, 0.3, 1.0))
+
+
+def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path):
+    plan = real_plan(spec, frames)
+    counts = []
+
+    class Bar:
+        def __init__(self, title):
+            pass
+
+        def __enter__(self):
+            return lambda done, total: counts.append((done, total))
+
+        def __exit__(self, *_):
+            pass
+
+    envelopes, written = study(plan, "drawn", tmp_path, Bar)
+    assert all(path.stat().st_size for path in written)
+    page = written[0].read_text()
+    assert all(case.title in page for case in plan.cases) and "Narrower" in page or "narrower in none" in page
+    assert counts[0] == (0, 7) and counts[-1] == (7, 7)  # severity 0 is one cell for all
+    assert all(e.severity > 0 for e in envelopes if e.pipeline == "twin")
+    assert all(e.reached for e in envelopes if e.case.name in ("hot-pixels", "noise+jpeg"))
+    cells = sorted((tmp_path / "cells").iterdir())
+    kept = cells[0].stat().st_mtime_ns
+    cells[1].write_text("{ torn")
+    counts.clear()
+    rows = run_sweep(plan, tmp_path, jobs=1, progress=lambda done, total: counts.append((done, total)))
+    assert counts == [(6, 7), (7, 7)] and cells[0].stat().st_mtime_ns == kept
+    assert len(rows) == 3 * 3 * 2 * 2
+    assert json.loads(cells[1].read_text())
+
+
+def levels_of_light():
+    """A model in a sweep's hands: says how bright the frame is."""
+    return {"meter": lambda frame: (np.array([frame.image.mean()]), ("mm",), True)}
+
+
+def test_models_are_asked_about_every_frame(spec, frames, tmp_path):
+    plan = replace(real_plan(spec, frames), severities=(0.0, 1.0), models=levels_of_light, model_names=("meter",))
+    rows = run_sweep(plan, tmp_path, jobs=1, progress=lambda done, total: None)
+    asked = [row for row in rows if row["pipeline"] == "meter"]
+    assert len(asked) == 3 * 2 * 2
+    curves = curves_of(rows, plan.cases, pitch_px=19.0)
+    brighter = next(c for c in curves if c.pipeline == "meter" and c.case == "hot-pixels" and c.measure.name == "pose_mm")
+    assert brighter.mean[0] == 0 and brighter.mean[1] > 5
+
+
+def test_cells_depend_on_what_they_were_computed_from(spec, frames):
+    plan = real_plan(spec, frames)
+    names = {cell.file for cell in cells_of(plan)}
+    other = Plan(plan.source, plan.detectors[:1], plan.cases, plan.severities)
+    assert names.isdisjoint(cell.file for cell in cells_of(other))
+    assert names == {cell.file for cell in cells_of(real_plan(spec, frames))}
+
+
+def test_undegraded_real_frames_stay_as_they_are(spec, frames, rest):
+    source = RealSource(spec, tuple(frames), np.stack([rest, rest]))
+    for condition in CONDITIONS.values():
+        if condition.image_level:
+            assert all(np.array_equal(s.frame.image, f.image) for s, f in zip(source.shoot(Case((condition,)), 0.0), frames, strict=True))
+
+
+def test_a_sweep_can_be_read_from_a_file(tmp_path):
+    path = tmp_path / "sweep.toml"
+    path.write_text('steps = [0.5, 0.1]\npairs = [["noise", "jpeg"]]\n[[condition]]\nname = "noise"\nsevere = 0.2\n')
+    plan = load_plan(path)
+    assert plan.severities() == (0.0, 0.1, 0.5)
+    single, pair = plan.cases()
+    assert single.conditions[0].value(1.0) == 0.2 and pair.name == "noise+jpeg" and pair.conditions[0].value(1.0) == 0.2
+    assert len(SweepPlan().cases()) == len(CONDITIONS)
+    path.write_text('[[condition]]\nname = "nois"\n')
+    with pytest.raises(TwinError, match="did you mean 'noise'"):
+        load_plan(path).cases()
+    path.write_text("stepps = [1]\n")
+    with pytest.raises(TwinError, match="stepps"):
+        load_plan(path)

@@ -1,0 +1,205 @@
+"""A condition: one way in which a sensor degrades, as frozen data, and where in the chain it acts.
+
+The chain is specification, contact, light on the film, camera response, frame, and the pipeline's own settings. Every hook
+given the nominal value returns what it was given, bit for bit.
+"""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scenes.sensor import SensorSpec
+from twin.geometry.pins import rest_pins
+from twin.projection import project
+from twin.realism.disc import lens_disc
+
+
+@dataclass(frozen=True)
+class View:
+    """What a condition may know of the picture it degrades.
+
+    Attributes
+    ----------
+    spec : SensorSpec
+        As it is rendered, degradations of the specification included.
+    center_px : (2,) float
+    radius_px : float
+        Of the disc through which the gel is seen.
+    px_per_mm : float
+        At the caps at rest.
+    caps_px : (N, 2) float
+        Where the caps are in this frame.
+    """
+
+    spec: SensorSpec
+    center_px: np.ndarray
+    radius_px: float
+    px_per_mm: float
+    caps_px: np.ndarray
+
+    @classmethod
+    def of(cls, spec: SensorSpec, caps_px: np.ndarray) -> "View":
+        """The view of a sensor whose caps are at ``caps_px`` (N, 2), raw-frame px."""
+        disc = lens_disc(spec)
+        caps_mm = rest_pins(spec).caps_mm
+        apart = [cKDTree(points).query(points, k=2)[0][:, 1] for points in (project(spec, caps_mm), caps_mm)]
+        return cls(spec, disc.center_px, disc.radius_px, float(np.median(apart[0] / apart[1])), caps_px)
+
+    @property
+    def cap_radius_px(self) -> float:
+        """Radius of a cap that faces the camera."""
+        return 0.5 * self.spec.pins.cap_diameter_mm * self.px_per_mm
+
+    @property
+    def saturation(self) -> float:
+        """Linear light that the camera shows as white."""
+        return 1.0 / self.spec.response.exposure
+
+    def grid(self, shape: tuple) -> tuple[np.ndarray, np.ndarray]:
+        """x and y (H, W) of a frame's pixels from the disc's centre, in its radius."""
+        y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+        return (x - np.float32(self.center_px[0])) / self.radius_px, (y - np.float32(self.center_px[1])) / self.radius_px
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One way in which a sensor degrades.
+
+    Severity 0 is ``nominal``, 1 is ``severe``; in between the parameter goes evenly.
+
+    Attributes
+    ----------
+    name, title, family : str
+    parameter, unit : str
+        What ``nominal`` and ``severe`` are values of.
+    nominal, severe : float
+    spec : callable, optional
+        ``spec(spec, value, rng)``: the degraded specification, before anything is rendered.
+    solves : bool
+        The specification's mechanics change: contacts are solved anew.
+    light : callable, optional
+        ``light(light, value, view, rng)``: linear light on the film, before the camera's response.
+    frame : callable, optional
+        ``frame(image, value, view, rng)``: gray levels or RGB (uint8).
+    moves : callable, optional
+        ``moves(px, value, view)``: where points (n, 2) of the picture go by ``light`` or ``frame``.
+    hides : callable, optional
+        ``hides(value, view, rng)``: (N,) bool, caps that are gone.
+    setting : callable, optional
+        ``setting(detector, value)``: a `DetectorSpec` that is set wrongly.
+    image_level : bool
+        Acts on a frame alone, so that a real frame can take its place.
+    """
+
+    name: str
+    title: str
+    family: str
+    parameter: str
+    unit: str
+    severe: float
+    nominal: float = 0.0
+    spec: Callable | None = field(default=None, repr=False)
+    solves: bool = False
+    light: Callable | None = field(default=None, repr=False)
+    frame: Callable | None = field(default=None, repr=False)
+    moves: Callable | None = field(default=None, repr=False)
+    hides: Callable | None = field(default=None, repr=False)
+    setting: Callable | None = field(default=None, repr=False)
+    image_level: bool = False
+
+    def value(self, severity: float) -> float:
+        """The parameter at a severity in [0, 1]."""
+        return self.nominal + severity * (self.severe - self.nominal)
+
+    def rng(self, draw: int = 0) -> np.random.Generator:
+        """The condition's own random numbers, the same at every severity: a degradation grows, it is not drawn anew."""
+        return np.random.default_rng([zlib.crc32(self.name.encode()), draw])
+
+
+@dataclass(frozen=True)
+class Case:
+    """One condition, or several at the same severity."""
+
+    conditions: tuple[Condition, ...]
+
+    @property
+    def name(self) -> str:
+        """Names of the conditions, joined by '+'."""
+        return "+".join(c.name for c in self.conditions)
+
+    @property
+    def title(self) -> str:
+        """Titles of the conditions."""
+        return " and ".join(c.title for c in self.conditions)
+
+    @property
+    def solves(self) -> bool:
+        """Contacts are solved anew."""
+        return any(c.solves for c in self.conditions)
+
+    @property
+    def image_level(self) -> bool:
+        """Acts on frames alone."""
+        return all(c.image_level for c in self.conditions)
+
+    def label(self, severity: float) -> str:
+        """The parameters' values in words."""
+        return ", ".join(f"{c.value(severity):.3g} {c.unit}".strip() for c in self.conditions)
+
+    def on_spec(self, spec: SensorSpec, severity: float) -> SensorSpec:
+        """The degraded specification."""
+        for c in self.conditions:
+            if c.spec is not None:
+                spec = c.spec(spec, c.value(severity), c.rng())
+        return spec
+
+    def on_light(self, light: np.ndarray, severity: float, view: View, draw: int) -> np.ndarray:
+        """Degraded linear light."""
+        for c in self.conditions:
+            if c.light is not None:
+                light = c.light(light, c.value(severity), view, c.rng(draw))
+        return light
+
+    def on_frame(self, image: np.ndarray, severity: float, view: View, draw: int) -> np.ndarray:
+        """A degraded frame."""
+        for c in self.conditions:
+            if c.frame is not None:
+                image = c.frame(image, c.value(severity), view, c.rng(draw))
+        return image
+
+    def on_points(self, px: np.ndarray, severity: float, view: View) -> np.ndarray:
+        """Where points (n, 2) go."""
+        for c in self.conditions:
+            if c.moves is not None:
+                px = c.moves(px, c.value(severity), view)
+        return px
+
+    def gone(self, severity: float, view: View) -> np.ndarray:
+        """(N,) bool: caps that are no longer there."""
+        gone = np.zeros(len(view.caps_px), bool)
+        for c in self.conditions:
+            if c.hides is not None:
+                gone |= c.hides(c.value(severity), view, c.rng())
+        return gone
+
+    def on_setting(self, detector, severity: float):
+        """A `DetectorSpec` set wrongly."""
+        for c in self.conditions:
+            if c.setting is not None:
+                detector = c.setting(detector, c.value(severity))
+        return detector
+
+
+def revised(spec: SensorSpec, **sections) -> SensorSpec:
+    """A copy of a specification with values changed, section by section; values are trusted to be in range."""
+    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
+
+
+def chosen(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
+    """(count,) bool: a share of places, drawn so that a larger share holds the smaller one."""
+    mask = np.zeros(count, bool)
+    mask[rng.permutation(count)[: round(share * count)]] = True
+    return mask

@@ -1,0 +1,114 @@
+"""What goes wrong between window and camera chip: focus, motion, dirt, scratches."""
+
+import cv2
+import numpy as np
+
+from twin.robustness.condition import Condition, View
+
+SUBPIXELS = 8  # per pixel and axis, of a blur's kernel
+MOTION_DEG = 30.0
+DIRT_SPACING_MM = 1.5  # sd of the smudges' size
+DIRT_OPACITY = 0.9
+DIRT_EDGE_MM = 0.5  # the lens is out of focus: a smudge's edge is soft
+SCRATCH_WIDTH_MM = 0.12
+SCRATCH_LIGHT = 0.25  # that a scratch scatters, in saturations
+FOCUS_STEPS = 6  # blurs between which a focus that varies is interpolated
+
+
+def blurred_by(light, kernel):
+    return cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REFLECT)
+
+
+def disc_kernel(diameter_px: float) -> np.ndarray:
+    """A disc's cover of pixels, sum 1: the circle of confusion."""
+    half = int(np.ceil(diameter_px / 2 + 0.5))
+    fine = (np.arange((2 * half + 1) * SUBPIXELS) + 0.5) / SUBPIXELS - half - 0.5
+    inside = fine[:, None] ** 2 + fine**2 <= (diameter_px / 2) ** 2
+    kernel = inside.reshape(2 * half + 1, SUBPIXELS, 2 * half + 1, SUBPIXELS).mean(axis=(1, 3))
+    if kernel.sum() == 0:  # a disc smaller than a sub-pixel
+        kernel[half, half] = 1
+    return (kernel / kernel.sum()).astype(np.float32)
+
+
+def line_kernel(length_px: float, degrees: float) -> np.ndarray:
+    """A straight path's cover of pixels, sum 1."""
+    half = int(np.ceil(length_px / 2 + 1))
+    along = np.linspace(-0.5, 0.5, 20 * half + 1) * length_px
+    x, y = along * np.cos(np.radians(degrees)) + half, along * np.sin(np.radians(degrees)) + half
+    kernel = np.zeros((2 * half + 2, 2 * half + 2))
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    for dx in (0, 1):
+        for dy in (0, 1):
+            np.add.at(kernel, (top + dy, left + dx), np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - top)))
+    return (kernel[: 2 * half + 1, : 2 * half + 1] / kernel.sum()).astype(np.float32)
+
+
+def defocus(light, value, view: View, rng):
+    return blurred_by(light, disc_kernel(value * view.px_per_mm)) if value else light
+
+
+def motion(light, value, view: View, rng):
+    return blurred_by(light, line_kernel(value * view.px_per_mm, MOTION_DEG)) if value else light
+
+
+def rolled_focus(light, value, view: View, rng):
+    """The circle of confusion grows evenly from one rim of the disc to the other: a lens that sits askew."""
+    if not value:
+        return light
+    x, y = view.grid(light.shape)
+    place = np.clip(0.5 + 0.5 * (0.8 * y - 0.6 * x), 0, 1) * FOCUS_STEPS
+    sharp_to_soft = [light] + [blurred_by(light, disc_kernel(value * view.px_per_mm * k / FOCUS_STEPS)) for k in range(1, FOCUS_STEPS + 1)]
+    mixed = np.zeros_like(light)
+    for k, layer in enumerate(sharp_to_soft):
+        weight = np.clip(1 - np.abs(place - k), 0, 1).astype(np.float32)
+        mixed += layer * (weight[..., None] if light.ndim == 3 else weight)
+    return mixed
+
+
+def dirt(light, value, view: View, rng):
+    """Smudges that cover a share of the disc and hold most light back."""
+    if not value:
+        return light
+    noise = rng.standard_normal(light.shape[:2], dtype=np.float32)
+    field = cv2.GaussianBlur(noise, (0, 0), DIRT_SPACING_MM * view.px_per_mm)
+    x, y = view.grid(light.shape)
+    level = np.quantile(field[x * x + y * y < 1], 1 - value)
+    cover = cv2.GaussianBlur((field >= level).astype(np.float32), (0, 0), DIRT_EDGE_MM * view.px_per_mm)
+    through = 1 - np.float32(DIRT_OPACITY) * cover
+    return light * (through[..., None] if light.ndim == 3 else through)
+
+
+def scratched(light, value, view: View, rng):
+    """Straight scratches across the disc that scatter the LEDs' light."""
+    if not value:
+        return light
+    turn, away = rng.uniform(0, np.pi, 1000), rng.uniform(-0.9, 0.9, 1000)
+    bright = rng.uniform(0.3, 1.0, 1000)
+    x, y = view.grid(light.shape)
+    half = max(0.5 * SCRATCH_WIDTH_MM * view.px_per_mm, 0.5) / view.radius_px
+    added = np.zeros(light.shape[:2], np.float32)
+    for k in range(int(np.ceil(value))):
+        part = min(value - k, 1.0)  # the last one only begins
+        distance = np.abs(np.cos(turn[k]) * x + np.sin(turn[k]) * y - away[k])
+        added += np.float32(part * bright[k] * SCRATCH_LIGHT * view.saturation) * np.exp(-0.5 * (distance / half) ** 2)
+    added *= x * x + y * y < 1
+    return light + (added[..., None] if light.ndim == 3 else added)
+
+
+_IMAGE = {"image_level": True}
+CONDITIONS = (
+    Condition("defocus", "camera out of focus", "optics", "circle of confusion at the caps", "mm", 4.0, light=defocus, **_IMAGE),
+    Condition(
+        "focus-rolled",
+        "focus rolled off to one side",
+        "optics",
+        "circle of confusion at the far rim",
+        "mm",
+        6.0,
+        light=rolled_focus,
+        **_IMAGE,
+    ),
+    Condition("motion-blur", "motion blur", "optics", "path of the picture during the exposure", "mm", 5.0, light=motion, **_IMAGE),
+    Condition("lens-dirt", "dirt on the lens", "optics", "share of the disc under smudges", "", 0.9, light=dirt, **_IMAGE),
+    Condition("lens-scratches", "scratched lens", "optics", "scratches", "", 120.0, light=scratched, **_IMAGE),
+)

@@ -1,0 +1,52 @@
+"""What goes wrong in the settings: the camera's window, the pipeline's threshold."""
+
+import numpy as np
+
+from twin.robustness.condition import Condition, View
+
+
+def offset_px(value: float, view: View) -> tuple[int, int]:
+    by = value * view.radius_px
+    return round(0.8 * by), round(-0.6 * by)
+
+
+def wrong_crop(image, value, view: View, rng):
+    """The camera's window read at another place: the picture is displaced, what is beyond it black."""
+    dx, dy = offset_px(value, view)
+    if not (dx or dy):
+        return image
+    height, width = image.shape[:2]
+    out = np.zeros_like(image)
+    out[max(dy, 0) : height + min(dy, 0), max(dx, 0) : width + min(dx, 0)] = image[
+        max(-dy, 0) : height + min(-dy, 0), max(-dx, 0) : width + min(-dx, 0)
+    ]
+    return out
+
+
+def displaced(px, value, view: View):
+    return px + np.array(offset_px(value, view))
+
+
+def too_strict(detector, value):
+    return detector.stricter(value)
+
+
+def too_lax(detector, value):
+    return detector.stricter(-value)
+
+
+CONDITIONS = (
+    Condition(
+        "wrong-crop",
+        "wrong crop",
+        "settings",
+        "displacement, of the disc's radius",
+        "",
+        0.9,
+        frame=wrong_crop,
+        moves=displaced,
+        image_level=True,
+    ),
+    Condition("threshold-strict", "threshold too strict", "settings", "gray levels", "", 120.0, setting=too_strict, image_level=True),
+    Condition("threshold-lax", "threshold too lax", "settings", "gray levels", "", 60.0, setting=too_lax, image_level=True),
+)

@@ -1,0 +1,138 @@
+"""How severe a condition may grow before a measure crosses its limit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.robustness.condition import Case
+from twin.robustness.measures import MEASURES, POSE_MEASURES, Measure
+
+DRAWS = 400  # of the bootstrap over the frames
+BAND = (5, 95)  # percentiles
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One measure of one pipeline under one case.
+
+    Attributes
+    ----------
+    case, pipeline : str
+    measure : Measure
+    limit : float
+    severity, mean, low, high : (S,) float
+        NaN where the measure has no meaning in any frame; the band is a 90 % bootstrap interval over the frames.
+    crossing : float
+        Severity at which the mean crosses the limit, linear between the steps; inf if it never does.
+    """
+
+    case: str
+    pipeline: str
+    measure: Measure
+    limit: float
+    severity: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    crossing: float
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """How far one pipeline goes under one case.
+
+    Attributes
+    ----------
+    case : Case
+    pipeline : str
+    severity : float
+        At which the first measure crosses its limit; inf if none does up to the severest.
+    measure : str
+        That one; "" if none.
+    """
+
+    case: Case
+    pipeline: str
+    severity: float
+    measure: str
+
+    @property
+    def reached(self) -> bool:
+        """Whether it fails within the range looked at."""
+        return np.isfinite(self.severity)
+
+    @property
+    def width(self) -> float:
+        """Severity, at most 1: a lower bound where it does not fail."""
+        return min(self.severity, 1.0)
+
+    @property
+    def label(self) -> str:
+        """In the parameter's unit."""
+        return self.case.label(self.severity) if self.reached else f"> {self.case.label(1.0)}"
+
+
+def crossing(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndarray) -> float:
+    """Severity at which a mean crosses its limit for the first time, linear between steps; inf if it never does."""
+    known = np.isfinite(mean)
+    severity, mean = severity[known], mean[known]
+    for k, value in enumerate(mean):
+        if measure.failed(value, limit):
+            if k == 0:
+                return 0.0
+            return float(severity[k - 1] + (severity[k] - severity[k - 1]) * (limit - mean[k - 1]) / (value - mean[k - 1]))
+    return np.inf
+
+
+def curves_of(rows: list[dict], cases: tuple[Case, ...], pitch_px: float) -> list[Curve]:
+    """Curves of all measures, pipelines and models; rows as `run_sweep` gives them."""
+    table = _poses_against_nominal(rows)
+    curves = []
+    for case in cases:
+        mine = [row for row in table if row["case"] == case.name]
+        for pipeline in dict.fromkeys(row["pipeline"] for row in mine):
+            own = [row for row in mine if row["pipeline"] == pipeline]
+            for measure in POSE_MEASURES if "pose_valid" in own[0] else MEASURES:
+                limit = measure.limit * pitch_px if measure.name == "centroid_px" else measure.limit
+                curves.append(_curve(case.name, pipeline, measure, limit, own))
+    return curves
+
+
+def envelopes_of(curves: list[Curve], cases: tuple[Case, ...]) -> list[Envelope]:
+    """The first crossing of each case and pipeline."""
+    found = []
+    for case in cases:
+        for pipeline in dict.fromkeys(c.pipeline for c in curves if c.case == case.name):
+            first = min((c for c in curves if c.case == case.name and c.pipeline == pipeline), key=lambda c: c.crossing)
+            reached = np.isfinite(first.crossing)
+            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else ""))
+    return found
+
+
+def _curve(case: str, pipeline: str, measure: Measure, limit: float, rows: list[dict]) -> Curve:
+    severities = np.array(sorted({row["severity"] for row in rows}))
+    mean, low, high = (np.full(len(severities), np.nan) for _ in range(3))
+    rng = np.random.default_rng(0)
+    for k, severity in enumerate(severities):
+        values = np.array([row[measure.name] for row in rows if row["severity"] == severity], float)
+        values = values[np.isfinite(values)]
+        if len(values):
+            draws = values[rng.integers(0, len(values), (DRAWS, len(values)))].mean(axis=1)
+            mean[k], (low[k], high[k]) = values.mean(), np.percentile(draws, BAND)
+    return Curve(case, pipeline, measure, limit, severities, mean, low, high, crossing(measure, limit, severities, mean))
+
+
+def _poses_against_nominal(rows: list[dict]) -> list[dict]:
+    """Rows of models with the mean absolute change of their lengths and angles against the same frame undegraded."""
+    nominal = {(r["case"], r["pipeline"], r["frame"]): r["pose"] for r in rows if "pose" in r and r["severity"] == 0}
+    table = []
+    for row in rows:
+        if "pose" in row:
+            first, now = nominal[row["case"], row["pipeline"], row["frame"]], row["pose"]
+            change = np.abs(np.array(now["values"]) - np.array(first["values"]))
+            row = row | {"pose_valid": float(now["valid"])}
+            for unit in ("mm", "deg"):
+                of_unit = [c for c, u in zip(change, now["units"], strict=True) if u == unit]
+                row[f"pose_{unit}"] = float(np.mean(of_unit)) if of_unit else np.nan
+        table.append(row)
+    return table

@@ -1,0 +1,118 @@
+"""A whole robustness study into one folder."""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.detectors import METHODS, DetectorSpec, load_detector, shipped_detector, tune, write_detector
+from twin.errors import TwinError
+from twin.preprocess.reference import nominal_reference
+from twin.recordings import open_recording
+from twin.robustness.condition import Case
+from twin.robustness.contacts import CONTACTS
+from twin.robustness.envelope import Envelope, curves_of, envelopes_of
+from twin.robustness.real import consensus
+from twin.robustness.report import write_report
+from twin.robustness.shots import RealSource, RenderedSource
+from twin.robustness.sweep import Plan, run_sweep
+from twin.types import Form, Frame
+
+
+def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress) -> tuple[DetectorSpec, ...]:
+    """Detectors by file, or by method: ours as the specification has it, others tuned on undegraded frames and kept in ``folder``.
+
+    Raises
+    ------
+    TwinError
+        A name is neither a method nor a file.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    chosen, digest = [], zlib.crc32(b"".join(frame.image.tobytes() for frame in frames))
+    for k, name in enumerate(names):
+        progress(k, len(names))
+        kept = folder / f"{name}-{spec.name}-{digest:08x}.toml"
+        if name == "twin":
+            chosen.append(shipped_detector(spec, frames[0].form))
+        elif name in METHODS:
+            if not kept.is_file():
+                write_detector(kept, tune(frames, spec, name).detector, "Tuned on undegraded frames.")
+            chosen.append(load_detector(kept).model_copy(update={"name": name}))
+        elif Path(name).suffix == ".toml":
+            chosen.append(load_detector(Path(name)))
+        else:
+            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a file written by 'twin tune'")
+        progress(k + 1, len(names))
+    if len({d.name for d in chosen}) < len(chosen):
+        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(d.name for d in chosen)}; rename the files")
+    return tuple(chosen)
+
+
+def rendered_study(spec: SensorSpec, pipelines: list[str], cases: tuple[Case, ...], severities: tuple, out: Path, bar: Callable, **options):
+    """A study on rendered frames; options and results as `study`."""
+    source = RenderedSource(spec, CONTACTS)
+    with bar("contacts, undegraded") as progress:
+        progress(0, 1)
+        frames = [shot.frame for shot in source.shoot(cases[0], 0.0)]
+        progress(1, 1)
+    with bar("tuning") as progress:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", progress)
+    return study(Plan(source, detectors, cases, severities), "rendered", out, bar, **options)
+
+
+def real_study(
+    spec: SensorSpec, path: Path, limit: int, pipelines: list[str], cases: tuple[Case, ...], severities: tuple, out: Path, bar, **options
+):
+    """A study on a folder of real frames: image-level conditions only; options and results as `study`."""
+    recording = open_recording(path, spec)
+    frames = [recording.read(int(k)) for k in np.unique(np.linspace(0, len(recording) - 1, min(limit, len(recording))).round())]
+    with bar("tuning") as progress:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", progress)
+        judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", progress)
+    source, notes = consensus(spec, frames, list(dict.fromkeys((*detectors, *judges))))
+    usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
+    if not usable:
+        raise TwinError("none of the conditions can be applied to frames that are already there; leave --frames out to render them")
+    if left := [c.name for c in cases if c not in usable]:
+        notes.append(f"left out, as they can't be applied to frames that are already there: {', '.join(left)}")
+    return study(Plan(source, detectors, usable, severities), path.name, out, bar, notes=notes, **options)
+
+
+def _on_frames(case: Case) -> bool:
+    """Acts on gray levels or settings, not on light: all that is left of a thresholded frame."""
+    return all(c.light is None and c.spec is None for c in case.conditions)
+
+
+def study(
+    plan: Plan, source: str, out: Path, bar: Callable, *, jobs: int = 1, models=None, model_names: tuple = (), notes: list | None = None
+) -> tuple[list[Envelope], list[Path]]:
+    """Sweep, judge and write; the envelopes and the files written, the page first.
+
+    Parameters
+    ----------
+    plan : Plan
+    source : str
+        Name of the frames for the page.
+    out : Path
+    bar : callable
+        ``bar(title)`` is a context manager that yields ``progress(done, total)``.
+    jobs : int
+        Processes.
+    models, model_names : callable, tuple of str
+        As `Plan` takes them.
+    notes : list of str, optional
+        For the page.
+    """
+    plan = replace(plan, models=models, model_names=model_names)
+    with bar("conditions x steps") as progress:
+        rows = run_sweep(plan, out, jobs=jobs, progress=progress)
+    curves = curves_of(rows, plan.cases, _pitch_px(plan.source))
+    envelopes = envelopes_of(curves, plan.cases)
+    return envelopes, write_report(out, plan, rows, curves, envelopes, source=source, notes=notes or [])
+
+
+def _pitch_px(source: RenderedSource | RealSource) -> float:
+    return float(np.mean(nominal_reference(source.spec, source.form).spacing_px))

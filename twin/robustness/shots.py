@@ -1,0 +1,154 @@
+"""Degraded frames with known truth: rendered ones, or real ones whose pins several detectors agree on."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.calibration.aligned import to_light
+from twin.camera import expose
+from twin.errors import ContactError
+from twin.geometry.pins import rest_pins
+from twin.optics.preview import Preview
+from twin.optics.static_layer import static_layer
+from twin.robustness.condition import Case, View, revised
+from twin.robustness.contacts import Contact, PinState, pins_under
+from twin.truth import CapTruth, cap_truth
+from twin.types import Form, Frame
+
+NEUTRAL = {
+    "response": {
+        "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "blur_sigma_px": 0.0, "brightness_drift": 0.0, "read_noise": 0.0,
+        "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0, "chroma_columns": 1, "jpeg_quality": 0,
+    },
+    "camera": {"vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0)},
+    "gel": {"haze": 0.0},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A degraded frame and where its pins truly are.
+
+    Attributes
+    ----------
+    name : str
+        Of the contact, or of the real frame.
+    frame : Frame
+    caps_px : (N, 2) float
+    visible : (N,) bool
+        The cap is there, within the frame, and nothing stands before it.
+    """
+
+    name: str
+    frame: Frame
+    caps_px: np.ndarray
+    visible: np.ndarray
+
+
+@dataclass(frozen=True)
+class RenderedSource:
+    """Frames of a sensor drawn by `Preview` over contacts; every pin's place is known."""
+
+    spec: SensorSpec
+    contacts: tuple[Contact, ...]
+    form: Form = Form.RAW
+
+    def names(self) -> list[str]:
+        """Of the frames."""
+        return [contact.name for contact in self.contacts]
+
+    def shoot(self, case: Case, severity: float) -> list[Shot]:
+        """The frames under a case; contacts that can't be solved are left out."""
+        spec = case.on_spec(self.spec, severity)
+        preview = Preview(spec, static=_static(spec))
+        view = View.of(spec, np.zeros((spec.pins.count, 2)))
+        geometry = _with_light_of(self.spec, spec)
+        shots = []
+        for draw, contact in enumerate(self.contacts):
+            try:
+                state, truth = _pressed(geometry, geometry if case.solves else self.spec, contact)
+            except ContactError:
+                continue
+            view = replace(view, caps_px=truth.caps_px)
+            light = case.on_light(preview.render(state), severity, view, draw)
+            image = case.on_frame(expose(light, spec, np.random.default_rng(draw)), severity, view, draw)
+            shots.append(_shot(contact.name, image, Form.RAW, case, severity, view, truth.visible))
+        return shots
+
+
+@dataclass(frozen=True)
+class RealSource:
+    """Real frames; truth is where several detectors agree that the pins are (`consensus`).
+
+    Attributes
+    ----------
+    spec : SensorSpec
+    frames : tuple of Frame
+    caps_px : (M, N, 2) float
+        Where nobody knows a pin: NaN.
+    """
+
+    spec: SensorSpec
+    frames: tuple[Frame, ...]
+    caps_px: np.ndarray
+
+    @property
+    def form(self) -> Form:
+        """Of the frames."""
+        return self.frames[0].form
+
+    def names(self) -> list[str]:
+        """Of the frames."""
+        return [frame.name for frame in self.frames]
+
+    def shoot(self, case: Case, severity: float) -> list[Shot]:
+        """The frames under a case, which must be `image_level`."""
+        neutral = revised(self.spec, **NEUTRAL)
+        spec = case.on_spec(neutral, severity)
+        in_light = severity > 0 and self.form == Form.RAW and any(c.spec is not None or c.light is not None for c in case.conditions)
+        view = View.of(neutral, self.caps_px[0])
+        shots = []
+        for draw, (frame, caps_px) in enumerate(zip(self.frames, self.caps_px, strict=True)):
+            view, image = replace(view, caps_px=caps_px), frame.image
+            if in_light:
+                light = to_light(image, neutral.response).astype(np.float32)
+                image = expose(case.on_light(light, severity, view, draw), spec, np.random.default_rng(draw))
+            image = case.on_frame(image, severity, view, draw)
+            shots.append(_shot(frame.name, image, self.form, case, severity, view, np.isfinite(caps_px[:, 0])))
+        return shots
+
+
+def _shot(name: str, image: np.ndarray, form: Form, case: Case, severity: float, view: View, visible: np.ndarray) -> Shot:
+    caps_px = case.on_points(view.caps_px, severity, view)
+    inside = np.all((caps_px >= 0) & (caps_px <= np.array(image.shape[1::-1]) - 1), axis=1)
+    return Shot(name, Frame(image, form, name), caps_px, visible & inside & ~case.gone(severity, view))
+
+
+def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
+    """A specification with all that moves no pin on the film as ``base`` has it: equal to ``base`` under most conditions."""
+    gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
+    alike = revised(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
+    return alike.model_copy(update={name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
+
+
+@lru_cache(maxsize=32)
+def _pressed(spec: SensorSpec, mechanics: SensorSpec, contact: Contact) -> tuple[PinState, CapTruth]:
+    """Pins under a contact of the sensor ``mechanics``, and where the camera of ``spec`` sees them."""
+    state = pins_under(mechanics, contact)
+    return state, cap_truth(spec, rest_pins(spec), state, Form.RAW)
+
+
+def _static(spec: SensorSpec) -> tuple:
+    """The static layer of a specification; most conditions leave it alone."""
+    plain = spec.model_copy(update={"gel": spec.gel.model_copy(update={"haze": 0.0, "absorption_per_mm": (0.0, 0.0, 0.0)})})
+    bare = {"cap_albedo": (1.0, 1.0, 1.0), "cap_levels": (), "cap_shapes": (), "skin_albedo": (0.0, 0.0, 0.0)}
+    plain = revised(plain, appearance=bare, camera={"vignetting": 0.0}, response=NEUTRAL["response"])
+    return _static_layer(plain.model_dump_json())
+
+
+@lru_cache(maxsize=2)
+def _static_layer(spec_json: str) -> tuple:
+    spec = SensorSpec.model_validate_json(spec_json)
+    return static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))

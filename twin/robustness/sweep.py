@@ -1,0 +1,168 @@
+"""Every case at every severity: cells that are computed in parallel, kept one by one, and never computed twice."""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from twin.detectors import DetectorSpec, Found, make_detector
+from twin.robustness.condition import Case
+from twin.robustness.measures import judge
+from twin.robustness.shots import RealSource, RenderedSource, Shot
+from twin.types import Frame
+
+FORMAT = 1  # raised whenever older cells must not be read
+SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+Models = Callable[[], dict]  # gives {name: estimate}, estimate(frame) -> (values, units, valid)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a sweep runs through.
+
+    Attributes
+    ----------
+    source : RenderedSource or RealSource
+    detectors : tuple of DetectorSpec
+        The first one is the one whose pictures are kept.
+    cases : tuple of Case
+    severities : tuple of float
+        From 0 up.
+    models : callable, optional
+        Gives estimators by name; called in each process.
+    model_names : tuple of str
+    """
+
+    source: RenderedSource | RealSource
+    detectors: tuple[DetectorSpec, ...]
+    cases: tuple[Case, ...]
+    severities: tuple[float, ...] = SEVERITIES
+    models: Models | None = None
+    model_names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One case at one severity."""
+
+    case: Case
+    severity: float
+    file: str
+
+
+def cells_of(plan: Plan) -> list[Cell]:
+    """All cells; severity 0 is one cell that all cases share, its case the first one."""
+    base = hashlib.sha256(_source_key(plan).encode()).hexdigest()
+    cells = []
+    for case in plan.cases:
+        for severity in plan.severities:
+            name = "nominal" if severity == 0 else case.name
+            values = [] if severity == 0 else [[c.name, c.value(severity)] for c in case.conditions]
+            digest = hashlib.sha256(json.dumps([base, values]).encode()).hexdigest()[:12]
+            cells.append(Cell(case, severity, f"{name}-{round(1000 * severity):04d}-{digest}"))
+    return cells
+
+
+def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> list[dict]:
+    """All rows of a sweep: one for each case, severity, frame and detector (or model).
+
+    Finished cells lie in ``folder/cells``; what lies there is not computed again.
+    """
+    cells = cells_of(plan)
+    (folder / "cells").mkdir(parents=True, exist_ok=True)
+    (folder / "pictures").mkdir(exist_ok=True)
+    open_cells = {cell.file: cell for cell in cells if _read(folder, cell) is None}
+    total = len({cell.file for cell in cells})
+    progress(total - len(open_cells), total)
+    if open_cells:
+        _compute(plan, folder, list(open_cells.values()), jobs, lambda done: progress(total - len(open_cells) + done, total))
+    return [row | {"case": cell.case.name, "severity": cell.severity} for cell in cells for row in _read(folder, cell) or []]
+
+
+def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress) -> None:
+    if jobs == 1:
+        _begin(plan, folder)
+        for done, cell in enumerate(cells):
+            _run(cell)
+            progress(done + 1)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin, initargs=(plan, folder)) as pool:
+        running = [pool.submit(_run, cell) for cell in cells]
+        try:
+            for done, future in enumerate(as_completed(running)):
+                future.result()
+                progress(done + 1)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+_WORK: dict = {}  # of this process: what `_begin` was given, built once
+
+
+def _begin(plan: Plan, folder: Path) -> None:
+    cv2.setNumThreads(1)
+    _WORK.update(plan=plan, folder=folder, models=plan.models() if plan.models else {})
+
+
+def _run(cell: Cell) -> None:
+    plan, folder = _WORK["plan"], _WORK["folder"]
+    rows, worst = [], None
+    detectors = [make_detector(plan.source.spec, cell.case.on_setting(spec, cell.severity)) for spec in plan.detectors]
+    for shot in plan.source.shoot(cell.case, cell.severity):
+        for place, detector in enumerate(detectors):
+            found = detector(shot.frame)
+            rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | judge(detector, found, shot))
+            if place == 0 and (worst is None or rows[-1]["recall"] < worst[0]):
+                worst = rows[-1]["recall"], shot, found
+        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot.frame)} for name, model in _WORK["models"].items()]
+    if worst is not None:
+        cv2.imwrite(str(folder / "pictures" / f"{cell.file}.jpg"), overlay(worst[1], worst[2]))
+    path = folder / "cells" / f"{cell.file}.json"
+    part = path.with_suffix(f".{os.getpid()}.part")
+    part.write_text(json.dumps(rows, default=float), encoding="utf-8")
+    os.replace(part, path)
+
+
+def _pose(estimate, frame: Frame) -> dict:
+    values, units, valid = estimate(frame)
+    return {"values": [float(v) for v in values], "units": list(units), "valid": bool(valid)}
+
+
+def overlay(shot: Shot, found: Found) -> np.ndarray:
+    """The frame (H, W, 3) uint8 BGR: true pins that are seen in green, missed ones in red, claims as dots."""
+    image = shot.frame.image
+    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
+    claims = found.claims_px
+    for px, visible in zip(shot.caps_px, shot.visible, strict=True):
+        if visible:
+            near = len(claims) and np.linalg.norm(claims - px, axis=1).min() < 3
+            cv2.circle(picture, tuple(int(round(v)) for v in px), 6, (90, 200, 90) if near else (60, 60, 255), 1, cv2.LINE_AA)
+    for px in claims:
+        cv2.circle(picture, tuple(int(round(v)) for v in px), 1, (0, 220, 255), -1)
+    return picture
+
+
+def _read(folder: Path, cell: Cell) -> list[dict] | None:
+    try:
+        return json.loads((folder / "cells" / f"{cell.file}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _source_key(plan: Plan) -> str:
+    """Everything that all cells depend on."""
+    source = plan.source
+    content = [FORMAT, source.spec.model_dump(mode="json"), [d.model_dump(mode="json") for d in plan.detectors], list(plan.model_names)]
+    if isinstance(source, RenderedSource):
+        content.append([[c.name, c.stimulus, vars(c.pose)] for c in source.contacts])
+    else:
+        content.append([[f.name, hashlib.sha256(f.image.tobytes()).hexdigest()] for f in source.frames])
+    return json.dumps(content)

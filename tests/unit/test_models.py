@@ -1,5 +1,7 @@
 """Networks obey the laws of what they work on: pins, graphs, rows."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -82,22 +84,41 @@ def test_a_batch_of_graphs_says_what_each_says_alone(layout):
     assert torch.allclose(together, torch.cat(alone), atol=1e-5)
 
 
-def test_averaging_is_kipf_and_wellings_with_its_gradient(layout):
-    from training.models.gcn import _Average
-
-    _, edges = layout
-    dense = torch.eye(PINS, dtype=torch.float64)
-    dense[edges[:, 1], edges[:, 0]] = 1
-    root = dense.sum(1).rsqrt()
-    dense = root[:, None] * dense * root
-    matrix = graph_rows([edges], PINS).batch(np.array([0]))
-    back = graph_rows([edges], PINS, transposed=True).batch(np.array([0]))
-    x = torch.randn(PINS, 3, requires_grad=True)
-    out = _Average.apply(matrix, back, x)
-    assert torch.allclose(out.double(), dense @ x.double(), atol=1e-6)
-    pull = torch.randn(PINS, 3)
-    out.backward(pull)
-    assert torch.allclose(x.grad.double(), dense.T @ pull.double(), atol=1e-6)
+def test_a_convolution_with_its_norm_is_kipf_and_wellings_with_torchs_norm(layout):
+    """Values, gradients and running statistics are those of the dense formula, with the bias that the norm cancels."""
+    rest, edges = layout
+    for kind in ("delaunay", "knn"):  # symmetric, and not
+        edges = frame_edges(kind, rest)
+        rows = np.array([0, 0])
+        matrices = [graph_rows([edges], PINS, transposed=t).batch(rows) for t in (False, True)]
+        torch.manual_seed(0)
+        network = Gcn(3, 2)
+        for norm in network.norms:
+            torch.nn.init.normal_(norm.weight), torch.nn.init.normal_(norm.bias)
+        x = (pin_rows(frames=2) * torch.tensor([80.0, 80.0, 30.0]) + torch.tensor([0, 0, 400.0])).requires_grad_()
+        plain = copy.deepcopy(network)
+        dense = torch.eye(PINS)
+        dense[edges[:, 1], edges[:, 0]] = 1
+        root = dense.sum(1).rsqrt()
+        dense = root[:, None] * dense * root
+        pull = torch.randn(2, 2)
+        grads = {}
+        for here in (network, plain):
+            x.grad = None
+            if here is network:
+                out = network(x, *matrices)["mean"]
+            else:
+                h = x
+                for layer, norm in zip(plain.convolutions, plain.norms, strict=True):
+                    h = torch.nn.functional.leaky_relu(norm((layer(dense @ h) + 3.0).flatten(0, 1))).view(2, PINS, -1)
+                out = plain.dense(h.mean(dim=1))
+            out.backward(pull)
+            grads[here] = [out.detach(), x.grad.clone(), *(p.grad for p in here.parameters())]
+        for a, b in zip(grads[network], grads[plain], strict=True):
+            assert torch.allclose(a, b, atol=2e-4 * float(b.abs().max()))
+        for a, b in zip(network.norms, plain.norms, strict=True):
+            assert torch.allclose(a.running_mean, b.running_mean - 0.3, rtol=1e-4, atol=1e-4)
+            assert torch.allclose(a.running_var, b.running_var, rtol=1e-4)
 
 
 @pytest.mark.parametrize("layers", [0, 2])
@@ -124,7 +145,7 @@ def test_duplicated_rows_do_not_change_the_loss():
 def test_layers_are_the_papers():
     assert CHANNELS == (16, 32, 48, 64, 96)
     count = {variant: sum(p.numel() for p in Gcn(3, 2, variant).parameters()) for variant in ("paper", "release")}
-    assert count["release"] == 37522  # as the release's network
+    assert count["release"] + sum(CHANNELS) == 37522  # as the release's network, less the biases that batch norm cancels
     assert count["paper"] < count["release"]
     filters = [[m.out_channels for m in Cnn(name, 2).convolutions if hasattr(m, "out_channels")] for name in ("cnn-v1", "cnn-v2")]
     assert filters == [[256] * 5, [48] * 5]

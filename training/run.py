@@ -155,6 +155,8 @@ def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, trai
         network.prepare(inputs.x[torch.from_numpy(train)])
     weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
     executed = torch.from_numpy(data.targets.executed.astype(np.float32))
+    if config.model == "vgnn":  # each frame also as it is seen where the camera sits otherwise
+        scaled, executed, learnt = scaled.repeat(2, 1), executed.repeat(2), np.concatenate([learnt, len(data) + learnt])
     return Loop(network, config.recipe, Rows(inputs, scaled, weight, executed, torch.from_numpy(learnt), torch.from_numpy(held)), seed)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from training.assemble import conformal_quantile
+from training.assemble import conformal_quantile, group_quantiles
 from training.inputs import frame_edges
 from training.kernel import fit_kernel
 from training.loop import row_loss
@@ -160,6 +160,18 @@ def test_intervals_cover_what_they_promise():
     assert conformal_quantile(scores[:5]).tolist() == scores[:5].max(axis=0).tolist()
 
 
+def test_intervals_of_two_kinds_of_frames_cover_both():
+    """Errors of two sizes, as raw labels have them: each group is covered, not only their mixture."""
+    rng = np.random.default_rng(5)
+    group = (rng.random(4000) < 0.3).astype(int)
+    scores = np.where(group, 5 * rng.random(4000), np.abs(rng.normal(0, 0.1, 4000)))[:, None]
+    found = group_quantiles(scores[:2000], group[:2000])
+    inside = scores[2000:] <= found[group[2000:]]
+    assert all(abs(inside[group[2000:] == k].mean() - 0.9) < 0.03 for k in (0, 1))
+    few = np.where(np.arange(2000) < 5, 1, 0)
+    assert np.array_equal(group_quantiles(scores[:2000], few)[1], conformal_quantile(scores[:2000]))
+
+
 def test_the_kernel_head_leaves_rows_out_as_fitting_without_them_does():
     rng = np.random.default_rng(6)
     x = torch.from_numpy(rng.normal(size=(60, 3)))
@@ -181,15 +193,15 @@ def test_the_cameras_own_motion_is_taken_out_and_contact_is_left():
     bump = np.exp(-(((rest - 128) / 60) ** 2).sum(axis=1))[:, None]
     frames = rest + states[:, :1, None] * 6 * bump + states[:, 1:, None] * 8 * bump * [1, 0.2] + rng.normal(0, 0.05, (400, 60, 2))
     area = np.ones((400, 60))
-    registration = fit_registration(frames[:300], rest)
-    nodes, _, taken = registration(frames[300:], area[300:])
+    registration, _ = fit_registration(frames[:300], rest)
+    nodes, _, taken, _ = registration(frames[300:], area[300:])
     assert (taken == 0).all(axis=1).mean() > 0.95
     turn = np.exp(1j * np.radians(1.0)) * 1.01
     z = ((frames[300:] - 128) @ [1, 1j]) * turn + (2 - 1j)
     moved = np.stack([z.real, z.imag], axis=-1) + 128
-    back, shrunk, taken = registration(moved, 1.01**2 * area[300:])
+    back, shrunk, taken, share = registration(moved, 1.01**2 * area[300:])
     assert np.abs(back - frames[300:]).max() < 0.4 and np.abs(moved - frames[300:]).mean() > 1.5
-    assert np.allclose(shrunk, 1, atol=0.01)
+    assert np.allclose(shrunk, 1, atol=0.01) and (share == 1).all()
 
 
 def test_lost_pins_continue_what_the_others_do():
@@ -197,7 +209,7 @@ def test_lost_pins_continue_what_the_others_do():
     rest = rng.uniform(-100, 100, (60, 2)) + 128
     waves = np.stack([np.sin((rest - 128) / 50), np.cos((rest[:, ::-1] - 128) / 70)])
     frames = rest + np.einsum("mk,knd->mnd", rng.normal(0, 3, (300, 2)), waves)
-    registration = fit_registration(frames[:250], rest)
+    registration, _ = fit_registration(frames[:250], rest)
     lost = np.zeros(60, bool)
     lost[[4, 17, 30]] = True
     spoilt = np.where(lost[:, None], frames[270] + 5, frames[270])
@@ -210,7 +222,7 @@ def test_frames_of_one_camera_tell_its_displacement_together():
     rest = rng.uniform(-100, 100, (60, 2)) + 128
     bump = np.exp(-(((rest - 128) / 60) ** 2).sum(axis=1))[:, None] * [3.0, 1.0]
     frames = rest + rng.uniform(-1, 1, (400, 1, 1)) * bump + rng.normal(0, 0.05, (400, 60, 2))
-    registration = fit_registration(frames[:300], rest)
+    registration, _ = fit_registration(frames[:300], rest)
     small = frames[300:] + 4 * registration.usual[2] * np.array([1.0, 0.0])  # too little to be told from one frame
     alone = registration(small, np.ones((100, 60)))[2]
     together = registration(small, np.ones((100, 60)), together=True)[2]

@@ -7,7 +7,7 @@ from time import perf_counter
 import torch
 from torch import nn
 
-from training.networks import predict_rows
+from training.networks import device_of, predict_rows
 from training.recipes import Recipe
 
 RISE_STEPS = 100  # over which the cosine schedule's rate rises to its full size
@@ -56,6 +56,7 @@ class Loop:
     def __post_init__(self) -> None:
         recipe = self.recipe
         parameters = list(self.network.parameters())
+        self.device = device_of(self.network)
         if recipe.decay:
             self.optimiser = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
         else:
@@ -123,7 +124,8 @@ class Loop:
         self.plateau.load_state_dict(state["plateau"])
         self.generator.set_state(state["generator"])
         torch.set_rng_state(state["torch"])
-        for key in ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves"):
+        self.averaged = [value.to(self.device) for value in state["averaged"]]
+        for key in ("best_weights", "steps", "epochs_done", "best", "since_best", "curves"):
             setattr(self, key, state[key])
 
     def _step(self, chosen: torch.Tensor) -> float:
@@ -131,8 +133,11 @@ class Loop:
             along = self.steps / (self.recipe.epochs * self.steps_of_epoch)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.recipe.rate * min(1.0, (self.steps + 1) / RISE_STEPS) * 0.5 * (1 + math.cos(math.pi * along))
-        out = self.network(*self.rows.inputs.batch(chosen))
-        loss = row_loss(out, self.rows.labels[chosen], self.rows.executed[chosen], self.rows.weight, self.recipe.loss)
+        out = self.network(*(part.to(self.device) for part in self.rows.inputs.batch(chosen)))
+        labels, executed, weight = (
+            part.to(self.device) for part in (self.rows.labels[chosen], self.rows.executed[chosen], self.rows.weight)
+        )
+        loss = row_loss(out, labels, executed, weight, self.recipe.loss)
         if hasattr(self.network, "penalty"):
             loss = loss + self.network.penalty()
         self.optimiser.zero_grad()

@@ -52,7 +52,8 @@ class Recipe:
     kernel: bool = True
 
 
-# the release's settings; the same with more and smaller steps that end at a rate of 0, where the paper says nothing; PoseNet's (Lepora 2020)
+# the release's settings; the same with more and smaller steps that end at a rate of 0, where the paper says nothing;
+# PoseNet's (Lepora 2020)
 _RELEASE = Recipe("graphs", 200, 512, 1.5e-3, "plateau", 30, 0.0, 0.0, "l1", "none", 1, False)
 _GRAPHS = Recipe("graphs", 150, 128, 2e-3, "cosine", 0, 0.0, 0.0, "l1", "none", 1, False)
 _POSENET = Recipe("images", 100, 16, 1e-4, "constant", 10, 0.0, 0.0, "l2", "unit", 1, False)

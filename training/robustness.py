@@ -57,7 +57,9 @@ def erased(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator
 CHANGES: dict[str, Callable] = {"1 % scale": scaled, "2 px shift": shifted, "1 deg turn": turned, "5 pins erased": erased}
 
 
-def judge_changes(estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Callable | None = None) -> list[dict]:
+def judge_changes(
+    estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Callable | None = None
+) -> list[dict]:
     """Errors against corrected labels of single frames as they are and under every change.
 
     Returns

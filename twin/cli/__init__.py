@@ -34,6 +34,8 @@ def main() -> None:
         preprocess,
         realism,
         render,
+        study,
+        study_tac_vgnn,
         train,
     )
 

@@ -130,11 +130,12 @@ def _turned(turn_deg: float) -> np.ndarray:
 
 
 def contacts_figure(contacts: list[AreaChange]) -> Figure:
-    """One column for each contact, shallow above deep."""
+    """One column for each contact, shallow above deep, all in the same colours."""
+    limit = max(contact.figures()["largest_growth_percent"] for contact in contacts)
     names = list(dict.fromkeys(contact.name for contact in contacts))
     figure, axes = new_figure(len(names), len(DEPTHS_MM), panel_inch=3.8)
     for column, name in enumerate(names):
         for row, contact in enumerate(contact for contact in contacts if contact.name == name):
             title = f"{name}, {contact.depth_mm:.1f} mm" + ("" if contact.source == "twin" else f"\n{contact.source}")
-            draw_area_change(axes[row * len(names) + column], contact.graph, contact.rest_area_px2, title)
+            draw_area_change(axes[row * len(names) + column], contact.graph, contact.rest_area_px2, title, limit=limit)
     return figure

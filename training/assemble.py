@@ -122,10 +122,11 @@ def prepared_inputs(model: str, data, train: np.ndarray) -> tuple[object, dict]:
     pins = data.pins
     if model == "vgnn":
         registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
-        seated = pin_inputs(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
-        taken = registration.difference(pins.nodes_px)
+        nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
+        seated = pin_inputs(registration, nodes_px, area_px2, pins.lost, pins.reference)
+        taken = registration.difference(nodes_px)
         taken[train] = left
-        displaced = pin_features(*registration.take_out(pins.nodes_px, pins.area_px2, taken), pins.reference)
+        displaced = pin_features(*registration.take_out(nodes_px, area_px2, taken), pins.reference)
         both = np.concatenate([seated.x.numpy(), displaced])
         share = np.repeat([0.0, 1.0], len(pins))
         return PinInputs(both, np.concatenate([pins.lost, pins.lost]), share), {"registration": registration.arrays()}
@@ -139,12 +140,17 @@ def frame_width(pins) -> int:
     return frame_size(pins.sensor, pins.form)[0]
 
 
-def pin_inputs(registration: Registration, nodes_px, area_px2, lost, reference: Reference, *, together: bool = False) -> PinInputs:
-    """Dense features of frames whose camera displacement is taken out; lost pins are put where the others' modes say."""
+def filled(registration: Registration, nodes_px, area_px2, lost, reference: Reference) -> tuple[np.ndarray, np.ndarray]:
+    """Pins (M, N, 2) and areas (M, N) with lost pins (M, N) where the others' modes put them."""
     nodes_px, area_px2 = nodes_px.copy(), area_px2.copy()
     for k in np.flatnonzero(lost.any(axis=1)):
         nodes_px[k] = registration.fill(nodes_px[k], lost[k])
         area_px2[k] = make_graph("voronoi", nodes_px[k], outmost=reference.outmost).area_px2
+    return nodes_px, area_px2
+
+
+def pin_inputs(registration: Registration, nodes_px, area_px2, lost, reference: Reference, *, together: bool = False) -> PinInputs:
+    """Dense features of frames (see ``filled``) whose camera displacement is taken out."""
     nodes, area, _, share = registration(nodes_px, area_px2, together=together)
     return PinInputs(pin_features(nodes, area, reference), lost, share)
 

@@ -42,6 +42,9 @@ class PinInputs:
         self.x, self.lost = torch.from_numpy(features.astype(np.float32)), torch.from_numpy(lost)
         self.displaced = torch.from_numpy(np.zeros(len(lost)) if displaced is None else displaced)
 
+    def __len__(self) -> int:
+        return len(self.x)
+
     def batch(self, rows: torch.Tensor) -> tuple:
         """Arguments of the network for some rows."""
         return self.x[rows], self.lost[rows]
@@ -56,6 +59,9 @@ class GraphInputs:
         self.forward: GraphRows = graph_rows(edges, nodes)
         self.back: GraphRows = self.forward if symmetric else graph_rows(edges, nodes, transposed=True)
 
+    def __len__(self) -> int:
+        return len(self.x)
+
     def batch(self, rows: torch.Tensor) -> tuple:
         """Arguments of the network for some rows."""
         chosen = rows.numpy()
@@ -68,6 +74,9 @@ class ImageInputs:
 
     def __init__(self, images: np.ndarray) -> None:
         self.images = torch.from_numpy(images)
+
+    def __len__(self) -> int:
+        return len(self.images)
 
     def batch(self, rows: torch.Tensor) -> tuple:
         """Arguments of the network for some rows."""

@@ -36,7 +36,8 @@ def drawn_table(sensor: str, frames: int) -> PinTable:
 
 def inputs_of(model: str, pins: PinTable):
     if model == "vgnn":
-        return PinInputs(pin_features(pins.nodes_px, pins.area_px2, pins.reference), pins.lost)
+        features = pin_features(pins.nodes_px, pins.area_px2, pins.reference)
+        return PinInputs(np.concatenate([features, features]), np.concatenate([pins.lost, pins.lost]))  # it sees each frame in two ways
     if model.startswith("cnn"):
         return ImageInputs(np.random.default_rng(0).integers(0, 256, (len(pins), 128, 128), dtype=np.uint8))
     return graph_inputs(model, pins, frame_size(pins.sensor, pins.form)[0])

@@ -56,10 +56,10 @@ def test_an_epochs_time_is_given_only_where_an_epoch_was_run(data):  # noqa: F81
     from training.inputs import ImageInputs, graph_inputs
 
     row = measure_training("gnn", data.pins, graph_inputs("gnn", data.pins, 256), 32)
-    assert row["frames_timed"] == len(data) and row["s_per_epoch"] == pytest.approx(row["ms_per_frame"] * len(data) / 1e3)
+    assert row["rows_timed"] == len(data) and row["s_per_epoch"] == pytest.approx(row["ms_per_frame"] * len(data) / 1e3)
     images = ImageInputs(np.zeros((len(data), 128, 128), np.uint8))
     row = measure_training("cnn-v2", data.pins, images, 8)
-    assert row["frames_timed"] == 32 and row["s_per_epoch"] is None
+    assert row["rows_timed"] == 32 and row["s_per_epoch"] is None
 
 
 def test_memory_is_what_was_taken_while_watched():

@@ -60,21 +60,22 @@ def measure_training(model: str, pins: PinTable, inputs, batch: int, *, device: 
     pins : PinTable
         M frames.
     inputs : PinInputs, GraphInputs or ImageInputs
-        Of the same frames.
+        Rows of an epoch: of the same frames, once or more often.
 
     Returns
     -------
     dict
-        ``model``, ``parameters``, ``batch``, ``frames_timed``, ``ms_per_frame``, ``s_per_epoch`` over M frames (None where
-        only some batches were timed) and ``memory_mib``. The first pass, which warms up, is not timed.
+        ``model``, ``parameters``, ``batch``, ``rows_timed``, ``ms_per_frame`` (in an epoch, all its rows together),
+        ``s_per_epoch`` (None where only some batches were timed) and ``memory_mib``. A first pass, not timed, warms up.
     """
     torch.manual_seed(0)
     network = build_network(model, pins.reference, 2)
     if hasattr(network, "prepare"):
         network.prepare(inputs.x[:500])
-    frames = min(STEPS.get(model, len(pins)) * batch, len(pins))
-    labels, executed, none = torch.randn(len(pins), 2), torch.full((len(pins),), torch.nan), torch.zeros(0, dtype=torch.long)
-    rows = Rows(inputs, labels, torch.ones(2), executed, torch.arange(frames), none)
+    count = len(inputs)
+    timed = min(STEPS.get(model, count) * batch, count)
+    labels, executed, none = torch.randn(count, 2), torch.full((count,), torch.nan), torch.zeros(0, dtype=torch.long)
+    rows = Rows(inputs, labels, torch.ones(2), executed, torch.arange(timed), none)
     loop = Loop(network.to(device), recipe_of(model, batch=batch), rows, 0)
     with PeakMemory(device) as memory:
         loop.epoch()
@@ -83,8 +84,8 @@ def measure_training(model: str, pins: PinTable, inputs, batch: int, *, device: 
         "model": model,
         "parameters": parameter_count(network),
         "batch": batch,
-        "frames_timed": frames,
-        "ms_per_frame": 1e3 * seconds / frames,
-        "s_per_epoch": seconds if frames == len(pins) else None,
+        "rows_timed": timed,
+        "ms_per_frame": 1e3 * seconds / timed * count / len(pins),
+        "s_per_epoch": seconds if timed == count else None,
         "memory_mib": memory.peak,
     }

@@ -39,7 +39,7 @@ def study_tac_vgnn(
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="instead of each model's own number")] = None,
     max_minutes: Annotated[float | None, typer.Option("--max-minutes", min=0, help="for all training together")] = None,
     batches: Annotated[
-        str, typer.Option("--batches", help="of the efficiency figure, with commas between; empty: without it")
+        str, typer.Option("--batches", help="of the efficiency figure, with commas between; empty: no figure")
     ] = "64,256,512",
     contacts: Annotated[bool, typer.Option("--contacts/--no-contacts", help="press and render the contacts of the area figure")] = True,
     device: Device = "auto",
@@ -95,7 +95,8 @@ def study_tac_vgnn(
     figures = [change.figures() for change in changes]
     if figures:
         written += [write_table(out / "contacts.csv", figures), draw_contacts(out / "contacts.png", changes)]
-    notes = {"device": device, "threads": torch.get_num_threads(), "labels": labels, "columns": [*SHOWN, *error_columns(found)]}
+    notes = {"device": device, "threads": torch.get_num_threads(), "labels": labels, "max_minutes": max_minutes}
+    notes["columns"] = [*SHOWN, *error_columns(found)]
     written.append(write_page(out, data=found, models=rows, graphs=graphs, efficiency=efficiency, contacts=figures, notes=notes))
     for path in written:
         print(f"wrote {path}")

@@ -1,23 +1,42 @@
-"""Specifications: what exists. Sensors and objects as data, validated where they enter."""
+"""Specifications: what exists. Sensors, objects, experiments and servo parameters as data, validated where they enter."""
 
 from scenes.errors import SpecError
+from scenes.experiment import ExperimentSpec
 from scenes.load import (
+    list_experiments,
     list_objects,
+    list_randomisations,
     list_sensors,
+    load_experiment,
     load_object,
+    load_randomisation,
     load_sensor,
+    load_servo,
     user_spec_dir,
 )
 from scenes.object import ObjectSpec
+from scenes.randomisation import RandomisationSpec
+from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
+from scenes.servo import PlacementSpec, ServoSpec
 
 __all__ = [
+    "ExperimentSpec",
     "ObjectSpec",
+    "PlacementSpec",
+    "RandomisationSpec",
+    "RigSpec",
     "SensorSpec",
+    "ServoSpec",
     "SpecError",
+    "list_experiments",
     "list_objects",
+    "list_randomisations",
     "list_sensors",
+    "load_experiment",
     "load_object",
+    "load_randomisation",
     "load_sensor",
+    "load_servo",
     "user_spec_dir",
 ]

@@ -9,8 +9,11 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 
 from scenes.errors import SpecError
+from scenes.experiment import ExperimentSpec
 from scenes.object import MeshShape, ObjectSpec
+from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
+from scenes.servo import ServoSpec
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
@@ -18,7 +21,7 @@ Spec = TypeVar("Spec", bound=BaseModel)
 
 
 def user_spec_dir() -> Path:
-    """Where a user's own ``sensors/*.toml`` and ``objects/*.toml`` lie.
+    """Where a user's own ``sensors/*.toml``, ``objects/``, ``experiments/``, ``randomisations/`` and ``servos/`` lie.
 
     ``TACTIP_SPECS`` if set, else ``$XDG_CONFIG_HOME/tactip-twin`` (``~/.config``).
     """
@@ -35,6 +38,16 @@ def list_sensors() -> dict[str, Path]:
 def list_objects() -> dict[str, Path]:
     """Object names and their files; a user's own file of the same name wins."""
     return _list("objects")
+
+
+def list_experiments() -> dict[str, Path]:
+    """Experiment names and their files; a user's own file of the same name wins."""
+    return _list("experiments")
+
+
+def list_randomisations() -> dict[str, Path]:
+    """Names of randomisations and their files; a user's own file of the same name wins."""
+    return _list("randomisations")
 
 
 def load_sensor(name_or_path: str | Path) -> SensorSpec:
@@ -69,6 +82,33 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
             raise SpecError(f"{spec_path}: shape.file: no such mesh file {file}; the path is relative to the specification")
         spec = spec.model_copy(update={"shape": spec.shape.model_copy(update={"file": str(file)})})
     return spec
+
+
+def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
+    """Load an experiment by name or by the path of its TOML file.
+
+    Raises
+    ------
+    SpecError
+        If there is no such experiment, or its file is wrong: names file, key and remedy.
+    """
+    return _read(_find(name_or_path, "experiments"), ExperimentSpec)
+
+
+def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
+    """Load a randomisation by name or by the path of its TOML file.
+
+    Raises
+    ------
+    SpecError
+        If there is no such randomisation, or its file is wrong: names file, key and remedy.
+    """
+    return _read(_find(name_or_path, "randomisations"), RandomisationSpec)
+
+
+def load_servo(name_or_path: str | Path) -> ServoSpec:
+    """Load servo parameters by name or by the path of their TOML file; ``SpecError`` as the others."""
+    return _read(_find(name_or_path, "servos"), ServoSpec)
 
 
 def _list(kind: str) -> dict[str, Path]:

@@ -1,4 +1,4 @@
-"""The specification of a TacTip: geometry, material, optics, camera, recording, pipeline.
+"""The specification of a TacTip: geometry, material, optics, camera, recording, pipeline, rig.
 
 Sensor frame: origin at the centre of the dome's sphere, z out of the tip (apex at
 ``z = skin.outer_radius_mm``), x and y along the image's x (right) and y (down) of an
@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from scenes.base import Fraction, Index, NearOne, NonNegative, Positive, Rgb, Section
+from scenes.rig import RigSpec
 
 
 class RelaxationTerm(Section):
@@ -345,7 +346,7 @@ class PipelineSpec(Section):
 
 
 class SensorSpec(Section):
-    """A TacTip, complete. ``name`` is the file's stem."""
+    """A TacTip, complete. ``name`` is the file's stem; ``rig`` is there where contacts of this sensor on a robot were calibrated."""
 
     name: str
     description: str
@@ -361,6 +362,7 @@ class SensorSpec(Section):
     response: ResponseSpec
     recording: RecordingSpec | None = None
     pipeline: PipelineSpec
+    rig: RigSpec | None = None
 
     @model_validator(mode="after")
     def _check(self):

@@ -48,9 +48,9 @@ def _item(value):
                 array.add_line(inline)
             array.add_line(indent="")
             return array
-        nested = bool(value) and isinstance(value[0], list | tuple)
-        row = 1 if nested else ROW
-        if not nested and len(value) <= ROW:
+        numbers = _numbers(value[0]) if value else 1
+        row = max(ROW // numbers, 1)
+        if numbers * len(value) <= ROW:
             array.extend(_item(v) for v in value)
             return array
         for start in range(0, len(value), row):
@@ -58,3 +58,8 @@ def _item(value):
         array.add_line(indent="")
         return array
     return value
+
+
+def _numbers(value) -> int:
+    """How many numbers a value holds."""
+    return sum(map(_numbers, value)) if isinstance(value, list | tuple) else 1

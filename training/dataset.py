@@ -9,16 +9,18 @@ import numpy as np
 
 import twin.preprocess
 from scenes.sensor import SensorSpec
+from training.simulated import is_pins_only, open_simulated
 from training.targets import Targets, choose_targets
 from twin.cache import cached_arrays
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, make_reference
+from twin.preprocess import Pipeline, make_graph, make_reference, nominal_reference
 from twin.preprocess.batch import recording_reference
 from twin.preprocess.reference import Reference
 from twin.recordings import Recording, open_recording
 from twin.types import Form
 
 HELD_OUT = 5  # one row in five is the validation part
+GROUP_COLUMN = "path_id"  # of a simulated data set's table
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,8 @@ class Dataset:
     targets : Targets
         M rows of labels, raw and corrected.
     folder : Path
+    group : (M,) array or None
+        Rows of one value belong together (the states of one simulated contact): they are never split.
     problems : list of str
         Everything odd about the recording, one line each, and what was left out for it.
     """
@@ -77,6 +81,7 @@ class Dataset:
     pins: PinTable
     targets: Targets
     folder: Path
+    group: np.ndarray | None = None
     problems: list = field(default_factory=list)
 
     def __len__(self) -> int:
@@ -86,12 +91,12 @@ class Dataset:
 def load_dataset(
     folder: str | Path, spec: SensorSpec, columns: str | tuple = "surface-2d", *, form: Form | None = None, progress: Callable | None = None
 ) -> Dataset:
-    """Read a labelled recording.
+    """Read a labelled recording, real or simulated.
 
     Parameters
     ----------
     folder : path
-        Anything ``open_recording`` takes that has a table of labels.
+        Anything ``open_recording`` takes that has a table of labels, or a simulated data set without pictures.
     columns : str or tuple of str
         A name of ``training.targets.PRESETS``, or the table's columns themselves.
     progress : callable, optional
@@ -102,9 +107,13 @@ def load_dataset(
     FrameError
         If there is no table, a chosen column is missing, or no row is usable.
     """
-    recording = open_recording(folder, spec, form)
     problems: list[str] = []
-    pins = pin_table(recording, spec, problems=problems, progress=progress)
+    if is_pins_only(Path(folder)):
+        recording, truth = open_simulated(Path(folder), spec)
+        pins = simulated_table(recording, spec, truth, progress=progress)
+    else:
+        recording = open_recording(folder, spec, form)
+        pins = pin_table(recording, spec, problems=problems, progress=progress)
     row_of = {name: k for k, name in enumerate(recording.names)}
     rows = np.array([row_of[name] for name in pins.image_name], int)
     targets = choose_targets(recording, spec, columns, rows, problems)
@@ -117,14 +126,41 @@ def load_dataset(
     good = np.flatnonzero(pins.valid & ~unlabelled)
     if not len(good):
         raise FrameError(f"{folder}: no frame has both pins and labels; {'; '.join(problems[:3])}")
-    return Dataset(pins.rows(good), targets.rows(good), Path(folder), list(recording.problems) + problems)
+    group = recording.labels[GROUP_COLUMN][rows][good] if GROUP_COLUMN in recording.labels else None
+    return Dataset(pins.rows(good), targets.rows(good), Path(folder), group, list(recording.problems) + problems)
 
 
-def split_rows(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Training and validation rows: a random fifth is held out (rows are sorted by label, so never by position)."""
+def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Training and validation rows: a random fifth is held out (rows are sorted by label, so never by position).
+
+    With ``group`` (count,) it is a fifth of the groups, with all their rows.
+    """
+    if group is not None:
+        names, of_row = np.unique(group, return_inverse=True)
+        _, held = split_rows(len(names), seed)
+        out = np.isin(of_row, held)
+        return np.flatnonzero(~out), np.flatnonzero(out)
     shuffled = np.random.default_rng(seed).permutation(count)
     held = -(-count // HELD_OUT)
     return np.sort(shuffled[held:]), shuffled[:held]
+
+
+def simulated_table(recording: Recording, spec: SensorSpec, truth: dict[str, np.ndarray], *, progress: Callable | None = None) -> PinTable:
+    """The table that a pipeline without a fault would make of simulated frames, from their pins; hidden caps count as lost."""
+    reference = nominal_reference(spec, recording.form)
+    nodes = truth["pins_px"].astype(float)
+
+    def compute() -> dict[str, np.ndarray]:
+        areas = np.empty(nodes.shape[:2])
+        for k, pins_px in enumerate(nodes):
+            areas[k] = make_graph("voronoi", pins_px, outmost=reference.outmost).area_px2
+            if progress:
+                progress(k + 1, len(nodes))
+        return {"area_px2": areas}
+
+    area_px2 = cached_arrays("simulated-areas", {"pins": nodes.tobytes(), "sensor": spec.name}, compute)["area_px2"]
+    seen = np.ones(len(nodes), bool)
+    return PinTable(spec, recording.form, reference, np.array(recording.names, str), nodes, area_px2, ~truth["visible"], seen)
 
 
 def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progress: Callable | None = None) -> PinTable:

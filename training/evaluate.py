@@ -13,6 +13,7 @@ from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
 from training.inputs import image_inputs
 from training.recipes import TrainingError
+from training.simulated import is_pins_only
 from twin.recordings import open_recording
 from twin.views.plots import new_figure
 
@@ -41,7 +42,7 @@ def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndar
             f"the run was trained on part of {trained_on} rows, this recording has {len(data)}; "
             "give --rows all for a recording it has not seen"
         )
-    return split_rows(len(data), split)[1]
+    return split_rows(len(data), split, data.group)[1]
 
 
 def predict_rows_of(estimator: PoseEstimator, data: Dataset, rows: np.ndarray) -> Prediction:
@@ -112,8 +113,10 @@ def _bins(error: np.ndarray, targets) -> dict:
     return found
 
 
-def time_frames(estimator: PoseEstimator, data: Dataset) -> float:
-    """Median ms from frame to pose, one frame at a time on one thread."""
+def time_frames(estimator: PoseEstimator, data: Dataset) -> float | None:
+    """Median ms from frame to pose, one frame at a time on one thread; None where there are no pictures."""
+    if is_pins_only(data.folder):
+        return None
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

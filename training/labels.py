@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from training.targets import read_executed
 from twin.errors import FrameError
 
 
@@ -64,12 +65,7 @@ def published_rows(folder: Path) -> tuple[list[dict], np.ndarray]:
         If ``targets.csv`` or one of its columns is missing.
     """
     rows = _read_rows(folder / "targets.csv", ("image_name", "pose_2", "pose_6", "move_1", "move_6"))
-    executed_file = folder / "move_executed.csv"
-    executed_of = {}
-    if executed_file.is_file():
-        executed_of = {
-            row["image_name"]: float(row["executed_estimate"]) for row in _read_rows(executed_file, ("image_name", "executed_estimate"))
-        }
+    executed_of = read_executed(folder, [])
     executed = np.array([executed_of.get(row["image_name"], 1.0) for row in rows])
     return rows, executed
 

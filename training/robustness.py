@@ -12,6 +12,8 @@ import numpy as np
 
 from training.dataset import Dataset
 from training.estimator import PoseEstimator
+from training.recipes import TrainingError
+from training.simulated import is_pins_only
 from twin.recordings import open_recording
 from twin.types import Form, Frame
 
@@ -67,7 +69,14 @@ def judge_changes(
     list of dict
         ``change``, ``frames``, ``not_valid``, and for every label ``<label>_mae`` and ``<label>_more``, the part by which the
         mean absolute error is larger than that of the same frames as they are.
+
+    Raises
+    ------
+    TrainingError
+        If the data set has no pictures.
     """
+    if is_pins_only(data.folder):
+        raise TrainingError(f"{data.folder}: a data set of pins has no pictures to change; render it, or judge without --robustness")
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
     place = {name: k for k, name in enumerate(recording.names)}
     changes: dict = {"none": lambda image, rng, estimator: image} | CHANGES

@@ -88,7 +88,7 @@ def train_run(
     """
     started = monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split)[0]
+    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     inputs, aside = prepared_inputs(config.model, data, train)
@@ -131,7 +131,7 @@ def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
     """
     if not (out / "weights.pt").is_file() or (out / "checkpoint.pt").is_file():
         return False
-    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split)[0]
+    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
     wanted = json.loads(json.dumps(resolve(config, data, train)))
     found = json.loads((out / "config.json").read_text())
     if _identity(wanted) != _identity({key: found.get(key) for key in wanted}):
@@ -178,7 +178,7 @@ def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, trai
     seed = 1000 * config.seed + member
     torch.manual_seed(seed)
     network = build_network(config.model, data.pins.reference, scaled.shape[1], config.size)
-    held, learnt = fold_rows(train, config.seed, member)
+    held, learnt = fold_rows(train, config.seed, member, data.group)
     if hasattr(network, "prepare"):
         network.prepare(inputs.x[torch.from_numpy(train)])
     network.to(device)
@@ -189,10 +189,12 @@ def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, trai
     return Loop(network, config.recipe, Rows(inputs, scaled, weight, executed, torch.from_numpy(learnt), torch.from_numpy(held)), seed)
 
 
-def fold_rows(train: np.ndarray, seed: int, member: int) -> tuple[np.ndarray, np.ndarray]:
-    """The tenth of the training rows that a network watches, and those it learns from."""
-    shuffled = np.random.default_rng([seed, 1]).permutation(train)
-    held = shuffled[member % FOLDS :: FOLDS]
+def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The tenth of the training rows that a network watches, and those it learns from; ``group`` as in ``Dataset``."""
+    parts = train if group is None else np.unique(group[train])
+    held = np.random.default_rng([seed, 1]).permutation(parts)[member % FOLDS :: FOLDS]
+    if group is not None:
+        held = train[np.isin(group[train], held)]
     return np.sort(held), np.setdiff1d(train, held)
 
 

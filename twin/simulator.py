@@ -46,11 +46,13 @@ class Simulator:
     spec : SensorSpec
     quality : {"preview", "standard", "high"}
         Samples per pixel of the renderer.
+    solver : SkinSolver, optional
+        Of the same sensor; by default one of the usual resolution.
     """
 
-    def __init__(self, spec: SensorSpec, *, quality: str = "standard") -> None:
+    def __init__(self, spec: SensorSpec, *, quality: str = "standard", solver: SkinSolver | None = None) -> None:
         self.spec = spec
-        self.solver = SkinSolver(spec)
+        self.solver = solver or SkinSolver(spec)
         self.rest = self.solver.rest()
         self._quality = quality
         self._renderer: Renderer | None = None

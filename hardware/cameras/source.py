@@ -10,7 +10,8 @@ class FrameSource(Protocol):
 
     A background reader keeps the newest frame. ``Frame.time_s`` is when the frame was exposed as well as can be known (the
     kernel's buffer time, else the arrival), ``Frame.sequence`` counts frames of the device, lost ones included where
-    the device tells.
+    the device tells. A live source whose pictures are frozen or black, or whose reader has ended after too many failed
+    reads, raises ``DeviceError`` from every read.
     """
 
     name: str
@@ -22,7 +23,11 @@ class FrameSource(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Frames that arrived and nobody read."""
+        """Frames that arrived, or that the device lost, and nobody read."""
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with the pictures ("" if nothing)."""
 
     def connect(self) -> None: ...
 

@@ -10,7 +10,10 @@ SECTIONS = {
         "aperture_mm": 0.0, "vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0),
     },
     "leds": {"size_mm": 1.6, "power": 0.7, "balance": (), "off": (), "mirror_share": 1.0, "core_share": 0.0},
-    "housing": {"ambient": 0.8, "glow": 3.2, "center_mm": (-0.22, 0.27), "rim": None},
+    "housing": {
+        "ambient": 0.8, "ambient_falloff_mm": 8.27586, "glow": 3.2, "glow_radius_mm": 16.4993, "glow_height_mm": 1.48726,
+        "glow_exponent": 1.48105, "center_mm": (-0.22, 0.27), "rim": None,
+    },
     "appearance": {
         "skin_albedo": (0.0048, 0.0066, 0.023), "pin_albedo": (0.006, 0.009, 0.03), "cap_albedo": (0.2, 0.41, 0.8),
         "skin_gloss": 0.0, "cap_gloss": 0.0,

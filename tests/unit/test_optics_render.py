@@ -7,6 +7,7 @@ from plain_sensor import changed, plain
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
+from twin.optics.placement import near_pins
 from twin.optics.render import Renderer
 from twin.projection import project
 
@@ -171,3 +172,19 @@ def test_what_cannot_be_rendered_is_refused(small):
     rest = rest_pins(small)
     with pytest.raises(RenderError, match="19"):
         Renderer(small, spp=1).render(PinRest(rest.base_mm[:5], rest.axis[:5], rest.caps_mm[:5]))
+
+
+def test_the_samples_stand_where_pins_are():
+    """A ray traced onto a pin belongs to a pixel that counts as near one; bare skin is left out."""
+    spec, window = plain(), (200, 150, 400, 350)
+    rest = rest_pins(spec)
+    near = near_pins(spec, rest, window)
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    across = np.cross(rest.axis, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    way = np.cos(turn)[:, None, None] * across + np.sin(turn)[:, None, None] * np.cross(rest.axis, across)
+    rims = project(spec, rest.caps_mm + 0.5 * spec.pins.cap_diameter_mm * way).reshape(-1, 2)
+    at = np.rint(np.concatenate([rims, project(spec, rest.base_mm)])).astype(int) - window[:2]
+    at = at[((at >= 0) & (at < 200)).all(axis=1)]
+    assert len(at) > 1000 and near[at[:, 1], at[:, 0]].all()
+    assert near.mean() < 0.8

@@ -2,8 +2,10 @@
 
 import pytest
 
-from scenes import SpecError, list_objects, list_sensors, load_object, load_sensor
+from scenes import SpecError, list_experiments, list_objects, list_sensors, load_experiment, load_object, load_sensor
 from scenes.load import SHIPPED
+
+LOADERS = {"sensors": load_sensor, "objects": load_object, "experiments": load_experiment}
 
 
 def edited(tmp_path, source, old, new):
@@ -21,6 +23,15 @@ def test_every_shipped_specification_loads():
         assert load_sensor(name).name == name
     for name in list_objects():
         assert load_object(name).name == name
+    for name in list_experiments():
+        assert load_object(load_experiment(name).object).name
+
+
+def test_the_recordings_ranges_are_those_of_their_experiment():
+    experiment = load_experiment("surface-2d")
+    moving = {label: ends for label, ends in experiment.ranges().items() if ends[0] < ends[1]}
+    assert moving == {"pose_2": (-4, 0), "pose_6": (-20, 20), "move_1": (-5, 5), "move_6": (-5, 5)}
+    assert experiment.tap == (0, 5, 0, 0, 0, 0) and experiment.axis == 1
 
 
 @pytest.mark.parametrize(("sensor_name", "pins"), [("mg400-331", 331), ("ur5-331", 331), ("mg400-127", 127)])
@@ -46,12 +57,17 @@ def test_pin_counts(sensor_name, pins):
         ("objects/sphere.toml", "radius_mm", "radius", ["shape.sphere.radius", "did you mean 'radius_mm'"]),
         ("objects/sphere.toml", '"sphere"', '"ball"', ["shape", "'ball'"]),
         ("objects/sphere.toml", "friction = 0.5", "friction = -1", ["friction", "greater than or equal to 0"]),
+        ("experiments/surface-2d.toml", "pose_2 = [", "pose_7 = [", ["pose.pose_7", "did you mean 'pose_"]),
+        ("experiments/surface-2d.toml", "[-4, 0]", "[0, -4]", ["pose_2", "lower end first"]),
+        ("experiments/surface-2d.toml", "[-4, 0]", "[-4, 1]", ["1 mm inside the object"]),
+        ("experiments/surface-2d.toml", "[0, 5, 0", "[1, 5, 0", ["tap must go along the approach, y"]),
+        ("experiments/surface-2d.toml", '["pose_2", ', '["depth", ', ["depth is no label"]),
     ],
 )
 def test_a_wrong_specification_names_file_key_and_remedy(tmp_path, source, old, new, words):
     path = edited(tmp_path, source, old, new)
     with pytest.raises(SpecError) as caught:
-        (load_sensor if "sensors" in source else load_object)(path)
+        LOADERS[source.split("/")[0]](path)
     for word in [str(path), *words]:
         assert word in str(caught.value)
     assert "\n" not in str(caught.value).strip() or "TOML" in str(caught.value)

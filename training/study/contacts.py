@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from scenes import load_object
 from scenes.sensor import SensorSpec
 from training.dataset import Dataset
-from training.recorded_contact import RECORDED_TAPS, TAP_MM
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.preprocess import Pipeline, make_graph
@@ -22,6 +21,7 @@ from twin.types import Form, PinGraph
 from twin.views.plots import draw_area_change, new_figure
 
 DEPTHS_MM = (2.0, 4.0)
+TAP_MM = 5.0  # of the published recordings (their meta.json: tap_move)
 ASIDE_MM = 6.0  # from the middle to the border of the surface that touches one side only
 # object, turn of the whole contact about the sensor's axis (x towards y, deg), offset before turning (mm); image y is down
 CONTACTS = {
@@ -103,14 +103,15 @@ def twin_contacts(spec: SensorSpec, form: Form, *, depths_mm=DEPTHS_MM, names=tu
 def recorded_contacts(data: Dataset) -> list[AreaChange]:
     """Recorded frames nearest to a straight press of these depths; none where the labels don't tell depth, angle and moves.
 
-    Depth beyond first touch is ``pose_2`` + tap + the sensor's contact offset (0 where it was never fitted).
+    Depth beyond first touch is ``pose_2`` + tap + the rig's contact offset (0 where it was never calibrated).
     """
     targets = data.targets
     if not {"pose_2", "pose_6"} <= set(targets.names) or not np.isfinite(targets.move).all():
         return []
-    tap = RECORDED_TAPS.get(data.pins.sensor.name)
-    depth = targets.corrected[:, targets.names.index("pose_2")] + TAP_MM + (tap.contact_offset_mm if tap else 0.0)
-    angle = targets.corrected[:, targets.names.index("pose_6")] + (tap.angle_offset_deg if tap else 0.0)
+    rig = data.pins.sensor.rig
+    offset_mm, offset_deg = (rig.contact_offset_mm, rig.turn_offset_deg[2]) if rig else (0.0, 0.0)
+    depth = targets.corrected[:, targets.names.index("pose_2")] + TAP_MM + offset_mm
+    angle = targets.corrected[:, targets.names.index("pose_6")] + offset_deg
     shear = targets.move * np.nan_to_num(targets.executed, nan=1.0)[:, None]
     found = []
     for wanted in DEPTHS_MM:

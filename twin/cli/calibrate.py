@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Sensor
+from twin.cli.options import FormOrAuto, Sensor
 
 calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(calibrate_app, name="calibrate")
@@ -63,4 +63,77 @@ def optics(
         print(f"note: {note}")
     before, after = found.before, found.after
     print(f"over the disc: PSNR {before['psnr_db']:.2f} -> {after['psnr_db']:.2f} dB, SSIM {before['ssim']:.3f} -> {after['ssim']:.3f}")
+    print(f"wrote {out}\nwrote {page}")
+
+
+CONTACT_HELP = """Fit the contact of a specification to labelled frames of the real sensor on its robot.
+
+From the no-contact frame (init_0.png) and N labelled frames: contact offset, tool point, angle offset and sign, tilt of the
+surface, direction of the robot's axes in the image, friction, stiffness of the gel relative to the skin, thickness of
+the skin, length of the pins. Whether each frame's move had been executed when it was taken is found along with them, and
+frames that fit no story lose their weight. As many frames again, at most 20, are kept out of the fit to state the error.
+
+\b
+Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/ with index.html (parameters with their
+uncertainty and what the frames tell of them, frames with their probabilities, before and after), calibration.json and
+contacts/: an interrupted run goes on where it was.
+
+\b
+It simulates about 50 + 45 N contacts, of 1 to 3 s each on one core; --workers divides that.
+
+\b
+Example:
+  twin calibrate contact --sensor mg400-331 --frames recordings/my-surface --labels 20 --out my-tactip.toml
+"""
+
+
+@calibrate_app.command("contact", help=CONTACT_HELP)
+def contact(
+    sensor: Sensor,
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with its no-contact frame")],
+    out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
+    labels: Annotated[int, typer.Option("--labels", min=4, metavar="N", help="frames to fit to, chosen at random")] = 20,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the choice of frames")] = 0,
+    experiment: Annotated[
+        str, typer.Option("--experiment", metavar="E", help="how they were recorded ('twin experiments')")
+    ] = "surface-2d",
+    object_: Annotated[
+        str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
+    ] = None,
+    hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="leave this parameter as it is; may be repeated")] = None,
+    workers: Annotated[int, typer.Option("--workers", min=1, metavar="N", help="processes on this machine")] = 1,
+    across: Annotated[int | None, typer.Option("--across", min=6, max=64, help="elements along each side of the skin's grid; even")] = None,
+    form: FormOrAuto = None,
+) -> None:
+    from scenes import load_experiment, load_object, load_sensor
+    from scenes.write import write_sensor
+    from training.contact_calibration import PARAMETERS
+    from training.contact_calibration.run import calibrate_contact
+    from twin.cli.progress import rate_bar
+    from twin.errors import FrameError
+
+    if out.suffix != ".toml":
+        raise FrameError(f"--out {out}: give the name of a .toml file")
+    known = {p.name for p in PARAMETERS}
+    if unknown := set(hold or ()) - known:
+        raise FrameError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(known))}")
+    parameters = tuple(p for p in PARAMETERS if p.name not in (hold or ()))
+    spec, plan = load_sensor(sensor), load_experiment(experiment)
+    touched = load_object(object_ or plan.object)
+    folder = out.with_name(f"{out.stem}-contact")
+    folder.mkdir(parents=True, exist_ok=True)
+    with rate_bar("contacts") as progress:
+        how = {"parameters": parameters, "workers": workers, "across": across, "form": form, "progress": progress}
+        fitted, summary, page = calibrate_contact(folder, frames, spec, plan, touched, labels, seed, **how)
+    write_sensor(out, fitted, f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {spec.name}.")
+    for problem in summary["problems"]:
+        print(f"note: {problem}")
+    for p in summary["parameters"]:
+        doubt = "" if p["known"] else "  (not told by these frames)"
+        print(f"{p['name']:26s} {p['start']:9.4g} -> {p['value']:9.4g} +- {p['sd']:.2g}{doubt}")
+    for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
+        if part := summary[key]:
+            print(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
+    if summary["distrusted"]:
+        print(f"not trusted: {', '.join(summary['distrusted'])}")
     print(f"wrote {out}\nwrote {page}")

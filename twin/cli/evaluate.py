@@ -60,7 +60,8 @@ def evaluate(
         )
     if metrics["leak_slope"] is not None:
         print(f"slope of the angle's error on move_6 where it was not executed: {metrics['leak_slope']:+.3f}")
-    print(f"{len(chosen)} frames, {metrics['ms_per_frame']:.1f} ms per frame (median, one thread)")
+    ms = metrics["ms_per_frame"]
+    print(f"{len(chosen)} frames" + ("" if ms is None else f", {ms:.1f} ms per frame (median, one thread)"))
     written = write_evaluation(out, made, found, chosen, metrics, labels)
     if robustness:
         with count_bar("changed frames") as progress:

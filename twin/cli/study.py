@@ -1,8 +1,44 @@
 """``twin study``: experiments that compare."""
 
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
 from twin.cli import app
+from twin.cli.options import Out, writable_folder
+from twin.cli.servo import PlainLight, ServoName
 
+OBJECTS = "can,mesh-can,square,prism,tin-box"  # the Tac-VGNN paper's
 study = typer.Typer(help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(study, name="study")
+
+SERVO_HELP = """Follow the paper's five objects with each model, in the twin, and compare.
+
+\b
+  twin study servo --model out/gnn --model out/tac-vgnn --out out/study
+
+Writes to --out: a folder for each model and object as 'twin servo' writes it, study.csv, study.png.
+"""
+
+
+@study.command("servo", help=SERVO_HELP)
+def study_servo(
+    models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
+    out: Out,
+    objects: Annotated[str, typer.Option("--objects", help="names with commas between")] = OBJECTS,
+    parameters: ServoName = "surface",
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="for each object, instead of once around it")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="of the twin's noise")] = 0,
+    plain_light: PlainLight = False,
+) -> None:
+    from training.estimator import PoseEstimator
+    from twin.cli.servo_study import run_study
+
+    names = [name.strip() for name in objects.split(",") if name.strip()]
+    labels = [model.name for model in models]
+    if len(set(labels)) < len(labels):
+        labels = [str(model) for model in models]
+    estimators = {label: PoseEstimator.load(model) for label, model in zip(labels, models, strict=True)}
+    lines = run_study(estimators, names, writable_folder(out), parameters=parameters, steps=steps, seed=seed, plain_light=plain_light)
+    print("\n".join(lines))

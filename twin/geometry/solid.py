@@ -8,7 +8,7 @@ inside is smoother still: below its surface it has a grid of half the lines, nes
 """
 
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -118,10 +118,10 @@ class Solid:
         return foot, np.linalg.inv(frame)
 
 
-def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus: Focus | None = None) -> Solid:
+def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus: Focus | None = None, keep: bool = True) -> Solid:
     """The body of a sensor, its grid fine around a focus (default: around the apex).
 
-    It depends on the sensor's geometry alone, and is kept on disk (see ``twin.cache``).
+    It depends on the sensor's geometry alone, and is kept on disk (see ``twin.cache``) if ``keep``.
     """
     resolution, focus = resolution or Resolution(), focus or Focus()
     inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
@@ -141,7 +141,8 @@ def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus
         "resolution": asdict(resolution),
         "focus": asdict(focus),
     }
-    kept = cached_arrays("solid", key, lambda: _arrays(spec, resolution, **frame))
+    arrays = partial(_arrays, spec, resolution, **frame)
+    kept = cached_arrays("solid", key, arrays) if keep else arrays()
     cells = {name: Cells(*(kept.pop(f"{name}_{part}") for part in _CELL_PARTS)) for name in ("skin", "gel_top", "gel_deep")}
     boxes = tuple(kept.pop(f"boxes_{kind}") for kind in range(3))
     upper = basis.count**2

@@ -1,8 +1,8 @@
 """From a sensor, an object and a path to converged contact states."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -12,35 +12,24 @@ from scenes.sensor import SensorSpec
 from twin.errors import ContactError
 from twin.geometry.chart import Focus
 from twin.geometry.mesh import build_mesh
-from twin.geometry.solid import Resolution, Solid, build_solid, pin_pose
+from twin.geometry.solid import Resolution, build_solid, pin_pose
 from twin.geometry.view import NodeView
-from twin.mechanics.balance import Balance, Body, Friction, LoadState
+from twin.mechanics.balance import Body, Friction
 from twin.mechanics.contact import contact_points
 from twin.mechanics.elements import Elements
 from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.material import law_coefficients
-from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
+from twin.mechanics.newton import LoadStepper
+from twin.mechanics.ongoing import OngoingContact, Setting
 from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, dome_directions, plan_path
-from twin.mechanics.relaxation import History
 from twin.stimulus import Stimulus, build_stimulus
 from twin.types import ContactState
 
-_PENALTY_MPA_MM = 30.0
 _STEP_MM = 0.4  # largest motion of the object across the contact in one load step
-_SMALLEST_STRIDE = 1 / 64  # of a regular load step
 _LOOK_MM = 2.0  # between the poses of the path at which that is looked for
 _FOCUS_POINTS = 2000  # on the sphere, to see where the object will press
 _FOCUS_POLAR_DEG, _FOCUS_AZIMUTH_DEG = 5.0, 15.0  # the focus's direction is rounded to these
 _MARGIN_RAD = np.radians(15.0)  # skin this far around what the rigid object would pass through may touch it
-
-
-@dataclass(frozen=True)
-class _Setting:
-    """A solid, and what is derived from it."""
-
-    solid: Solid
-    body: Body
-    view: NodeView
 
 
 class SkinSolver:
@@ -50,10 +39,12 @@ class SkinSolver:
     ----------
     spec : SensorSpec
     resolution : Resolution, optional
+    keep : bool
+        Whether what depends on the geometry is kept on disk; not for geometries that are used once.
     """
 
-    def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None):
-        self.spec, self.resolution = spec, resolution or Resolution()
+    def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None, keep: bool = True):
+        self.spec, self.resolution, self._keep = spec, resolution or Resolution(), keep
         self.mesh = build_mesh(spec)
         self._blas = ThreadpoolController()
         self._setting = lru_cache(maxsize=32)(self._set_up)
@@ -117,7 +108,7 @@ class SkinSolver:
         """
         spec = stimulus if isinstance(stimulus, ObjectSpec) else None
         field = build_stimulus(spec) if spec else stimulus
-        law = _friction(spec, friction)
+        law = friction_of(spec, friction)
         compliance = compliance_mm_per_n if compliance_mm_per_n is not None else (spec.compliance_mm_per_n if spec else 0.0)
         plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec, field, pose)
         if release:
@@ -126,57 +117,42 @@ class SkinSolver:
             yield 1.0, self.rest(T_sensor_object=plan.at(1.0))
             return
         reached = self._reached(field, plan)
-        with self._one_thread():
-            setting = self._setting(_focus(reached))
-            stepper = LoadStepper(setting.body, self._frontal(setting, reached), field, law, compliance)
-        body = setting.body
-        count = len(body.points.area_mm2)
-        state = LoadState(
-            control_mm=setting.solid.control_mm,
-            border=np.zeros(2),
-            anchor_mm=np.zeros((count, 3)),
-            held=np.zeros(count, bool),
-            slid_mm=np.zeros(count),
-            penalty_mpa_mm=_PENALTY_MPA_MM,
-            T=plan.at(0.0),
-        )
-        terms = [self.spec.skin.relaxation, self.spec.gel.relaxation, self.spec.gel.relaxation]
-        past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, terms, strict=True)]
+        contact = self.begin(field, law, compliance, reached, plan.at(0.0), focus=_focus(reached))
         stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
-        for number in range(1, len(stops)):
-            done, stride = 0.0, 1.0
-            while done < 1:
-                stride = min(stride, 1 - done)
-                start = stops[number - 1] + done * (stops[number] - stops[number - 1])
-                at = stops[number - 1] + (done + stride) * (stops[number] - stops[number - 1])
-                span_s = plan.time_s(at) - plan.time_s(start)
-                now = [p.before(kind, term, span_s) for p, kind, term in zip(past, body.kinds, terms, strict=True)]
-                try:
-                    with self._one_thread():
-                        stepper.follow(replace(body, kinds=tuple(kind for kind, _ in now)))
-                        state, balance, looked = stepper.step(state, plan.at(at), [given for _, given in now])
-                        result = self._contact_state(setting, state, balance, looked)
-                except NoConvergence as failure:
-                    stride /= 2
-                    if stride >= _SMALLEST_STRIDE:
-                        continue
-                    raise ContactError(
-                        f"no convergence in load step {number} of {len(stops) - 1} ({at / stops[-1]:.0%} of the path): relative residual "
-                        f"{failure.relative:.1e}, needed {RESIDUAL_TOLERANCE:.0e}; try less indentation, shear or friction, "
-                        f"a rounder object, or another resolution"
-                    ) from None
-                past = [p.after(kind, term, span_s, state.control_mm) for p, kind, term in zip(past, body.kinds, terms, strict=True)]
-                done += stride
-                stride = min(2 * stride, 1.0)
-                yield float(at / stops[-1]), result
+        for number, (start, stop) in enumerate(pairwise(stops), 1):
+            where = f"load step {number} of {len(stops) - 1} ({stop / stops[-1]:.0%} of the path)"
+            for at, state in contact.advance(plan.at, start, stop, plan.time_s, where):
+                yield float(at / stops[-1]), state
+
+    def begin(
+        self, field: Stimulus, law: Friction, compliance: float, reached: np.ndarray, T: np.ndarray, *, focus: Focus
+    ) -> OngoingContact:
+        """A contact at its start, the object at ``T`` and free of the skin.
+
+        Parameters
+        ----------
+        reached : (k, 3) float
+            Directions of the dome that the object may come to press, and ``focus``: where the solid is fine.
+        """
+        with self._one_thread():
+            setting = self._setting(focus)
+        contact = OngoingContact(self.spec, setting, T, self._one_thread)
+        self.reach(contact, field, law, compliance, reached)
+        return contact
+
+    def reach(self, contact: OngoingContact, field: Stimulus, law: Friction, compliance: float, reached: np.ndarray) -> None:
+        """Let the contact go on where the object presses other directions (k, 3) of the dome than before."""
+        with self._one_thread():
+            frontal = self._frontal(contact.setting, reached)
+            contact.stepper = LoadStepper(contact.setting.body, frontal, field, law, compliance)
 
     def _one_thread(self):
         """BLAS on one thread: the matrices are small, and the result must not depend on the number of cores."""
         return self._blas.limit(limits=1, user_api="blas")
 
-    def _set_up(self, focus: Focus) -> _Setting:
+    def _set_up(self, focus: Focus) -> Setting:
         spec = self.spec
-        solid = build_solid(spec, resolution=self.resolution, focus=focus)
+        solid = build_solid(spec, resolution=self.resolution, focus=focus, keep=self._keep)
         gel = law_coefficients(spec.gel, layer=False)
         kinds = (
             Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True),
@@ -184,9 +160,9 @@ class SkinSolver:
             Elements(solid.gel_deep, gel),
         )
         points = contact_points(solid, spec.skin.outer_radius_mm)
-        return _Setting(solid, Body(kinds, points, ~solid.fixed, spec.gel.sealed), NodeView.of(spec, self.mesh, solid))
+        return Setting(solid, Body(kinds, points, ~solid.fixed, spec.gel.sealed), NodeView.of(spec, self.mesh, solid))
 
-    def _frontal(self, setting: _Setting, reached: np.ndarray) -> FrontalSolver:
+    def _frontal(self, setting: Setting, reached: np.ndarray) -> FrontalSolver:
         """Elimination of all but the outer controls that may be touched: those that carry points around the reached directions."""
         solid, points = setting.solid, setting.body.points
         directions = points.positions(solid.control_mm) / self.spec.skin.outer_radius_mm
@@ -215,40 +191,9 @@ class SkinSolver:
         pressed = deepest < 0
         return directions[pressed] if pressed.any() else directions[[deepest.argmin()]]
 
-    def _contact_state(self, setting: _Setting, state: LoadState, balance: Balance, looked: np.ndarray) -> ContactState:
-        contact, points = balance.contact, setting.body.points
-        touched = np.flatnonzero(contact.penetration_mm > 0)
-        where = looked[touched]
-        turn = state.T[:3, :3]
-        at = points.positions(state.control_mm)[where]
-        normal = contact.normal[touched] @ turn.T
-        force = -balance.point_force_n[touched]
-        normal_n = contact.normal_n[touched]
-        base, axis, caps = pin_pose(setting.solid, state.control_mm)
-        pose = state.T.copy()
-        pose[2, 3] += state.border[0]
-        return ContactState(
-            nodes_mm=setting.view.nodes(state.control_mm),
-            base_mm=base,
-            axis=axis,
-            caps_mm=caps,
-            force_n=force.sum(axis=0),
-            torque_nmm=np.cross(at, force).sum(axis=0),
-            area_mm2=float(points.area_mm2[where].sum()),
-            contact_mm=at,
-            normal=normal,
-            normal_n=normal_n,
-            tangential_n=force + normal_n[:, None] * normal,
-            point_area_mm2=points.area_mm2[where],
-            slipping=contact.slipping[touched],
-            T_sensor_object=pose,
-            elastic_nmm=state.elastic_nmm,
-            dissipated_nmm=state.dissipated_nmm,
-            residual=balance.relative,
-        )
 
-
-def _friction(spec: ObjectSpec | None, override: float | Friction | None) -> Friction:
+def friction_of(spec: ObjectSpec | None, override: float | Friction | None = None) -> Friction:
+    """An object's friction, or what is given instead; none for a bare field."""
     if isinstance(override, Friction):
         return override
     if override is not None:

@@ -9,6 +9,7 @@ from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.optics.camera_rays import CameraRays
+from twin.optics.placement import SKIN_SAVING, near_pins
 from twin.optics.sampling import PixelSamples
 from twin.optics.scalar import ScalarView
 from twin.optics.scene import build_scene, move_meshes
@@ -40,7 +41,7 @@ class Renderer:
     window_px : (x0, y0, x1, y1), optional
         Part of the raw frame to render, end exclusive; the whole frame by default.
     spp : int, optional
-        Samples per pixel instead of the quality's.
+        Samples per pixel instead of the quality's: where pins are; bare skin gets a quarter (`twin.optics.placement`).
     bounces : int
         Scatterings of a path after its first.
     """
@@ -144,7 +145,7 @@ class GelView:
     def __init__(self, mi, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int):
         import drjit as dr
 
-        self._mi, self._dr = mi, dr
+        self._mi, self._dr, self._spec, self._window_px = mi, dr, spec, window_px
         scene = build_scene(mi, spec, **surfaces)
         self.params = mi.traverse(scene)
         self.tracer = GelTracer.of(mi, spec, scene, bounces)
@@ -154,22 +155,35 @@ class GelView:
         """Move the meshes' vertices."""
         move_meshes(self.params, surfaces)
 
-    def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state=None) -> np.ndarray:
-        """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row."""
-        passes, each = 1, spp
+    def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state) -> np.ndarray:
+        """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row; fewer samples on bare skin."""
+        mi, dr = self._mi, self._dr
+        pins = near_pins(self._spec, state, self._window_px).ravel()[pixels]
+        passes, each, few = 1, spp, -(-spp // SKIN_SAVING)
         while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
-            passes, each = 2 * passes, -(-each // 2)  # halves: nets of powers of two are even
-        total = 0.0
+            passes, each, few = 2 * passes, -(-each // 2), -(-few // 2)  # halves: nets of powers of two are even
+        counts = np.where(pins, each, few)
+        rows = np.repeat(np.arange(len(pixels), dtype=np.uint32), counts)
+        index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        row, total = mi.UInt32(rows), 0.0
+        pixel, number = mi.UInt32(pixels.astype(np.uint32)[rows]), mi.UInt32(index.astype(np.uint32))
         for k in range(passes):
-            total = total + np.array(self.trace(self._mi.UInt32(pixels.astype(np.uint32)), each, (seed * 1009 + k) % 2**32)).T
-        return total / passes
+            light = self._light(pixel, number, each, (seed * 1009 + k) % 2**32)
+            found = dr.zeros(mi.Spectrum, len(pixels))
+            dr.scatter_add(found, light, row)
+            total = total + np.array(found).T
+        return total / (passes * counts[:, None])
 
     def trace(self, pixels, spp: int, seed: int):
-        """The same as a spectrum of Dr.Jit, differentiable in what the tracer and the scene hold."""
+        """Mean light of pixels as a spectrum of Dr.Jit, differentiable in what the tracer and the scene hold."""
         mi, dr = self._mi, self._dr
         number = dr.arange(mi.UInt32, len(pixels) * spp)
-        pixel = dr.gather(mi.UInt32, pixels, number // spp)
-        random = PixelSamples(mi, dr, pixel, number % spp, spp, seed)
-        place, direction, transmittance = self.rays.sample(mi, dr, pixel, random)
-        light = self.tracer.radiance(mi, dr, place, direction, random) * transmittance
+        light = self._light(dr.gather(mi.UInt32, pixels, number // spp), number % spp, spp, seed)
         return mi.Spectrum(*(dr.block_sum(channel, spp) / spp for channel in light))
+
+    def _light(self, pixel, number, spp: int, seed: int):
+        """Light of samples: of the pixel and the number, below ``spp``, of each."""
+        mi, dr = self._mi, self._dr
+        random = PixelSamples(mi, dr, pixel, number, spp, seed)
+        place, direction, transmittance = self.rays.sample(mi, dr, pixel, random)
+        return self.tracer.radiance(mi, dr, place, direction, random) * transmittance

@@ -1,0 +1,76 @@
+"""What every arm of ours shares: the context manager, refusals when not connected, waiting until it is at rest."""
+
+import time
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from hardware.arms.arm import ArmState
+from hardware.arms.motion import turn_between_deg
+from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
+
+POLL_S = 0.005  # below the 8 ms of the fastest feedback
+BELIEVE_REST_S = 0.15  # at rest elsewhere for this long: the move won't come (a move shows in feedback sooner)
+
+
+class BaseArm(ABC):
+    """Base of the arms; see ``hardware.arms.arm.Arm`` for what each method promises."""
+
+    name: str
+    axes: int
+
+    @property
+    @abstractmethod
+    def is_connected(self) -> bool: ...
+
+    @abstractmethod
+    def connect(self) -> None: ...
+
+    @abstractmethod
+    def disconnect(self) -> None: ...
+
+    @abstractmethod
+    def state(self, *, max_age_s: float = 1.0) -> ArmState: ...
+
+    def __enter__(self):
+        self.connect()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.disconnect()
+
+    def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
+        """Wait for feedback of the arm at rest at ``pose``; see ``Arm``."""
+        deadline = time.monotonic() + timeout_s
+        asked_s, rest_since = time.monotonic(), None
+        while True:
+            state = self.state()
+            if state.error:
+                raise DeviceError(f"{self.name}: {state.error}")
+            off_mm = float(np.linalg.norm(state.pose[:3] - np.asarray(pose)[:3]))
+            off_deg = turn_between_deg(state.pose, np.asarray(pose, float))
+            if state.moving or state.time_s < asked_s:
+                rest_since = None
+            elif off_mm <= tolerance_mm and off_deg <= tolerance_deg:
+                return state
+            else:
+                rest_since = rest_since or state.time_s
+            if rest_since is not None and state.time_s - rest_since > max(BELIEVE_REST_S, 0.1 * timeout_s):
+                raise DeviceError(
+                    f"{self.name}: at rest {off_mm:.2f} mm and {off_deg:.2f} deg from where it was sent; the move was not executed. "
+                    "Check for a stop button, a brake or an obstacle, call stop() and clear_error(), then move again"
+                )
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    f"{self.name}: not there after {timeout_s:g} s ({off_mm:.2f} mm and {off_deg:.2f} deg to go); "
+                    "call stop(), then give more time or more speed"
+                )
+            time.sleep(POLL_S)
+
+    def _require_connected(self) -> None:
+        if not self.is_connected:
+            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+
+    def _require_disconnected(self) -> None:
+        if self.is_connected:
+            raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")

@@ -1,0 +1,152 @@
+"""Kinematics of arms. Poses are (6,): ``x, y, z, rx, ry, rz`` in mm and deg, static xyz Euler angles.
+
+Both Dobots carry their wrist on a parallel linkage: J2 and J3 are absolute angles of the two links, so with
+J2 from the vertical and J3 downwards from the horizontal
+
+    rho = R0 + L1 sin J2 + L2 cos J3        z = Z0 + L1 cos J2 - L2 sin J3        R = J1 + J4 (not wrapped)
+"""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Violation:
+    """Why joints or a pose can't be had; ``code`` is the alarm by which the Dobots tell it."""
+
+    code: int
+    text: str
+
+
+class OutOfReachError(ValueError):
+    """No joint angles reach the pose."""
+
+
+class Kinematics(Protocol):
+    """Joints to pose and back, and what the joints may be."""
+
+    axes: int
+
+    def forward(self, joints_deg: np.ndarray) -> np.ndarray:
+        """Pose (6,) at the joints (J,)."""
+
+    def inverse(self, pose: np.ndarray) -> np.ndarray:
+        """Joints (J,) at the pose (6,); ``OutOfReachError`` where there are none."""
+
+    def violation(self, joints_deg: np.ndarray) -> Violation | None:
+        """The limit that the joints break, if any."""
+
+    def nearest_pose(self, pose: np.ndarray) -> np.ndarray:
+        """The pose (6,) without the turns that the arm does not have."""
+
+
+NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23  # alarms of planning
+FIRST_JOINT_ALARM = 64  # J1 above, J1 below, J2 above, ... up to 71
+LINKAGE_ABOVE, LINKAGE_BELOW = 72, 73
+LIMIT_TOLERANCE_DEG = 1e-6  # rounding of an inverse at a limit is no violation of it
+
+
+@dataclass(frozen=True)
+class LinkageKinematics:
+    """An arm of four axes on a parallel linkage.
+
+    Attributes
+    ----------
+    l1_mm, l2_mm : float
+        Upper arm and forearm.
+    r0_mm, z0_mm : float
+        Reach and height of the tool with both links of no length.
+    limits_deg : (4, 2) tuple
+        Smallest and largest angle of each joint.
+    linkage_deg : float or None
+        J3 - J2 may not exceed this (None: no such limit known).
+    """
+
+    l1_mm: float
+    l2_mm: float
+    r0_mm: float
+    z0_mm: float
+    limits_deg: tuple
+    linkage_deg: float | None = None
+    axes: int = 4
+
+    def forward(self, joints_deg: np.ndarray) -> np.ndarray:
+        j1, j2, j3, _ = np.radians(joints_deg)
+        rho = self.r0_mm + self.l1_mm * np.sin(j2) + self.l2_mm * np.cos(j3)
+        z = self.z0_mm + self.l1_mm * np.cos(j2) - self.l2_mm * np.sin(j3)
+        return np.array([rho * np.cos(j1), rho * np.sin(j1), z, 0.0, 0.0, joints_deg[0] + joints_deg[3]])
+
+    def inverse(self, pose: np.ndarray) -> np.ndarray:
+        x, y, z, _, _, turn = pose
+        out, up = np.hypot(x, y) - self.r0_mm, z - self.z0_mm  # from the shoulder to the wrist
+        span = np.hypot(out, up)
+        if not abs(self.l1_mm - self.l2_mm) < span <= self.l1_mm + self.l2_mm:
+            raise OutOfReachError(f"x {x:.1f}, y {y:.1f}, z {z:.1f} mm is out of reach (J1 to J3 have no solution)")
+        from_vertical = np.arctan2(out, up)
+        at_shoulder = np.arccos((self.l1_mm**2 + span**2 - self.l2_mm**2) / (2 * self.l1_mm * span))
+        at_wrist = np.arccos((self.l2_mm**2 + span**2 - self.l1_mm**2) / (2 * self.l2_mm * span))
+        j1 = np.degrees(np.arctan2(y, x))
+        return np.array([j1, np.degrees(from_vertical - at_shoulder), np.degrees(from_vertical + at_wrist) - 90.0, turn - j1])
+
+    def violation(self, joints_deg: np.ndarray) -> Violation | None:
+        for n, (angle, (low, high)) in enumerate(zip(joints_deg, self.limits_deg, strict=True)):
+            if not low - LIMIT_TOLERANCE_DEG <= angle <= high + LIMIT_TOLERANCE_DEG:
+                code = FIRST_JOINT_ALARM + 2 * n + (angle < low)
+                return Violation(code, f"J{n + 1} at {angle:.2f} deg is outside [{low:g}, {high:g}] deg")
+        apart = joints_deg[2] - joints_deg[1]
+        if self.linkage_deg is not None and apart > self.linkage_deg + LIMIT_TOLERANCE_DEG:
+            return Violation(LINKAGE_ABOVE, f"J3 - J2 = {apart:.2f} deg is more than the linkage's {self.linkage_deg:g} deg")
+        return None
+
+    def nearest_pose(self, pose: np.ndarray) -> np.ndarray:
+        """``rx = ry = 0``, and R by full turns to where J4 is within its range and closest to its middle."""
+        x, y, z, _, _, turn = np.asarray(pose, float)
+        j1 = np.degrees(np.arctan2(y, x))
+        return np.array([x, y, z, 0.0, 0.0, turn - 360.0 * np.round((turn - j1) / 360.0)])
+
+    def fitted(self, joints_deg: np.ndarray, poses: np.ndarray) -> "LinkageKinematics":
+        """The same arm with the four lengths that fit measured pairs best (they enter linearly).
+
+        Parameters
+        ----------
+        joints_deg : (M, 4) float
+        poses : (M, 6) float
+        """
+        _, j2, j3, _ = np.radians(joints_deg).T
+        rho, z = np.hypot(poses[:, 0], poses[:, 1]), poses[:, 2]
+        one, none = np.ones_like(rho), np.zeros_like(rho)
+        rows = np.vstack([np.c_[np.sin(j2), np.cos(j3), one, none], np.c_[np.cos(j2), -np.sin(j3), none, one]])
+        (l1, l2, r0, z0), _, rank, _ = np.linalg.lstsq(rows, np.r_[rho, z], rcond=None)
+        if rank < 4:
+            raise ValueError(f"{len(rho)} pairs leave the lengths open; give some of different J2 and J3")
+        return replace(self, l1_mm=float(l1), l2_mm=float(l2), r0_mm=float(r0), z0_mm=float(z0))
+
+
+_MG400_LIMITS_DEG = ((-160.0, 160.0), (-25.0, 85.0), (-25.0, 105.0), (-180.0, 180.0))
+# The linkage's limit is in no manual; a real arm alarms at exactly 60 deg.
+MG400_NOMINAL = LinkageKinematics(175.0, 175.0, 109.5, -53.8, _MG400_LIMITS_DEG, 60.0)
+MG400 = LinkageKinematics(174.207, 175.070, 109.500, -53.000, _MG400_LIMITS_DEG, 60.0)  # fitted to a real arm
+MG400_REACH_MM = 440.0
+_MAGICIAN_LIMITS_DEG = ((-125.0, 125.0), (-5.0, 90.0), (-15.0, 70.0), (-150.0, 150.0))  # those in use
+MAGICIAN = LinkageKinematics(135.0, 147.0, 0.0, 0.0, _MAGICIAN_LIMITS_DEG)
+
+
+@dataclass(frozen=True)
+class StageKinematics:
+    """An ideal stage of six axes: its "joints" are the pose, three in mm and three in deg."""
+
+    axes: int = 6
+
+    def forward(self, joints_deg: np.ndarray) -> np.ndarray:
+        return np.array(joints_deg, float)
+
+    def inverse(self, pose: np.ndarray) -> np.ndarray:
+        return np.array(pose, float)
+
+    def violation(self, joints_deg: np.ndarray) -> Violation | None:
+        return None
+
+    def nearest_pose(self, pose: np.ndarray) -> np.ndarray:
+        return np.array(pose, float)

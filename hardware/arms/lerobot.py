@@ -1,0 +1,66 @@
+"""An arm in the shape of a LeRobot robot (matched by shape; nothing of LeRobot is needed)."""
+
+from functools import cached_property
+
+import numpy as np
+
+from hardware.arms.arm import Arm
+
+_POSE = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class LeRobotArm:
+    """An arm as LeRobot's scripts have it: observations and actions are dicts of floats, in mm and deg.
+
+    Parameters
+    ----------
+    arm : Arm
+        Give a ``SafeArm`` to have actions clipped; ``send_action`` tells what was really sent.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        self.arm, self.name = arm, arm.name
+
+    @cached_property
+    def _keys(self) -> tuple[str, ...]:
+        return _POSE if self.arm.axes == 6 else tuple(key for key in _POSE if key not in ("rx", "ry"))
+
+    @property
+    def observation_features(self) -> dict[str, type]:
+        joints = {f"joint_{n}.pos": float for n in range(1, self.arm.axes + 1)}
+        return {key: float for key in self._keys} | joints
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        return {key: float for key in self._keys}
+
+    @property
+    def is_connected(self) -> bool:
+        return self.arm.is_connected
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Always: these arms know their joints' zeros (a Magician once it was homed)."""
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Connect and enable; there is nothing to calibrate."""
+        self.arm.connect()
+        self.arm.enable()
+
+    def get_observation(self) -> dict[str, float]:
+        state = self.arm.state()
+        pose = dict(zip(_POSE, state.pose.tolist(), strict=True))
+        return {key: pose[key] for key in self._keys} | {f"joint_{n}.pos": float(q) for n, q in enumerate(state.joints_deg, start=1)}
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        """Begin a move towards the pose and don't wait for it; keys left out stay. Returns what was really sent."""
+        unknown = set(action) - set(_POSE)
+        if unknown:
+            raise KeyError(f"an action has the keys {', '.join(self._keys)}, not {', '.join(sorted(unknown))}")
+        pose = dict(zip(_POSE, self.arm.state().pose.tolist(), strict=True)) | action
+        sent = self.arm.move_linear(np.array([pose[key] for key in _POSE], float), wait=False)
+        return {key: float(value) for key, value in zip(_POSE, sent, strict=True) if key in self._keys}
+
+    def disconnect(self) -> None:
+        self.arm.disconnect()

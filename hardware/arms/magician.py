@@ -1,0 +1,241 @@
+"""Driver of the Dobot Magician over its serial port."""
+
+import contextlib
+import struct
+import termios
+import time
+from dataclasses import replace
+from threading import RLock
+
+import numpy as np
+import serial
+from serial.tools import list_ports
+
+from hardware.arms.arm import ArmState
+from hardware.arms.base import POLL_S, BaseArm
+from hardware.arms.dobot_alarms import explain
+from hardware.arms.kinematics import MAGICIAN, OutOfReachError
+from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+
+REPLY_TIMEOUT_S = 0.3  # a reply takes some 10 ms
+TRIES = 4  # what is sent may be sent again: moves are absolute, a second one moves nothing
+HOME_TIMEOUT_S = 60.0
+PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)  # what pyserial raises when a port vanishes
+ACCELERATION = 4.0  # mm/s2 and deg/s2 for each mm/s and deg/s: full speed within a quarter of a second
+
+
+class Magician(BaseArm):
+    """A Dobot Magician.
+
+    It has no switch for its motors: ``enable`` lets us move it, ``disable`` stops it and no longer does.
+
+    Parameters
+    ----------
+    port : str
+        For example ``/dev/ttyUSB0``.
+    tool_x_mm : float
+        Reach of the tool beyond the wrist.
+    """
+
+    axes = 4
+
+    def __init__(self, port: str, *, tool_x_mm: float = 0.0) -> None:
+        self.name, self._port_name = f"Magician at {port}", port
+        self.kinematics = replace(MAGICIAN, r0_mm=tool_x_mm)
+        self._serial: serial.Serial | None = None
+        self._lock, self._buffer = RLock(), b""
+        self._enabled = False
+        self._last_index: int | None = None  # of the newest move, None if none is to come
+
+    @property
+    def is_connected(self) -> bool:
+        return self._serial is not None
+
+    def connect(self) -> None:
+        self._require_disconnected()
+        try:
+            self._serial = serial.Serial(self._port_name, BAUD, timeout=0.05, write_timeout=REPLY_TIMEOUT_S, exclusive=True)
+        except PORT_ERRORS as error:
+            attached = [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
+            raise DeviceNotConnectedError(
+                f"{self.name}: can't open the port ({error}); Magicians attached: {', '.join(attached) or 'none'}. Plug in the USB cable "
+                "and switch the arm on; the user must be in the group 'dialout', and no other program may hold the port; "
+                "without an arm: 'twin emulate magician'"
+            ) from error
+        try:
+            self._buffer = b""
+            self._request(Id.GET_POSE)
+        except BaseException:
+            self._close()
+            raise
+
+    def disconnect(self) -> None:
+        if self.is_connected:
+            with contextlib.suppress(DeviceError):
+                self.stop()
+            self._close()
+
+    def enable(self) -> None:
+        self._require_connected()
+        if alarms := self._alarms():
+            raise DeviceError(f"{self.name}: {explain(alarms)}")
+        self._request(Id.END_EFFECTOR, struct.pack("<3f", self.kinematics.r0_mm, 0.0, 0.0), ctrl=WRITE)
+        self._request(Id.PTP_COMMON_PARAMS, struct.pack("<2f", 100.0, 100.0), ctrl=WRITE)
+        self._forget_queue()
+        self._request(Id.QUEUE_START, ctrl=WRITE)
+        self._enabled = True
+
+    def disable(self) -> None:
+        self.stop()
+        self._enabled = False
+
+    def clear_error(self) -> None:
+        self._forget_queue()
+        self._request(Id.ALARMS, ctrl=WRITE)
+        self._request(Id.QUEUE_START, ctrl=WRITE)
+
+    def stop(self) -> None:
+        self._forget_queue()
+        self._request(Id.QUEUE_START, ctrl=WRITE)  # empty now; without this the next move would wait for ever
+
+    def home(self, *, timeout_s: float = HOME_TIMEOUT_S) -> None:
+        """Find the joints' zeros. The arm moves through its whole range: keep clear of it."""
+        self._require_enabled()
+        self._last_index = self._index_of(self._request(Id.HOME, struct.pack("<I", 0), ctrl=WRITE | QUEUED))
+        self._await_queue(timeout_s)
+
+    def state(self, *, max_age_s: float = 1.0) -> ArmState:
+        self._require_connected()
+        begun_s = time.monotonic()
+        try:
+            moving = self._last_index is not None and self._index_of(self._request(Id.QUEUE_INDEX)) < self._last_index
+            values = np.array(struct.unpack("<8f", self._request(Id.GET_POSE)))
+            alarms = self._alarms()
+        except DeviceNotConnectedError:
+            raise
+        except DeviceError as error:
+            raise StaleDataError(f"{error}. Don't trust the last pose") from error
+        if time.monotonic() - begun_s > max_age_s:
+            raise StaleDataError(
+                f"{self.name}: the arm took {time.monotonic() - begun_s:.2f} s to tell its state (allowed {max_age_s:g} s)"
+            )
+        pose = np.array([*values[:3], 0.0, 0.0, values[3]])
+        return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
+
+    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
+        self._require_connected()
+        if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
+            raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
+        line = (linear_mm_s, angular_deg_s, ACCELERATION * linear_mm_s, ACCELERATION * angular_deg_s)
+        joints = [angular_deg_s] * 4 + [ACCELERATION * angular_deg_s] * 4
+        self._request(Id.PTP_COORDINATE_PARAMS, struct.pack("<4f", *line), ctrl=WRITE)
+        self._request(Id.PTP_JOINT_PARAMS, struct.pack("<8f", *joints), ctrl=WRITE)
+
+    def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        sent = self.kinematics.nearest_pose(pose)
+        try:
+            joints = self.kinematics.inverse(sent) if np.isfinite(sent).all() else np.full(4, np.nan)
+        except OutOfReachError as error:
+            raise DeviceError(f"{self.name}: {error}; nothing was sent") from error
+        self._move(Ptp.MOVL_XYZ, sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
+        return sent
+
+    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        sent = np.array(joints_deg, float)
+        if sent.shape != (4,):
+            raise DeviceError(f"{self.name}: {sent.size} joint angles; it has 4 joints")
+        self._move(Ptp.MOVJ_ANGLE, sent, sent, self.kinematics.forward(sent), wait=wait, timeout_s=timeout_s)
+        return sent
+
+    def _move(self, mode: Ptp, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray, *, wait: bool, timeout_s: float) -> None:
+        self._require_enabled()
+        if not np.isfinite(joints).all():
+            raise DeviceError(f"{self.name}: the target {numbers} is not a number; nothing was sent")
+        if violation := self.kinematics.violation(joints):
+            raise DeviceError(f"{self.name}: {violation.text}; nothing was sent. Choose a target within reach and limits")
+        if alarms := self._alarms():
+            raise DeviceError(f"{self.name}: {explain(alarms)}")
+        begun_s = time.monotonic()
+        self._last_index = self._index_of(self._request(Id.PTP, struct.pack("<B4f", mode, *numbers), ctrl=WRITE | QUEUED))
+        if not wait:
+            return
+        try:
+            self._await_queue(timeout_s)
+            self.wait_settled(pose, timeout_s=max(begun_s + timeout_s - time.monotonic(), 0.2))
+        except BaseException:  # also Ctrl-C: what was begun must not go on unwatched
+            with contextlib.suppress(DeviceError):
+                self.stop()
+            raise
+
+    def _await_queue(self, timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while (state := self.state()).moving or state.error:
+            if state.error:
+                raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
+                    "or look for what holds the arm"
+                )
+            time.sleep(POLL_S)
+
+    def _forget_queue(self) -> None:
+        """Stop at once and empty the queue."""
+        self._require_connected()
+        self._request(Id.QUEUE_FORCE_STOP, ctrl=WRITE)
+        self._request(Id.QUEUE_CLEAR, ctrl=WRITE)
+        self._last_index = None
+
+    def _alarms(self) -> list[int]:
+        bits = int.from_bytes(self._request(Id.ALARMS), "little")
+        return [n for n in range(bits.bit_length()) if bits >> n & 1]
+
+    @staticmethod
+    def _index_of(payload: bytes) -> int:
+        return int.from_bytes(payload[:8], "little")
+
+    def _require_enabled(self) -> None:
+        self._require_connected()
+        if not self._enabled:
+            raise DeviceError(f"{self.name}: not enabled; call enable() first")
+
+    def _request(self, id: Id, params: bytes = b"", *, ctrl: int = 0) -> bytes:
+        """Send a command and wait for the reply with the same id and ctrl; send again if none comes or it is damaged."""
+        sent = Message(id, ctrl, params).to_bytes()
+        with self._lock:
+            for _ in range(TRIES):
+                self._require_connected()
+                try:
+                    self._serial.reset_input_buffer()
+                    self._buffer = b""
+                    self._serial.write(sent)
+                    if (reply := self._reply(id, ctrl)) is not None:
+                        return reply.params
+                except PORT_ERRORS as error:
+                    self._close()
+                    raise DeviceNotConnectedError(
+                        f"{self.name}: the port vanished ({error}). The arm goes on with what is queued: switch it off if it moves! "
+                        "Plug the cable in, then connect() again"
+                    ) from error
+        raise DeviceError(
+            f"{self.name}: no valid reply to command {int(id)} in {TRIES} tries of {REPLY_TIMEOUT_S:g} s; switch the arm on, "
+            "check that the port is a Magician's and the cable is sound"
+        )
+
+    def _reply(self, id: Id, ctrl: int) -> Message | None:
+        deadline = time.monotonic() + REPLY_TIMEOUT_S
+        while time.monotonic() < deadline:
+            self._buffer += self._serial.read(max(1, self._serial.in_waiting))
+            message, self._buffer = take_message(self._buffer)
+            while message is not None:
+                if (message.id, message.ctrl) == (id, ctrl):
+                    return message
+                message, self._buffer = take_message(self._buffer)
+        return None
+
+    def _close(self) -> None:
+        if self._serial is not None:
+            with contextlib.suppress(*PORT_ERRORS):
+                self._serial.close()
+        self._serial, self._enabled, self._last_index = None, False, None

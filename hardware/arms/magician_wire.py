@@ -1,0 +1,112 @@
+"""What goes over the Magician's serial line: ``AA AA | len | id | ctrl | params | checksum``. Used by driver and emulator."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+BAUD = 115200  # 8N1
+USB_VENDORS = {4292: "CP210x", 6790: "CH340"}
+HEADER = b"\xaa\xaa"
+LENGTH_LIMIT = 0xAA  # a length is below; so AA AA AA never begins a frame at its first byte
+WRITE, QUEUED = 1, 2  # bits of ctrl
+
+
+class Id(IntEnum):
+    """Commands."""
+
+    GET_POSE = 10
+    RESET_POSE = 11
+    ALARMS = 20  # read: the state; write: clear them (the manual prints 21, devices use 20)
+    HOME_PARAMS = 30
+    HOME = 31
+    END_EFFECTOR = 60
+    LASER = 61
+    SUCTION = 62
+    GRIPPER = 63
+    JOG_JOINT_PARAMS = 70
+    JOG_COORDINATE_PARAMS = 71
+    JOG_COMMON_PARAMS = 72
+    JOG = 73
+    PTP_JOINT_PARAMS = 80
+    PTP_COORDINATE_PARAMS = 81
+    PTP_JUMP_PARAMS = 82
+    PTP_COMMON_PARAMS = 83
+    PTP = 84
+    CP_PARAMS = 90
+    CP = 91
+    WAIT = 110
+    IO = 131
+    QUEUE_START = 240
+    QUEUE_STOP = 241
+    QUEUE_FORCE_STOP = 242
+    QUEUE_CLEAR = 245
+    QUEUE_INDEX = 246
+    QUEUE_SPACE = 247
+
+
+class Ptp(IntEnum):
+    """Modes of a point-to-point command."""
+
+    JUMP_XYZ = 0
+    MOVJ_XYZ = 1
+    MOVL_XYZ = 2
+    JUMP_ANGLE = 3
+    MOVJ_ANGLE = 4
+    MOVL_ANGLE = 5
+    MOVJ_INC = 6
+    MOVL_INC = 7
+    MOVJ_XYZ_INC = 8
+    JUMP_MOVL_XYZ = 9
+
+
+@dataclass(frozen=True)
+class Message:
+    """One frame without its wrapping."""
+
+    id: int
+    ctrl: int = 0
+    params: bytes = b""
+
+    @property
+    def is_write(self) -> bool:
+        return bool(self.ctrl & WRITE)
+
+    @property
+    def is_queued(self) -> bool:
+        return bool(self.ctrl & QUEUED)
+
+    def to_bytes(self) -> bytes:
+        """The frame; ``ValueError`` if the parameters are too long for one."""
+        length = 2 + len(self.params)
+        if length >= LENGTH_LIMIT:
+            raise ValueError(f"{len(self.params)} bytes of parameters; a frame holds at most {LENGTH_LIMIT - 3}")
+        body = bytes([self.id, self.ctrl]) + self.params
+        return HEADER + bytes([length]) + body + bytes([checksum(body)])
+
+
+def checksum(body: bytes) -> int:
+    """Two's complement of the sum of id, ctrl and params."""
+    return -sum(body) & 0xFF
+
+
+def take_message(buffer: bytes) -> tuple[Message | None, bytes]:
+    """The first valid frame in what has arrived, and what is left.
+
+    Noise and frames with a wrong checksum are skipped; AA within the parameters is legal, so a frame is only
+    believed as a whole. Bytes that may still become a frame are kept.
+    """
+    start, unfinished = buffer.find(HEADER), None
+    while start >= 0:
+        if start + 3 > len(buffer):
+            unfinished = start if unfinished is None else unfinished
+            break
+        end = start + 3 + buffer[start + 2] + 1
+        if 2 <= buffer[start + 2] < LENGTH_LIMIT:
+            body = buffer[start + 3 : end - 1]
+            if end <= len(buffer) and buffer[end - 1] == checksum(body):
+                return Message(body[0], body[1], body[2:]), buffer[end:]
+            if end > len(buffer) and unfinished is None:
+                unfinished = start
+        start = buffer.find(HEADER, start + 1)
+    if unfinished is not None:
+        return None, buffer[unfinished:]
+    return None, buffer[-1:] if buffer.endswith(HEADER[:1]) else b""

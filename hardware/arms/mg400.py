@@ -1,0 +1,283 @@
+"""Driver of the Dobot MG400 over TCP."""
+
+import contextlib
+import re
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from hardware.arms import kinematics as arms
+from hardware.arms.arm import ArmState
+from hardware.arms.base import POLL_S, BaseArm
+from hardware.arms.dobot_alarms import explain
+from hardware.arms.kinematics import LinkageKinematics, OutOfReachError
+from hardware.arms.mg400_link import SILENCE_S, CommandPort, Feedback
+from hardware.arms.mg400_wire import (
+    DASHBOARD_PORT,
+    DEFAULT_HOSTS,
+    FEEDBACK_PERIOD_S,
+    MAX_JOINT_DEG_S,
+    MAX_LINEAR_MM_S,
+    MOTION_PORT,
+    Mode,
+    Reply,
+    why_refused,
+)
+from hardware.errors import DeviceError, DeviceNotConnectedError
+
+ENABLE_TIMEOUT_S = 5.0
+SETTLE_S = 0.5  # at least, for feedback to confirm a move: two periods of the slow port
+RESTED_S = 0.05  # without replies (old firmware), at rest for this long counts as done
+
+
+@dataclass(frozen=True)
+class Mg400Ports:
+    """Where the arm listens; the feedback ports are tried in order."""
+
+    dashboard: int = DASHBOARD_PORT
+    motion: int = MOTION_PORT
+    feedback: tuple[int, ...] = tuple(FEEDBACK_PERIOD_S)[:2]
+
+    def shifted(self, offset: int) -> "Mg400Ports":
+        """All of them, so much higher."""
+        return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
+
+
+class MG400(BaseArm):
+    """A Dobot MG400.
+
+    Its pose is that of the tool in the user frame that are selected in the arm (0 and 0 after ``enable``).
+
+    Parameters
+    ----------
+    host : str
+    ports : Mg400Ports
+    kinematics : LinkageKinematics
+        Checks targets before they are sent, so that the arm need not alarm.
+    """
+
+    axes = 4
+
+    def __init__(
+        self,
+        host: str = DEFAULT_HOSTS["LAN1"],
+        *,
+        ports: Mg400Ports = Mg400Ports(),  # noqa: B008  (frozen)
+        kinematics: LinkageKinematics = arms.MG400,
+    ) -> None:
+        self.name, self.kinematics = f"MG400 at {host}", kinematics
+        self._dashboard = CommandPort(self.name, host, ports.dashboard)
+        self._motion = CommandPort(self.name, host, ports.motion)
+        self._feedback = Feedback(self.name, host, ports.feedback)
+        self._in_use = False  # between connect and disconnect, connections lost or not
+        self._bare = False  # old firmware: echoes on the dashboard, nothing on the motion port
+        self._alarm_text: str | None = None
+
+    @property
+    def is_connected(self) -> bool:
+        return self._dashboard.is_open and self._motion.is_open
+
+    def connect(self) -> None:
+        self._require_disconnected()
+        self._close()  # what is left of a lost connection
+        try:
+            self._dashboard.open()
+            self._motion.open()
+            self._feedback.open()
+            self._bare = self._dashboard.request("RobotMode()").error_id is None
+            self._ask("RobotMode()")
+            self._in_use = True
+        except BaseException:
+            self._close()
+            raise
+
+    def disconnect(self) -> None:
+        if self._dashboard.is_open:
+            for request in ("ResetRobot()", "DisableRobot()"):
+                with contextlib.suppress(DeviceError):
+                    self._dashboard.request(request)
+        self._close()
+
+    def enable(self) -> None:
+        self._require_connected()
+        if self._mode() == Mode.ERROR:
+            raise DeviceError(f"{self.name}: {self._alarm()}")
+        for request in ("EnableRobot()", "User(0)", "Tool(0)"):
+            self._ask(request)
+        self._await_mode(lambda mode: mode in (Mode.ENABLED, Mode.RUNNING), "was not enabled; check its button and that no stop is pressed")
+
+    def disable(self) -> None:
+        self._require_connected()
+        self._ask("DisableRobot()")
+
+    def clear_error(self) -> None:
+        """Clear the alarms and forget the queue; after an emergency stop ``enable`` brings the arm back."""
+        self._require_connected()
+        with contextlib.suppress(DeviceError):
+            self._ask("ResetRobot()")
+        self._ask("ClearError()")
+        self._await_mode(lambda mode: mode != Mode.ERROR, "the alarm stays; remove its cause (release the emergency stop, free the arm)")
+        self._alarm_text = None
+
+    def stop(self) -> None:
+        if not self._in_use:
+            self._require_connected()
+        try:
+            if not self._dashboard.is_open:  # lost: the arm may still move, so try once more to reach it
+                self._dashboard.open()
+            self._ask("ResetRobot()")
+        except DeviceNotConnectedError as error:
+            raise DeviceNotConnectedError(f"{self.name}: can't be told to stop. Press its emergency stop! {error}") from error
+
+    def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
+        self._require_connected()
+        packet, time_s = self._feedback.newest(max_age_s)
+        x, y, z, turn = packet["tool_actual"][:4]
+        mode = int(packet["mode"])
+        if mode != Mode.ERROR:
+            self._alarm_text = None
+        return ArmState(
+            np.array([x, y, z, 0.0, 0.0, turn]),
+            packet["q_actual"][:4].copy(),
+            time_s,
+            bool(packet["enabled"]),
+            mode in (Mode.RUNNING, Mode.JOG),
+            self._alarm() if mode == Mode.ERROR else "",
+        )
+
+    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
+        """The arm takes whole percents of its fastest, at least 1; lower speeds become that."""
+        self._require_connected()
+        if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
+            raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
+        self.set_speed_percent(linear=100 * linear_mm_s / MAX_LINEAR_MM_S, angular=100 * angular_deg_s / MAX_JOINT_DEG_S)
+
+    def set_speed_percent(self, *, linear: float | None = None, angular: float | None = None, overall: float | None = None) -> None:
+        """``SpeedL``, ``SpeedJ`` and ``SpeedFactor``, which all multiply; rounded down to whole percents."""
+        self._require_connected()
+        for name, percent in (("SpeedL", linear), ("SpeedJ", angular), ("SpeedFactor", overall)):
+            if percent is not None:
+                self._ask(f"{name}({int(np.clip(np.floor(percent + 1e-9), 1, 100))})")
+
+    def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        sent = self.kinematics.nearest_pose(pose)
+        try:
+            joints = self.kinematics.inverse(sent) if np.isfinite(sent).all() else np.full(4, np.nan)
+        except OutOfReachError as error:
+            raise DeviceError(f"{self.name}: {error}; nothing was sent") from error
+        self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
+        return sent
+
+    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        sent = np.array(joints_deg, float)
+        if sent.shape != (4,):
+            raise DeviceError(f"{self.name}: {sent.size} joint angles; it has 4 joints")
+        self._move("JointMovJ", sent, sent, None, wait=wait, timeout_s=timeout_s)
+        return sent
+
+    def _move(
+        self, command: str, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float
+    ) -> None:
+        self._require_connected()
+        if not np.isfinite(joints).all():
+            raise DeviceError(f"{self.name}: the target {numbers} is not a number; nothing was sent")
+        if violation := self.kinematics.violation(joints):
+            raise DeviceError(f"{self.name}: {violation.text}; nothing was sent. Choose a target within reach and limits")
+        packet, _ = self._feedback.newest(SILENCE_S)  # old firmware would not tell
+        if int(packet["mode"]) == Mode.ERROR:
+            raise DeviceError(f"{self.name}: {self._alarm()}")
+        if not packet["enabled"]:
+            raise DeviceError(f"{self.name}: not enabled; call enable() first")
+        begun_s = time.monotonic()
+        self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)})")
+        if not wait:
+            return
+        try:
+            self._await_queue(begun_s + timeout_s, timeout_s)
+            left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
+            if pose is not None:
+                self.wait_settled(pose, timeout_s=left_s)
+            else:
+                self._await_joints(joints, left_s)
+        except BaseException:  # also Ctrl-C: what was begun must not go on unwatched
+            with contextlib.suppress(DeviceError):
+                self.stop()
+            raise
+
+    def _send_motion(self, text: str) -> None:
+        if self._bare:
+            self._motion.send(text)
+        else:
+            self._check(text, self._motion.request(text))
+
+    def _await_queue(self, deadline: float, timeout_s: float) -> None:
+        """Wait for ``Sync``, raced against an alarm, silence and the time limit. A move may never show as RUNNING."""
+        if not self._bare:
+            self._motion.send("Sync()")
+        rest_since, asked_s = None, time.monotonic()
+        while True:
+            if not self._bare and self._motion.poll("Sync()", wait_s=POLL_S):
+                return
+            state = self.state()
+            if state.error:
+                self._forget_sync()
+                raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
+            rest_since = None if state.moving or state.time_s < asked_s else rest_since or state.time_s
+            if self._bare and rest_since is not None and state.time_s - rest_since > RESTED_S:
+                return
+            if time.monotonic() > deadline:
+                self._forget_sync()
+                raise DeviceError(
+                    f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
+                    "or look for what holds the arm"
+                )
+            if self._bare:
+                time.sleep(POLL_S)
+
+    def _forget_sync(self) -> None:
+        """A ``Sync`` without its reply would confuse the next one: begin the connection anew."""
+        with contextlib.suppress(DeviceError):
+            self._motion.open()
+
+    def _await_joints(self, joints: np.ndarray, timeout_s: float) -> None:
+        self.wait_settled(self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s)  # the lengths are not exactly this arm's
+
+    def _await_mode(self, reached, otherwise: str) -> None:
+        """Wait for feedback in such a mode that came after now."""
+        asked_s = time.monotonic()
+        while True:
+            packet, time_s = self._feedback.newest(SILENCE_S)
+            if time_s > asked_s and reached(int(packet["mode"])):
+                return
+            if time.monotonic() - asked_s > ENABLE_TIMEOUT_S:
+                raise DeviceError(f"{self.name}: {otherwise} (mode {int(packet['mode'])})")
+            time.sleep(POLL_S)
+
+    def _mode(self) -> int:
+        return int(self._feedback.newest(SILENCE_S)[0]["mode"])
+
+    def _alarm(self) -> str:
+        """The alarms, asked for once."""
+        if self._alarm_text is None:
+            ids: list[int] = []
+            with contextlib.suppress(DeviceError):
+                groups = re.findall(r"\[([^\[\]]*)\]", self._dashboard.request("GetErrorID()").values)  # 5 to 7 of them
+                ids = [int(text) for group in groups for text in re.findall(r"-?\d+", group)]
+            self._alarm_text = explain(ids)
+        return self._alarm_text
+
+    def _ask(self, request: str) -> Reply:
+        reply = self._dashboard.request(request)
+        self._check(request, reply)
+        return reply
+
+    def _check(self, request: str, reply: Reply) -> None:
+        if reply.error_id:
+            raise DeviceError(f"{self.name}: {why_refused(reply.error_id, request)}")
+
+    def _close(self) -> None:
+        self._in_use = False
+        self._dashboard.close()
+        self._motion.close()
+        self._feedback.close()

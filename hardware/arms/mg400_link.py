@@ -1,0 +1,211 @@
+"""The MG400's connections: one for requests and replies, one that keeps the newest feedback."""
+
+import contextlib
+import socket
+import time
+from threading import Condition, Event, RLock, Thread
+
+import numpy as np
+
+from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+
+CONNECT_TIMEOUT_S = 2.0
+REPLY_TIMEOUT_S = 2.0
+SILENCE_S = 1.0  # feedback older than this counts for nothing, and its connection is given up
+RECONNECT_S = 0.5  # the arm's users wait 5 s; a servo that holds still wants to know sooner
+BACKLOG_BYTES = 64 * PACKET_BYTES  # read at once: more than comes in half a second
+
+
+class CommandPort:
+    """Requests and their replies over one connection. Calls from several threads take turns."""
+
+    def __init__(self, name: str, host: str, port: int) -> None:
+        self._name, self._address = name, (host, port)
+        self._socket: socket.socket | None = None
+        self._lock, self._buffer = RLock(), ""
+
+    @property
+    def is_open(self) -> bool:
+        return self._socket is not None
+
+    def open(self) -> None:
+        self.close()
+        try:
+            self._socket = socket.create_connection(self._address, CONNECT_TIMEOUT_S)
+        except OSError as error:
+            host, port = self._address
+            raise DeviceNotConnectedError(
+                f"{self._name}: no connection to {host}:{port} ({error.strerror or error}). Check that the arm is on, that this machine "
+                f"has an address in its network ('ping {host}') and that no other program holds the port; without an arm: "
+                "'twin emulate mg400' and mg400:127.0.0.1"
+            ) from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def close(self) -> None:
+        with self._lock:
+            if self._socket is not None:
+                self._socket.close()
+            self._socket, self._buffer = None, ""
+
+    def request(self, text: str, *, timeout_s: float = REPLY_TIMEOUT_S) -> Reply:
+        """Send a request and wait for its reply; late replies to others are dropped.
+
+        Raises
+        ------
+        DeviceNotConnectedError
+            The connection is lost.
+        DeviceError
+            No reply in time.
+        """
+        with self._lock:
+            self.send(text)
+            deadline = time.monotonic() + timeout_s
+            while time.monotonic() < deadline:
+                if reply := self.poll(text, wait_s=deadline - time.monotonic()):
+                    return reply
+        host, port = self._address
+        raise DeviceError(f"{self._name}: no reply to {text} from {host}:{port} within {timeout_s:g} s; check the arm, then connect again")
+
+    def send(self, text: str) -> None:
+        with self._lock:
+            if self._socket is None:
+                raise DeviceNotConnectedError(f"{self._name}: the connection was lost; disconnect() and connect() again")
+            try:
+                self._socket.settimeout(REPLY_TIMEOUT_S)
+                self._socket.sendall(text.encode("ascii"))
+            except OSError as error:
+                self._lost(error)
+
+    def poll(self, request: str, *, wait_s: float) -> Reply | None:
+        """The reply to a request, if it comes within ``wait_s``."""
+        with self._lock:
+            deadline = time.monotonic() + wait_s
+            wanted = request.split("(")[0].lower()
+            while True:
+                reply, self._buffer = take_reply(self._buffer)
+                if reply is not None and reply.name == wanted:
+                    return reply
+                if reply is None and (time.monotonic() >= deadline or not self._receive(deadline)):
+                    return None
+
+    def _receive(self, deadline: float) -> bool:
+        if self._socket is None:
+            raise DeviceNotConnectedError(f"{self._name}: the connection was lost; disconnect() and connect() again")
+        try:
+            self._socket.settimeout(max(deadline - time.monotonic(), 1e-4))
+            data = self._socket.recv(4096)
+        except TimeoutError:
+            return False
+        except OSError as error:
+            self._lost(error)
+        if not data:
+            self._lost(None)
+        self._buffer += data.decode("ascii", errors="replace")
+        return True
+
+    def _lost(self, error: OSError | None) -> None:
+        self.close()
+        reason = f" ({error.strerror or error})" if error else ""
+        raise DeviceNotConnectedError(
+            f"{self._name}: the arm closed the connection{reason}. Check its power and cable, then disconnect() and connect() again"
+        ) from error
+
+
+class Feedback:
+    """The newest feedback packet, kept by a thread that reads everything there is and reconnects after silence.
+
+    Attributes
+    ----------
+    skipped_bytes : int
+        That were no whole, valid packet.
+    reconnects : int
+    """
+
+    def __init__(self, name: str, host: str, ports: tuple[int, ...]) -> None:
+        self._name, self._host, self._ports = name, host, ports
+        self._newest: tuple[np.void, float] | None = None
+        self._arrived, self._ended = Condition(), Event()
+        self._thread: Thread | None = None
+        self.skipped_bytes = self.reconnects = 0
+
+    def open(self) -> None:
+        """Connect, to the first port that lets us, and wait for a packet.
+
+        Raises
+        ------
+        DeviceNotConnectedError
+            No port lets us, or nothing comes.
+        """
+        connection = self._connect()
+        self._ended.clear()
+        self._thread = Thread(target=self._read, args=(connection,), daemon=True, name="mg400-feedback")
+        self._thread.start()
+        with self._arrived:
+            if not self._arrived.wait_for(lambda: self._newest is not None, CONNECT_TIMEOUT_S):
+                self.close()
+                raise DeviceNotConnectedError(f"{self._name}: connected, but no valid feedback came; restart the arm, then connect again")
+
+    def close(self) -> None:
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join(timeout=2.0)
+        self._thread, self._newest = None, None
+
+    def newest(self, max_age_s: float) -> tuple[np.void, float]:
+        """The newest packet and when it arrived.
+
+        Raises
+        ------
+        StaleDataError
+            It is older than ``max_age_s``.
+        """
+        with self._arrived:
+            newest = self._newest
+        age_s = np.inf if newest is None else time.monotonic() - newest[1]
+        if age_s > max_age_s:
+            raise StaleDataError(
+                f"{self._name}: no feedback for {age_s:.1f} s (allowed {max_age_s:g} s); the reader keeps trying to reconnect. "
+                "Don't trust the last pose: stop, check the cable, then go on"
+            )
+        return newest
+
+    def _connect(self) -> socket.socket:
+        errors = []
+        for port in self._ports:
+            try:
+                return socket.create_connection((self._host, port), CONNECT_TIMEOUT_S)
+            except OSError as error:
+                errors.append(f"{port}: {error.strerror or error}")
+        raise DeviceNotConnectedError(
+            f"{self._name}: no feedback port of {self._host} takes connections ({'; '.join(errors)}); close other programs that use the arm"
+        )
+
+    def _read(self, connection: socket.socket) -> None:
+        while not self._ended.is_set():
+            with contextlib.suppress(OSError):
+                self._read_until_silent(connection)
+            connection.close()
+            if self._ended.wait(RECONNECT_S):
+                return
+            with contextlib.suppress(DeviceNotConnectedError):
+                connection = self._connect()
+                self.reconnects += 1
+
+    def _read_until_silent(self, connection: socket.socket) -> None:
+        connection.settimeout(SILENCE_S / 4)
+        buffer, valid_s = b"", time.monotonic()
+        while not self._ended.is_set() and time.monotonic() - valid_s < SILENCE_S:
+            try:
+                data = connection.recv(BACKLOG_BYTES)
+            except TimeoutError:
+                continue
+            if not data:
+                return
+            packet, buffer, skipped = newest_packet(buffer + data)
+            self.skipped_bytes += skipped
+            if packet is not None and len(data) < BACKLOG_BYTES:  # else older ones still wait to be read
+                valid_s = time.monotonic()
+                with self._arrived:
+                    self._newest = (packet, valid_s)
+                    self._arrived.notify_all()

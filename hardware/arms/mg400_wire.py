@@ -1,0 +1,176 @@
+"""What goes over the MG400's wires: ports, error ids, modes, replies and the feedback packet. Used by driver and emulator."""
+
+import re
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+DASHBOARD_PORT, MOTION_PORT = 29999, 30003
+FEEDBACK_PERIOD_S = {30004: 0.008, 30005: 0.2, 30006: 0.05}
+DEFAULT_HOSTS = {"LAN1": "192.168.1.6", "LAN2": "192.168.2.6", "Wi-Fi": "192.168.9.1"}
+
+# Speed at SpeedL and SpeedJ of 100 %. The vendor's figures have not been verified on an arm: taken high, so
+# that an arm never moves faster than it was asked to.
+MAX_LINEAR_MM_S, MAX_JOINT_DEG_S = 1000.0, 300.0
+
+
+class ErrorId(IntEnum):
+    """First number of a reply; of the last two n is added, the number of the parameter (from 1)."""
+
+    ACCEPTED = 0
+    FAILED = -1
+    NO_SUCH_COMMAND = -10000
+    PARAMETER_COUNT = -20000
+    PARAMETER_TYPE = -30000
+    PARAMETER_RANGE = -40000
+
+
+class Mode(IntEnum):
+    """``RobotMode``."""
+
+    INIT = 1
+    BRAKE_OPEN = 2
+    POWER_STATUS = 3
+    DISABLED = 4
+    ENABLED = 5
+    BACKDRIVE = 6
+    RUNNING = 7
+    RECORDING = 8
+    ERROR = 9
+    PAUSE = 10
+    JOG = 11
+
+
+@dataclass(frozen=True)
+class Reply:
+    """One reply; ``error_id`` is None for the bare echo of old firmware."""
+
+    error_id: int | None
+    values: str
+    echo: str
+
+    @property
+    def name(self) -> str:
+        return self.echo.split("(")[0].strip().lower()
+
+    def numbers(self) -> list[float]:
+        return [float(text) for text in re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", self.values)]
+
+
+def take_reply(buffer: str) -> tuple[Reply | None, str]:
+    """The first complete reply in what has arrived, and what is left.
+
+    Replies end at ``;``, except that a refusal may come as two fragments: ``-1,{},;EnableRobot();``.
+    """
+    end = buffer.find(";")
+    while end >= 0:
+        text = buffer[:end].strip()
+        numbered = re.fullmatch(r"(-?\d+)\s*,\s*\{(.*)\}\s*,?\s*;?\s*(.*)", text, re.DOTALL)
+        if numbered and numbered[3]:
+            return Reply(int(numbered[1]), numbered[2], numbered[3]), buffer[end + 1 :]
+        if not numbered:
+            return Reply(None, "", text), buffer[end + 1 :]
+        end = buffer.find(";", end + 1)  # the echo is still to come
+    return None, buffer
+
+
+def why_refused(error_id: int, request: str) -> str:
+    """What an error id means, with the remedy."""
+    if error_id == ErrorId.FAILED:
+        return (
+            f"the arm refused {request} (-1). If it refuses everything it is not in TCP mode: in DobotStudio Pro choose "
+            "TCP/IP Secondary Development; else it is disabled, in error, or the user or tool frame does not exist"
+        )
+    if error_id == ErrorId.NO_SUCH_COMMAND:
+        return (
+            f"the arm knows no {request} (-10000). If it says so to everything, the motion port 30003 is not open or another client "
+            "holds it: close other programs (DobotStudio Pro, scripts), then connect again; else its firmware is too old"
+        )
+    if error_id == ErrorId.PARAMETER_COUNT:
+        return f"wrong number of parameters in {request} (-20000); its firmware may be of another version"
+    kind, n = ("range", -error_id - 40000) if error_id < ErrorId.PARAMETER_RANGE else ("type", -error_id - 30000)
+    return f"parameter {n} of {request} has the wrong {kind} ({error_id})"
+
+
+PACKET_BYTES = 1440
+TEST_VALUE = 0x0123456789ABCDEF
+_LENGTH = PACKET_BYTES.to_bytes(2, "little")
+TEST_BYTES = TEST_VALUE.to_bytes(8, "little")
+TEST_OFFSET = 48
+ROBOT_TYPE_MG400 = 1
+
+_SIX = ("<f8", (6,))
+_FIELDS = {  # name: (format, offset)
+    "length": ("<u2", 0),
+    "digital_in": ("<u8", 8),
+    "digital_out": ("<u8", 16),
+    "mode": ("<u8", 24),
+    "unix_ms": ("<u8", 32),
+    "test_value": ("<u8", TEST_OFFSET),
+    "speed_scaling": ("<f8", 64),
+    "q_target": (_SIX, 192),
+    "qd_target": (_SIX, 240),
+    "q_actual": (_SIX, 432),
+    "qd_actual": (_SIX, 480),
+    "i_actual": (_SIX, 528),
+    "tool_actual": (_SIX, 624),  # X, Y, Z, R, -, -: R is the fourth
+    "tcp_speed_actual": (_SIX, 672),
+    "tcp_force": (_SIX, 720),
+    "tool_target": (_SIX, 768),
+    "tcp_speed_target": (_SIX, 816),
+    "user_index": ("u1", 1012),
+    "tool_index": ("u1", 1013),
+    "queue_runs": ("u1", 1014),
+    "paused": ("u1", 1015),
+    "brake": ("u1", 1025),
+    "enabled": ("u1", 1026),
+    "drag": ("u1", 1027),
+    "running": ("u1", 1028),
+    "error": ("u1", 1029),
+    "jog": ("u1", 1030),
+    "robot_type": ("u1", 1031),
+    "m_actual": (_SIX, 1120),
+    "load": (("<f8", (4,)), 1168),  # kg, and its centre x, y, z in mm
+    "user": (_SIX, 1200),
+    "tool": (_SIX, 1248),
+    "trace_index": ("<u8", 1296),
+    "target_quaternion": (("<f8", (4,)), 1352),
+    "actual_quaternion": (("<f8", (4,)), 1384),
+}
+PACKET = np.dtype(
+    {
+        "names": list(_FIELDS),
+        "formats": [form for form, _ in _FIELDS.values()],
+        "offsets": [offset for _, offset in _FIELDS.values()],
+        "itemsize": PACKET_BYTES,
+    }
+)
+
+
+def newest_packet(buffer: bytes) -> tuple[np.void | None, bytes, int]:
+    """The newest whole packet in what has arrived.
+
+    A packet counts if its length is 1440, its test value stands where it must, no other packet begins inside it and
+    another, or nothing yet, follows it (else it was cut short).
+
+    Returns
+    -------
+    packet : record of ``PACKET`` or None
+    rest : bytes
+        What came after it.
+    skipped : int
+        Bytes before it that were no packet.
+    """
+    newest, begin, used = None, None, 0
+    at = buffer.find(TEST_BYTES)
+    while at >= 0:
+        start, following = at - TEST_OFFSET, buffer.find(TEST_BYTES, at + 1)
+        whole = start >= 0 and start + PACKET_BYTES <= len(buffer) and not 0 <= following < start + PACKET_BYTES
+        if whole and buffer.startswith(_LENGTH, start) and _LENGTH.startswith(buffer[start + PACKET_BYTES :][:2]):
+            newest, begin = np.frombuffer(buffer[start : start + PACKET_BYTES], PACKET)[0], start
+            used += PACKET_BYTES
+        at = following
+    if newest is None:
+        return None, buffer[-2 * PACKET_BYTES :], max(0, len(buffer) - 2 * PACKET_BYTES)
+    return newest, buffer[begin + PACKET_BYTES :], begin + PACKET_BYTES - used

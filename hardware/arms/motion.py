@@ -1,0 +1,195 @@
+"""Motion of a simulated or emulated arm: pieces one after another, each with a trapezoidal (or constant) speed."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from threading import Lock
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from hardware.arms.kinematics import LINE_LEAVES_WORKSPACE, NO_INVERSE, TARGET_LIMIT, Kinematics, OutOfReachError, Violation
+
+LINE_STEP_MM = 5.0  # a line is checked for limits at places this far apart
+HISTORY_N = 512  # pieces kept, so that a camera can ask where the arm was
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """Speed and acceleration along a line (mm), in turning and of joints (deg). No acceleration (inf): constant speed."""
+
+    linear_mm_s: float
+    angular_deg_s: float
+    linear_mm_s2: float = np.inf
+    angular_deg_s2: float = np.inf
+
+    def scaled(self, factor: float) -> "Speeds":
+        """The same motion in ``1 / factor`` of the time."""
+        return Speeds(
+            self.linear_mm_s * factor, self.angular_deg_s * factor, self.linear_mm_s2 * factor**2, self.angular_deg_s2 * factor**2
+        )
+
+
+def travel_time_s(length: float, speed: float, acceleration: float) -> float:
+    """Time to go ``length`` from rest to rest."""
+    if length <= 0:
+        return 0.0
+    if np.isinf(speed) or length * acceleration < speed**2:  # never reaches full speed
+        return 2.0 * np.sqrt(length / acceleration)
+    return length / speed + speed / acceleration
+
+
+def travelled(fraction: float, ramp: float) -> float:
+    """Share of the way at a share of the time, when speeding up and slowing down take ``ramp`` of the time each."""
+    t = min(max(fraction, 0.0), 1.0)
+    if ramp > 0:
+        if t < ramp:
+            return t**2 / (2 * ramp * (1 - ramp))
+        if t > 1 - ramp:
+            return 1 - (1 - t) ** 2 / (2 * ramp * (1 - ramp))
+    return (t - ramp / 2) / (1 - ramp)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One move: from pose to pose in a straight line, or from joints to joints.
+
+    ``cut_s`` is where a stop ended it (inf: not at all).
+    """
+
+    kinematics: Kinematics
+    start: np.ndarray  # pose (6,) if linear, else joints (J,)
+    end: np.ndarray
+    linear: bool
+    start_s: float
+    duration_s: float
+    ramp: float
+    cut_s: float = np.inf
+
+    @property
+    def end_s(self) -> float:
+        return min(self.start_s + self.duration_s, max(self.cut_s, self.start_s))
+
+    def pose(self, time_s: float) -> np.ndarray:
+        value = self._value(time_s)
+        return value if self.linear else self.kinematics.forward(value)
+
+    def joints_deg(self, time_s: float) -> np.ndarray:
+        value = self._value(time_s)
+        return self.kinematics.inverse(value) if self.linear else value
+
+    def _value(self, time_s: float) -> np.ndarray:
+        elapsed = min(time_s, self.cut_s) - self.start_s
+        share = travelled(elapsed / self.duration_s if self.duration_s > 0 else 1.0, self.ramp)
+        return between(self.kinematics, self.start, self.end, share, self.linear)
+
+
+def between(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, share: float, linear: bool) -> np.ndarray:
+    """The pose or joints at a share of the way; exactly the ends at 0 and 1.
+
+    An arm of six axes turns the shortest way; one of four by as many degrees as R differs, which is not wrapped.
+    """
+    if share <= 0 or share >= 1:
+        return (start if share <= 0 else end).copy()
+    value = start + share * (end - start)
+    if linear and kinematics.axes == 6:
+        turns = Rotation.from_euler("xyz", [start[3:], end[3:]], degrees=True)
+        value[3:] = Slerp([0.0, 1.0], turns)(share).as_euler("xyz", degrees=True)
+    return value
+
+
+def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Violation | None:
+    """What a straight line would break: its end first, then the way there."""
+    steps = max(1, int(np.ceil(np.linalg.norm(end[:3] - start[:3]) / LINE_STEP_MM)))
+    for n in (steps, *range(1, steps)):
+        try:
+            broken = kinematics.violation(kinematics.inverse(between(kinematics, start, end, n / steps, True)))
+        except OutOfReachError as error:
+            broken = Violation(NO_INVERSE, str(error))
+        if broken and n < steps:
+            return Violation(LINE_LEAVES_WORKSPACE, f"the line to it leaves the workspace: {broken.text}")
+        if broken:
+            return broken if broken.code == NO_INVERSE else Violation(TARGET_LIMIT, broken.text)
+    return None
+
+
+class MotionTrack:
+    """Where an arm is, was and (as planned) will be. Safe to use from several threads.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    joints_deg : (J,) float
+        Where it stands to begin with.
+    """
+
+    def __init__(self, kinematics: Kinematics, joints_deg: np.ndarray) -> None:
+        self.kinematics = kinematics
+        self._lock = Lock()
+        rest = Piece(kinematics, np.asarray(joints_deg, float), np.asarray(joints_deg, float), False, -np.inf, 0.0, 0.0)
+        self._pieces: deque[Piece] = deque([rest], maxlen=HISTORY_N)
+
+    @property
+    def end_s(self) -> float:
+        """When the last piece ends (-inf if there was none)."""
+        return self._pieces[-1].end_s
+
+    def pose(self, time_s: float) -> np.ndarray:
+        return self._at(time_s).pose(time_s)
+
+    def joints_deg(self, time_s: float) -> np.ndarray:
+        return self._at(time_s).joints_deg(time_s)
+
+    def moving(self, time_s: float) -> bool:
+        return bool(self.end_s > time_s)
+
+    def target(self) -> Piece:
+        return self._pieces[-1]
+
+    def move(self, end: np.ndarray, speeds: Speeds, *, linear: bool, now_s: float) -> Piece | Violation:
+        """Append a move to a pose (linear) or to joints; it begins when the last one ends. A violation changes nothing."""
+        with self._lock:
+            last = self._pieces[-1]
+            begins_s = max(now_s, last.end_s)
+            start = last.pose(begins_s) if linear else last.joints_deg(begins_s)
+            end = np.asarray(end, float)
+            broken = check_line(self.kinematics, start, end) if linear else self.kinematics.violation(end)
+            if broken:
+                return broken
+            length, turn = _lengths(self.kinematics, start, end, linear)
+            times = [
+                travel_time_s(length, speeds.linear_mm_s, speeds.linear_mm_s2),
+                travel_time_s(turn, speeds.angular_deg_s, speeds.angular_deg_s2),
+            ]
+            slowest = int(np.argmax(times))
+            speed = (speeds.linear_mm_s, speeds.angular_deg_s)[slowest]
+            acceleration = (speeds.linear_mm_s2, speeds.angular_deg_s2)[slowest]
+            ramp = min(0.5, speed / acceleration / times[slowest]) if times[slowest] > 0 else 0.0
+            piece = Piece(self.kinematics, start, end, linear, begins_s, times[slowest], ramp)
+            self._pieces.append(piece)
+            return piece
+
+    def stop(self, now_s: float) -> None:
+        """Stand still from ``now_s`` on and forget what was still to come."""
+        with self._lock:
+            kept = [piece for piece in self._pieces if piece.start_s < now_s] or [self._pieces[0]]
+            if kept[-1].end_s > now_s:
+                kept[-1] = replace(kept[-1], cut_s=now_s)
+            self._pieces = deque(kept, maxlen=HISTORY_N)
+
+    def _at(self, time_s: float) -> Piece:
+        with self._lock:
+            return next((piece for piece in reversed(self._pieces) if piece.start_s <= time_s), self._pieces[0])
+
+
+def _lengths(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, linear: bool) -> tuple[float, float]:
+    """Way in mm and in deg."""
+    if not linear:
+        return 0.0, float(np.abs(end - start).max())
+    turn = turn_between_deg(start, end) if kinematics.axes == 6 else abs(end[5] - start[5])
+    return float(np.linalg.norm(end[:3] - start[:3])), float(turn)
+
+
+def turn_between_deg(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle between the orientations of two poses (6,)."""
+    first, second = Rotation.from_euler("xyz", [a[3:], b[3:]], degrees=True)
+    return float(np.degrees((first.inv() * second).magnitude()))

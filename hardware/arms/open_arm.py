@@ -1,0 +1,53 @@
+"""One way to any arm: ``open_arm("mg400:192.168.1.6")``."""
+
+from hardware.arms.arm import Arm
+from hardware.arms.magician import Magician
+from hardware.arms.magician_wire import USB_VENDORS
+from hardware.arms.mg400 import MG400, Mg400Ports
+from hardware.arms.mg400_wire import DASHBOARD_PORT, DEFAULT_HOSTS
+from hardware.arms.simulated import SimulatedArm
+from hardware.errors import DeviceError
+
+ARM_SPECS = (
+    "mg400 or mg400:ADDRESS[:DASHBOARD_PORT] (an arm, or 127.0.0.1 with 'twin emulate mg400'), magician or magician:/dev/ttyUSB0, "
+    "simulated (six axes) or simulated:4"
+)
+
+
+def open_arm(spec: str) -> Arm:
+    """An arm by its specification; nothing is opened before ``connect``.
+
+    Parameters
+    ----------
+    spec : str
+        See ``ARM_SPECS``. Without an address the MG400 is looked for at its first network port's (192.168.1.6), without
+        a port the Magician at the one USB adapter of its kind.
+
+    Raises
+    ------
+    DeviceError
+        The specification is not understood, or no Magician is attached.
+    """
+    kind, _, rest = spec.partition(":")
+    if kind == "simulated" and rest in ("", "4", "6"):
+        return SimulatedArm(axes=int(rest or 6), name=f"simulated arm of {rest or 6} axes")
+    if kind == "mg400":
+        host, _, port = rest.partition(":")
+        if port and not port.isdigit():
+            raise DeviceError(f"arm '{spec}': '{port}' is no port; for example mg400:127.0.0.1:29999")
+        return MG400(host or DEFAULT_HOSTS["LAN1"], ports=Mg400Ports().shifted(int(port) - DASHBOARD_PORT if port else 0))
+    if kind == "magician":
+        return Magician(rest or _attached_magician())
+    raise DeviceError(f"no arm '{spec}'; there are: {ARM_SPECS}")
+
+
+def _attached_magician() -> str:
+    from serial.tools import list_ports
+
+    found = [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
+    if len(found) != 1:
+        raise DeviceError(
+            f"{'no' if not found else len(found)} serial adapters of a Magician's kind ({', '.join(USB_VENDORS.values())}) are attached: "
+            f"{', '.join(found) or 'plug in its USB cable'}; name one, for example magician:/dev/ttyUSB0"
+        )
+    return found[0]

@@ -1,0 +1,168 @@
+"""A simulated arm behind the same protocol as the real ones: moves take time, and it can misbehave on purpose."""
+
+import time
+from enum import StrEnum
+
+import numpy as np
+
+from hardware.arms.arm import ArmState
+from hardware.arms.base import BaseArm
+from hardware.arms.kinematics import MG400, Kinematics, StageKinematics, Violation
+from hardware.arms.motion import MotionTrack, Speeds
+from hardware.errors import DeviceError, StaleDataError
+
+STALL_AFTER = 0.5  # share of a move's time after which a stalling arm stands still
+SLOW_FACTOR = 0.1
+
+
+class SimulatedFault(StrEnum):
+    """What a simulated arm can do wrong."""
+
+    SLOW = "slow"  # moves at a tenth of the speed
+    STALL = "stall"  # stops halfway and says that it is at rest
+    IGNORE = "ignore"  # accepts a move and does not execute it
+    COLLIDE = "collide"  # stops halfway with an error
+    SILENT = "silent"  # feedback no longer arrives
+
+
+class SimulatedArm(BaseArm):
+    """A simulated arm of six axes (an ideal stage) or four (the MG400's linkage).
+
+    Parameters
+    ----------
+    axes : {4, 6}
+    pose : (6,) float
+        Where it stands to begin with.
+    speeds : Speeds
+        Of moves until ``set_speed``; without acceleration the speed is constant.
+    time_scale : float
+        How much faster than real it moves (``inf``: at once).
+    faults : iterable of SimulatedFault
+        ``faults`` is a set that may be changed at any time; it counts for moves begun afterwards (SILENT at once).
+    """
+
+    def __init__(
+        self,
+        *,
+        axes: int = 6,
+        pose: np.ndarray = (300.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        speeds: Speeds = Speeds(100.0, 100.0, 1000.0, 1000.0),  # noqa: B008  (frozen)
+        time_scale: float = 1.0,
+        faults: tuple[SimulatedFault, ...] = (),
+        name: str = "simulated arm",
+    ) -> None:
+        kinematics: Kinematics = StageKinematics() if axes == 6 else MG400
+        if axes not in (4, 6):
+            raise DeviceError(f"a simulated arm has 4 or 6 axes, not {axes}")
+        self.name, self.axes, self.kinematics = name, axes, kinematics
+        self.track = MotionTrack(kinematics, kinematics.inverse(np.asarray(pose, float)))
+        self.faults = {SimulatedFault(fault) for fault in faults}
+        self._speeds, self._scale = speeds, time_scale
+        self._connected = self._enabled = False
+        self._errors: list[tuple[float, str]] = []  # (from when, what)
+        self._silent_since: float | None = None
+
+    @property
+    def is_connected(self) -> bool:
+        return self._connected
+
+    def connect(self) -> None:
+        self._require_disconnected()
+        self._connected = True
+
+    def disconnect(self) -> None:
+        if self._connected:
+            self.stop()
+            self._connected = self._enabled = False
+
+    def enable(self) -> None:
+        self._require_connected()
+        if error := self._error(time.monotonic()):
+            raise DeviceError(f"{self.name}: {error}; call clear_error() first")
+        self._enabled = True
+
+    def disable(self) -> None:
+        self._require_connected()
+        self.track.stop(time.monotonic())
+        self._enabled = False
+
+    def clear_error(self) -> None:
+        self._require_connected()
+        self._errors.clear()
+
+    def stop(self) -> None:
+        self._require_connected()
+        now_s = time.monotonic()
+        self.track.stop(now_s)
+        self._errors = [(since, text) for since, text in self._errors if since <= now_s]
+
+    def state(self, *, max_age_s: float = 1.0) -> ArmState:
+        self._require_connected()
+        now_s = time.monotonic()
+        told_s = self._told_s(now_s)
+        if now_s - told_s > max_age_s:
+            raise StaleDataError(
+                f"{self.name}: newest feedback is {now_s - told_s:.2f} s old (allowed {max_age_s:g} s); stop, then reconnect the arm"
+            )
+        return ArmState(
+            self.track.pose(told_s),
+            self.track.joints_deg(told_s),
+            told_s,
+            self._enabled,
+            self.track.moving(told_s),
+            self._error(told_s),
+        )
+
+    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
+        self._require_connected()
+        if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
+            raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
+        self._speeds = Speeds(linear_mm_s, angular_deg_s, self._speeds.linear_mm_s2, self._speeds.angular_deg_s2)
+
+    def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        sent = self.kinematics.nearest_pose(pose)
+        self._move(sent, linear=True, wait=wait, settled=sent, timeout_s=timeout_s)
+        return sent
+
+    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        sent = np.array(joints_deg, float)
+        if sent.shape != (self.axes,):
+            raise DeviceError(f"{self.name}: {sent.size} joint angles; it has {self.axes} joints")
+        self._move(sent, linear=False, wait=wait, settled=self.kinematics.forward(sent), timeout_s=timeout_s)
+        return sent
+
+    def _move(self, end: np.ndarray, *, linear: bool, wait: bool, settled: np.ndarray, timeout_s: float) -> None:
+        self._require_connected()
+        now_s = time.monotonic()
+        if error := self._error(now_s):
+            raise DeviceError(f"{self.name}: {error}; call clear_error(), then enable()")
+        if not self._enabled:
+            raise DeviceError(f"{self.name}: not enabled; call enable() first")
+        if not np.isfinite(end).all():
+            raise DeviceError(f"{self.name}: the target {end} is not a number; nothing was sent")
+        if SimulatedFault.IGNORE not in self.faults:
+            self._begin(end, linear, now_s)
+        if wait:
+            self.wait_settled(settled, timeout_s=timeout_s)
+
+    def _begin(self, end: np.ndarray, linear: bool, now_s: float) -> None:
+        factor = self._scale * (SLOW_FACTOR if SimulatedFault.SLOW in self.faults else 1.0)
+        piece = self.track.move(end, self._speeds.scaled(factor), linear=linear, now_s=now_s)
+        if isinstance(piece, Violation):
+            raise DeviceError(f"{self.name}: refused (alarm {piece.code}): {piece.text}; choose a target within reach and limits")
+        halfway_s = piece.start_s + STALL_AFTER * piece.duration_s
+        if self.faults & {SimulatedFault.STALL, SimulatedFault.COLLIDE}:
+            self.track.stop(halfway_s)
+        if SimulatedFault.COLLIDE in self.faults:
+            self._errors.append((halfway_s, "collision (alarm 112); free the arm"))
+
+    def _error(self, time_s: float) -> str:
+        return next((text for since, text in self._errors if since <= time_s), "")
+
+    def _told_s(self, now_s: float) -> float:
+        """When the newest feedback was sent: now, unless the arm fell silent."""
+        if SimulatedFault.SILENT not in self.faults:
+            self._silent_since = None
+        elif self._silent_since is None:
+            self._silent_since = now_s
+        return now_s if self._silent_since is None else self._silent_since

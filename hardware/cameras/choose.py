@@ -1,0 +1,56 @@
+"""From what a user writes after ``--camera`` to a frame source."""
+
+from pathlib import Path
+
+from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.recorded import RecordedSource
+from hardware.cameras.source import FrameSource
+from hardware.cameras.uvc import UvcCamera, UvcSettings
+from hardware.errors import DeviceError
+from hardware.session import SessionSource, is_session
+from scenes.sensor import SensorSpec
+from twin.preprocess.forms import frame_size
+from twin.types import Form
+
+
+def open_camera(
+    text: str,
+    spec: SensorSpec | None = None,
+    form: Form | None = None,
+    *,
+    settings: UvcSettings | None = None,
+    twin: FrameSource | None = None,
+) -> FrameSource:
+    """A frame source, not yet connected.
+
+    Parameters
+    ----------
+    text : str
+        ``0`` or ``/dev/video2`` (a USB camera), an ``http://`` address (a stream of JPEGs), ``twin``, a folder of pictures, a
+        recording, a recorded session or a video.
+    spec : SensorSpec, optional
+    form : Form, optional
+        Live sources: that of the sensor's recordings, where it has one; else told by the frames.
+    settings : UvcSettings, optional
+    twin : FrameSource, optional
+        What ``twin`` stands for.
+
+    Raises
+    ------
+    DeviceError, FrameError
+        There is no such thing.
+    """
+    live_form = form or (Form.RECORDING if spec is not None and spec.recording is not None else Form.RAW)
+    if spec is not None:
+        frame_size(spec, live_form)
+    if text == "twin":
+        if twin is None:
+            raise DeviceError("the twin as a camera needs an arm and an object; use 'twin servo', 'twin collect' or 'twin emulate camera'")
+        return twin
+    if text.isdecimal() or text.startswith("/dev/"):
+        return UvcCamera(int(text) if text.isdecimal() else text, spec, live_form, settings)
+    if "://" in text:
+        return MjpegCamera(text, spec, live_form)
+    if not Path(text).exists():
+        raise DeviceError(f"--camera {text}: no such file or folder; expected a number, /dev/videoN, http://..., twin, a folder or a video")
+    return SessionSource(text) if is_session(text) else RecordedSource(text, spec, form)

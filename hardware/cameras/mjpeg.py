@@ -1,0 +1,130 @@
+"""A camera behind a URL: JPEG pictures over HTTP, multipart/x-mixed-replace."""
+
+import http.client
+import time
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+
+from hardware.cameras.capture import capture
+from hardware.cameras.reader import LiveSource, Picture, ReadFailed
+from hardware.errors import DeviceError
+from scenes.sensor import SensorSpec
+from twin.recordings.quiet import quiet
+from twin.types import Form
+
+SILENT_S = 2.0  # no byte for so long: the read failed
+LARGEST_PART = 32_000_000  # bytes
+TIME_HEADERS = ("x-timestamp",)  # Unix seconds of the exposure, as mjpg-streamer sends it
+CLOCK_SLACK_S = 60.0  # a stamp farther from now is from another clock
+START, END = b"\xff\xd8", b"\xff\xd9"
+
+
+class MjpegCamera(LiveSource):
+    """A stream of JPEG pictures.
+
+    A part's ``X-Timestamp`` (Unix seconds) is taken as the time of exposure, else its arrival; ``X-Sequence`` tells lost ones.
+
+    Parameters
+    ----------
+    url : str
+    spec : SensorSpec, optional
+    form : Form
+    """
+
+    def __init__(self, url: str, spec: SensorSpec | None = None, form: Form = Form.RAW) -> None:
+        super().__init__(url, form)
+        self._spec = spec
+        parts = urlsplit(url)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise DeviceError(f"{url}: not the address of a stream; expected http://host:port/path")
+        self._parts, self._connection, self._stream, self._last = parts, None, None, None
+
+    def _open(self) -> None:
+        kind = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
+        connection = kind(self._parts.hostname, self._parts.port, timeout=SILENT_S)
+        try:
+            connection.request("GET", (self._parts.path or "/") + (f"?{self._parts.query}" if self._parts.query else ""))
+            answer = connection.getresponse()
+        except (OSError, http.client.HTTPException) as error:
+            connection.close()
+            raise DeviceError(f"{self.name}: no answer ({error}); start the stream or check the address") from error
+        kind = answer.getheader("Content-Type", "")
+        if answer.status != 200 or "multipart" not in kind:
+            connection.close()
+            raise DeviceError(f"{self.name}: answers {answer.status} {kind or 'without a type'}; expected a multipart stream of JPEGs")
+        self._connection, self._stream = connection, answer
+
+    def _close(self) -> None:
+        if self._connection is not None:
+            self._stream.close()
+            self._connection.close()
+            self._connection = self._stream = None
+
+    def _grab(self) -> Picture:
+        if self._stream is None:
+            try:
+                self._open()
+            except DeviceError as error:
+                self._pause()
+                raise ReadFailed(str(error)) from error
+        try:
+            headers, data = next_part(self._stream)
+        except (OSError, EOFError, http.client.HTTPException) as error:
+            self._close()  # to be opened anew
+            raise ReadFailed(str(error) or type(error).__name__) from error
+        image = decode_jpeg(data)
+        number = int(headers["x-sequence"]) if headers.get("x-sequence", "").isdecimal() else None
+        lost = max(0, number - self._last - 1) if number is not None and self._last is not None else 0
+        if number is not None:
+            self._last = number
+        return Picture(image, stamped_s(headers), lost)
+
+    def _finish(self, image):
+        return capture(image, self._spec, self.form, self.name)
+
+
+def next_part(stream) -> tuple[dict, bytes]:
+    """Headers (lower case) and body of the next part of a multipart stream; ``EOFError`` at its end."""
+    headers: dict[str, str] = {}
+    while True:  # up to the next part's headers, past its boundary
+        line = stream.readline(65536)
+        if not line:
+            raise EOFError("the stream ended")
+        name, colon, value = line.decode("latin-1").strip().partition(":")
+        if colon:
+            headers[name.lower()] = value.strip()
+        elif not name and headers:
+            break
+    length = int(headers.get("content-length", 0)) if headers.get("content-length", "0").isdecimal() else 0
+    if not 0 < length <= LARGEST_PART:
+        raise EOFError(f"a part without a usable Content-Length ({headers.get('content-length', 'none')})")
+    data = stream.read(length)
+    if len(data) < length:
+        raise EOFError(f"the stream ended within a picture ({len(data)} of {length} bytes)")
+    return headers, data
+
+
+def decode_jpeg(data: bytes) -> np.ndarray:
+    """A whole JPEG as gray (H, W) or RGB (H, W, 3) uint8; ``ReadFailed`` for a torn one, which decoders fill up with gray."""
+    if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
+        raise ReadFailed(f"a torn JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
+    with quiet():
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ReadFailed("a damaged JPEG")
+    return image if image.ndim == 2 else image[..., ::-1].copy()
+
+
+def stamped_s(headers: dict) -> float:
+    """Time of exposure on the monotonic clock, from a part's headers; now where they don't tell."""
+    now_s, unix_s = time.monotonic(), time.time()
+    for name in TIME_HEADERS:
+        try:
+            age_s = unix_s - float(headers[name])
+        except (KeyError, ValueError):
+            continue
+        if abs(age_s) < CLOCK_SLACK_S:
+            return now_s - max(age_s, 0.0)
+    return now_s

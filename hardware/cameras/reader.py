@@ -1,0 +1,217 @@
+"""What every live source shares: a background reader that keeps the newest frame and says what is wrong."""
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
+from twin.types import Form, Frame
+
+MOST_FAILED_READS = 10  # in a row; one more ends the reader
+FAILED_PAUSE_S = 0.2  # before the device is tried again
+FROZEN_S, FROZEN_N = 0.5, 5  # the same picture for so long, and so often: no live sensor does that, for its noise
+BLACK_LEVEL = 16  # nothing brighter: the lamps are off, or nothing is seen
+FIRST_FRAME_S = 10.0
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a device delivered.
+
+    Attributes
+    ----------
+    image : (H, W) or (H, W, 3) uint8
+        Gray or RGB.
+    time_s : float
+        ``time.monotonic()`` of the exposure, as well as can be known.
+    lost : int
+        Pictures that the device says it lost before this one.
+    """
+
+    image: np.ndarray
+    time_s: float
+    lost: int = 0
+
+
+class ReadFailed(Exception):  # noqa: N818  (no error until it happens too often)
+    """One picture could not be had; the reader tries again."""
+
+
+class LiveSource(ABC):
+    """Base of the live sources; see ``hardware.cameras.source.FrameSource`` for what each method promises.
+
+    Parameters
+    ----------
+    name : str
+    form : Form
+        Of the frames it hands out.
+    """
+
+    is_live = True
+    notices_still = True  # whether a picture that doesn't change is a fault
+
+    def __init__(self, name: str, form: Form) -> None:
+        self.name, self.form = name, Form(form)
+        self.failed = 0  # reads that failed, in all
+        self._new = threading.Condition()
+        self._end = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._reset()
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Open the device; ``DeviceError`` if there is none."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Let go of the device; without effect when closed."""
+
+    @abstractmethod
+    def _grab(self) -> Picture:
+        """The next picture; ``ReadFailed``."""
+
+    def _finish(self, image: np.ndarray) -> np.ndarray:
+        """The picture in the source's form."""
+        return image
+
+    @property
+    def is_connected(self) -> bool:
+        return self._thread is not None
+
+    @property
+    def dropped(self) -> int:
+        """Frames that arrived, or that the device lost, and nobody read."""
+        return self._dropped
+
+    @property
+    def delivered(self) -> int:
+        """Frames that somebody read."""
+        return self._delivered
+
+    @property
+    def arrived(self) -> int:
+        """Frames of the device so far, lost ones included."""
+        return self._sequence
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with the pictures ("" if nothing): frozen or black."""
+        return self._fault
+
+    def connect(self) -> None:
+        if self.is_connected:
+            raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")
+        self._open()
+        self._reset()
+        self._end.clear()
+        self._thread = threading.Thread(target=self._run, name=f"reader of {self.name}", daemon=True)
+        self._thread.start()
+
+    def disconnect(self) -> None:
+        if self._thread is None:
+            return
+        self._end.set()
+        self._thread.join(timeout=15.0)
+        self._thread = None
+        self._close()
+
+    def __enter__(self):
+        self.connect()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.disconnect()
+
+    def read(self, *, timeout_s: float = 1.0) -> Frame:
+        return self._take(lambda frame: frame.sequence != self._read_last, timeout_s, "no new frame")
+
+    def read_after(self, time_s: float, *, timeout_s: float = 2.0) -> Frame:
+        return self._take(lambda frame: frame.time_s > time_s, timeout_s, "no frame exposed since then")
+
+    def read_latest(self, *, max_age_s: float = 0.5) -> Frame:
+        frame = self._take(lambda _: True, FIRST_FRAME_S, "no frame at all")
+        age_s = time.monotonic() - frame.time_s
+        if age_s > max_age_s:
+            raise StaleDataError(f"{self.name}: the newest frame is {age_s:.2f} s old (allowed {max_age_s:g} s); check camera and cable")
+        return frame
+
+    def _take(self, wanted, timeout_s: float, missing: str) -> Frame:
+        deadline = time.monotonic() + timeout_s
+        with self._new:
+            while True:
+                if self._error is not None:
+                    raise DeviceError(f"{self.name}: {self._error}") from self._error
+                if self._thread is None:
+                    raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+                if self._fault:
+                    raise DeviceError(f"{self.name}: {self._fault}")
+                if self._frame is not None and wanted(self._frame):
+                    if self._frame.sequence != self._read_last:
+                        self._read_last = self._frame.sequence
+                        self._dropped -= 1
+                        self._delivered += 1
+                    return self._frame
+                left_s = deadline - time.monotonic()
+                if left_s <= 0:
+                    raise TimeoutError(f"{self.name}: {missing} within {timeout_s:g} s")
+                self._new.wait(left_s)
+
+    def _reset(self) -> None:
+        self._frame: Frame | None = None
+        self._error: Exception | None = None
+        self._fault = ""
+        self._read_last, self._sequence, self._dropped, self._delivered = -1, 0, 0, 0
+        self._still: tuple[np.ndarray, float, int] | None = None  # picture, since when, how often
+
+    def _run(self) -> None:
+        in_a_row = 0
+        while not self._end.is_set():
+            try:
+                picture = self._grab()
+                image = self._finish(picture.image)
+            except ReadFailed as failure:
+                self.failed += 1
+                in_a_row += 1
+                if in_a_row > MOST_FAILED_READS:
+                    self._give_up(
+                        DeviceError(f"{in_a_row} reads in a row failed, the last: {failure}; check camera and cable, then connect again")
+                    )
+                    return
+            except Exception as error:
+                self._give_up(error)
+                return
+            else:
+                in_a_row = 0
+                with self._new:
+                    self._fault = self._look_at(picture)
+                    self._sequence += 1 + picture.lost
+                    self._dropped += 1 + picture.lost
+                    name = f"frame_{self._sequence:06d}.png"
+                    self._frame = Frame(image, self.form, name, picture.time_s, self._sequence)
+                    self._new.notify_all()
+
+    def _pause(self) -> None:
+        """Wait before the device is tried again."""
+        self._end.wait(FAILED_PAUSE_S)
+
+    def _give_up(self, error: Exception) -> None:
+        with self._new:
+            self._error = error
+            self._new.notify_all()
+
+    def _look_at(self, picture: Picture) -> str:
+        if picture.image.max(initial=0) < BLACK_LEVEL:
+            return "the picture is black; check the sensor's lamps and the camera's exposure"
+        if not self.notices_still:
+            return ""
+        if self._still is None or not np.array_equal(self._still[0], picture.image):
+            self._still = (picture.image, picture.time_s, 1)
+            return ""
+        image, since_s, count = self._still
+        self._still = (image, since_s, count + 1)
+        if count + 1 >= FROZEN_N and picture.time_s - since_s >= FROZEN_S:
+            return f"the picture has been frozen for {picture.time_s - since_s:.1f} s; unplug the camera and connect it again"
+        return ""

@@ -1,0 +1,88 @@
+"""Frames from disk behind the live sources' protocol: they wait for their reader, and end."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+
+from hardware.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from scenes.sensor import SensorSpec
+from twin.recordings import Recording, open_recording
+from twin.types import Form, Frame
+
+
+class SequentialSource(ABC):
+    """Frames that wait for their reader, and end: what folders, videos and sessions share.
+
+    Parameters
+    ----------
+    name : str
+    form : Form
+    """
+
+    is_live = False
+    dropped = 0
+    fault = ""
+
+    def __init__(self, name: str, form: Form) -> None:
+        self.name, self.form = name, form
+        self._left: Iterator[Frame] | None = None
+        self._newest: Frame | None = None
+
+    @abstractmethod
+    def _frames(self) -> Iterator[Frame]:
+        """All frames from the first on."""
+
+    @property
+    def is_connected(self) -> bool:
+        return self._left is not None
+
+    def connect(self) -> None:
+        if self.is_connected:
+            raise DeviceAlreadyConnectedError(f"{self.name}: connected already; disconnect() first")
+        self._left, self._newest = self._frames(), None
+
+    def disconnect(self) -> None:
+        self._left = None
+
+    def __enter__(self):
+        self.connect()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.disconnect()
+
+    def read(self, *, timeout_s: float = 1.0) -> Frame:
+        if self._left is None:
+            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+        frame = next(self._left, None)
+        if frame is None:
+            raise EOFError(f"{self.name}: the recording is at its end")
+        self._newest = frame
+        return frame
+
+    def read_latest(self, *, max_age_s: float = 0.5) -> Frame:
+        """The frame read last, or the first: a recording does not age."""
+        return self.read() if self._newest is None or self._left is None else self._newest
+
+    def read_after(self, time_s: float, *, timeout_s: float = 2.0) -> Frame:
+        """The next frame: a recording was exposed when it was, and waits."""
+        return self.read()
+
+
+class RecordedSource(SequentialSource):
+    """A folder of pictures, a recording, a video.
+
+    Parameters
+    ----------
+    path : path
+    spec : SensorSpec, optional
+    form : Form, optional
+        Told by the frames' size and content if not given.
+    """
+
+    def __init__(self, path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> None:
+        self.recording: Recording = open_recording(path, spec, form)
+        super().__init__(str(path), self.recording.form)
+
+    def _frames(self) -> Iterator[Frame]:
+        return iter(self.recording)

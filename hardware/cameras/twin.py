@@ -1,0 +1,106 @@
+"""A camera in the twin: the sensor's view, drawn for the contact that the arm's pose makes."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from hardware.arms.arm import ArmState
+from hardware.cameras.reader import LiveSource, Picture, ReadFailed
+from hardware.errors import DeviceError
+from hardware.rig_geometry import PlacedObject
+from scenes.sensor import SensorSpec
+from twin.camera import expose, record
+from twin.errors import ContactError
+from twin.mechanics.follow import Follower
+from twin.mechanics.solver import SkinSolver
+from twin.optics.preview import Preview
+from twin.preprocess.forms import frame_size
+from twin.types import ContactState, Form
+
+PoseSource = Callable[[], ArmState]
+RETRY_S = 0.05
+STEADY_SD = 1.0  # gray levels of noise where the specification has none: a real sensor's measured temporal noise
+
+
+class TwinCamera(LiveSource):
+    """Draws what the sensor sees while an arm moves it about an object.
+
+    Each frame shows the arm's pose at its ``time_s``. Contacts are solved step after step with all they remember, so what a
+    frame shows depends on the way there.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    placed : PlacedObject
+    arm : callable
+        The arm's newest state.
+    form : Form
+    fps : float
+        No more frames a second than this.
+    seed : int
+        Of the noise.
+    preview : Preview, optional
+        Of the window that the form needs; the direct light's by default.
+    """
+
+    notices_still = False  # the twin has a memory, not a cable
+
+    def __init__(
+        self,
+        spec: SensorSpec,
+        placed: PlacedObject,
+        arm: PoseSource,
+        form: Form = Form.RAW,
+        *,
+        fps: float = 30.0,
+        seed: int = 0,
+        preview: Preview | None = None,
+    ) -> None:
+        super().__init__(f"twin of {spec.name}", form)
+        frame_size(spec, self.form)
+        self._spec, self._placed, self._arm, self._period_s = spec, placed, arm, 1.0 / fps
+        self._seed, self._preview = seed, preview
+        self._follower: Follower | None = None
+        self._drawn, self._due_s = 0, 0.0
+        self.state: ContactState | None = None  # of the newest frame
+
+    def _open(self) -> None:
+        if self._preview is None:
+            self._preview = preview_of(self._spec, self.form)
+        if self._follower is None:
+            self._follower = Follower(SkinSolver(self._spec), self._placed.spec)
+
+    def _close(self) -> None:
+        pass
+
+    def _grab(self) -> Picture:
+        self._end.wait(max(0.0, self._due_s - time.monotonic()))
+        self._due_s = time.monotonic() + self._period_s
+        try:
+            told = self._arm()
+            self.state = self._follower.move(self._placed.seen_from(told.pose), told.time_s)
+        except (ContactError, DeviceError) as error:
+            self._end.wait(RETRY_S)
+            raise ReadFailed(str(error)) from error
+        light = self._preview.render(self.state)
+        self._drawn += 1
+        rng = np.random.default_rng((self._seed, self._drawn))
+        return Picture(steady(expose(light, self._spec, rng, origin_px=self._preview.window_px[:2]), self._spec, rng), told.time_s)
+
+    def _finish(self, image: np.ndarray) -> np.ndarray:
+        if self.form is Form.RECORDING:
+            return record(image, self._spec.recording, origin_px=self._preview.window_px[:2])
+        return image
+
+
+def preview_of(spec: SensorSpec, form: Form) -> Preview:
+    """The preview of the part of the raw frame that a form needs."""
+    return Preview(spec, window_px=spec.recording.crop_px if form is Form.RECORDING else None)
+
+
+def steady(image: np.ndarray, spec: SensorSpec, rng: np.random.Generator) -> np.ndarray:
+    """A frame with the least noise that a real sensor has, where the specification has none."""
+    if spec.response.read_noise or spec.response.shot_noise:
+        return image
+    return np.clip(np.rint(image + STEADY_SD * rng.standard_normal(image.shape, np.float32)), 0, 255).astype(np.uint8)

@@ -1,0 +1,115 @@
+"""A USB camera through OpenCV and Video4Linux."""
+
+import time
+from dataclasses import dataclass
+
+import cv2
+
+from hardware.cameras.capture import capture
+from hardware.cameras.reader import LiveSource, Picture, ReadFailed
+from hardware.errors import DeviceError
+from scenes.sensor import SensorSpec
+from twin.types import Form
+
+MANUAL_EXPOSURE = 1  # V4L2; 3 is automatic
+CLOCK_SLACK_S = 5.0  # a buffer's time farther from now is not on the monotonic clock
+BUFFERS = 1
+
+
+@dataclass(frozen=True)
+class UvcSettings:
+    """What is asked of the camera; None leaves it alone.
+
+    Attributes
+    ----------
+    exposure : float
+        In 100 us units.
+    white_balance_k : float
+        Colour temperature.
+    """
+
+    width_px: int = 640
+    height_px: int = 480
+    fps: float = 30.0
+    exposure: float | None = 78.0
+    gain: float | None = None
+    white_balance_k: float | None = None
+
+
+class UvcCamera(LiveSource):
+    """A camera of this machine.
+
+    Parameters
+    ----------
+    node : int or str
+        Number, or device node.
+    spec : SensorSpec, optional
+    form : Form
+    settings : UvcSettings
+    """
+
+    def __init__(self, node: int | str, spec: SensorSpec | None = None, form: Form = Form.RAW, settings: UvcSettings | None = None) -> None:
+        super().__init__(f"camera {node}", form)
+        self._node, self._spec = node, spec
+        size = {"width_px": spec.camera.width_px, "height_px": spec.camera.height_px} if spec else {}
+        self.settings = settings or UvcSettings(**size)
+        self.report: list[tuple[str, float, float]] = []  # what was asked, and what the camera says it does
+        self._device: cv2.VideoCapture | None = None
+
+    def _open(self) -> None:
+        device = cv2.VideoCapture(self._node, cv2.CAP_V4L2)
+        if not device.isOpened():
+            raise DeviceError(
+                f"{self.name}: can't be opened; see 'twin doctor' for the cameras there are, and whether another program uses it"
+            )
+        self.report = apply_settings(device, self.settings)
+        self._device = device
+
+    def _close(self) -> None:
+        if self._device is not None:
+            self._device.release()
+            self._device = None
+
+    def _grab(self) -> Picture:
+        if self._device is None:
+            try:
+                self._open()
+            except DeviceError as error:
+                self._pause()
+                raise ReadFailed(str(error)) from error
+        good, image = self._device.read()
+        if not good or image is None or not image.size:
+            self._close()  # pulled out: it has to be opened anew
+            raise ReadFailed("no picture")
+        return Picture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(self._device.get(cv2.CAP_PROP_POS_MSEC)))
+
+    def _finish(self, image):
+        return capture(image, self._spec, self.form, self.name)
+
+
+def exposed_s(position_ms: float) -> float:
+    """The kernel's buffer time (ms on the monotonic clock) if that is what it is, else now: ``time.monotonic()`` seconds."""
+    now_s = time.monotonic()
+    return position_ms / 1e3 if 0 <= now_s - position_ms / 1e3 < CLOCK_SLACK_S else now_s
+
+
+def apply_settings(device, settings: UvcSettings) -> list[tuple[str, float, float]]:
+    """Ask for the settings in the order in which cameras take them; name, asked and read back of each."""
+    asked = [
+        ("fourcc", cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),
+        ("width", cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),
+        ("height", cv2.CAP_PROP_FRAME_HEIGHT, settings.height_px),
+        ("fps", cv2.CAP_PROP_FPS, settings.fps),
+        ("buffers", cv2.CAP_PROP_BUFFERSIZE, BUFFERS),
+    ]
+    if settings.exposure is not None:
+        asked += [("auto exposure", cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE), ("exposure", cv2.CAP_PROP_EXPOSURE, settings.exposure)]
+    if settings.gain is not None:
+        asked.append(("gain", cv2.CAP_PROP_GAIN, settings.gain))
+    asked.append(("auto white balance", cv2.CAP_PROP_AUTO_WB, 0))
+    if settings.white_balance_k is not None:
+        asked.append(("white balance", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k))
+    asked.append(("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0))
+    for _, key, value in asked:  # set() may fail without a word
+        device.set(key, value)
+    return [(name, float(value), float(device.get(key))) for name, key, value in asked]

@@ -1,0 +1,244 @@
+"""Collecting labelled frames: pose, tap, shear, frame; in the recordings' own format, resumable.
+
+The arm comes from ``CLEAR_MM`` away, and between contacts lifts off by ``LIFT_MM``. A frame is taken only after the arm has
+said that it stands at the commanded pose, and only one exposed after that; what the table holds is the pose that it said.
+"""
+
+import csv
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hardware.arms.arm import Arm, ArmState
+from hardware.cameras.source import FrameSource
+from hardware.errors import DeviceError
+from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
+from scenes.experiment import LABELS, ExperimentSpec
+from twin.errors import TwinError
+from twin.recordings.images import write_image
+from twin.types import Form, Frame
+
+CLEAR_MM, LIFT_MM = 50.0, 10.0
+MOVE_TIMEOUT_S, FRAME_TIMEOUT_S = 30.0, 5.0
+TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
+COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One contact as asked for: label of the pose after the move, and the move, (6,) each in mm and deg."""
+
+    pose: np.ndarray
+    move: np.ndarray
+
+
+@dataclass
+class Collection:
+    """A folder that labelled frames are collected into.
+
+    Parameters
+    ----------
+    folder : Path
+        New, empty, or of a collection with the same ``about``, which is gone on with.
+    about : dict
+        What the frames depend on (JSON).
+    form : Form
+    """
+
+    folder: Path
+    about: dict
+    form: Form
+
+    def __post_init__(self):
+        self.pictures = self.folder / ("frames_bw" if self.form is Form.RECORDING else "images")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        meta, about = self.folder / META, json.loads(json.dumps(self.about))
+        if meta.is_file():
+            before = json.loads(meta.read_text())
+            if other := [key for key in about if before.get(key) != about[key]]:
+                raise DeviceError(
+                    f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
+                )
+        elif any(self.folder.iterdir()):
+            raise DeviceError(f"{self.folder}: holds something else; give an empty or a new folder")
+        else:
+            meta.write_text(json.dumps(about, indent=1) + "\n")
+        self.pictures.mkdir(exist_ok=True)
+        table = self.folder / TABLE
+        if not table.is_file():
+            table.write_text(",".join(COLUMNS) + "\n")
+        self._drop_torn_line(table)
+
+    @property
+    def count(self) -> int:
+        """Contacts collected so far."""
+        with (self.folder / TABLE).open(newline="") as file:
+            return sum(1 for _ in csv.reader(file)) - 1
+
+    @property
+    def has_rest(self) -> bool:
+        """Whether the frame without contact has been taken."""
+        return (self.pictures / REST).is_file()
+
+    def keep_rest(self, frame: Frame) -> None:
+        """Keep the frame without contact."""
+        write_image(self.pictures / REST, frame.image)
+
+    def keep(self, index: int, frame: Frame, label: np.ndarray, move: np.ndarray, log: dict) -> None:
+        """Write a contact: its picture, a line of the log, its row; a row's picture is always there."""
+        name = f"frame_{index}_0.png"
+        write_image(self.pictures / name, frame.image)
+        with (self.folder / LOG).open("a") as file:
+            file.write(json.dumps({"image_name": name, **log}) + "\n")
+        row = [name, f"frame_{index}", 1, index + 1, *(f"{value:.9g}" for value in (*label, *move))]
+        with (self.folder / TABLE).open("a", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerow(row)
+            file.flush()
+            os.fsync(file.fileno())
+
+    @staticmethod
+    def _drop_torn_line(table: Path) -> None:
+        text = table.read_text()
+        if not text.endswith("\n"):
+            table.write_text(text[: text.rfind("\n") + 1])
+
+
+def draw_contact(experiment: ExperimentSpec, seed: int, index: int) -> Contact:
+    """Pose and move of contact ``index``, each number even over its range; depends on nothing else."""
+    low, high = np.array(list(experiment.ranges().values())).T
+    numbers = np.random.default_rng([seed, index]).uniform(low, high)
+    return Contact(numbers[:6], numbers[6:])
+
+
+class WorkFrame:
+    """The robot's coordinates of an experiment in front of an object.
+
+    A label means there what the mounting says: at its origin, after ``clear`` and ``tap``, the tool is as deep and as far from
+    the normal as labels of 0 stand for.
+    """
+
+    def __init__(self, experiment: ExperimentSpec, placed: PlacedObject) -> None:
+        self._offset = np.array(experiment.clear) + np.array(experiment.tap)
+        mounting = placed.mounting
+        self._T = matrix_of(placed.start_pose(mounting.depth_mm(0.0)))
+        turn = np.radians(mounting.angle_deg(0.0)) * mounting.out_of_plane
+        self._T[:3, :3] = self._T[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+        self._T[:3, 3] -= self._T[:3, :3] @ self._offset[:3]
+        self._toward = mounting.axis
+
+    def base_pose(self, label: np.ndarray, near: np.ndarray, *, away_mm: float = 0.0) -> np.ndarray:
+        """The arm's pose (6,) at work coordinates (6,), ``away_mm`` back along the approach."""
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xyz", label[3:], degrees=True).as_matrix()
+        T[:3, 3] = label[:3] - away_mm * self._toward
+        return pose_of(self._T @ T, near)
+
+    def label(self, base_pose: np.ndarray) -> np.ndarray:
+        """The pose's label (6,) with the arm at a pose (6,), after the tap."""
+        return pose_of(np.linalg.inv(self._T) @ matrix_of(base_pose), np.zeros(6)) - self._offset
+
+
+def collect(
+    source: FrameSource,
+    arm: Arm,
+    experiment: ExperimentSpec,
+    placed: PlacedObject,
+    collection: Collection,
+    count: int,
+    *,
+    seed: int,
+    speed: tuple[float, float],
+    guards: tuple = (),
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Collect up to ``count`` contacts; those that the collection holds already are not made again.
+
+    Whatever happens the arm is stopped, withdrawn and disabled.
+
+    Parameters
+    ----------
+    seed : int
+        Of the draws.
+    speed : (float, float)
+        In mm/s and deg/s.
+
+    Returns
+    -------
+    int
+        Contacts in the collection.
+
+    Raises
+    ------
+    DeviceError
+        The arm did not come to stand where it was sent, or no frame came.
+    """
+    frame_of = WorkFrame(experiment, placed)
+    clear, tap = np.array(experiment.clear), np.array(experiment.tap)
+    arm.enable()
+    arm.set_speed(*speed)
+
+    def go(label: np.ndarray, away_mm: float = 0.0) -> ArmState:
+        state = arm.state()
+        target = frame_of.base_pose(label, state.pose, away_mm=away_mm)
+        for guard in guards:
+            target = guard(state, target)
+        sent = arm.move_linear(target, wait=False, timeout_s=MOVE_TIMEOUT_S)
+        return arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
+
+    def stop_at(label: np.ndarray) -> ArmState:
+        """Go there and be seen there: what the skin remembers depends on where the arm has been."""
+        state = go(label)
+        _frame_after(source, state)
+        return state
+
+    here = np.zeros(6)
+    try:
+        state = go(here, CLEAR_MM)
+        if not collection.has_rest:
+            collection.keep_rest(_frame_after(source, state))
+        for index in range(collection.count, count):
+            asked = draw_contact(experiment, seed, index)
+            before = asked.pose - asked.move + clear
+            go(before, LIFT_MM)
+            here = before
+            stop_at(before)
+            stop_at(before + tap)
+            here = asked.pose + clear + tap
+            confirmed = go(here)
+            frame = _frame_after(source, confirmed)
+            after = arm.state()
+            log = {
+                "asked": [*asked.pose.tolist(), *asked.move.tolist()],
+                "confirmed_pose": confirmed.pose.tolist(),
+                "confirmed_s": confirmed.time_s,
+                "frame_s": frame.time_s,
+                "sequence": frame.sequence,
+                "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
+            }
+            collection.keep(index, frame, frame_of.label(confirmed.pose), asked.move, log)
+            _frame_after(source, go(here, LIFT_MM))
+            if progress is not None:
+                progress(index + 1, count)
+    finally:
+        _withdraw(arm, lambda: go(here, CLEAR_MM))
+    return collection.count
+
+
+def _frame_after(source: FrameSource, state: ArmState) -> Frame:
+    try:
+        return source.read_after(state.time_s, timeout_s=FRAME_TIMEOUT_S)
+    except TimeoutError as error:
+        raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
+
+
+def _withdraw(arm: Arm, back: Callable[[], ArmState]) -> None:
+    for act in (arm.stop, back, arm.disable):
+        try:
+            act()
+        except TwinError:  # the first error is on its way already; each of these is tried whatever became of the others
+            continue

@@ -1,0 +1,188 @@
+"""A camera emulated on this machine: JPEG pictures over HTTP (multipart/x-mixed-replace), and what can go wrong with them."""
+
+import threading
+import time
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+
+from hardware.cameras.source import FrameSource
+from hardware.emulators.faults import Faults
+from hardware.errors import DeviceError
+from hardware.stream import CONTENT_TYPE, jpeg_of, write_part
+from twin.errors import TwinError
+
+CLIENT_WAIT_S = 0.5
+FAULTS = {
+    "frozen": (None, "the same picture again and again"),
+    "black": (None, "the lamps are off"),
+    "dropped": (2.0, "every n-th picture is lost"),
+    "late": (0.3, "pictures arrive this many seconds after their exposure"),
+    "torn": (3.0, "every n-th JPEG ends too early"),
+    "unplugged": (1.0, "the connection is cut and none taken for this many seconds, once"),
+    "silent": (None, "connections stay open, nothing comes"),
+}
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A picture on the wire: number, exposure (Unix seconds), when it may be sent (monotonic), bytes."""
+
+    number: int
+    exposed_unix_s: float
+    due_s: float
+    jpeg: bytes
+
+
+class CameraEmulator:
+    """Serves a source's frames as a stream; a context manager that listens between ``start`` and ``stop``.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Live; connected and disconnected with the emulator.
+    host : str
+    port : int
+        0: a free one, see ``url``.
+    faults : iterable of str
+        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` may be changed while it runs.
+
+    Attributes
+    ----------
+    made, sent : int
+        Pictures so far, lost ones included, and parts sent to any client.
+    """
+
+    def __init__(self, source: FrameSource, *, host: str = "127.0.0.1", port: int = 0, faults: tuple[str, ...] = ()) -> None:
+        self.faults = Faults(FAULTS, faults)
+        self._source, self._address = source, (host, port)
+        self._new = threading.Condition()
+        self._part: _Part | None = None
+        self._end = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._server: ThreadingHTTPServer | None = None
+        self._pulled_s: float | None = None
+        self.error: Exception | None = None
+        self.made = self.sent = 0
+
+    @property
+    def url(self) -> str:
+        """Where the stream is."""
+        host, port = self._server.server_address[:2]
+        return f"http://{host}:{port}/stream.mjpg"
+
+    def start(self) -> None:
+        try:
+            self._server = _Server(self._address, _handler_of(self))
+        except OSError as error:
+            raise DeviceError(
+                f"camera emulator: can't listen on {self._address[0]}:{self._address[1]} ({error.strerror}); give another --port"
+            ) from error
+        self._end.clear()
+        self._source.connect()
+        for target in (self._make, self._server.serve_forever):
+            self._threads.append(threading.Thread(target=target, name="camera emulator", daemon=True))
+            self._threads[-1].start()
+
+    def stop(self) -> None:
+        self._end.set()
+        if self._server is not None:
+            self._server.shutdown()
+            self._server.server_close()
+        for thread in self._threads:
+            thread.join(timeout=15.0)
+        self._threads.clear()
+        self._source.disconnect()
+
+    def __enter__(self) -> "CameraEmulator":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def pulled_out(self) -> bool:
+        """Whether the plug is out just now."""
+        span_s = self.faults.value("unplugged")
+        if span_s is None:
+            self._pulled_s = None
+            return False
+        self._pulled_s = self._pulled_s or time.monotonic()
+        return time.monotonic() - self._pulled_s < span_s
+
+    def next_part(self, after: int) -> _Part | None:
+        """The newest part with a higher number, when it is due; None if there is none for a while."""
+        with self._new:
+            self._new.wait_for(lambda: self._part is not None and self._part.number > after, CLIENT_WAIT_S)
+            part = self._part
+        if part is None or part.number <= after:
+            return None
+        self._end.wait(max(0.0, part.due_s - time.monotonic()))
+        return part
+
+    def _make(self) -> None:
+        last: np.ndarray | None = None
+        while not self._end.is_set():
+            try:
+                frame = self._source.read(timeout_s=CLIENT_WAIT_S)
+            except TimeoutError:
+                continue
+            except (TwinError, EOFError) as error:
+                self.error = error
+                return
+            image = frame.image
+            if "frozen" in self.faults and last is not None:
+                image = last
+            last = image
+            if "black" in self.faults:
+                image = np.zeros_like(image)
+            self.made += 1
+            if "silent" in self.faults or self._every("dropped"):
+                continue
+            jpeg = jpeg_of(image)
+            if self._every("torn"):
+                jpeg = jpeg[: len(jpeg) // 2]
+            age_s = time.monotonic() - frame.time_s
+            part = _Part(self.made, time.time() - age_s, time.monotonic() + (self.faults.value("late") or 0.0), jpeg)
+            with self._new:
+                self._part = part
+                self._new.notify_all()
+
+    def _every(self, fault: str) -> bool:
+        value = self.faults.value(fault)
+        return value is not None and self.made % max(1, round(value)) == 0
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    allow_reuse_address = True
+
+
+def _handler_of(camera: CameraEmulator) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if camera.pulled_out:
+                self.send_error(503, "unplugged")
+                return
+            self.send_response(200)
+            self.send_header("Content-Type", CONTENT_TYPE)
+            self.end_headers()
+            number = 0
+            while not (camera._end.is_set() or camera.pulled_out):
+                part = camera.next_part(number)
+                if part is None:
+                    continue
+                number = part.number
+                headers = {"X-Timestamp": f"{part.exposed_unix_s:.6f}", "X-Sequence": part.number}
+                try:
+                    write_part(self.wfile, part.jpeg, headers)
+                except OSError:
+                    return
+                camera.sent += 1
+
+        def log_message(self, *_: object) -> None:
+            """Keep still."""
+
+    return Handler

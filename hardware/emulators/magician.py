@@ -1,0 +1,163 @@
+"""A Dobot Magician emulated on this machine, over a real pseudo-terminal."""
+
+import contextlib
+import os
+import pty
+import random
+import select
+import termios
+import time
+import tty
+from pathlib import Path
+from threading import Event, Lock, Thread, Timer
+
+import numpy as np
+
+from hardware.arms.magician_wire import take_message
+from hardware.emulators.faults import Faults
+from hardware.emulators.magician_controller import START_JOINTS_DEG, MagicianController
+from twin.errors import TwinError
+
+SPLIT_AT = 4
+FAULTS = {
+    "noise": (5.0, "this many random bytes come before each reply"),
+    "split-frames": (0.02, "replies come in two pieces, this many seconds apart"),
+    "wrong-checksum": (3.0, "every n-th reply has a wrong checksum"),
+    "lost-reply": (3.0, "every n-th reply never comes"),
+    "mute": (None, "no reply ever comes"),
+    "unplugged": (5.0, "the cable is pulled, this many seconds after the start"),
+    "lost-steps": (0.5, "each move stops with an alarm after this share of its time"),
+    "stall": (0.5, "each move stops after this share of its time, and its command never ends"),
+    "ignore-moves": (None, "moves are accepted and not executed"),
+    "slow": (0.1, "moves at this share of the speed"),
+    "wide-queue-space": (None, "the queue's space is told in 8 bytes instead of 4"),
+}
+
+
+class MagicianEmulator:
+    """A Magician on a pseudo-terminal; a context manager that lives between ``start`` and ``stop``.
+
+    Parameters
+    ----------
+    link : Path or None
+        A symbolic link to make to the terminal; removed at the end.
+    faults : iterable of str
+        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` may be changed while it runs.
+    joints_deg : (4,) float
+    time_scale : float
+        How much faster than the real arm it moves.
+
+    Attributes
+    ----------
+    device : str
+        The terminal that a client opens.
+    """
+
+    def __init__(
+        self,
+        *,
+        link: Path | None = None,
+        faults: tuple[str, ...] = (),
+        joints_deg=START_JOINTS_DEG,
+        time_scale: float = 1.0,
+    ) -> None:
+        self.faults = Faults(FAULTS, faults)
+        self.arm = MagicianController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
+        self.device = ""
+        self._link = link
+        self._ends: tuple[int, int] | None = None  # ours, the client's
+        self._lock, self._ended = Lock(), Event()
+        self._thread: Thread | None = None
+        self._noise, self._replies = random.Random(0), 0
+
+    def __enter__(self) -> "MagicianEmulator":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def pose(self, time_s: float | None = None) -> np.ndarray:
+        """Pose (6,) of the tool at a ``time.monotonic()`` (now if not given)."""
+        return self.arm.pose(time_s)
+
+    def start(self) -> None:
+        """Make the terminal.
+
+        Raises
+        ------
+        TwinError
+            The link can't be made.
+        """
+        self._ends = pty.openpty()
+        tty.setraw(self._ends[1])
+        self.device = os.ttyname(self._ends[1])
+        if self._link is not None:
+            try:
+                self._link.symlink_to(self.device)
+            except OSError as error:
+                self.unplug()
+                raise TwinError(
+                    f"{self._link}: can't make the link ({error.strerror}); remove what is there or give another --link"
+                ) from error
+        self._thread = Thread(target=self._serve, daemon=True, name="magician-emulator")
+        self._thread.start()
+        if (after_s := self.faults.value("unplugged")) is not None:
+            timer = Timer(after_s, self.unplug)
+            timer.daemon = True
+            timer.start()
+
+    def stop(self) -> None:
+        self.unplug()
+        if self._thread is not None:
+            self._thread.join(timeout=2.0)
+
+    def unplug(self) -> None:
+        """Pull the cable: the terminal vanishes. The arm goes on with what is queued."""
+        self._ended.set()
+        with self._lock:
+            for end in self._ends or ():
+                with contextlib.suppress(OSError):
+                    os.close(end)
+            self._ends = None
+            if self._link is not None and self._link.is_symlink():
+                self._link.unlink()
+
+    def _serve(self) -> None:
+        buffer = b""
+        while not self._ended.is_set():
+            with self._lock:
+                if self._ends is None:
+                    return
+                ready, _, _ = select.select([self._ends[0]], [], [], 0.0)
+                data = os.read(self._ends[0], 4096) if ready else b""
+                if data and termios.tcgetattr(self._ends[1])[4] != termios.B115200:
+                    data = b""  # at another speed it is noise
+            if not data:
+                time.sleep(0.001)
+                continue
+            message, buffer = take_message(buffer + data)
+            while message is not None:
+                self._send(self.arm.answer(message).to_bytes())
+                message, buffer = take_message(buffer)
+
+    def _send(self, frame: bytes) -> None:
+        self._replies += 1
+        if "mute" in self.faults or self._every("lost-reply"):
+            return
+        if self._every("wrong-checksum"):
+            frame = frame[:-1] + bytes([frame[-1] ^ 0xFF])
+        if (count := self.faults.value("noise")) is not None:
+            frame = self._noise.randbytes(int(count)) + frame
+        pause_s = self.faults.value("split-frames")
+        pieces = [frame] if pause_s is None else [frame[:SPLIT_AT], frame[SPLIT_AT:]]
+        for n, piece in enumerate(pieces):
+            if n:
+                time.sleep(pause_s)
+            with self._lock, contextlib.suppress(OSError):
+                if self._ends is not None:
+                    os.write(self._ends[0], piece)
+
+    def _every(self, fault: str) -> bool:
+        every = self.faults.value(fault)
+        return every is not None and self._replies % int(every) == 0

@@ -1,0 +1,251 @@
+"""The emulated Magician's controller: its commands, its queue and its alarms. Knows no serial port."""
+
+import struct
+import time
+from dataclasses import dataclass, replace
+from threading import RLock
+
+import numpy as np
+
+from hardware.arms.kinematics import MAGICIAN, NO_INVERSE, OutOfReachError, Violation
+from hardware.arms.magician_wire import Id, Message, Ptp
+from hardware.arms.motion import MotionTrack, Speeds
+from hardware.emulators.faults import Faults
+
+QUEUE_N = 32
+NOT_UNDERSTOOD, LOST_STEPS = 1, 80
+START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
+HOME_SPEED_DEG_S = 30.0
+JOG_MM, JOG_DEG = 400.0, 300.0  # a jog's far end, beyond any limit
+PARAMETERS = {  # what is stored as it comes: number of bytes, what they are to begin with
+    Id.HOME_PARAMS: struct.pack("<4f", 200.0, 0.0, 0.0, 0.0),
+    Id.END_EFFECTOR: struct.pack("<3f", 0.0, 0.0, 0.0),
+    Id.LASER: bytes(2),
+    Id.SUCTION: bytes(2),
+    Id.GRIPPER: bytes(2),
+    Id.IO: bytes(2),
+    Id.JOG_JOINT_PARAMS: struct.pack("<8f", *[20.0] * 4, *[50.0] * 4),
+    Id.JOG_COORDINATE_PARAMS: struct.pack("<8f", *[20.0] * 4, *[50.0] * 4),
+    Id.JOG_COMMON_PARAMS: struct.pack("<2f", 50.0, 50.0),
+    Id.PTP_JOINT_PARAMS: struct.pack("<8f", *[200.0] * 8),
+    Id.PTP_COORDINATE_PARAMS: struct.pack("<4f", *[200.0] * 4),
+    Id.PTP_JUMP_PARAMS: struct.pack("<2f", 20.0, 100.0),
+    Id.PTP_COMMON_PARAMS: struct.pack("<2f", 50.0, 50.0),
+    Id.CP_PARAMS: struct.pack("<3fB", 100.0, 50.0, 10.0, 0),
+}
+SIZES = {Id.RESET_POSE: (9,), Id.HOME: (4, 0), Id.JOG: (2,), Id.PTP: (17,), Id.CP: (17, 14), Id.WAIT: (4,)}  # 14: pydobot's CP
+
+
+@dataclass(frozen=True)
+class Queued:
+    """A command in the queue and when it came."""
+
+    index: int
+    message: Message
+    time_s: float
+
+
+class MagicianController:
+    """What the arm does with its commands. Every method may be called from any thread."""
+
+    def __init__(self, faults: Faults, *, joints_deg=START_JOINTS_DEG, time_scale: float = 1.0) -> None:
+        self.faults, self._time_scale = faults, time_scale
+        self.kinematics = MAGICIAN
+        self.track = MotionTrack(MAGICIAN, np.asarray(joints_deg, float))
+        self.lock = RLock()
+        self.alarms: set[int] = set()
+        self._params = dict(PARAMETERS)
+        self._queue: list[Queued] = []
+        self._running = False
+        self._since_s = self._ends_s = -np.inf  # the head can't begin before; the head is done (inf: not begun)
+        self._begun, self._lost_at_s = False, np.inf
+        self._issued = self._current = 0
+
+    def pose(self, time_s: float | None = None) -> np.ndarray:
+        with self.lock:
+            now_s = self.advance()
+            return self.track.pose(now_s if time_s is None else time_s)
+
+    def answer(self, message: Message) -> Message:
+        """Do a command, or queue it; the reply has its id and ctrl."""
+        with self.lock:
+            now_s = self.advance()
+            if not self._understood(message):
+                self.alarms.add(NOT_UNDERSTOOD)
+                return Message(message.id, message.ctrl)
+            if message.is_write and message.is_queued:
+                self._issued += 1
+                self._queue.append(Queued(self._issued, message, now_s))
+                self.advance()
+                return Message(message.id, message.ctrl, struct.pack("<Q", self._issued))
+            return Message(message.id, message.ctrl, self._write(message, now_s) if message.is_write else self._read(message, now_s))
+
+    def advance(self) -> float:
+        """Do what the queue has to do until now; the time now."""
+        now_s = time.monotonic()
+        with self.lock:
+            if self._lost_at_s <= now_s:
+                self.alarms.add(LOST_STEPS)
+                self._lost_at_s = np.inf
+            while self._running and self._queue and not self.alarms:
+                head = self._queue[0]
+                if not self._begun:
+                    begins_s = max(self._since_s, head.time_s)
+                    self._ends_s = self._do(head.message, begins_s)
+                    self._begun = True
+                if self._ends_s > now_s:
+                    break
+                self._since_s, self._current, self._begun = self._ends_s, head.index, False
+                self._queue.pop(0)
+            return now_s
+
+    def _understood(self, message: Message) -> bool:
+        if message.id in SIZES:
+            return message.is_write and len(message.params) in SIZES[message.id]
+        if message.id in PARAMETERS:
+            return not message.is_write or len(message.params) == len(PARAMETERS[message.id])
+        return message.id in set(Id)
+
+    def _read(self, message: Message, now_s: float) -> bytes:
+        if message.id == Id.GET_POSE:
+            pose = self.track.pose(now_s)
+            return struct.pack("<8f", *pose[[0, 1, 2, 5]], *self.track.joints_deg(now_s))
+        if message.id == Id.ALARMS:
+            return sum(1 << alarm for alarm in self.alarms).to_bytes(16, "little")
+        if message.id == Id.QUEUE_INDEX:
+            return struct.pack("<Q", self._current)
+        if message.id == Id.QUEUE_SPACE:
+            return struct.pack("<Q" if "wide-queue-space" in self.faults else "<I", max(0, QUEUE_N - len(self._queue)))
+        return self._params.get(message.id, b"")
+
+    def _write(self, message: Message, now_s: float) -> bytes:
+        if message.id == Id.ALARMS:
+            self.alarms.clear()
+        elif message.id == Id.QUEUE_START:
+            self._since_s, self._running = now_s, True
+        elif message.id == Id.QUEUE_STOP:  # what is being done is done to its end
+            self._running = False
+        elif message.id == Id.QUEUE_FORCE_STOP:
+            self.track.stop(now_s)
+            self._running, self._begun = False, False
+        elif message.id == Id.QUEUE_CLEAR:
+            self._queue.clear()
+            self._begun = False
+        else:
+            self._do(message, now_s)
+        return b""
+
+    def _do(self, message: Message, begins_s: float) -> float:
+        """Begin a command; when it will be done."""
+        params = message.params
+        if message.id in PARAMETERS:
+            self._params[message.id] = params
+            if message.id == Id.END_EFFECTOR:
+                self._set_tool(struct.unpack("<3f", params)[0], begins_s)
+        elif message.id == Id.PTP:
+            mode, *numbers = struct.unpack("<B4f", params)
+            return self._ptp(mode, np.array(numbers), begins_s)
+        elif message.id == Id.CP:
+            absolute, x, y, z = struct.unpack("<B3f", params[:13])
+            here = self._target_pose()
+            end = np.array([x, y, z, 0, 0, 0]) if absolute else here + [x, y, z, 0, 0, 0]
+            end[5] = here[5]
+            speed, acceleration = self._floats(Id.CP_PARAMS, "<3fB")[1], self._floats(Id.CP_PARAMS, "<3fB")[0]
+            return self._go(end, Speeds(speed, speed, acceleration, acceleration), begins_s, linear=True)
+        elif message.id == Id.HOME:
+            x, y, z, r = self._floats(Id.HOME_PARAMS, "<4f")
+            return self._go_to(np.array([x, y, z, 0, 0, r]), Speeds(HOME_SPEED_DEG_S, HOME_SPEED_DEG_S), begins_s)
+        elif message.id == Id.WAIT:
+            return begins_s + struct.unpack("<I", params)[0] / 1000.0
+        elif message.id == Id.JOG:
+            self._jog(*params, begins_s)
+        return begins_s  # ResetPose: nothing, the emulated arm always knows where it stands
+
+    def _ptp(self, mode: int, numbers: np.ndarray, begins_s: float) -> float:
+        here, joints = self._target_pose(), self._target_joints()
+        target = np.array([*numbers[:3], 0.0, 0.0, numbers[3]])
+        line, turn = self._ptp_speeds()
+        if mode in (Ptp.MOVJ_ANGLE, Ptp.MOVJ_INC):
+            return self._go(numbers + (joints if mode == Ptp.MOVJ_INC else 0.0), turn, begins_s, linear=False)
+        if mode in (Ptp.JUMP_ANGLE, Ptp.MOVL_ANGLE):
+            target = self.kinematics.forward(numbers)
+        elif mode in (Ptp.MOVL_INC, Ptp.MOVJ_XYZ_INC):
+            target = here + target
+        elif mode not in set(Ptp):
+            return self._alarm(NOT_UNDERSTOOD, begins_s)
+        if mode in (Ptp.MOVJ_XYZ, Ptp.MOVJ_XYZ_INC):
+            return self._go_to(target, turn, begins_s)
+        if mode in (Ptp.JUMP_XYZ, Ptp.JUMP_ANGLE, Ptp.JUMP_MOVL_XYZ):
+            height, limit = self._floats(Id.PTP_JUMP_PARAMS, "<2f")
+            top = min(max(here[2], target[2]) + height, limit)
+            over, above = here.copy(), target.copy()
+            over[2] = above[2] = top
+            begins_s = self._go(over, line, begins_s, linear=True)
+            across = mode == Ptp.JUMP_MOVL_XYZ
+            begins_s = self._go(above, line, begins_s, linear=True) if across else self._go_to(above, turn, begins_s)
+        return self._go(target, line, begins_s, linear=True)
+
+    def _jog(self, joints: int, command: int, begins_s: float) -> None:
+        self.track.stop(begins_s)
+        if not 1 <= command <= 8:
+            return
+        axis, sign = (command - 1) // 2, 1 if command % 2 else -1
+        speed = struct.unpack("<8f", self._params[Id.JOG_JOINT_PARAMS if joints else Id.JOG_COORDINATE_PARAMS])[axis]
+        speed *= self._floats(Id.JOG_COMMON_PARAMS, "<2f")[0] / 100.0 * self._time_scale
+        start = self.track.joints_deg(begins_s) if joints else self.track.pose(begins_s)
+        at, length = (axis if joints or axis < 3 else 5), JOG_DEG if joints or axis == 3 else JOG_MM
+        while length > 0.5 and speed > 0:  # the far end is where the arm still can be
+            end = start.copy()
+            end[at] += sign * length
+            moved = self.track.move(end, Speeds(speed, speed), linear=not joints, now_s=begins_s)
+            if not isinstance(moved, Violation):
+                return
+            length *= 0.9
+
+    def _go_to(self, pose: np.ndarray, speeds: Speeds, begins_s: float) -> float:
+        try:
+            return self._go(self.kinematics.inverse(pose), speeds, begins_s, linear=False)
+        except OutOfReachError:
+            return self._alarm(NO_INVERSE, begins_s)
+
+    def _go(self, end: np.ndarray, speeds: Speeds, begins_s: float, *, linear: bool) -> float:
+        if self.alarms or "ignore-moves" in self.faults:
+            return begins_s
+        speeds = speeds.scaled(self._time_scale * (self.faults.value("slow") or 1.0))
+        piece = self.track.move(end, speeds, linear=linear, now_s=begins_s)
+        if isinstance(piece, Violation):
+            return self._alarm(piece.code, begins_s)
+        share = self.faults.value("stall")
+        if share is not None and piece.duration_s > 0:
+            self.track.stop(piece.start_s + share * piece.duration_s)
+            return np.inf
+        share = self.faults.value("lost-steps")
+        if share is not None and piece.duration_s > 0:
+            self.track.stop(piece.start_s + share * piece.duration_s)
+            self._lost_at_s = self.track.end_s
+        return piece.end_s
+
+    def _alarm(self, alarm: int, begins_s: float) -> float:
+        self.alarms.add(alarm)
+        return begins_s
+
+    def _ptp_speeds(self) -> tuple[Speeds, Speeds]:
+        speed, acceleration = np.clip(self._floats(Id.PTP_COMMON_PARAMS, "<2f"), 0.01, 100.0) / 100.0
+        xyz, r, xyz2, r2 = self._floats(Id.PTP_COORDINATE_PARAMS, "<4f")
+        joints = self._floats(Id.PTP_JOINT_PARAMS, "<8f")
+        line = Speeds(speed * xyz, speed * r, acceleration * xyz2, acceleration * r2)
+        return line, Speeds(speed * joints[0], speed * min(joints[:4]), acceleration * joints[4], acceleration * min(joints[4:]))
+
+    def _floats(self, id: Id, form: str) -> tuple:
+        return struct.unpack(form, self._params[id])
+
+    def _set_tool(self, x_mm: float, time_s: float) -> None:
+        joints = self.track.joints_deg(time_s)
+        self.kinematics = replace(MAGICIAN, r0_mm=x_mm)
+        self.track = MotionTrack(self.kinematics, joints)
+
+    def _target_pose(self) -> np.ndarray:
+        return self.track.pose(np.inf)
+
+    def _target_joints(self) -> np.ndarray:
+        return self.track.joints_deg(np.inf)

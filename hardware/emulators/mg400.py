@@ -1,0 +1,271 @@
+"""A Dobot MG400 emulated on this machine, over real TCP sockets on all five ports."""
+
+import contextlib
+import select
+import socket
+import struct
+import time
+from threading import Event, Lock, Thread, Timer
+
+import numpy as np
+
+from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT, ErrorId
+from hardware.emulators.faults import Faults
+from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
+from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller
+from hardware.emulators.mg400_feedback import feedback_packet
+from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
+from twin.errors import TwinError
+
+PORTS = (DASHBOARD_PORT, MOTION_PORT, *FEEDBACK_PERIOD_S)
+OLD_FIRMWARE, NEW_FIRMWARE = "1.5.5", "1.7.0"
+FIRST_NUMBERED_REPLIES = (1, 5, 6)  # older firmware answers bare echoes
+SHORT_BYTES = 1000
+POLL_S = 0.002
+FAULTS = {
+    "no-tcp-mode": (None, "not in TCP mode: every command is refused with -1"),
+    "split-refusals": (None, "a refusal arrives as two fragments: -1,{},;EnableRobot();"),
+    "needs-motion-client": (None, "the dashboard answers -10000 until a client is on the motion port"),
+    "motion-port-closed": (None, "nobody listens on the motion port and the dashboard answers -10000"),
+    "one-client": (None, "a port hangs up on a second client"),
+    "emergency-stop": (0.0, "the emergency stop is pressed, this many seconds after the start"),
+    "no-fast-feedback": (None, "nobody listens on 30004"),
+    "no-feedback": (None, "nobody listens on 30004 to 30006"),
+    "silent-feedback": (1.0, "each feedback connection falls silent after this many seconds"),
+    "short-packets": (10.0, "every n-th feedback packet is cut short"),
+    "wrong-test-value": (10.0, "every n-th feedback packet has a wrong test value"),
+    "collision": (0.5, "each move ends in a collision alarm after this share of its time"),
+    "stall": (0.5, "each move stops without an alarm after this share of its time"),
+    "ignore-moves": (None, "moves are accepted and not executed"),
+    "slow": (0.1, "moves at this share of the speed"),
+    "no-sync-reply": (None, "Sync() is never answered"),
+    "six-value-pose": (None, "GetPose() gives six values"),
+    "error-groups": (7.0, "GetErrorID() gives this many groups"),
+    "die": (5.0, "the arm goes dead, this many seconds after the start"),
+}
+
+
+class Mg400Emulator:
+    """An MG400 on loopback; a context manager that listens between ``start`` and ``stop``.
+
+    Parameters
+    ----------
+    host : str
+        Address to listen on.
+    port_offset : int or None
+        Added to the arm's ports; None: free ports, see ``ports``.
+    faults : iterable of str
+        ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` may be changed while it runs.
+    firmware : str
+        Below 1.5.6 it answers bare echoes and nothing on the motion port; from 1.6 on it has SetUser and SetTool;
+        from 1.7 on it refuses ``GetPose`` with keywords.
+    joints_deg : (4,) float
+        Where the arm stands to begin with.
+    time_scale : float
+        How much faster than the real arm it moves.
+
+    Attributes
+    ----------
+    ports : dict of int to int
+        The arm's own port to the one listened on here.
+    """
+
+    def __init__(
+        self,
+        *,
+        host: str = "127.0.0.1",
+        port_offset: int | None = 0,
+        faults: tuple[str, ...] = (),
+        firmware: str = NEW_FIRMWARE,
+        joints_deg=START_JOINTS_DEG,
+        time_scale: float = 1.0,
+    ) -> None:
+        try:
+            version = parse_firmware(firmware)
+        except ValueError as error:
+            raise TwinError(str(error)) from error
+        self.host, self._port_offset = host, port_offset
+        self.faults = Faults(FAULTS, faults)
+        self.arm = Mg400Controller(self.faults, joints_deg=joints_deg, time_scale=time_scale)
+        self._commands = Mg400Commands(self.arm, version)
+        self._bare = version < FIRST_NUMBERED_REPLIES
+        self.ports: dict[int, int] = {}
+        self._sockets: list[socket.socket] = []  # bound
+        self._listeners: dict[socket.socket, int] = {}  # of them, those that listen
+        self._clients: dict[socket.socket, int] = {}
+        self._lock, self._ended = Lock(), Event()
+        self._threads: list[Thread] = []
+
+    def __enter__(self) -> "Mg400Emulator":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def pose(self, time_s: float | None = None) -> np.ndarray:
+        """Pose (6,) of the flange at a ``time.monotonic()`` (now if not given)."""
+        now_s = self.arm.update()
+        return self.arm.track.pose(now_s if time_s is None else time_s)
+
+    def start(self) -> None:
+        """Begin to listen.
+
+        Raises
+        ------
+        TwinError
+            A port is taken.
+        """
+        deaf = {MOTION_PORT} if "motion-port-closed" in self.faults else set()
+        deaf |= set(FEEDBACK_PERIOD_S) if "no-feedback" in self.faults else {30004} if "no-fast-feedback" in self.faults else set()
+        for port in PORTS:
+            listener = socket.socket()
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._sockets.append(listener)
+            try:
+                listener.bind((self.host, 0 if self._port_offset is None else port + self._port_offset))
+            except OSError as error:
+                self.stop()
+                raise TwinError(
+                    f"can't listen on {self.host}:{port + (self._port_offset or 0)} ({error.strerror}); "
+                    "end what uses the port (another emulator?), or give another --port-offset"
+                ) from error
+            self.ports[port] = listener.getsockname()[1]
+            if port not in deaf:
+                listener.listen()
+                self._listeners[listener] = port
+        self._run(self._accept)
+        for name, action in (("emergency-stop", self.arm.press_emergency_stop), ("die", self.kill)):
+            if (after_s := self.faults.value(name)) is not None:
+                timer = Timer(after_s, action)
+                timer.daemon = True
+                timer.start()
+
+    def stop(self) -> None:
+        """Hang up and no longer listen."""
+        self._close(abruptly=False)
+        for thread in self._threads:
+            thread.join(timeout=2.0)
+
+    def kill(self) -> None:
+        """Go dead: every connection is reset, nobody listens any more."""
+        self._close(abruptly=True)
+
+    def _close(self, *, abruptly: bool) -> None:
+        self._ended.set()
+        with self._lock:
+            for client in self._clients:
+                with contextlib.suppress(OSError):
+                    if abruptly:
+                        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                        client.close()
+                    else:
+                        client.shutdown(socket.SHUT_RDWR)
+            for bound in self._sockets:
+                with contextlib.suppress(OSError):
+                    bound.shutdown(socket.SHUT_RDWR)  # a thread that waits for it would keep it listening
+                bound.close()
+            self._clients.clear()
+
+    def _run(self, target, *arguments) -> None:
+        thread = Thread(target=target, args=arguments, daemon=True, name="mg400-emulator")
+        self._threads.append(thread)
+        thread.start()
+
+    def _accept(self) -> None:
+        while not self._ended.is_set():
+            try:
+                ready, _, _ = select.select([one for one in self._listeners if one.fileno() >= 0], [], [], 0.05)
+                accepted = [(listener.accept()[0], self._listeners[listener]) for listener in ready]
+            except (OSError, ValueError):  # closed meanwhile
+                continue
+            for client, port in accepted:
+                with self._lock:
+                    taken = port in self._clients.values() and "one-client" in self.faults
+                    if not taken:
+                        self._clients[client] = port
+                if taken:
+                    client.close()
+                else:
+                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    self._run(self._serve, client, port)
+
+    def _serve(self, client: socket.socket, port: int) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            if port in FEEDBACK_PERIOD_S:
+                self._feed(client, FEEDBACK_PERIOD_S[port])
+            else:
+                self._converse(client, port)
+        with self._lock:
+            self._clients.pop(client, None)
+        client.close()
+
+    def _feed(self, client: socket.socket, period_s: float) -> None:
+        begun_s = due_s = time.monotonic()
+        count = 0
+        while not self._ended.is_set():
+            silent_after_s = self.faults.value("silent-feedback")
+            if silent_after_s is None or time.monotonic() - begun_s < silent_after_s:
+                count += 1
+                client.sendall(self._packet(count))
+            due_s = max(due_s + period_s, time.monotonic())
+            self._ended.wait(max(0.0, due_s - time.monotonic()) or POLL_S)
+
+    def _packet(self, count: int) -> bytes:
+        packet = feedback_packet(self.arm)
+        if (every := self.faults.value("wrong-test-value")) is not None and count % int(every) == 0:
+            packet["test_value"] = 0
+        data = packet.tobytes()
+        if (every := self.faults.value("short-packets")) is not None and count % int(every) == 0:
+            return data[:SHORT_BYTES]
+        return data
+
+    def _converse(self, client: socket.socket, port: int) -> None:
+        buffer = ""
+        while data := client.recv(4096):
+            buffer += data.decode("ascii", errors="replace")
+            request, buffer = take_request(buffer)
+            while request is not None:
+                self._answer(client, port, request)
+                request, buffer = take_request(buffer)
+
+    def _answer(self, client: socket.socket, port: int, request: Request) -> None:
+        try:
+            values = self._execute(port, request)
+            if request.name in ("sync", "syncall") and not self._wait_until_done(client):
+                return
+            reply = f"0,{{{values}}},{request.text};"
+        except RefusedError as refusal:
+            if "split-refusals" in self.faults and not self._bare:
+                client.sendall(f"{refusal.error_id},{{}},;".encode())
+                time.sleep(0.02)  # so that they come in two pieces
+                reply = f"{request.text};"
+            else:
+                reply = f"{refusal.error_id},{{}},{request.text};"
+        if not self._bare:
+            client.sendall(reply.encode())
+        elif port == DASHBOARD_PORT:
+            client.sendall(f"{request.text};".encode())
+
+    def _execute(self, port: int, request: Request) -> str:
+        if "no-tcp-mode" in self.faults:
+            raise RefusedError(ErrorId.FAILED)
+        with self._lock:
+            alone = MOTION_PORT not in self._clients.values()
+        if alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults):
+            raise RefusedError(ErrorId.NO_SUCH_COMMAND)
+        commands = self._commands.dashboard if port == DASHBOARD_PORT else self._commands.motion
+        if request.name not in commands:
+            raise RefusedError(ErrorId.NO_SUCH_COMMAND)
+        with self.arm.lock:
+            return commands[request.name](request)
+
+    def _wait_until_done(self, client: socket.socket) -> bool:
+        """Wait until the queue is empty; False if the client went away or no answer is to come."""
+        while self.arm.busy() or "no-sync-reply" in self.faults:
+            readable, _, _ = select.select([client], [], [], POLL_S)
+            if self._ended.is_set() or (readable and not client.recv(1, socket.MSG_PEEK)):
+                return False
+            if readable:
+                time.sleep(POLL_S)
+        return True

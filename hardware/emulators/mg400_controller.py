@@ -1,0 +1,263 @@
+"""The emulated MG400's controller: modes, alarms, frames and the queue of moves. Knows no sockets."""
+
+import time
+from dataclasses import dataclass
+from threading import RLock
+
+import numpy as np
+
+from hardware.arms.kinematics import MG400, OutOfReachError, Violation
+from hardware.arms.mg400_wire import MAX_JOINT_DEG_S, MAX_LINEAR_MM_S, ErrorId, Mode
+from hardware.arms.motion import MotionTrack, Speeds, check_line
+from hardware.emulators.faults import Faults
+from hardware.emulators.mg400_grammar import RefusedError
+
+MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0  # of the emulator: those of the arm are not known
+EMERGENCY_STOP, COLLISIONS = 85, (112, -2)
+START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)  # wherever it was left; here far from all limits
+JOG_STEP = 1.0  # mm or deg, in which the end of a jog is looked for
+JOG_REACH = 1000.0
+
+
+@dataclass(frozen=True)
+class PlanarFrame:
+    """A user or tool frame of an arm that turns about z only."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    r: float = 0.0
+
+    def __matmul__(self, other: "PlanarFrame") -> "PlanarFrame":
+        c, s = np.cos(np.radians(self.r)), np.sin(np.radians(self.r))
+        return PlanarFrame(self.x + c * other.x - s * other.y, self.y + s * other.x + c * other.y, self.z + other.z, self.r + other.r)
+
+    def inverse(self) -> "PlanarFrame":
+        c, s = np.cos(np.radians(self.r)), np.sin(np.radians(self.r))
+        return PlanarFrame(-c * self.x - s * self.y, s * self.x - c * self.y, -self.z, -self.r)
+
+    @classmethod
+    def of_pose(cls, pose: np.ndarray) -> "PlanarFrame":
+        return cls(*(float(value) for value in np.asarray(pose)[[0, 1, 2, 5]]))
+
+    @property
+    def pose(self) -> np.ndarray:
+        return np.array([self.x, self.y, self.z, 0.0, 0.0, self.r])
+
+
+@dataclass(frozen=True)
+class Order:
+    """A queued move: to a pose in a line, or to joints. ``end_s`` is when it will be done."""
+
+    end: np.ndarray
+    linear: bool
+    speeds: Speeds
+    jog: bool = False
+    end_s: float = np.inf
+
+
+class Mg400Controller:
+    """What the arm does with its commands. Every method may be called from any thread.
+
+    Parameters
+    ----------
+    faults : Faults
+    joints_deg : (4,) float
+        Where it stands to begin with.
+    time_scale : float
+        How much faster than the real arm it moves.
+    """
+
+    def __init__(self, faults: Faults, *, joints_deg=START_JOINTS_DEG, time_scale: float = 1.0) -> None:
+        self.faults, self.kinematics, self._time_scale = faults, MG400, time_scale
+        self.track = MotionTrack(MG400, np.asarray(joints_deg, float))
+        self.lock = RLock()
+        self.enabled = self.paused = False
+        self.alarms: list[int] = []
+        self.load = (0.0, 0.0, 0.0, 0.0)
+        self.digital_out = 0
+        self.percent = {"speedj": 100.0, "speedl": 100.0, "accj": 100.0, "accl": 100.0, "cp": 0.0, "speedfactor": 100.0}
+        self.users, self.tools = {0: PlanarFrame()}, {0: PlanarFrame()}
+        self.user, self.tool = 0, 0
+        self._orders: list[Order] = []  # begun or planned on the track
+        self._held: list[Order] = []  # waiting for Continue
+        self._due: list[tuple[float, tuple[int, ...]]] = []  # alarms that will come
+
+    def update(self) -> float:
+        """Let alarms that are due come; the time now."""
+        now_s = time.monotonic()
+        with self.lock:
+            for due_s, alarms in sorted(self._due):
+                if due_s <= now_s and not self.alarms:
+                    self.raise_alarm(*alarms, time_s=due_s)
+        return now_s
+
+    def raise_alarm(self, *alarms: int, time_s: float | None = None) -> None:
+        """Stop with alarms; the queue is held until ``ClearError`` and ``Continue``."""
+        with self.lock:
+            self._hold(time.monotonic() if time_s is None else time_s)
+            self.alarms += alarms
+
+    def press_emergency_stop(self) -> None:
+        """Power off, with an alarm."""
+        with self.lock:
+            self.raise_alarm(EMERGENCY_STOP)
+            self._held.clear()
+            self.enabled = False
+
+    def mode(self) -> Mode:
+        now_s = self.update()
+        with self.lock:
+            if self.alarms:
+                return Mode.ERROR
+            if not self.enabled:
+                return Mode.DISABLED
+            if self.paused:
+                return Mode.PAUSE
+            if self.track.moving(now_s):
+                return Mode.JOG if self._orders[-1].jog else Mode.RUNNING
+            return Mode.ENABLED
+
+    def busy(self) -> bool:
+        """Whether anything is still to be done (``Sync`` waits for it)."""
+        now_s = self.update()
+        with self.lock:
+            return bool(self._held) or self.track.moving(now_s)
+
+    @property
+    def queue_runs(self) -> bool:
+        return not (self.alarms or self._held)
+
+    def enable(self) -> None:
+        with self.lock:
+            if self.alarms:
+                raise RefusedError(ErrorId.FAILED)
+            self.enabled = True
+
+    def disable(self) -> None:
+        with self.lock:
+            self.reset()
+            self.enabled = False
+
+    def clear_error(self) -> None:
+        with self.lock:
+            self.alarms.clear()
+
+    def reset(self) -> None:
+        """Stop and forget the queue."""
+        with self.lock:
+            self._hold(time.monotonic())
+            self._held.clear()
+            self.paused = False
+
+    def pause(self) -> None:
+        with self.lock:
+            self._hold(time.monotonic())
+            self.paused = True
+
+    def resume(self) -> None:
+        """``Continue``: do what was held."""
+        with self.lock:
+            if self.alarms or not self.enabled:
+                raise RefusedError(ErrorId.FAILED)
+            self.paused = False
+            held, self._held = self._held, []
+            for order in held:
+                self._plan(order)
+
+    def order(self, order: Order) -> None:
+        """Queue a move.
+
+        Raises
+        ------
+        RefusedError
+            The arm is disabled or in error.
+        """
+        with self.lock:
+            self.update()
+            if self.alarms or not self.enabled:
+                raise RefusedError(ErrorId.FAILED)
+            if "ignore-moves" in self.faults:
+                return
+            if self.paused or self._held:
+                self._held.append(order)
+            else:
+                self._plan(order)
+
+    def last_target(self) -> PlanarFrame:
+        """Flange where the queue will leave it."""
+        with self.lock:
+            last = self._held[-1] if self._held else None
+            if last is None:
+                return PlanarFrame.of_pose(self.track.pose(max(self.track.end_s, time.monotonic())))
+            return PlanarFrame.of_pose(last.end if last.linear else self.kinematics.forward(last.end))
+
+    def last_joints_deg(self) -> np.ndarray:
+        """Joints where the queue will leave it."""
+        return self.joints_at(self.last_target())
+
+    def joints_at(self, flange: PlanarFrame) -> np.ndarray:
+        """Joints at a flange pose.
+
+        Raises
+        ------
+        RefusedError
+            There are none.
+        """
+        try:
+            return self.kinematics.inverse(flange.pose)
+        except OutOfReachError as error:
+            raise RefusedError(ErrorId.FAILED) from error
+
+    def speeds(self, percent: float, acceleration: float) -> Speeds:
+        """At the given percentages."""
+        factor = self._time_scale * percent / 100.0 * self.percent["speedfactor"] / 100.0
+        if (slow := self.faults.value("slow")) is not None:
+            factor *= slow
+        ramp = acceleration / 100.0 * self._time_scale**2
+        return Speeds(MAX_LINEAR_MM_S * factor, MAX_JOINT_DEG_S * factor, MAX_LINEAR_MM_S2 * ramp, MAX_JOINT_DEG_S2 * ramp)
+
+    def jog(self, axis: str, *, user: PlanarFrame) -> None:
+        """Move along an axis (``J1+``, ``X-``, ...) until the arm can't, or until ``MoveJog()``; the limit is an alarm."""
+        sign = {"+": 1.0, "-": -1.0}[axis[-1]]
+        with self.lock:
+            if self.alarms or not self.enabled:
+                raise RefusedError(ErrorId.FAILED)
+            self.reset()
+            joints = self.track.joints_deg(time.monotonic())
+            linear = not axis.startswith("j")
+            start = self.kinematics.forward(joints) if linear else joints
+            step = np.zeros(len(start))
+            if linear:
+                along = PlanarFrame(r=user.r) @ PlanarFrame(**{axis[0]: sign})
+                step = np.array([along.x, along.y, along.z, 0, 0, along.r if axis[0] == "r" else 0.0])
+            else:
+                step[int(axis[1]) - 1] = sign
+            length, violation = 0.0, None
+            while violation is None and length < JOG_REACH:
+                violation = self._at_end(start + (length + JOG_STEP) * step, linear)
+                length += JOG_STEP if violation is None else 0.0
+            self._plan(Order(start + length * step, linear, self.speeds(10.0, 100.0), jog=True))
+            if violation is not None:
+                self._due = [(self.track.end_s, (violation.code,))]
+
+    def _at_end(self, end: np.ndarray, linear: bool) -> Violation | None:
+        return check_line(self.kinematics, end, end) if linear else self.kinematics.violation(end)
+
+    def _plan(self, order: Order) -> None:
+        planned = self.track.move(order.end, order.speeds, linear=order.linear, now_s=time.monotonic())
+        if isinstance(planned, Violation):
+            self._due.append((max(self.track.end_s, time.monotonic()), (planned.code,)))
+            return
+        waiting = [one for one in self._orders if one.end_s > time.monotonic()]
+        self._orders = [*waiting, Order(order.end, order.linear, order.speeds, order.jog, planned.end_s)]
+        if planned.duration_s > 0 and (share := self.faults.value("collision")) is not None:
+            self._due.append((planned.start_s + share * planned.duration_s, COLLISIONS))
+        if planned.duration_s > 0 and (share := self.faults.value("stall")) is not None:
+            self.track.stop(planned.start_s + share * planned.duration_s)
+
+    def _hold(self, time_s: float) -> None:
+        """Stand still and keep what is still to be done."""
+        self._held = [order for order in self._orders if order.end_s > time_s and not order.jog] + self._held
+        self._orders, self._due = [order for order in self._orders if order.end_s <= time_s], []
+        self.track.stop(time_s)

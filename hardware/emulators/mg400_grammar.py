@@ -1,0 +1,85 @@
+"""The MG400's requests: ``Name(p1,p2,Key=v)``. Taken from a stream, and checked against what a command wants."""
+
+import re
+from dataclasses import dataclass
+
+from hardware.arms.mg400_wire import ErrorId
+
+
+@dataclass(frozen=True)
+class Request:
+    """One request: its name in lower case, its parameters, its keywords in lower case, and the text as delivered."""
+
+    name: str
+    values: tuple[str, ...]
+    keywords: dict
+    text: str
+
+
+class RefusedError(Exception):
+    """A request is answered by an error id."""
+
+    def __init__(self, error_id: int) -> None:
+        super().__init__(f"refused: {error_id}")
+        self.error_id = int(error_id)
+
+
+def take_request(buffer: str) -> tuple[Request | None, str]:
+    """The first whole request in what has arrived, and what is left. It ends at the ``)`` that closes it; no newline is needed."""
+    depth = 0
+    for n, letter in enumerate(buffer):
+        depth += {"(": 1, ")": -1}.get(letter, 0)
+        if letter == ")" and depth <= 0:
+            return _parse(buffer[: n + 1].strip(" \r\n\t;")), buffer[n + 1 :]
+    return None, buffer
+
+
+def _parse(text: str) -> Request:
+    name, _, inside = text.partition("(")
+    values, keywords = [], {}
+    for part in re.split(r",(?![^{(]*[})])", inside[:-1]):  # not at commas within braces
+        key, equals, value = part.partition("=")
+        if equals:
+            keywords[key.strip().lower()] = value.strip()
+        elif part.strip():  # clients leave commas at the end
+            values.append(part.strip())
+    return Request(name.strip().lower(), tuple(values), keywords, text)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a parameter may be."""
+
+    integer: bool = False
+    low: float = float("-inf")
+    high: float = float("inf")
+
+
+def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tuple[int, ...]) -> list[float]:
+    """The request's values as numbers.
+
+    Raises
+    ------
+    RefusedError
+        Their count (-20000), the type (-3000n) or range (-4000n) of the n-th is wrong.
+    """
+    if len(request.values) not in counts:
+        raise RefusedError(ErrorId.PARAMETER_COUNT)
+    return [_number(text, parameter, n) for n, (text, parameter) in enumerate(zip(request.values, parameters, strict=False), start=1)]
+
+
+def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:
+    """A keyword's number; its place n counts on after the values."""
+    if key not in request.keywords:
+        return default
+    return _number(request.keywords[key], parameter, len(request.values) + 1 + list(request.keywords).index(key))
+
+
+def _number(text: str, parameter: Parameter, n: int) -> float:
+    try:
+        number = int(text) if parameter.integer else float(text)
+    except ValueError as error:
+        raise RefusedError(ErrorId.PARAMETER_TYPE - n) from error
+    if not parameter.low <= number <= parameter.high:  # also where it is not a number
+        raise RefusedError(ErrorId.PARAMETER_RANGE - n)
+    return number

@@ -1,0 +1,163 @@
+"""Watching a camera: every frame through the model, kept if wanted, the newest shown."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hardware.cameras.source import FrameSource
+from hardware.errors import DeviceError
+from hardware.session import SessionWriter
+from hardware.step import Estimate, Estimator
+from hardware.timing import Spread, Timing
+from twin.types import Frame
+
+KEPT_TIMES = 10_000
+RATE_SPAN = 30  # frames over which the rate is told
+SHOW_S = 0.1  # between pictures of the view
+FRAME_TIMEOUT_S = 5.0
+
+
+@dataclass
+class LiveSession:
+    """Estimates the pose in every frame of a source that can be had.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Connected.
+    estimator : Estimator
+    record : SessionWriter, optional
+    on_estimate : callable, optional
+        Called with each frame and its estimate.
+    """
+
+    source: FrameSource
+    estimator: Estimator
+    record: SessionWriter | None = None
+    on_estimate: Callable[[Frame, Estimate], None] | None = None
+    newest: tuple[Frame, Estimate] | None = None
+    count: int = 0
+    _ages: deque = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _late: deque = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _spent: deque = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _done: deque = field(default_factory=lambda: deque(maxlen=RATE_SPAN))
+    _begun_s: float = field(default_factory=time.monotonic)
+
+    def run(self, *, most: int | None = None, seconds: float | None = None, going: Callable[[], bool] = lambda: True) -> Timing:
+        """Go on until the recording ends, ``most`` frames or ``seconds`` are over, or ``going()`` is false.
+
+        Raises
+        ------
+        DeviceError
+            The camera ended, or gives nothing.
+        """
+        self._begun_s = time.monotonic()
+        while going() and (most is None or self.count < most) and (seconds is None or time.monotonic() - self._begun_s < seconds):
+            try:
+                frame = self.source.read(timeout_s=FRAME_TIMEOUT_S)
+            except EOFError:
+                break
+            except TimeoutError as error:
+                raise DeviceError(f"{error}; check the camera") from error
+            taken_s = time.monotonic()
+            estimate = self.estimator(frame)
+            now_s = time.monotonic()
+            if self.source.is_live:
+                self._ages.append(taken_s - frame.time_s)
+                self._late.append(now_s - frame.time_s)
+            self._spent.append(now_s - taken_s)
+            self._done.append(now_s)
+            self.count += 1
+            self.newest = (frame, estimate)
+            if self.record is not None:
+                self.record.append(frame, estimate_line(estimate) | {"time_s": now_s})
+            if self.on_estimate is not None:
+                self.on_estimate(frame, estimate)
+        return self.timing()
+
+    def timing(self) -> Timing:
+        """Figures so far."""
+        rate_hz = self.count / max(time.monotonic() - self._begun_s, 1e-9)
+        spreads = [Spread.of(list(times)) for times in (self._late, self._ages, self._spent)]
+        return Timing(self.count, rate_hz, rate_hz, *spreads, self.source.dropped)
+
+    def lines(self, estimate: Estimate) -> list[str]:
+        """Pose with its interval, rates and losses, for people."""
+        if estimate.valid:
+            rows = zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True)
+            pose = [f"{name} {value:+.2f} [{low:+.2f}, {high:+.2f}]" for name, value, low, high in rows]
+        else:
+            pose = [f"not valid: {estimate.reason}"]
+        done = list(self._done)
+        now_hz = (len(done) - 1) / (done[-1] - done[0]) if len(done) > 1 and done[-1] > done[0] else 0.0
+        late = f", exposure to pose {1e3 * float(np.median(self._late)):.0f} ms" if self._late else ""
+        return ["   ".join(pose), f"{now_hz:.1f} frames/s, {self.count} frames, {self.source.dropped} dropped{late}"]
+
+
+def estimate_line(estimate: Estimate) -> dict:
+    """An estimate as a session keeps it."""
+    return {
+        "names": list(estimate.names),
+        "value": np.asarray(estimate.value),
+        "low": np.asarray(estimate.low),
+        "high": np.asarray(estimate.high),
+        "valid": bool(estimate.valid),
+        "reason": estimate.reason,
+    }
+
+
+def same_estimates(steps: list[dict], estimates: list[Estimate]) -> int:
+    """How many of a session's steps hold exactly the estimates that its frames give now."""
+    same = 0
+    for step, estimate in zip(steps, estimates, strict=False):
+        kept = np.array([np.nan if value is None else value for value in step.get("value", [])], float)
+        same += np.array_equal(kept, np.asarray(estimate.value, float), equal_nan=True)
+    return same
+
+
+class Shower:
+    """Draws the newest frame at its own pace, so that drawing holds up nothing. A context manager.
+
+    Parameters
+    ----------
+    session : LiveSession
+    draw : callable
+        From frame, estimate and lines to a picture (H, W, 3).
+    view : BrowserView or WindowView
+    """
+
+    def __init__(self, session: LiveSession, draw: Callable[[Frame, Estimate, list], np.ndarray], view) -> None:
+        self._session, self._draw, self._view = session, draw, view
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+
+    @property
+    def open(self) -> bool:
+        """Whether the user has not closed the view."""
+        return not self._end.is_set()
+
+    def __enter__(self) -> "Shower":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join(timeout=5.0)
+
+    def _run(self) -> None:
+        shown = None
+        with self._view as view:
+            while not self._end.wait(SHOW_S):
+                newest = self._session.newest
+                if newest is None or newest is shown:
+                    continue
+                shown = newest
+                with suppress(RuntimeError):  # the figures' queues grew while they were read; the next picture has them
+                    lines = self._session.lines(newest[1])
+                    if not view.show(self._draw(*newest, lines), {str(k): line for k, line in enumerate(lines)}):
+                        self._end.set()

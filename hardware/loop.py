@@ -1,0 +1,261 @@
+"""The servo loop: frame, pose, law, arm. Knows a frame source, an estimator and an arm, and not what stands behind them."""
+
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hardware.arm_track import ArmTrack
+from hardware.arms.arm import Arm, ArmState
+from hardware.cameras.source import FrameSource
+from hardware.errors import DeviceError, StaleDataError
+from hardware.mounting import Mounting
+from hardware.rig_geometry import matrix_of, moved
+from hardware.safe_arm import RefusedMoveError
+from hardware.safety import Code
+from hardware.servo import Memory, Reading, servo_step, tangent_of
+from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
+from hardware.timing import Spread, Timing
+from scenes.servo import ServoSpec
+from twin.errors import TwinError
+from twin.types import Frame
+
+MOST_PIECES, NEAR_MM = 200, 0.5
+MOVE_TIMEOUT_S = 10.0
+BEHIND_MOVES = 2.0  # largest moves that an arm may lag behind before it is told more
+
+
+@dataclass
+class ServoLoop:
+    """Runs the law on what a camera shows.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Connected.
+    estimator : Estimator
+    arm : Arm
+        Connected; ``run`` enables and disables it.
+    servo : ServoSpec
+    mounting : Mounting
+    settings : LoopSettings
+    guards : list of Guard
+        Asked before every move, in order; each may clamp or refuse.
+    sense : callable, optional
+        Told the depth (mm) and the exposure (``time.monotonic()``) of each fresh estimate, before the move.
+    retreat : callable, optional
+        Withdraws the arm, given the direction (3,) away from the object in the base frame; by default a straight move of the
+        servo's ``clear_mm``.
+    on_step : callable, optional
+        Called with each record, its frame and its estimate, after the command was given.
+    """
+
+    source: FrameSource
+    estimator: Estimator
+    arm: Arm
+    servo: ServoSpec
+    mounting: Mounting
+    settings: LoopSettings
+    guards: list[Guard] = field(default_factory=list)
+    sense: Callable[[float, float], None] | None = None
+    retreat: Callable[[np.ndarray], object] | None = None
+    on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
+
+    def __post_init__(self):
+        self.records: list[StepRecord] = []
+        self.notes: list[str] = []  # what went wrong
+        self._held_since: float | None = None
+        self._track = ArmTrack(self.arm)
+        self._started_s = self._ended_s = 0.0
+
+    def run(self, start_pose: np.ndarray) -> Timing:
+        """Approach the start pose (6,), follow the surface for the given steps, retreat.
+
+        Whatever happens, Ctrl-C too, the arm is stopped, retreats along the sensor's axis and is disabled.
+
+        Raises
+        ------
+        DeviceError
+            No usable frame or estimate for ``give_up_s``, or the arm failed.
+        """
+        touching = False
+        try:
+            self.arm.enable()
+            self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
+            self._move(self._away_from(start_pose), wait=True)
+            touching = True
+            self._move(start_pose, wait=True)
+            with nullcontext() if self.settings.blocking else self._track.watched():
+                self._follow()
+        finally:
+            self._ended_s = time.monotonic()
+            self._let_go(retreat=touching)
+        return self.timing()
+
+    def timing(self) -> Timing:
+        """Figures of the steps so far."""
+        fresh = [record for record in self.records if record.fresh]
+        spent_s = max(self._ended_s - self._started_s, 1e-9)
+        return Timing(
+            len(self.records),
+            len(self.records) / spent_s,
+            len(fresh) / spent_s,
+            Spread.of([record.latency_s for record in fresh]),
+            Spread.of([record.age_s for record in self.records]),
+            Spread.of([record.compute_s for record in fresh]),
+            self.source.dropped,
+        )
+
+    def _follow(self) -> None:
+        memory, used, tangent, estimate, reading, doubt = Memory(), None, None, None, Reading(np.nan, np.nan), ""
+        exposed_pose, sent = np.full(6, np.nan), None
+        self._started_s = due_s = arrived_s = time.monotonic()
+        while len(self.records) < self.settings.steps:
+            if not self.settings.blocking:
+                time.sleep(max(0.0, due_s - time.monotonic()))
+                due_s = max(due_s + self.settings.period_s, time.monotonic())
+            state = self._state()
+            try:
+                frame = self._frame(state, arrived_s)
+            except EOFError:
+                return
+            except (StaleDataError, TimeoutError, DeviceError) as problem:
+                self._hold(str(problem), problem)
+                continue
+            taken_s = time.monotonic()
+            fresh = used is None or frame.sequence != used.sequence
+            if fresh:
+                estimate, used = self.estimator(frame), frame
+                reading, doubt = self._reading(estimate)
+                if not doubt:
+                    exposed_pose = self._track.pose_at(frame.time_s) if self.source.is_live else state.pose
+                    tangent = tangent_of(self.mounting, exposed_pose, reading)
+                    if self.sense is not None:
+                        self.sense(reading.depth_mm, frame.time_s)
+            if doubt:
+                self._hold(doubt, None)
+                continue
+            from_pose = state.pose if sent is None or not state.moving else sent
+            if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
+                continue  # the arm is still on its way
+            if not fresh and _apart_mm(from_pose, exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
+                continue  # too far from what was seen last
+            step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
+            try:
+                sent = self._move(step.pose, wait=False)
+            except RefusedMoveError as refused:
+                if refused.decision.code is not Code.STALE_FRAME:
+                    raise
+                self._hold(str(refused), refused)
+                continue
+            memory, self._held_since = step.memory, None
+            now_s = time.monotonic()
+            record = StepRecord(
+                len(self.records),
+                now_s,
+                frame.sequence,
+                frame.time_s,
+                taken_s - frame.time_s,
+                fresh,
+                now_s - frame.time_s,
+                now_s - taken_s,
+                tuple(estimate.names),
+                estimate.value,
+                estimate.low,
+                estimate.high,
+                reading.depth_mm,
+                reading.angle_deg,
+                from_pose,
+                exposed_pose,
+                state.joints_deg,
+                sent,
+            )
+            self.records.append(record)
+            if self.on_step is not None:
+                self.on_step(record, frame, estimate)
+            if self.settings.blocking:
+                self.arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
+
+    def _frame(self, state: ArmState, arrived_s: float) -> Frame:
+        if not self.source.is_live:
+            return self.source.read()
+        if self.settings.blocking:
+            return self.source.read_after(state.time_s, timeout_s=self.settings.frame_timeout_s)
+        if not self.records:  # not one of the approach
+            return self.source.read_after(arrived_s, timeout_s=self.settings.frame_timeout_s)
+        return self.source.read_latest(max_age_s=self.servo.max_frame_age_s)
+
+    def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
+        """What an estimate means, and why it isn't to be believed ("" if it is)."""
+        if not estimate.valid:
+            return Reading(np.nan, np.nan), estimate.reason
+        value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
+        try:
+            depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]
+        except KeyError as missing:
+            raise DeviceError(
+                f"the model tells {', '.join(estimate.names)}; following a surface needs {self.mounting.depth_label} and "
+                f"{self.mounting.angle_label} (the experiment's)"
+            ) from missing
+        reading = Reading(self.mounting.depth_mm(depth), self.mounting.angle_deg(angle))
+        for name, got, (low, high) in (
+            ("mm deep", reading.depth_mm, self.servo.plausible_mm),
+            ("deg from the normal", reading.angle_deg, self.servo.plausible_deg),
+        ):
+            if not low <= got <= high:
+                return reading, f"the model says {got:.1f} {name}, which can't be ([{low:g}, {high:g}]); give another model or sensor"
+        return reading, ""
+
+    def _hold(self, reason: str, problem: Exception | None) -> None:
+        """Stop where the arm is; give up after a while."""
+        if self._held_since is None:
+            self._held_since = time.monotonic()
+            self.arm.stop()
+            self.notes.append(f"held still before step {len(self.records)}: {reason}")
+        held_s = time.monotonic() - self._held_since
+        if held_s > self.settings.give_up_s:
+            raise DeviceError(f"no usable frame for {held_s:.1f} s, the arm holds still: {reason}") from problem
+        time.sleep(min(0.05, self.settings.period_s))
+
+    def _state(self) -> ArmState:
+        state = self.arm.state()
+        if state.error:
+            raise DeviceError(f"{self.arm.name}: {state.error}")
+        self._track.add(state)
+        return state
+
+    def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:
+        """Move, in as many pieces as guards and arm make of it if the end is waited for; what was sent last."""
+        for _ in range(MOST_PIECES if wait else 1):
+            state, allowed = self._state(), target
+            for guard in self.guards:
+                allowed = guard(state, allowed)
+            sent = self.arm.move_linear(allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S)
+            if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM:
+                break
+        return sent
+
+    def _away_from(self, pose: np.ndarray) -> np.ndarray:
+        return moved(pose, -self.servo.clear_mm * self.mounting.axis)
+
+    def _let_go(self, *, retreat: bool) -> None:
+        """Stop, retreat, disable; each is tried whatever became of the others."""
+
+        def back() -> None:
+            pose = self.arm.state().pose
+            if self.retreat is not None:
+                self.retreat(-matrix_of(pose)[:3, :3] @ self.mounting.axis)
+            else:
+                self.arm.move_linear(self._away_from(pose), wait=True, timeout_s=MOVE_TIMEOUT_S)
+
+        for name, act in (("stop", self.arm.stop), *((("retreat", back),) if retreat else ()), ("disable", self.arm.disable)):
+            try:
+                act()
+            except TwinError as error:
+                self.notes.append(f"{name} failed: {error}")
+
+
+def _apart_mm(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.linalg.norm(one[:3] - other[:3]))

@@ -1,0 +1,90 @@
+"""How a sensor sits on an arm's tool, and what its labels call zero; from the sensor's rig and an experiment."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.experiment import ExperimentSpec
+from scenes.sensor import SensorSpec
+from twin.kinematics import rig_of
+
+_DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # approach, and across it
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """A sensor on a tool. Following happens in the plane of ``axis`` and ``across``.
+
+    Attributes
+    ----------
+    axis : (3,) float
+        The sensor's z (out of the dome's apex) in the tool frame.
+    across : (3,) float
+        Direction of the tool frame, at right angles to the axis, along which the tool is fed.
+    image_turn_deg : float
+        Azimuth of ``across`` in the sensor frame, from image x towards image y.
+    centre_mm : (3,) float
+        The dome's centre in the tool frame.
+    radius_mm : float
+        Of the dome.
+    depth_label, angle_label : str
+        The labels that tell how deep, and how far from the surface's normal the tool is.
+    zero_mm, zero_deg : float
+        Indentation where the depth's label is 0, and the angle's label where the sensor stands normal to the surface.
+    angle_sign : int
+        -1 where the label grows as the tool turns from the axis towards ``across``.
+    """
+
+    axis: np.ndarray
+    across: np.ndarray
+    image_turn_deg: float
+    centre_mm: np.ndarray
+    radius_mm: float
+    depth_label: str
+    angle_label: str
+    zero_mm: float
+    zero_deg: float
+    angle_sign: int
+
+    @property
+    def out_of_plane(self) -> np.ndarray:
+        """(3,) axis of the tool frame about which a positive angle turns it: ``across`` towards ``axis``."""
+        return np.cross(self.across, self.axis)
+
+    @property
+    def apex_mm(self) -> np.ndarray:
+        """(3,) the dome's apex in the tool frame."""
+        return self.centre_mm + self.radius_mm * self.axis
+
+    @classmethod
+    def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Mounting":
+        """The mounting that the sensor's rig describes, with the experiment's approach and zero."""
+        rig = rig_of(sensor)
+        axis, across = (np.array(direction, float) for direction in _DIRECTIONS[experiment.approach])
+        turn = np.cross(across, axis)
+        about = int(np.abs(turn).argmax())
+        sign = int(np.sign(turn[about])) * rig.turn_sign
+        return cls(
+            axis,
+            across,
+            rig.image_turn_deg,
+            rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across,
+            sensor.skin.outer_radius_mm,
+            f"pose_{experiment.axis + 1}",
+            f"pose_{about + 4}",
+            experiment.zero_mm + rig.contact_offset_mm,
+            sign * rig.plate_tilt_deg - rig.turn_offset_deg[about],
+            sign,
+        )
+
+    def depth_mm(self, label: float) -> float:
+        """Depth beyond first touch that a label stands for."""
+        return label + self.zero_mm
+
+    def angle_deg(self, label: float) -> float:
+        """Angle from the surface's normal that a label stands for."""
+        return self.angle_sign * (label - self.zero_deg)
+
+    def labels(self, depth_mm: float, angle_deg: float) -> tuple[float, float]:
+        """The depth's and the angle's label that a depth and an angle would have."""
+        return depth_mm - self.zero_mm, self.zero_deg + self.angle_sign * angle_deg

@@ -1,0 +1,149 @@
+"""Where tool, sensor and object are: poses of the arm as matrices, and what a sensor at a pose truly touches."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hardware.mounting import Mounting
+from scenes.object import ObjectSpec
+from scenes.servo import PlacementSpec
+from twin.stimulus import build_stimulus
+
+OUTLINE_STEP_MM = 0.5
+LONGEST_OUTLINE_MM = 2000.0
+
+
+def matrix_of(pose: np.ndarray) -> np.ndarray:
+    """``T_base_tool`` (4, 4) of an arm's pose (6,) in mm and deg."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", np.asarray(pose, float)[3:], degrees=True).as_matrix()
+    T[:3, 3] = pose[:3]
+    return T
+
+
+def pose_of(T: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """The arm's pose (6,) of ``T_base_tool`` (4, 4), its turn about z within half a turn of that of ``near`` (6,)."""
+    angles = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
+    angles[2] += 360.0 * np.round((near[5] - angles[2]) / 360.0)
+    return np.concatenate([T[:3, 3], angles])
+
+
+def moved(pose: np.ndarray, step_mm: np.ndarray) -> np.ndarray:
+    """The pose (6,) shifted by a step (3,) of the tool's frame."""
+    out = np.array(pose, float)
+    out[:3] += matrix_of(pose)[:3, :3] @ np.asarray(step_mm, float)
+    return out
+
+
+def sensor_in_tool(mounting: Mounting) -> np.ndarray:
+    """``T_tool_sensor`` (4, 4)."""
+    axis, across = mounting.axis, mounting.across
+    turn = np.radians(mounting.image_turn_deg)
+    side = np.cross(axis, across)  # where the sensor's azimuth goes on to, a quarter turn after ``across``
+    T = np.eye(4)
+    T[:3, 0] = np.cos(turn) * across - np.sin(turn) * side
+    T[:3, 1] = np.sin(turn) * across + np.cos(turn) * side
+    T[:3, 2] = axis
+    T[:3, 3] = mounting.centre_mm
+    return T
+
+
+def object_in_base(placement: PlacementSpec) -> np.ndarray:
+    """``T_base_object`` (4, 4)."""
+    c, s = np.cos(np.radians(placement.turn_deg)), np.sin(np.radians(placement.turn_deg))
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([[c, s, 0], [0, 0, -1], [-s, c, 0]])
+    T[:3, 3] = placement.position_mm
+    return T
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What a sensor at a pose truly touches, rigid bodies assumed.
+
+    Attributes
+    ----------
+    depth_mm : float
+        Of the tool, along the surface's normal, from where an unturned sensor first touches (what the depth's label less its zero means).
+    angle_deg : float
+        Of the tool from the surface's normal.
+    indent_mm : float
+        Of the dome.
+    point_mm : (3,) float
+        Place of the surface nearest to the dome's centre, in the base frame.
+    """
+
+    depth_mm: float
+    angle_deg: float
+    indent_mm: float
+    point_mm: np.ndarray
+
+
+class PlacedObject:
+    """An object in front of a mounted sensor.
+
+    Parameters
+    ----------
+    spec : ObjectSpec
+    placement : PlacementSpec
+    mounting : Mounting
+    """
+
+    def __init__(self, spec: ObjectSpec, placement: PlacementSpec, mounting: Mounting) -> None:
+        self.spec, self.mounting = spec, mounting
+        self.T_base_object = object_in_base(placement)
+        self._T_tool_sensor = sensor_in_tool(mounting)
+        # the outline without its texture, as far out as that lies
+        self._field = build_stimulus(spec.model_copy(update={"texture": None}))
+        self._raised_mm = spec.texture.wire_diameter_mm if spec.texture else 0.0
+
+    def seen_from(self, pose: np.ndarray) -> np.ndarray:
+        """``T_sensor_object`` (4, 4) with the arm at a pose (6,)."""
+        return np.linalg.inv(matrix_of(pose) @ self._T_tool_sensor) @ self.T_base_object
+
+    def start_pose(self, indent_mm: float) -> np.ndarray:
+        """The arm's pose (6,) with the sensor normal to the object at its origin, that deep."""
+        x, y, z = self.mounting.across, self.mounting.axis, self.mounting.out_of_plane
+        T = np.eye(4)  # the tool's across, axis and plane's normal lie along the object's x, z and -y
+        T[:3, :3] = self.T_base_object[:3, [0, 2, 1]] * [1, 1, -1] @ np.stack([x, y, z])
+        out_mm = self.mounting.radius_mm + self._raised_mm - indent_mm
+        centre = self.T_base_object[:3, 3] - out_mm * self.T_base_object[:3, 2]
+        T[:3, 3] = centre - T[:3, :3] @ self.mounting.centre_mm
+        return pose_of(T, np.zeros(6))
+
+    def touch(self, pose: np.ndarray) -> Touch:
+        """What the sensor truly touches with the arm at a pose (6,)."""
+        T = matrix_of(pose)
+        centre = T[:3, :3] @ self.mounting.centre_mm + T[:3, 3]
+        turn = self.T_base_object[:3, :3]
+        distance, gradient, _ = self._field.probe(((centre - self.T_base_object[:3, 3]) @ turn)[None])
+        gap, outward = float(distance[0]) - self._raised_mm, turn @ gradient[0]
+        axis, across = T[:3, :3] @ self.mounting.axis, T[:3, :3] @ self.mounting.across
+        inward = -outward
+        angle = np.degrees(np.arctan2(inward @ across, inward @ axis))
+        tool_gap = gap + float(outward @ (T[:3, 3] - centre))
+        depth = self.mounting.apex_mm @ self.mounting.axis - tool_gap
+        return Touch(depth, float(angle), self.mounting.radius_mm - gap, centre - gap * outward)
+
+    def distance_mm(self, place_mm: np.ndarray) -> float:
+        """Of a place (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""
+        local = (place_mm - self.T_base_object[:3, 3]) @ self.T_base_object[:3, :3] * [1, 0, 1]
+        return float(self._field.distance(local[None])[0]) - self._raised_mm
+
+    def outline(self) -> np.ndarray:
+        """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x."""
+        at, points = np.zeros(3), [np.zeros(2)]
+        while len(points) * OUTLINE_STEP_MM < LONGEST_OUTLINE_MM:
+            _, gradient, _ = self._field.probe(at[None])
+            outward = gradient[0] * [1, 0, 1]
+            outward /= np.linalg.norm(outward)
+            at = at + OUTLINE_STEP_MM * np.array([-outward[2], 0.0, outward[0]])
+            for _ in range(4):
+                distance, gradient, _ = self._field.probe(at[None])
+                at = at - distance[0] * gradient[0] * [1, 0, 1]
+            points.append(at[[0, 2]])
+            if len(points) > 10 and np.linalg.norm(points[-1]) < 0.75 * OUTLINE_STEP_MM:
+                points[-1] = np.zeros(2)
+                break
+        return np.array(points)

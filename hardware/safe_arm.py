@@ -1,0 +1,185 @@
+"""An arm that may only do what ``hardware.safety`` allows."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hardware.arms.arm import Arm, ArmState
+from hardware.errors import DeviceError, StaleDataError
+from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
+
+KEPT_DECISIONS = 10_000
+RETREAT_SHARES = (1.0, 0.75, 0.5, 0.25)  # as far as the limits allow
+
+
+class RefusedMoveError(DeviceError):
+    """A move was not allowed; ``decision`` says why."""
+
+    def __init__(self, name: str, decision: Decision) -> None:
+        super().__init__(f"{name}: not moved ({decision.code}, {decision.action}): {decision.reason}")
+        self.decision = decision
+
+
+@dataclass(frozen=True)
+class LoggedDecision:
+    """A decision, what it was about, and when (``time.monotonic()``)."""
+
+    time_s: float
+    call: str
+    decision: Decision
+
+
+class SafeArm:
+    """Wraps an arm: every move is decided on first, and every decision is logged.
+
+    Used as a context manager, it leaves by stopping; after any exception (Ctrl-C too) it stops, retreats along
+    the object's normal and disables. ``stop``, ``disable``, ``clear_error`` and ``disconnect`` are never refused.
+
+    Parameters
+    ----------
+    arm : Arm
+    limits : SafetyLimits
+    normal : (3,) float
+        Direction in the base frame in which the tool leaves the object; ``normal`` may be set at any time.
+    log : callable or None
+        Called with every LoggedDecision; the newest are kept in ``decisions`` in any case.
+    """
+
+    def __init__(
+        self, arm: Arm, limits: SafetyLimits, *, normal=(0.0, 0.0, 1.0), log: Callable[[LoggedDecision], None] | None = None
+    ) -> None:
+        if limits.joints_deg is not None and len(limits.joints_deg) != arm.axes:
+            raise DeviceError(f"{arm.name} has {arm.axes} joints, the limits are for {len(limits.joints_deg)}; give those of this arm")
+        self.arm, self.limits = arm, limits
+        self.name, self.axes = arm.name, arm.axes
+        self.kinematics = getattr(arm, "kinematics", None)
+        self.normal = np.asarray(normal, float)
+        self.decisions: deque[LoggedDecision] = deque(maxlen=KEPT_DECISIONS)
+        self._log, self._sensed = log, None
+
+    def sense(self, *, depth_mm: float, frame_time_s: float) -> None:
+        """What the sensor tells; from the first call on, a move needs a frame that is new enough. NaN: depth not known."""
+        self._sensed = Sensed(depth_mm, frame_time_s)
+
+    @property
+    def is_connected(self) -> bool:
+        return self.arm.is_connected
+
+    def connect(self) -> None:
+        self.arm.connect()
+
+    def disconnect(self) -> None:
+        self._note("disconnect", Decision(Action.MOVE, Code.UNGATED, ""))
+        self.arm.disconnect()
+
+    def __enter__(self) -> "SafeArm":
+        self.connect()
+        return self
+
+    def __exit__(self, kind: type | None, *_: object) -> None:
+        try:
+            if kind is not None and self.is_connected:
+                self.shutdown(kind.__name__)
+        finally:
+            self.disconnect()
+
+    def enable(self) -> None:
+        self.arm.enable()
+        self.set_speed(self.limits.linear_mm_s, self.limits.angular_deg_s)
+
+    def disable(self) -> None:
+        self._note("disable", Decision(Action.MOVE, Code.UNGATED, ""))
+        self.arm.disable()
+
+    def clear_error(self) -> None:
+        self._note("clear_error", Decision(Action.MOVE, Code.UNGATED, ""))
+        self.arm.clear_error()
+
+    def stop(self) -> None:
+        self._note("stop", Decision(Action.MOVE, Code.UNGATED, ""))
+        self.arm.stop()
+
+    def state(self, *, max_age_s: float = 1.0) -> ArmState:
+        return self.arm.state(max_age_s=max_age_s)
+
+    def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
+        return self.arm.wait_settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s)
+
+    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
+        """Faster than allowed becomes what is allowed."""
+        linear, angular = min(linear_mm_s, self.limits.linear_mm_s), min(angular_deg_s, self.limits.angular_deg_s)
+        if (linear, angular) != (linear_mm_s, angular_deg_s):
+            self._note("set_speed", Decision(Action.MOVE, Code.SPEED_CAPPED, f"to {linear:g} mm/s and {angular:g} deg/s"))
+        self.arm.set_speed(linear, angular)
+
+    def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        """As ``Arm.move_linear``; the pose returned is the one that was allowed.
+
+        Raises
+        ------
+        RefusedMoveError
+            It was not allowed. Depending on why, the arm was stopped, or stopped and retreated.
+        """
+        state = self._newest_state("move_linear")
+        decision = decide(pose, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
+        self._obey("move_linear", decision)
+        return self.arm.move_linear(decision.pose, wait=wait, timeout_s=timeout_s)
+
+    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        """As ``Arm.move_joints``; see ``move_linear``."""
+        state = self._newest_state("move_joints")
+        decision = decide_joints(joints_deg, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
+        self._obey("move_joints", decision)
+        return self.arm.move_joints(joints_deg, wait=wait, timeout_s=timeout_s)
+
+    def retreat(self) -> np.ndarray | None:
+        """Leave the object along its normal, as far as the limits allow; the pose reached, None if none is allowed."""
+        state = self.arm.state(max_age_s=self.limits.feedback_age_s)
+        free = self.limits.model_copy(update={"step_mm": None, "step_deg": None})
+        self.arm.set_speed(min(self.limits.retreat_mm_s, self.limits.linear_mm_s), self.limits.angular_deg_s)
+        for share in RETREAT_SHARES:
+            target = state.pose.copy()
+            target[:3] += share * self.limits.retreat_mm * self.normal / np.linalg.norm(self.normal)
+            decision = decide(target, state, free, now_s=time.monotonic(), kinematics=self.kinematics)
+            self._note("retreat", decision)
+            if decision.action is Action.MOVE:
+                return self.arm.move_linear(decision.pose)
+        return None
+
+    def shutdown(self, why: str) -> None:
+        """Stop, retreat along the normal, disable: each is tried whatever became of the others."""
+        self._note("shutdown", Decision(Action.RETRACT, Code.SHUTDOWN, why))
+        for step in (self.arm.stop, self.retreat, self.arm.disable):
+            try:
+                step()
+            except DeviceError as error:
+                self._note(f"shutdown: {step.__name__}", Decision(Action.HOLD, Code.SHUTDOWN, str(error)))
+
+    def _newest_state(self, call: str) -> ArmState:
+        try:
+            return self.arm.state(max_age_s=self.limits.feedback_age_s)
+        except StaleDataError as error:
+            self._obey(call, Decision(Action.HOLD, Code.STALE_FEEDBACK, str(error)))
+            raise
+
+    def _obey(self, call: str, decision: Decision) -> None:
+        self._note(call, decision)
+        if decision.action is Action.MOVE:
+            return
+        try:
+            if decision.action in (Action.HOLD, Action.RETRACT):
+                self.arm.stop()
+            if decision.action is Action.RETRACT:
+                self.retreat()
+        except DeviceError as error:
+            raise RefusedMoveError(self.name, Decision(decision.action, decision.code, f"{decision.reason}; and then: {error}")) from error
+        raise RefusedMoveError(self.name, decision)
+
+    def _note(self, call: str, decision: Decision) -> None:
+        entry = LoggedDecision(time.monotonic(), call, decision)
+        self.decisions.append(entry)
+        if self._log is not None:
+            self._log(entry)

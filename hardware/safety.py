@@ -1,0 +1,251 @@
+"""What an arm may do: a pure decision with a code before every move. Limits are data."""
+
+import tomllib
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, ValidationError
+
+from hardware.arms.arm import ArmState
+from hardware.arms.kinematics import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError
+from hardware.arms.motion import check_line, turn_between_deg
+from hardware.errors import DeviceError
+from scenes.base import NonNegative, Positive, Section
+
+SHIPPED_LIMITS = Path(__file__).parent / "limits"
+
+
+def _rising(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] >= pair[1]:
+        raise ValueError(f"the first of {pair} must be the smaller")
+    return pair
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_rising)]
+
+
+class SafetyLimits(Section):
+    """What a loop may do with an arm. What is None is not limited."""
+
+    box_mm: tuple[Range, Range, Range]  # of x, y, z of the tool in the base frame
+    annulus_mm: tuple[NonNegative, Positive] | None = None  # distance from the base's axis
+    joints_deg: tuple[Range, ...] | None = None
+    linkage_deg: Positive | None = None  # largest J3 - J2
+    step_mm: Positive | None = None  # of one move; longer ones are shortened
+    step_deg: Positive | None = None
+    linear_mm_s: Positive = 100.0
+    angular_deg_s: Positive = 90.0
+    contact_mm: Positive = 6.0  # deepest indentation that the sensor may tell
+    frame_age_s: Positive = 0.5
+    feedback_age_s: Positive = 1.0
+    retreat_mm: Positive = 50.0  # at the end and after a failure the tool goes so far from the object
+    retreat_mm_s: Positive = 50.0
+
+
+def load_limits(name_or_path: str | Path) -> SafetyLimits:
+    """Limits by name (``mg400``, ``magician``) or by the path of their TOML file.
+
+    Raises
+    ------
+    DeviceError
+        There is no such file, or it is wrong.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        path = SHIPPED_LIMITS / f"{name_or_path}.toml"
+    try:
+        return SafetyLimits.model_validate(tomllib.loads(path.read_text()))
+    except OSError as error:
+        shipped = ", ".join(sorted(file.stem for file in SHIPPED_LIMITS.glob("*.toml")))
+        raise DeviceError(f"{path}: no such limits ({error.strerror}); give one of {shipped}, or the path of a TOML file") from error
+    except (tomllib.TOMLDecodeError, ValidationError) as error:
+        raise DeviceError(f"{path}: not valid limits: {error}; see {SHIPPED_LIMITS / 'mg400.toml'} for an example") from error
+
+
+class Code(StrEnum):
+    """Why it was decided so."""
+
+    OK = "ok"
+    STEP_SHORTENED = "step-shortened"
+    NOT_A_NUMBER = "not-a-number"
+    NOT_ENABLED = "not-enabled"
+    ARM_ERROR = "arm-error"
+    STALE_FEEDBACK = "stale-feedback"
+    STALE_FRAME = "stale-frame"
+    TOO_DEEP = "too-deep"
+    OUTSIDE_BOX = "outside-box"
+    OUTSIDE_ANNULUS = "outside-annulus"
+    OUT_OF_REACH = "out-of-reach"
+    JOINT_LIMIT = "joint-limit"
+    LINKAGE_LIMIT = "linkage-limit"
+    LINE_BLOCKED = "line-blocked"
+    STEP_TOO_LONG = "step-too-long"
+    UNGATED = "ungated"  # stop, disable, clear_error: never refused
+    SPEED_CAPPED = "speed-capped"
+    SHUTDOWN = "shutdown"
+
+
+class Action(StrEnum):
+    """What to do about it."""
+
+    MOVE = "move"
+    REFUSE = "refuse"  # don't send it; what goes on may go on
+    HOLD = "hold"  # stop and stand still
+    RETRACT = "retract"  # stop, and leave the object along its normal
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What was decided about a move. ``pose`` (6,) is what may be sent, None if nothing."""
+
+    action: Action
+    code: Code
+    reason: str
+    pose: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """What the loop knows of the contact: how deep (mm, NaN if not known) and when the frame was exposed (``time.monotonic()``)."""
+
+    depth_mm: float
+    frame_time_s: float
+
+
+def decide(
+    target: np.ndarray,
+    state: ArmState,
+    limits: SafetyLimits,
+    *,
+    now_s: float,
+    kinematics: Kinematics | None = None,
+    sensed: Sensed | None = None,
+) -> Decision:
+    """Whether the tool may move straight to a pose.
+
+    Parameters
+    ----------
+    target : (6,) float
+        mm and deg.
+    state : ArmState
+        Newest feedback.
+    now_s : float
+        ``time.monotonic()``.
+    kinematics : Kinematics or None
+        Without, joints, linkage and reach are not checked.
+    sensed : Sensed or None
+        Without, neither the frame's age nor the depth is checked.
+    """
+    if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
+        return halted
+    target = np.asarray(target, float)
+    if target.shape != (6,) or not np.isfinite(target).all():
+        return Decision(Action.REFUSE, Code.NOT_A_NUMBER, f"the target {target} is not six numbers")
+    unwrapped = kinematics is not None and kinematics.axes == 4
+    pose, shortened = shorten(state.pose, kinematics.nearest_pose(target) if unwrapped else target, limits, unwrapped=unwrapped)
+    if refused := _place(pose, state.pose, limits) or (kinematics and _joints(pose, state.pose, limits, kinematics)):
+        return refused
+    if shortened:
+        return Decision(Action.MOVE, Code.STEP_SHORTENED, f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg", pose)
+    return Decision(Action.MOVE, Code.OK, "", pose)
+
+
+def decide_joints(
+    joints_deg: np.ndarray, state: ArmState, limits: SafetyLimits, *, now_s: float, kinematics: Kinematics, sensed=None
+) -> Decision:
+    """Whether the joints may go there: as ``decide``, checked at every degree of the way. Such a move is not shortened but refused."""
+    if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
+        return halted
+    end = np.asarray(joints_deg, float)
+    if not np.isfinite(end).all():
+        return Decision(Action.REFUSE, Code.NOT_A_NUMBER, f"the joints {end} are not numbers")
+    steps = max(1, int(np.ceil(np.abs(end - state.joints_deg).max())))
+    for share in np.arange(1, steps + 1) / steps:
+        joints = state.joints_deg + share * (end - state.joints_deg)
+        pose = kinematics.forward(joints)
+        if refused := _broken_joints(joints, limits, kinematics) or _place(pose, pose, limits):
+            return refused
+    if shorten(state.pose, pose, limits)[1]:
+        return Decision(
+            Action.REFUSE, Code.STEP_TOO_LONG, f"it would carry the tool farther than a step of {limits.step_mm} mm; go in steps"
+        )
+    return Decision(Action.MOVE, Code.OK, "", pose)
+
+
+def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwrapped: bool = False) -> tuple[np.ndarray, bool]:
+    """The target, or a point as far on the way to it as a step may be; and whether it was shortened.
+
+    Turns go the shorter way, but as told where they are ``unwrapped`` (R of an arm of four axes).
+    """
+    way = target - start
+    if not unwrapped:
+        way[3:] = (way[3:] + 180.0) % 360.0 - 180.0
+    length, turn = float(np.linalg.norm(way[:3])), abs(way[5]) if unwrapped else turn_between_deg(start, target)
+    shares = [limit / size for limit, size in ((limits.step_mm, length), (limits.step_deg, turn)) if limit is not None and size > limit]
+    return (start + min(shares) * way, True) if shares else (target.copy(), False)
+
+
+def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed | None) -> Decision | None:
+    if (age_s := now_s - state.time_s) > limits.feedback_age_s:
+        return Decision(Action.HOLD, Code.STALE_FEEDBACK, f"feedback is {age_s:.2f} s old (allowed {limits.feedback_age_s:g} s)")
+    if state.error:
+        return Decision(Action.HOLD, Code.ARM_ERROR, state.error)
+    if not state.enabled:
+        return Decision(Action.REFUSE, Code.NOT_ENABLED, "the arm is not enabled; call enable() first")
+    if sensed is None:
+        return None
+    if not (age_s := now_s - sensed.frame_time_s) <= limits.frame_age_s:
+        return Decision(Action.HOLD, Code.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)")
+    if sensed.depth_mm > limits.contact_mm:
+        return Decision(Action.RETRACT, Code.TOO_DEEP, f"{sensed.depth_mm:.1f} mm deep in contact (allowed {limits.contact_mm:g} mm)")
+    return None
+
+
+def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decision | None:
+    for axis, value, (low, high) in zip("xyz", pose[:3], limits.box_mm, strict=True):
+        if not low <= value <= high:
+            return Decision(Action.REFUSE, Code.OUTSIDE_BOX, f"{axis} {value:.1f} mm is outside the box's [{low:g}, {high:g}] mm")
+    if limits.annulus_mm is None:
+        return None
+    inner, outer = limits.annulus_mm
+    nearest = min(_distance_to_axis(start[:2], pose[:2]), float(np.hypot(*pose[:2])))
+    if np.hypot(*pose[:2]) > outer or (nearest < inner and nearest < np.hypot(*start[:2])):
+        return Decision(
+            Action.REFUSE, Code.OUTSIDE_ANNULUS, f"comes within {nearest:.1f} mm of the base's axis or beyond [{inner:g}, {outer:g}] mm"
+        )
+    return None
+
+
+def _distance_to_axis(a: np.ndarray, b: np.ndarray) -> float:
+    """Smallest distance of the line from a to b (in the plane) from the origin."""
+    along = b - a
+    length = float(along @ along)
+    share = 0.0 if length == 0 else float(np.clip(-(a @ along) / length, 0.0, 1.0))
+    return float(np.linalg.norm(a + share * along))
+
+
+def _joints(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics) -> Decision | None:
+    pose = kinematics.nearest_pose(pose)
+    try:
+        joints = kinematics.inverse(pose)
+    except OutOfReachError as error:
+        return Decision(Action.REFUSE, Code.OUT_OF_REACH, str(error))
+    if broken := _broken_joints(joints, limits, kinematics):
+        return broken
+    blocked = check_line(kinematics, kinematics.nearest_pose(start), pose)
+    return blocked and Decision(Action.REFUSE, Code.LINE_BLOCKED, blocked.text)
+
+
+def _broken_joints(joints: np.ndarray, limits: SafetyLimits, kinematics: Kinematics) -> Decision | None:
+    if own := kinematics.violation(joints):
+        code = Code.LINKAGE_LIMIT if own.code in (LINKAGE_ABOVE, LINKAGE_BELOW) else Code.JOINT_LIMIT
+        return Decision(Action.REFUSE, code, own.text)
+    for n, (angle, (low, high)) in enumerate(zip(joints, limits.joints_deg or (), strict=False), start=1):
+        if not low <= angle <= high:
+            return Decision(Action.REFUSE, Code.JOINT_LIMIT, f"J{n} at {angle:.1f} deg is outside [{low:g}, {high:g}] deg")
+    if limits.linkage_deg is not None and joints[2] - joints[1] > limits.linkage_deg:
+        return Decision(Action.REFUSE, Code.LINKAGE_LIMIT, f"J3 - J2 = {joints[2] - joints[1]:.1f} deg is more than {limits.linkage_deg:g}")
+    return None

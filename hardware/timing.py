@@ -1,0 +1,61 @@
+"""How fast and how late a loop is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+LEVELS = (50, 95, 99)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Percentiles of times in seconds; NaN without any."""
+
+    p50: float
+    p95: float
+    p99: float
+
+    @classmethod
+    def of(cls, times_s: list[float]) -> "Spread":
+        """The spread of what was measured."""
+        return cls(*np.percentile(times_s, LEVELS).tolist()) if times_s else cls(*[float("nan")] * 3)
+
+    def __str__(self) -> str:
+        return " / ".join(f"{1e3 * value:.1f}" for value in (self.p50, self.p95, self.p99)) + " ms (50 / 95 / 99 %)"
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What a loop measured.
+
+    Attributes
+    ----------
+    steps : int
+    rate_hz : float
+        Decisions a second, and ``fresh_hz``: those on a frame not used before.
+    latency_s : Spread
+        From a fresh frame's exposure to the command it led to.
+    age_s : Spread
+        Of the frame behind every decision, when it was made.
+    compute_s : Spread
+        From having the frame to the command.
+    dropped : int
+        Frames that nobody read.
+    """
+
+    steps: int
+    rate_hz: float
+    fresh_hz: float
+    latency_s: Spread
+    age_s: Spread
+    compute_s: Spread
+    dropped: int
+
+    def lines(self) -> list[str]:
+        """For people."""
+        return [
+            f"{self.steps} steps at {self.rate_hz:.1f} Hz, fresh frames at {self.fresh_hz:.1f} Hz, {self.dropped} frames dropped",
+            f"exposure to command: {self.latency_s}",
+            f"age of the frame at each decision: {self.age_s}",
+            f"frame to command: {self.compute_s}",
+        ]

@@ -1,0 +1,211 @@
+"""How well a surface was followed: the paper's smoothness, and measures that do not depend on the axes."""
+
+import csv
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hardware.mounting import Mounting
+from hardware.rig_geometry import PlacedObject, matrix_of
+from hardware.servo import Reading, tangent_of
+from hardware.step import StepRecord
+
+LOCAL_N = 9  # points in a window of the local smoothness
+SETTLING_N = 5  # steps after the start that the errors leave out
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A followed surface, step by step (M steps); the truth is NaN where there is none.
+
+    Attributes
+    ----------
+    tool_mm : (M, 2) float
+        Where the tool was, base frame x and y.
+    felt_mm : (M, 2) float
+        The surface as the estimates place it.
+    depth_mm, angle_deg : (M,) float
+        Estimated.
+    true_depth_mm, true_angle_deg, true_indent_mm : (M,) float
+    off_mm : (M,) float
+        Distance of ``felt_mm`` from the true surface.
+    along_mm : (M,) float
+        Way along the object's outline to the place that is touched.
+    """
+
+    tool_mm: np.ndarray
+    felt_mm: np.ndarray
+    depth_mm: np.ndarray
+    angle_deg: np.ndarray
+    true_depth_mm: np.ndarray
+    true_angle_deg: np.ndarray
+    true_indent_mm: np.ndarray
+    off_mm: np.ndarray
+    along_mm: np.ndarray
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Of one trajectory; NaN without the truth.
+
+    Attributes
+    ----------
+    steps : int
+    smoothness : float
+        The paper's S: mean of |dy / dx| over neighbouring points (pairs of equal x left out). Depends on the axes.
+    local_smoothness : float
+        The same within windows, each turned so that its ends lie along x: mean over the windows.
+    path_error_mm : float
+        Root mean square distance of the felt surface from the true one.
+    depth_error_mm, angle_error_deg : float
+        Mean absolute error of the estimates.
+    hold_depth_mm, hold_angle_deg : float
+        Mean absolute distance of the true depth and angle from the reference.
+    jerk : float
+        Root mean square third difference of the tool's path, mm per step^3.
+    completed : float
+        Share of the wanted way along the outline.
+    lost_contacts : float
+        Times that the sensor left the surface.
+    """
+
+    steps: int
+    smoothness: float
+    local_smoothness: float
+    path_error_mm: float
+    depth_error_mm: float
+    angle_error_deg: float
+    hold_depth_mm: float
+    hold_angle_deg: float
+    jerk: float
+    completed: float
+    lost_contacts: float
+
+
+def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedObject | None = None) -> Trajectory:
+    """The trajectory of a loop's steps on fresh frames.
+
+    Parameters
+    ----------
+    records : list of StepRecord
+    mounting : Mounting
+    placed : PlacedObject, optional
+        Tells the truth where it is known.
+    """
+    used = [record for record in records if record.fresh]
+    poses = np.array([record.exposed_pose for record in used]).reshape(-1, 6)
+    depth, angle = (np.array([getattr(record, key) for record in used]) for key in ("depth_mm", "angle_deg"))
+    felt = np.array([felt_place(mounting, record) for record in used]).reshape(-1, 3)
+    none = np.full(len(used), np.nan)
+    if placed is None:
+        return Trajectory(poses[:, :2], felt[:, :2], depth, angle, none, none, none, none, none)
+    touches = [placed.touch(pose) for pose in poses]
+    outline = placed.outline()
+    local = (np.array([touch.point_mm for touch in touches]).reshape(-1, 3) - placed.T_base_object[:3, 3]) @ placed.T_base_object[:3, :3]
+    return Trajectory(
+        poses[:, :2],
+        felt[:, :2],
+        depth,
+        angle,
+        np.array([touch.depth_mm for touch in touches]),
+        np.array([touch.angle_deg for touch in touches]),
+        np.array([touch.indent_mm for touch in touches]),
+        np.array([abs(placed.distance_mm(place)) for place in felt]),
+        way_along(outline, local[:, [0, 2]]),
+    )
+
+
+def felt_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
+    """Where (3,) an estimate puts the surface: the foot of the dome's centre on the tangent."""
+    tangent = tangent_of(mounting, record.exposed_pose, Reading(record.depth_mm, record.angle_deg))
+    tool = matrix_of(record.exposed_pose)
+    centre, inward = tool[:3, :3] @ mounting.centre_mm + tool[:3, 3], tangent[:3, :3] @ mounting.axis
+    on_tangent = tangent[:3, :3] @ mounting.apex_mm + tangent[:3, 3]
+    return centre + (inward @ (on_tangent - centre)) * inward
+
+
+def measure(path: Trajectory, *, indent_mm: float, angle_deg: float, wanted_mm: float) -> Measures:
+    """Measures of a trajectory against a reference depth and angle and a wanted way along the outline."""
+    late = slice(min(SETTLING_N, max(len(path.depth_mm) - 1, 0)), None)
+
+    def mean_abs(values: np.ndarray) -> float:
+        return float(np.abs(values[late]).mean()) if len(values[late]) else float("nan")
+
+    return Measures(
+        len(path.depth_mm),
+        smoothness(path.tool_mm),
+        local_smoothness(path.tool_mm),
+        float(np.sqrt((path.off_mm[late] ** 2).mean())) if len(path.off_mm) else float("nan"),
+        mean_abs(path.depth_mm - path.true_depth_mm),
+        mean_abs(path.angle_deg - path.true_angle_deg),
+        mean_abs(path.true_depth_mm - indent_mm),
+        mean_abs(path.true_angle_deg - angle_deg),
+        jerk(path.tool_mm),
+        float(np.clip(path.along_mm.max(initial=0.0) / wanted_mm, 0, 1)) if wanted_mm > 0 else float("nan"),
+        lost_contacts(path.true_indent_mm),
+    )
+
+
+def smoothness(points_mm: np.ndarray) -> float:
+    """Mean of |dy / dx| over neighbouring points (M, 2); pairs of equal x have no slope and are left out."""
+    dx, dy = np.diff(points_mm, axis=0).T if len(points_mm) > 1 else np.zeros((2, 0))
+    sloped = np.abs(dx) > 1e-9
+    return float(np.abs(dy[sloped] / dx[sloped]).mean()) if sloped.any() else float("nan")
+
+
+def local_slopes(points_mm: np.ndarray) -> np.ndarray:
+    """Smoothness (M - LOCAL_N + 1,) of each window of points, turned so that its ends lie along x."""
+    slopes = []
+    for window in (points_mm[k : k + LOCAL_N] for k in range(len(points_mm) - LOCAL_N + 1)):
+        chord = window[-1] - window[0]
+        along = chord / max(np.linalg.norm(chord), 1e-9)
+        slopes.append(smoothness((window - window[0]) @ np.column_stack([along, [-along[1], along[0]]])))
+    return np.array(slopes)
+
+
+def local_smoothness(points_mm: np.ndarray) -> float:
+    """Mean of ``local_slopes``; NaN for too few points."""
+    slopes = local_slopes(points_mm)
+    return float(np.nanmean(slopes)) if len(slopes) else float("nan")
+
+
+def jerk(points_mm: np.ndarray) -> float:
+    """Root mean square of the third differences of points (M, 2)."""
+    third = np.diff(points_mm, n=3, axis=0)
+    return float(np.sqrt((third**2).sum(axis=1).mean())) if len(third) else float("nan")
+
+
+def lost_contacts(indent_mm: np.ndarray) -> float:
+    """How often the indentation (M,) falls to zero or less; the start counts as touching. NaN where it isn't known."""
+    if np.isnan(indent_mm).any():
+        return float("nan")
+    off = np.concatenate([[False], indent_mm <= 0])
+    return float((off[1:] & ~off[:-1]).sum())
+
+
+def way_along(outline_mm: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
+    """Way (M,) along an outline (N, 2) to the places nearest to points (M, 2), going on over its end where it is closed."""
+    steps = np.linalg.norm(np.diff(outline_mm, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    nearest = np.array([np.argmin(np.linalg.norm(outline_mm - point, axis=1)) for point in points_mm], int)
+    if np.allclose(outline_mm[0], outline_mm[-1]) and len(nearest):
+        found = np.unwrap(way[nearest], period=way[-1])
+        return found - way[-1] * np.round(found[0] / way[-1])
+    return way[nearest]
+
+
+def write_csv(path: Path, trajectory: Trajectory) -> Path:
+    """The trajectory as a table."""
+    columns: dict[str, np.ndarray] = {}
+    for name, values in asdict(trajectory).items():
+        if values.ndim == 2:
+            stem = name.removesuffix("_mm")
+            columns |= {f"{stem}_x_mm": values[:, 0], f"{stem}_y_mm": values[:, 1]}
+        else:
+            columns[name] = values
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["step", *columns])
+        writer.writerows([k, *(f"{value:.6g}" for value in row)] for k, row in enumerate(zip(*columns.values(), strict=True)))
+    return path

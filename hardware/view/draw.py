@@ -1,0 +1,49 @@
+"""One picture of one frame: pins and graph over it, the Voronoi map beside it, pose and rates below."""
+
+import cv2
+import numpy as np
+
+from twin.preprocess.overlay import draw_overlay
+from twin.types import Frame, Observation
+
+TEXT_PX, MARGIN_PX = 18, 8
+FULL_CHANGE = 0.3  # relative change of a cell's area at the ends of the colours
+WHITE, GRAY = (255, 255, 255), (28, 32, 38)
+
+
+def draw_view(frame: Frame, seen: Observation, rest_area_px2: np.ndarray | None, lines: list[str]) -> np.ndarray:
+    """(H, W, 3) uint8 RGB.
+
+    Parameters
+    ----------
+    frame : Frame
+    seen : Observation
+        What the pipeline saw in it.
+    rest_area_px2 : (N,) float, optional
+        Cell areas without contact; without them no map is drawn.
+    lines : list of str
+        Text below.
+    """
+    left = draw_overlay(frame, seen, scale=1)
+    picture = np.hstack([left, voronoi_map(frame.image.shape[:2], seen, rest_area_px2)])
+    text = np.full((2 * MARGIN_PX + TEXT_PX * len(lines), picture.shape[1], 3), GRAY, np.uint8)
+    for k, line in enumerate(lines):
+        place = (MARGIN_PX, MARGIN_PX + TEXT_PX * k + TEXT_PX - 5)
+        cv2.putText(text, line.encode("ascii", "replace").decode(), place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, WHITE, 1, cv2.LINE_AA)
+    return np.vstack([picture, text])
+
+
+def voronoi_map(shape: tuple, seen: Observation, rest_area_px2: np.ndarray | None) -> np.ndarray:
+    """Cells (H, W, 3) coloured by their relative change of area: blue smaller, red larger than without contact."""
+    canvas = np.full((*shape, 3), GRAY, np.uint8)
+    if seen.graph is None or rest_area_px2 is None or not seen.graph.cells:
+        return canvas
+    change = np.clip((seen.graph.area_px2 / rest_area_px2 - 1) / FULL_CHANGE, -1, 1)
+    levels = np.nan_to_num(127.5 * (1 + change), nan=127.5).astype(np.uint8)
+    colors = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_JET)[:, 0, ::-1]
+    for cell, color in zip(seen.graph.cells, colors, strict=True):
+        if len(cell) > 2:
+            corners = np.round(np.asarray(cell)).astype(np.int32)
+            cv2.fillPoly(canvas, [corners], color.tolist(), cv2.LINE_AA)
+            cv2.polylines(canvas, [corners], True, GRAY, 1, cv2.LINE_AA)
+    return canvas

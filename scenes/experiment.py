@@ -1,0 +1,103 @@
+"""The specification of an experiment: which contacts are made, and how, in the robot's coordinates.
+
+Labels are those of the recordings: ``pose_1..6`` and ``move_1..6`` are x, y, z (mm) and Rx, Ry, Rz (deg) of the tool in
+the work frame. For each contact a pose and a move are drawn evenly from their ranges. The arm goes to
+``pose - move + clear``, taps by ``tap``, moves by ``move`` (the shear), and the frame is taken at ``pose + clear + tap``.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from scenes.base import Section
+
+LABELS = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7))
+AXES = {"x": 0, "y": 1, "z": 2}
+
+Range = tuple[float, float]
+Six = tuple[float, float, float, float, float, float]
+
+
+class PoseRanges(Section):
+    """Lowest and highest value of each coordinate of the pose; equal: held there."""
+
+    pose_1: Range = (0.0, 0.0)
+    pose_2: Range = (0.0, 0.0)
+    pose_3: Range = (0.0, 0.0)
+    pose_4: Range = (0.0, 0.0)
+    pose_5: Range = (0.0, 0.0)
+    pose_6: Range = (0.0, 0.0)
+
+
+class MoveRanges(Section):
+    """The same of the move that follows the tap."""
+
+    move_1: Range = (0.0, 0.0)
+    move_2: Range = (0.0, 0.0)
+    move_3: Range = (0.0, 0.0)
+    move_4: Range = (0.0, 0.0)
+    move_5: Range = (0.0, 0.0)
+    move_6: Range = (0.0, 0.0)
+
+
+class ExperimentSpec(Section):
+    """An experiment, complete. ``name`` is the file's stem.
+
+    Attributes
+    ----------
+    object : str
+        What is touched, if nothing else is said: a name of ``twin objects`` or a file.
+    approach : {"x", "y", "z"}
+        Axis of the work frame along which the sensor looks at the object (an arm of four axes holds it level: "y").
+    zero_mm : float
+        How far an unturned sensor indents the object at ``pose + clear + tap`` where the approach's coordinate of the pose is 0.
+    clear, tap : six numbers
+        Added to the pose before the tap; the tap itself. mm and deg.
+    targets : tuple of str
+        The labels a model is to learn.
+    seed : int
+        Of the draws.
+    """
+
+    name: str
+    description: str
+    source: str = ""
+    object: str
+    approach: Literal["x", "y", "z"]
+    zero_mm: float
+    clear: Six = (0.0,) * 6
+    tap: Six
+    targets: Annotated[tuple[str, ...], Field(min_length=1)]
+    seed: Annotated[int, Field(ge=0)] = 0
+    pose: PoseRanges
+    move: MoveRanges = MoveRanges()
+
+    @property
+    def axis(self) -> int:
+        """Index of the approach's coordinate in a pose."""
+        return AXES[self.approach]
+
+    def ranges(self) -> dict[str, Range]:
+        """Range of each of the twelve labels, in the recordings' order."""
+        return {**self.pose.model_dump(), **self.move.model_dump()}
+
+    @property
+    def highest_mm(self) -> float:
+        """The approach's largest coordinate before the move, which is where the tap goes deepest."""
+        return self.ranges()[f"pose_{self.axis + 1}"][1] - self.ranges()[f"move_{self.axis + 1}"][0]
+
+    @model_validator(mode="after")
+    def _check(self):
+        for label, (low, high) in self.ranges().items():
+            if low > high:
+                raise ValueError(f"{label} = [{low:g}, {high:g}]: give the lower end first")
+        if unknown := [label for label in self.targets if label not in LABELS]:
+            raise ValueError(f"targets: {', '.join(unknown)} is no label; choose of {', '.join(LABELS)}")
+        if any(self.tap[k] for k in range(6) if k != self.axis):
+            raise ValueError(f"tap must go along the approach, {self.approach}, alone")
+        if self.tap[self.axis] <= 0:
+            raise ValueError(f"tap must go towards the object: its {self.approach} is {self.tap[self.axis]:g}, expected more than 0")
+        start_mm = self.zero_mm + self.highest_mm - self.tap[self.axis]
+        if start_mm > 0:
+            raise ValueError(f"the deepest tap would begin {start_mm:g} mm inside the object; give a longer tap and as much more clear")
+        return self

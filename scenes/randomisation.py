@@ -1,0 +1,95 @@
+"""The specification of what differs from one simulated frame to the next."""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from scenes.base import Fraction, NonNegative, Positive, Section
+from scenes.sensor import SensorSpec
+
+Ends = tuple[float, float]
+
+
+class Spread(Section):
+    """How a number is drawn around a specification's own, by exactly one of these.
+
+    ``scale``: times a factor, even in its logarithm between the two ends; ``add``: plus a number drawn evenly between
+    them; ``value``: instead of it a number drawn evenly between them (rounded where the specification wants an integer).
+    """
+
+    scale: tuple[Positive, Positive] | None = None
+    add: Ends | None = None
+    value: Ends | None = None
+
+    @property
+    def ends(self) -> Ends:
+        """The two ends, of whichever kind."""
+        return self.scale or self.add or self.value
+
+    @model_validator(mode="after")
+    def _check(self):
+        given = [ends for ends in (self.scale, self.add, self.value) if ends is not None]
+        if len(given) != 1:
+            raise ValueError("give exactly one of scale, add and value")
+        if given[0][0] > given[0][1]:
+            raise ValueError(f"give the lower end first, got {list(given[0])}")
+        return self
+
+
+class FrictionSpread(Section):
+    """Friction of a contact: none in ``free_share`` of the contacts, ``stick`` in ``stick_share``, otherwise even in its logarithm."""
+
+    low: Positive
+    high: Positive
+    free_share: Fraction = 0.0
+    stick_share: Fraction = 0.0
+    stick: Positive = 3.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.low > self.high:
+            raise ValueError("low must not be larger than high")
+        if self.free_share + self.stick_share > 1:
+            raise ValueError("free_share and stick_share must not sum to more than 1")
+        return self
+
+
+class RandomisationSpec(Section):
+    """What is drawn anew for each contact. ``name`` is the file's stem.
+
+    Attributes
+    ----------
+    executed_share : float
+        Share of the moves that are executed before the frame is taken.
+    pin_noise_px : float
+        Sd of the noise that is added to the stored pins (not to pictures: those have the camera's own noise).
+    friction : FrictionSpread, optional
+        Without it the rig's or the object's own.
+    sensor : dict of str to Spread
+        By the key in the sensor's specification, with dots: material, geometry, camera, light, rig.
+    """
+
+    name: str
+    description: str
+    executed_share: Fraction = 1.0
+    pin_noise_px: NonNegative = 0.0
+    friction: FrictionSpread | None = None
+    sensor: Annotated[dict[str, Spread], Field(default_factory=dict)]
+
+    @model_validator(mode="after")
+    def _check(self):
+        for key in self.sensor:
+            if number_type(key) is None:
+                raise ValueError(f"sensor.'{key}' names no number of a sensor's specification; expected e.g. 'skin.young_modulus_mpa'")
+        return self
+
+
+def number_type(key: str) -> type | None:
+    """``int`` or ``float`` for the dotted key of a number in ``SensorSpec``, else None."""
+    section, _, name = key.partition(".")
+    field = SensorSpec.model_fields.get(section)
+    models = [m for m in (field.annotation, *getattr(field.annotation, "__args__", ())) if hasattr(m, "model_fields")] if field else []
+    found = models[0].model_fields.get(name) if models else None
+    kind = found.annotation if found else None
+    kind = getattr(kind, "__origin__", kind)
+    return kind if kind in (int, float) else None

@@ -1,0 +1,74 @@
+"""The specification of following a surface in a plane, and of where the object stands."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from scenes.base import NonNegative, Positive, Section
+
+Three = tuple[float, float, float]
+
+
+class PlacementSpec(Section):
+    """Where an object stands in the arm's base frame: its origin, and its turn about the base's z.
+
+    Without a turn the object's outward side looks to -y of the base, its section lies level and its y axis points down.
+    """
+
+    position_mm: Three = (300.0, 60.0, 0.0)
+    turn_deg: float = 0.0
+
+
+class ServoSpec(Section):
+    """Following a surface: a proportional and integral law on depth and angle with a feed along the surface. ``name`` is the file's stem.
+
+    Attributes
+    ----------
+    experiment : str
+        The one whose labels the model tells: its approach, and what they call zero.
+    indent_mm, angle_deg : float
+        The reference: how deep, and how far from the normal.
+    feed_mm : float
+        Along the surface, in each step.
+    kp_*, ki_* : float
+        Share of the error, and of its sum over the steps, that a step takes back.
+    integral_mm, integral_deg : float
+        The sums never exceed these.
+    largest_move_mm, largest_turn_deg : float
+        Of one step.
+    clear_mm : float
+        From where the surface is approached, and to where the arm retreats.
+    linear_mm_s, angular_deg_s : float
+    plausible_mm, plausible_deg : (lowest, highest)
+        Depths and angles that a sensor in contact can have; a model that tells others is not believed, and the arm holds still.
+    blind_mm : float
+        Without a newer frame the tool goes no farther than this from where the newest one was exposed.
+    max_frame_age_s : float
+        An older frame decides nothing: the arm stops and holds.
+    placement : PlacementSpec
+        Where the object stands.
+    """
+
+    name: str
+    description: str
+    source: str = ""
+    experiment: str = "surface-2d"
+    indent_mm: Positive = 3.0
+    angle_deg: float = 0.0
+    feed_mm: Positive = 1.0
+    kp_depth: NonNegative = 0.5
+    ki_depth: NonNegative = 0.3
+    kp_angle: NonNegative = 1.0
+    ki_angle: NonNegative = 0.1
+    integral_mm: NonNegative = 5.0
+    integral_deg: NonNegative = 45.0
+    largest_move_mm: Positive = 2.0
+    largest_turn_deg: Positive = 10.0
+    clear_mm: Positive = 50.0
+    linear_mm_s: Positive = 20.0
+    angular_deg_s: Positive = 60.0
+    plausible_mm: tuple[float, float] = (-3.0, 8.0)
+    plausible_deg: tuple[float, float] = (-60.0, 60.0)
+    blind_mm: Positive = 4.0
+    max_frame_age_s: Annotated[float, Field(gt=0, le=10)] = 0.5
+    placement: PlacementSpec = PlacementSpec()

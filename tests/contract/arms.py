@@ -1,0 +1,49 @@
+"""The arms under one contract: each entry makes the arm as a user would, with its emulator beneath it."""
+
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from hardware.arms.magician import Magician
+from hardware.arms.mg400 import MG400, Mg400Ports
+from hardware.arms.simulated import SimulatedArm
+from hardware.emulators.magician import MagicianEmulator
+from hardware.emulators.mg400 import Mg400Emulator
+
+ARMS = ("simulated-6", "simulated-4", "mg400", "mg400-old", "magician")
+
+
+@dataclass
+class Bench:
+    """An arm that isn't connected yet, a pose well within its reach, and what is beneath it."""
+
+    arm: object
+    home: np.ndarray
+    device: object  # the emulator, or the simulated arm itself
+    reads: object  # pose of the device itself
+
+
+def mg400_of(emulator, **options) -> MG400:
+    ports = emulator.ports
+    return MG400("127.0.0.1", ports=Mg400Ports(ports[29999], ports[30003], (ports[30004], ports[30005])), **options)
+
+
+@contextmanager
+def bench(kind: str, *, faults: tuple[str, ...] = (), time_scale: float = 4.0):
+    with ExitStack() as stack:
+        if kind.startswith("simulated"):
+            axes = int(kind[-1])
+            arm = SimulatedArm(axes=axes, time_scale=time_scale)
+            yield Bench(arm, np.array([300.0, 0, 0, 0, 0, 0]), arm, lambda: arm.track.pose(np.inf))
+        elif kind.startswith("mg400"):
+            firmware = "1.5.5" if kind.endswith("old") else "1.7.0"
+            emulator = stack.enter_context(Mg400Emulator(port_offset=None, faults=faults, firmware=firmware, time_scale=time_scale))
+            arm = mg400_of(emulator)
+            yield Bench(arm, np.array([300.0, 0, 0, 0, 0, 10]), emulator, emulator.pose)
+        else:
+            emulator = stack.enter_context(MagicianEmulator(faults=faults, time_scale=time_scale))
+            arm = Magician(emulator.device)
+            yield Bench(arm, np.array([200.0, 0, 30, 0, 0, 10]), emulator, emulator.pose)
+        if arm.is_connected:
+            arm.disconnect()

@@ -1,0 +1,212 @@
+"""One contract for every arm: simulated, MG400 over TCP, Magician over a pseudo-terminal."""
+
+import time
+
+import numpy as np
+import pytest
+from arms import ARMS, bench
+
+from hardware.arms.open_arm import open_arm
+from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
+
+SETTLED_MM = 0.1  # repeatability of the arms is half of it
+SLOW_MM_S, FAST_MM_S = 20.0, 200.0
+
+
+@pytest.fixture(params=ARMS)
+def at(request):
+    with bench(request.param) as at:
+        yield at
+
+
+@pytest.fixture
+def ready(at):
+    at.arm.connect()
+    at.arm.enable()
+    at.arm.set_speed(FAST_MM_S, FAST_MM_S)
+    at.arm.move_linear(at.home)
+    return at
+
+
+def test_nothing_works_before_connect_and_nothing_moves_before_enable(at):
+    arm = at.arm
+    before = at.reads()
+    assert not arm.is_connected
+    for call in (
+        arm.enable,
+        arm.disable,
+        arm.clear_error,
+        arm.stop,
+        arm.state,
+        lambda: arm.move_linear(at.home),
+        lambda: arm.set_speed(1, 1),
+    ):
+        with pytest.raises(DeviceNotConnectedError, match="connect"):
+            call()
+    arm.connect()
+    assert arm.is_connected and not arm.state().enabled
+    with pytest.raises(DeviceAlreadyConnectedError):
+        arm.connect()
+    with pytest.raises(DeviceError):
+        arm.move_linear(at.home)
+    assert np.array_equal(at.reads(), before)
+    arm.disconnect()
+    arm.disconnect()
+    assert not arm.is_connected
+
+
+def test_a_move_ends_at_rest_where_it_was_sent(ready):
+    for offset in ([10, 20, -5, 0, 0, 15], [-10, -20, 5, 0, 0, -15], [0, 0, 0, 0, 0, 0]):
+        target = ready.home + offset
+        sent = ready.arm.move_linear(target)
+        state = ready.arm.state()
+        assert np.allclose(sent, target) and not state.moving and state.enabled and not state.error
+        assert np.linalg.norm(state.pose[:3] - target[:3]) < SETTLED_MM
+        assert np.allclose(ready.reads(), target, atol=SETTLED_MM)  # not only said, but so
+        assert state.joints_deg.shape == (ready.arm.axes,) and abs(time.monotonic() - state.time_s) < 1.0
+
+
+def test_a_move_to_where_it_is_returns_soon(ready):
+    begun = time.monotonic()
+    ready.arm.move_linear(ready.home)
+    assert time.monotonic() - begun < 2.0  # the arm never says that it runs
+
+
+def test_joints_move_too(ready):
+    joints = ready.arm.state().joints_deg + 2.0
+    assert np.allclose(ready.arm.move_joints(joints), joints)
+    assert np.allclose(ready.arm.state().joints_deg, joints, atol=0.01)
+    with pytest.raises(DeviceError, match="joints"):
+        ready.arm.move_joints(np.zeros(3))
+
+
+def test_four_axes_keep_level_and_turn_as_suits_the_wrist(ready):
+    sent = ready.arm.move_linear(ready.home + [0, 0, 0, 5, 5, 360])
+    if ready.arm.axes == 4:
+        assert np.allclose(sent, ready.home)
+    else:
+        assert np.allclose(sent[3:5], 5)
+
+
+def test_stop_ends_a_move_and_what_is_queued(ready):
+    ready.arm.set_speed(SLOW_MM_S, SLOW_MM_S)
+    for n in (1, 2, 3):
+        ready.arm.move_linear(ready.home + [0, 20 * (-1) ** n, 0, 0, 0, 0], wait=False)
+    time.sleep(0.1)
+    assert ready.arm.state().moving
+    ready.arm.stop()
+    time.sleep(0.1)
+    still = ready.reads()
+    time.sleep(0.2)
+    assert np.array_equal(ready.reads(), still) and not ready.arm.state().moving
+    assert np.linalg.norm(still[:3] - ready.home[:3]) < 20
+    ready.arm.move_linear(ready.home)  # and it can go on
+
+
+def test_without_wait_it_returns_at_once_and_settles_later(ready):
+    ready.arm.set_speed(SLOW_MM_S, SLOW_MM_S)
+    target = ready.home + [0, 20, 0, 0, 0, 0]
+    begun = time.monotonic()
+    ready.arm.move_linear(target, wait=False)
+    assert time.monotonic() - begun < 0.15
+    state = ready.arm.wait_settled(target)
+    assert np.linalg.norm(state.pose[:3] - target[:3]) < SETTLED_MM and not state.moving
+
+
+def test_too_little_time_is_an_error_and_the_arm_stops(ready):
+    ready.arm.set_speed(SLOW_MM_S, SLOW_MM_S)
+    with pytest.raises(DeviceError, match="time"):
+        ready.arm.move_linear(ready.home + [0, 100, 0, 0, 0, 0], timeout_s=0.4)
+    ready.arm.stop()
+    still = ready.reads()
+    time.sleep(0.1)
+    assert np.array_equal(ready.reads(), still)
+
+
+def test_what_can_not_be_is_refused_before_anything_moves(ready):
+    before = ready.reads()
+    targets = [np.full(6, np.nan)]
+    if ready.arm.axes == 4:
+        targets += [[900.0, 0, 0, 0, 0, 0], [20.0, 0, 0, 0, 0, 0]]
+    for target in targets:
+        with pytest.raises(DeviceError):
+            ready.arm.move_linear(np.array(target))
+    for speeds in ((0, 10), (10, np.nan), (-1, 1), (np.inf, 1)):
+        with pytest.raises(DeviceError, match="positive"):
+            ready.arm.set_speed(*speeds)
+    assert np.array_equal(ready.reads(), before)
+    ready.arm.move_linear(ready.home + [5, 0, 0, 0, 0, 0])  # no alarm was raised
+
+
+def test_where_it_was_can_be_asked_later(ready):
+    """A camera that is emulated from the arm's pose needs it at the time of exposure."""
+    where = ready.device.track.pose if hasattr(ready.device, "track") else ready.device.pose
+    ready.arm.set_speed(SLOW_MM_S, SLOW_MM_S)
+    ready.arm.move_linear(ready.home + [0, 20, 0, 0, 0, 0], wait=False)
+    times = [time.monotonic() + 0.01 * n for n in range(10)]
+    time.sleep(0.15)
+    asked = [where(t) for t in times]
+    assert np.ptp([pose[1] for pose in asked]) > 0.5
+    ready.arm.stop()
+    ready.arm.move_linear(ready.home)
+    assert np.allclose([where(t) for t in times], asked)
+
+
+def test_speed_is_at_most_what_was_asked(ready):
+    ready.arm.set_speed(40.0, 40.0)
+    begun = time.monotonic()
+    ready.arm.move_linear(ready.home + [0, 40, 0, 0, 0, 0])
+    assert time.monotonic() - begun > 40 / 40.0 / 4.0  # benches run four times as fast
+
+
+def test_disable_stops_and_enable_goes_on(ready):
+    ready.arm.set_speed(SLOW_MM_S, SLOW_MM_S)
+    ready.arm.move_linear(ready.home + [0, 50, 0, 0, 0, 0], wait=False)
+    ready.arm.disable()
+    time.sleep(0.1)
+    assert not ready.arm.state().enabled
+    still = ready.reads()
+    with pytest.raises(DeviceError):
+        ready.arm.move_linear(ready.home)
+    assert np.array_equal(ready.reads(), still)
+    ready.arm.enable()
+    ready.arm.set_speed(FAST_MM_S, FAST_MM_S)
+    ready.arm.move_linear(ready.home)
+
+
+def test_it_connects_again_after_disconnect(ready):
+    ready.arm.disconnect()
+    ready.arm.connect()
+    assert np.allclose(ready.arm.state().pose[:3], ready.home[:3], atol=SETTLED_MM)
+
+
+def test_as_a_context_manager(at):
+    with at.arm as arm:
+        assert arm is at.arm and arm.is_connected
+    assert not at.arm.is_connected
+
+
+@pytest.mark.parametrize(
+    ("spec", "remedy"),
+    [
+        ("mg400:127.0.0.1:1", "twin emulate mg400"),
+        ("magician:/dev/no-such-port", "twin emulate magician"),
+    ],
+)
+def test_what_is_not_there_is_one_clear_error(spec, remedy):
+    arm = open_arm(spec)  # opens nothing yet
+    with pytest.raises(DeviceNotConnectedError, match=remedy):
+        arm.connect()
+    assert not arm.is_connected
+
+
+@pytest.mark.parametrize("spec", ["", "ur5", "simulated:5", "mg400:host:port"])
+def test_what_is_no_arm_names_those_that_are(spec):
+    with pytest.raises(DeviceError, match="mg400"):
+        open_arm(spec)
+
+
+def test_names_of_arms():
+    assert open_arm("simulated").axes == 6 and open_arm("simulated:4").axes == 4
+    assert open_arm("mg400").name == "MG400 at 192.168.1.6" and open_arm("mg400:10.0.0.1:29999").axes == 4
+    assert open_arm("magician:/dev/ttyUSB0").axes == 4

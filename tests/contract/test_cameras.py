@@ -1,0 +1,320 @@
+"""One suite over every frame source: the twin, a folder, a video, a session, a stream over a real socket, a USB camera."""
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from noisy_camera import NoisyCamera, number_of
+
+from hardware.arms.simulated import SimulatedArm
+from hardware.cameras.choose import open_camera
+from hardware.cameras.lerobot import LeRobotCamera
+from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.reader import MOST_FAILED_READS
+from hardware.cameras.source import FrameSource
+from hardware.cameras.twin import TwinCamera
+from hardware.cameras.uvc import UvcSettings, apply_settings, exposed_s
+from hardware.devices import cameras
+from hardware.emulators.camera import CameraEmulator
+from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.mounting import Mounting
+from hardware.rig_geometry import PlacedObject
+from hardware.session import SessionWriter
+from scenes import PlacementSpec, load_experiment, load_object, load_sensor
+from twin.recordings.images import write_image
+from twin.types import Form, Frame
+
+COUNT = 6  # frames of the recorded sources
+WAIT_S = 60.0  # for the twin's first frame, whose kernels may have to be compiled
+
+
+def pictures() -> list[np.ndarray]:
+    rng = np.random.default_rng(1)
+    return [rng.integers(40, 220, (48, 64), np.uint8) for _ in range(COUNT)]
+
+
+def make_folder(path: Path) -> str:
+    path.mkdir()
+    for k, image in enumerate(pictures()):
+        write_image(path / f"frame_{k}.png", image)
+    return str(path)
+
+
+def make_video(path: Path) -> str:
+    file = path.with_suffix(".avi")
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48), False)
+    for image in pictures():
+        writer.write(image)
+    writer.release()
+    return str(file)
+
+
+def make_session(path: Path) -> str:
+    with SessionWriter(path, {}) as session:
+        for k, image in enumerate(pictures()):
+            session.append(Frame(image, Form.RAW, f"f{k}", 10.0 + k, k + 1), {})
+    return str(path)
+
+
+def twin_camera() -> tuple[SimulatedArm, TwinCamera]:
+    sensor = load_sensor("mg400-331")
+    placed = PlacedObject(load_object("plane"), PlacementSpec(), Mounting.of(sensor, load_experiment("surface-2d")))
+    arm = SimulatedArm(axes=6, pose=placed.start_pose(0.5), time_scale=20.0)
+    arm.connect()
+    arm.enable()
+    return arm, TwinCamera(sensor, placed, arm.state, Form.RECORDING)
+
+
+@pytest.fixture(scope="module")
+def twin():
+    """One twin for all: its solver is slow to begin."""
+    arm, camera = twin_camera()
+    yield camera
+    camera.disconnect()
+    arm.disconnect()
+
+
+@pytest.fixture(params=["twin", "folder", "video", "session", "mjpeg", "uvc"])
+def source(request, tmp_path):
+    if request.param == "twin":
+        camera = request.getfixturevalue("twin")
+        camera.disconnect()
+        yield camera
+        camera.disconnect()
+        return
+    if request.param == "uvc":
+        found = cameras()
+        if not found:
+            pytest.skip("no camera is attached to this machine")
+        yield open_camera(found[0].node)
+        return
+    if request.param == "mjpeg":
+        with CameraEmulator(NoisyCamera()) as emulator:
+            yield open_camera(emulator.url)
+        return
+    make = {"folder": make_folder, "video": make_video, "session": make_session}[request.param]
+    yield open_camera(make(tmp_path / "recorded"))
+
+
+def test_it_opens_once_and_closes_for_good(source: FrameSource):
+    assert not source.is_connected
+    with pytest.raises((DeviceNotConnectedError, DeviceError)):
+        source.read(timeout_s=0.01)
+    with source:
+        assert source.is_connected
+        with pytest.raises(DeviceAlreadyConnectedError):
+            source.connect()
+        assert source.read(timeout_s=WAIT_S).image.dtype == np.uint8
+    assert not source.is_connected
+    source.disconnect()  # without effect
+
+
+def test_read_gives_each_frame_once_and_in_order(source: FrameSource):
+    with source:
+        frames = [source.read(timeout_s=WAIT_S) for _ in range(4)]
+    numbers, times = [f.sequence for f in frames], [f.time_s for f in frames]
+    assert all(a < b for a, b in zip(numbers[:-1], numbers[1:], strict=True))
+    assert all(a <= b for a, b in zip(times[:-1], times[1:], strict=True))
+    assert all(f.form == source.form and f.image.shape == frames[0].image.shape for f in frames)
+    if source.is_live:
+        assert abs(frames[-1].time_s - time.monotonic()) < WAIT_S
+
+
+def test_the_latest_may_be_read_again_and_a_recording_ends(source: FrameSource):
+    with source:
+        first = source.read(timeout_s=WAIT_S)
+        latest = source.read_latest(max_age_s=WAIT_S)
+        assert latest.sequence >= first.sequence
+        if source.is_live:
+            after = source.read_after(time.monotonic(), timeout_s=WAIT_S)
+            assert after.time_s > latest.time_s
+            with pytest.raises(TimeoutError):
+                source.read_after(time.monotonic() + 3600.0, timeout_s=0.05)
+            with pytest.raises(StaleDataError):
+                source.read_latest(max_age_s=-1.0)
+        else:
+            assert source.dropped == 0
+            for _ in range(COUNT - 1):
+                source.read()
+            with pytest.raises(EOFError):
+                source.read()
+
+
+def test_every_live_frame_is_delivered_or_counted_as_dropped(source: FrameSource):
+    if not source.is_live:
+        pytest.skip("a recording drops nothing")
+    with source:
+        for _ in range(3):
+            source.read(timeout_s=WAIT_S)
+            time.sleep(0.1)
+        with source._new:
+            assert source.arrived == source.delivered + source.dropped
+
+
+def test_the_lerobot_shape(source: FrameSource):
+    camera = LeRobotCamera(source)
+    if source.is_live:
+        source.connect()
+        source.read(timeout_s=WAIT_S)
+        source.disconnect()
+    camera.connect(warmup=True)
+    assert camera.is_connected
+    assert camera.read().dtype == np.uint8
+    assert camera.read_latest(max_age_ms=1e3 * WAIT_S).ndim in (2, 3)
+    if source.is_live:
+        assert camera.async_read(timeout_ms=1e3 * WAIT_S).size
+        with pytest.raises(TimeoutError):
+            camera.read_latest(max_age_ms=-1)
+    camera.disconnect()
+    assert not camera.is_connected
+    assert isinstance(LeRobotCamera.find_cameras(), list)
+
+
+def test_a_folders_pictures_come_as_they_are(tmp_path):
+    for make in (make_folder, make_session):
+        with open_camera(make(tmp_path / make.__name__)) as source:
+            for image in pictures():
+                np.testing.assert_array_equal(source.read().image, image)
+
+
+class TestStream:
+    """What may go wrong with a camera, over a real socket."""
+
+    @pytest.fixture
+    def stream(self):
+        with CameraEmulator(NoisyCamera(fps=60)) as emulator, MjpegCamera(emulator.url) as camera:
+            camera.read(timeout_s=5)
+            yield emulator, camera
+
+    def test_pictures_are_new_and_their_exposure_is_known(self, stream):
+        _, camera = stream
+        frame = camera.read_after(time.monotonic(), timeout_s=2)
+        assert 0 <= time.monotonic() - frame.time_s < 1.0
+        assert number_of(frame.image) == number_of(frame.image) % 20
+
+    def test_a_frozen_picture_is_noticed_and_forgiven(self, stream):
+        emulator, camera = stream
+        emulator.faults.add("frozen")
+        self._until(lambda: camera.fault)
+        with pytest.raises(DeviceError, match="frozen"):
+            camera.read_latest()
+        emulator.faults.clear()
+        self._until(lambda: not camera.fault)
+        assert camera.read(timeout_s=2).image.size
+
+    def test_a_black_picture_is_noticed(self, stream):
+        emulator, camera = stream
+        emulator.faults.add("black")
+        self._until(lambda: camera.fault)
+        with pytest.raises(DeviceError, match="black"):
+            camera.read()
+
+    def test_a_torn_jpeg_is_never_handed_out(self, stream):
+        emulator, camera = stream
+        emulator.faults.add("torn=3")
+        self._until(lambda: camera.failed >= 3)
+        frames = [camera.read(timeout_s=2) for _ in range(5)]
+        assert all(frame.image.shape == (48, 64) for frame in frames)
+        assert all(frame.image[-8:].std() > 10 for frame in frames)  # noise down to the last rows
+
+    def test_lost_pictures_are_counted(self, stream):
+        emulator, camera = stream
+        before = camera.arrived
+        emulator.faults.add("dropped=2")
+        made = emulator.made
+        for _ in range(5):
+            camera.read(timeout_s=2)
+        assert camera.arrived - before >= emulator.made - made - 4  # those on the way
+        with camera._new:
+            assert camera.arrived == camera.delivered + camera.dropped
+
+    def test_late_pictures_are_told_by_their_age(self, stream):
+        emulator, camera = stream
+        emulator.faults.add("late=0.4")
+        asked_s = time.monotonic()
+        frame = camera.read_after(asked_s, timeout_s=3)
+        assert time.monotonic() - asked_s > 0.35
+        assert asked_s < frame.time_s < time.monotonic() - 0.35
+        with pytest.raises(StaleDataError):
+            camera.read_latest(max_age_s=0.2)
+
+    def test_unplugged_and_back(self, stream):
+        emulator, camera = stream
+        emulator.faults.add("unplugged=0.8")
+        with pytest.raises((TimeoutError, DeviceError)):
+            camera.read_after(time.monotonic() + 0.1, timeout_s=0.5)
+        assert camera.read_after(time.monotonic(), timeout_s=5).image.size
+        assert camera.failed > 0
+
+    def test_unplugged_for_good_ends_with_a_clear_error(self, stream):
+        emulator, camera = stream
+        emulator.faults.add("unplugged=60")
+        deadline = time.monotonic() + 10
+        with pytest.raises(DeviceError, match=f"{MOST_FAILED_READS + 1} reads in a row failed"):
+            while time.monotonic() < deadline:
+                try:
+                    camera.read_after(time.monotonic(), timeout_s=0.2)
+                except TimeoutError:
+                    continue
+
+    def test_nothing_there_says_so(self):
+        with pytest.raises(DeviceError, match="no answer"):
+            MjpegCamera("http://127.0.0.1:9/stream").connect()
+        with pytest.raises(DeviceError, match="http"):
+            MjpegCamera("rtsp://somewhere/stream")
+
+    def test_opencv_opens_the_emulators_stream_too(self, stream):
+        emulator, _ = stream
+        capture = cv2.VideoCapture(emulator.url, cv2.CAP_FFMPEG)
+        good, image = capture.read()
+        capture.release()
+        assert good and image.shape == (48, 64, 3)
+
+    @staticmethod
+    def _until(condition, timeout_s: float = 5.0):
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, "it did not happen in time"
+            time.sleep(0.01)
+
+
+class TestUvcSettings:
+    """Against a device that takes some settings and ignores others."""
+
+    class Device:
+        def __init__(self):
+            self.log, self.values = [], {}
+
+        def set(self, key, value):
+            self.log.append(key)
+            if key != cv2.CAP_PROP_GAIN:
+                self.values[key] = value
+            return True
+
+        def get(self, key):
+            return self.values.get(key, -1.0)
+
+    def test_they_are_asked_for_in_order_and_read_back(self):
+        device = self.Device()
+        report = apply_settings(device, UvcSettings(exposure=78, gain=5, white_balance_k=4600))
+        order = [
+            cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_BUFFERSIZE,
+            cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_GAIN, cv2.CAP_PROP_AUTO_WB, cv2.CAP_PROP_WB_TEMPERATURE,
+            cv2.CAP_PROP_AUTOFOCUS,
+        ]  # fmt: skip
+        assert device.log == order
+        told = {name: (asked, got) for name, asked, got in report}
+        assert told["gain"] == (5.0, -1.0)
+        assert told["exposure"] == (78.0, 78.0)
+
+    def test_the_kernels_time_is_taken_only_where_it_can_be(self):
+        now_s = time.monotonic()
+        assert exposed_s(1e3 * (now_s - 0.05)) == pytest.approx(now_s - 0.05)
+        assert exposed_s(0.0) == pytest.approx(now_s, abs=0.5)
+        assert exposed_s(1e3 * (now_s + 100)) == pytest.approx(now_s, abs=0.5)
+
+    def test_a_missing_camera_says_so(self):
+        with pytest.raises(DeviceError, match="can't be opened"):
+            open_camera("/dev/video97").connect()

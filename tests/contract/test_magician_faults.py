@@ -1,0 +1,113 @@
+"""Whatever a Magician's line does wrong, the driver recovers, or stops it and says what to do."""
+
+import time
+
+import numpy as np
+import pytest
+
+from hardware.arms.magician import Magician
+from hardware.emulators.magician import FAULTS, MagicianEmulator
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from twin.errors import TwinError
+
+AWAY = np.array([200.0, 20, 30, 0, 0, 20])
+HARMLESS = ("noise=7", "split-frames=0.01", "wrong-checksum=5", "lost-reply=5", "wide-queue-space")
+
+
+def go(arm, *, timeout_s=10.0):
+    arm.connect()
+    arm.enable()
+    arm.move_linear(AWAY, timeout_s=timeout_s)
+
+
+@pytest.mark.parametrize("fault", HARMLESS)
+def test_these_disturb_nothing(fault):
+    with MagicianEmulator(faults=(fault,), time_scale=4.0) as emulator, Magician(emulator.device) as arm:
+        arm.enable()
+        arm.move_linear(AWAY)
+        assert np.allclose(emulator.pose(), AWAY, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("faults", "remedy"),
+    [
+        (("mute",), "switch the arm on"),
+        (("lost-steps",), "home it"),
+        (("stall",), "more time"),
+        (("ignore-moves",), "not executed"),
+        (("slow=0.01",), "more time"),
+        (("unplugged=0.2", "slow=0.01"), "Plug the cable in"),
+    ],
+)
+def test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still(faults, remedy):
+    with MagicianEmulator(faults=faults) as emulator:
+        arm = Magician(emulator.device)
+        with pytest.raises(DeviceError, match=remedy):
+            go(arm, timeout_s=0.8)
+        if "unplugged=0.2" in faults:
+            assert not arm.is_connected
+        else:  # an arm that is out of reach goes on: that is what the error says
+            still = emulator.pose()
+            time.sleep(0.1)
+            assert np.array_equal(emulator.pose(), still)
+        arm.disconnect()
+
+
+def test_the_list_above_is_complete():
+    mark = test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still.pytestmark[0]
+    tried = {fault.split("=")[0] for faults, _ in mark.args[1] for fault in faults} | {fault.split("=")[0] for fault in HARMLESS}
+    assert tried == set(FAULTS)
+
+
+def test_an_alarm_is_told_cleared_and_the_arm_goes_on():
+    with MagicianEmulator(faults=("lost-steps",), time_scale=4.0) as emulator, Magician(emulator.device) as arm:
+        arm.enable()
+        with pytest.raises(DeviceError, match="alarm 80"):
+            arm.move_linear(AWAY)
+        with pytest.raises(DeviceError, match="alarm 80"):
+            arm.enable()
+        emulator.faults.clear()
+        arm.clear_error()
+        arm.move_linear(AWAY)
+
+
+def test_an_arm_that_falls_silent_is_stale():
+    with MagicianEmulator() as emulator, Magician(emulator.device) as arm:
+        arm.enable()
+        emulator.faults.add("mute")
+        with pytest.raises(StaleDataError, match="Don't trust the last pose"):
+            arm.state()
+        emulator.faults.clear()
+
+
+def test_plugged_in_again_it_connects_again(tmp_path):
+    link = tmp_path / "arm"
+    arm = Magician(str(link))
+    with MagicianEmulator(link=link):
+        arm.connect()
+    with pytest.raises(DeviceNotConnectedError):
+        arm.enable()
+    with MagicianEmulator(link=link, time_scale=4.0):
+        arm.connect()
+        arm.enable()
+        arm.move_linear(AWAY)
+        arm.disconnect()
+    assert not link.exists()
+
+
+def test_homing_ends_at_home_with_its_tool():
+    with MagicianEmulator(time_scale=20.0) as emulator:
+        arm = Magician(emulator.device, tool_x_mm=50.0)
+        arm.connect()
+        arm.enable()
+        arm.move_linear([260.0, 10, 20, 0, 0, 0])
+        arm.home()
+        assert np.allclose(arm.state().pose, [200, 0, 0, 0, 0, 0], atol=0.01)
+        arm.disconnect()
+
+
+def test_a_link_that_can_not_be_made_is_one_clear_error(tmp_path):
+    (tmp_path / "arm").write_text("mine")
+    with pytest.raises(TwinError, match="--link"):
+        MagicianEmulator(link=tmp_path / "arm").start()
+    assert (tmp_path / "arm").read_text() == "mine"

@@ -1,0 +1,222 @@
+"""Whatever an MG400 does wrong, the driver recovers, or stops it and says what to do."""
+
+import socket
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arms import mg400_of
+
+from hardware.arms import kinematics as arms
+from hardware.arms.mg400 import Mg400Ports
+from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet
+from hardware.emulators.mg400 import FAULTS, Mg400Emulator
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from twin.errors import TwinError
+
+HOME = np.array([300.0, 0, 0, 0, 0, 10])
+AWAY = HOME + [0, 60, -10, 0, 0, 20]
+SLOW_SHARE_PERCENT = 5.0  # of 1000 mm/s: a move of 60 mm takes over a second
+
+HARMLESS = (
+    "split-refusals",
+    "needs-motion-client",
+    "one-client",
+    "no-fast-feedback",
+    "short-packets=3",
+    "wrong-test-value=3",
+    "six-value-pose",
+    "error-groups=7",
+)
+
+
+def emulated(*faults, **options):
+    return Mg400Emulator(port_offset=None, faults=faults, **options)
+
+
+def go(arm, *, timeout_s=10.0):
+    arm.connect()
+    arm.enable()
+    arm.move_linear(HOME, timeout_s=timeout_s)
+    arm.move_linear(AWAY, timeout_s=timeout_s)
+
+
+@pytest.mark.parametrize("fault", HARMLESS)
+def test_these_disturb_nothing(fault):
+    with emulated(fault, time_scale=4.0) as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        arm.move_linear(AWAY)
+        assert np.allclose(emulator.pose(), AWAY, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("faults", "remedy"),
+    [
+        (("no-tcp-mode",), "TCP/IP Secondary Development"),
+        (("no-tcp-mode", "split-refusals"), "TCP/IP Secondary Development"),
+        (("motion-port-closed",), "no other program holds the port"),
+        (("no-feedback",), "close other programs"),
+        (("silent-feedback=0",), "restart the arm"),
+        (("emergency-stop",), "release the emergency stop"),
+        (("collision",), "free the arm by hand"),
+        (("stall",), "not executed"),
+        (("ignore-moves",), "not executed"),
+        (("slow=0.01",), "more time"),
+        (("no-sync-reply",), "more time"),
+        (("silent-feedback=0.2", "slow=0.05"), "no feedback"),
+        (("die=0.15", "slow=0.05"), "power and cable"),
+    ],
+)
+def test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still(faults, remedy):
+    with emulated(*faults) as emulator:
+        arm = mg400_of(emulator)
+        with pytest.raises(DeviceError, match=remedy):
+            go(arm, timeout_s=1.5)
+        if "die=0.15" not in faults:  # a dead arm can't be told
+            time.sleep(0.1)
+            still = emulator.pose()
+            time.sleep(0.1)
+            assert np.array_equal(emulator.pose(), still)
+        arm.disconnect()
+
+
+def test_the_list_above_is_complete():
+    mark = test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still.pytestmark[0]
+    tried = {fault.split("=")[0] for faults, _ in mark.args[1] for fault in faults} | {fault.split("=")[0] for fault in HARMLESS}
+    assert tried == set(FAULTS)
+
+
+def test_an_unknown_fault_names_the_near_one():
+    with pytest.raises(TwinError, match="did you mean collision"):
+        emulated("colision")
+    with pytest.raises(TwinError, match="not a number"):
+        emulated("slow=fast")
+
+
+def test_recovery_from_an_emergency_stop():
+    with emulated(time_scale=4.0) as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        arm.set_speed_percent(linear=SLOW_SHARE_PERCENT)
+        arm.move_linear(AWAY, wait=False)
+        emulator.arm.press_emergency_stop()
+        with pytest.raises(DeviceError, match="alarm 85"):
+            arm.wait_settled(AWAY)
+        assert "alarm 85" in arm.state().error
+        with pytest.raises(DeviceError, match="clear_error"):
+            arm.enable()
+        stopped = emulator.pose()
+        arm.clear_error()
+        assert not arm.state().enabled  # ClearError alone does not bring it back
+        arm.enable()
+        time.sleep(0.1)
+        assert np.array_equal(emulator.pose(), stopped)  # nothing of the old queue goes on
+        arm.set_speed_percent(linear=100)
+        arm.move_linear(AWAY)
+
+
+def test_recovery_from_a_collision():
+    with emulated("collision", time_scale=4.0) as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        with pytest.raises(DeviceError, match="alarm 112.*alarm -2"):
+            arm.move_linear(AWAY)
+        emulator.faults.clear()
+        arm.clear_error()
+        arm.enable()
+        assert np.allclose(arm.move_linear(AWAY), AWAY)
+
+
+def test_feedback_that_falls_silent_is_stale_after_a_second_and_comes_back():
+    with emulated("silent-feedback=0.3") as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        told = arm.state()
+        time.sleep(1.3)
+        emulator.faults.clear()
+        with pytest.raises(StaleDataError, match="Don't trust the last pose"):
+            arm.state()
+        deadline = time.monotonic() + 5.0
+        while time.monotonic() < deadline:
+            try:
+                assert arm.state().time_s > told.time_s
+                break
+            except StaleDataError:
+                time.sleep(0.05)
+        arm.move_linear(AWAY)
+
+
+def test_a_slow_reader_gets_the_newest_pose():
+    with emulated(time_scale=4.0) as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        arm.move_linear(AWAY, wait=False)
+        time.sleep(1.0)  # 125 packets later
+        state = arm.state()
+        assert time.monotonic() - state.time_s < 0.1 and np.allclose(state.pose, AWAY, atol=0.01)
+
+
+def test_a_backlog_is_read_through_to_its_end():
+    """Bytes that wait in the socket are all read before any is believed."""
+    packets = np.zeros(50, PACKET)
+    packets["length"], packets["test_value"], packets["unix_ms"] = PACKET_BYTES, TEST_VALUE, np.arange(50)
+    packet, rest, skipped = newest_packet(packets.tobytes() + packets[:1].tobytes()[:700])
+    assert packet["unix_ms"] == 49 and len(rest) == 700 and skipped == 0
+
+
+def test_unknown_targets_alarm_in_the_arm_if_the_driver_lets_them_through():
+    blind = replace(arms.MG400, limits_deg=((-360, 360),) * 4, linkage_deg=None)
+    with emulated(time_scale=4.0) as emulator, mg400_of(emulator, kinematics=blind) as arm:
+        arm.enable()
+        with pytest.raises(DeviceError, match="alarm 18"):
+            arm.move_linear([160.0, 0, -100, 0, 0, 0])
+
+
+def test_several_clients_in_turn_and_at_once():
+    with emulated(time_scale=4.0) as emulator:
+        for _ in range(3):
+            with mg400_of(emulator) as arm:
+                arm.enable()
+                arm.move_linear(AWAY)
+        with mg400_of(emulator) as first, mg400_of(emulator) as second:
+            first.enable()
+            assert second.state().enabled or first.state().enabled
+
+
+def test_a_taken_port_is_an_error_with_a_remedy():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        offset = taken.getsockname()[1] - 29999
+        with pytest.raises(TwinError, match="--port-offset"):
+            Mg400Emulator(port_offset=offset).start()
+
+
+def test_a_lost_arm_can_not_be_stopped_and_that_is_said_loudly():
+    with emulated() as emulator:
+        arm = mg400_of(emulator)
+        arm.connect()
+        emulator.kill()
+        with pytest.raises(DeviceNotConnectedError):
+            arm.enable()
+        with pytest.raises(DeviceNotConnectedError, match="Press its emergency stop"):
+            arm.stop()
+        arm.disconnect()
+
+
+def test_after_a_lost_connection_it_connects_again_and_reads_once():
+    others = set(threading.enumerate())
+    with emulated(time_scale=4.0) as emulator:
+        arm = mg400_of(emulator)
+        arm.connect()
+        arm.enable()
+        arm._motion.close()
+        assert not arm.is_connected
+        arm.stop()  # the dashboard is still there
+        arm.connect()
+        arm.enable()
+        arm.move_linear(AWAY)
+        assert sum(thread.name == "mg400-feedback" for thread in set(threading.enumerate()) - others) == 1
+        arm.disconnect()
+
+
+def test_the_default_ports_are_the_arms():
+    assert Mg400Ports() == Mg400Ports(29999, 30003, (30004, 30005))

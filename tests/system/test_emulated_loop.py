@@ -1,0 +1,88 @@
+"""The whole rig over real sockets: an emulated MG400 and, beside it, the twin's camera that knows the arm by its feedback alone."""
+
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hardware.arms.mg400 import MG400, Mg400Ports
+from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT
+from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.twin import TwinCamera
+from hardware.emulators.arm_pose import FeedbackPose
+from hardware.emulators.camera import CameraEmulator
+from hardware.emulators.mg400 import Mg400Emulator
+from hardware.errors import DeviceError
+from hardware.mounting import Mounting
+from hardware.rig_geometry import PlacedObject
+from hardware.safe_arm import SafeArm
+from hardware.safety import load_limits
+from hardware.step import LoopSettings
+from hardware.trajectory import measure, trajectory_of
+from scenes import load_experiment, load_object, load_sensor, load_servo
+from twin.cli.rig import Rig, servo_loop
+from twin.preprocess import Pipeline
+from twin.types import Form
+
+sys.path.append(str(Path(__file__).parents[1] / "contract"))
+from true_estimator import TrueEstimator  # noqa: E402
+
+FIRST_S = 90.0  # kernels may have to be compiled
+STEPS = 12
+
+
+@pytest.fixture
+def emulated():
+    sensor, servo = load_sensor("mg400-331"), load_servo("surface")
+    placed = PlacedObject(load_object("can"), servo.placement, Mounting.of(sensor, load_experiment("surface-2d")))
+    with Mg400Emulator(port_offset=None, time_scale=4.0) as arm:
+        pose = FeedbackPose("127.0.0.1", tuple(arm.ports[port] for port in FEEDBACK_PERIOD_S))
+        with pose, CameraEmulator(TwinCamera(sensor, placed, pose, Form.RAW)) as camera:
+            ports = Mg400Ports(arm.ports[DASHBOARD_PORT], arm.ports[MOTION_PORT], tuple(arm.ports[p] for p in list(FEEDBACK_PERIOD_S)[:2]))
+            safe = SafeArm(MG400("127.0.0.1", ports=ports), load_limits("mg400"))
+            with Rig(MjpegCamera(camera.url, sensor, Form.RECORDING), safe, placed, True) as rig:
+                rig.source.read(timeout_s=FIRST_S)
+                truth = SimpleNamespace(track=SimpleNamespace(pose=arm.pose))
+                yield rig, servo, camera, TrueEstimator(truth, placed), Pipeline(sensor, Form.RECORDING)
+
+
+def assert_let_go(rig):
+    deadline = time.monotonic() + 2.0
+    while rig.arm.state().enabled and time.monotonic() < deadline:  # feedback comes a little later
+        time.sleep(0.01)
+    state = rig.arm.state()
+    assert not state.enabled
+    assert rig.placed.touch(state.pose).indent_mm < -10
+
+
+def test_it_follows_the_can_and_the_frames_show_the_contact(emulated):
+    rig, servo, camera, estimator, pipeline = emulated
+    found: list[int] = []
+
+    def look(record, frame, estimate):
+        seen = pipeline(frame)
+        assert seen.valid, seen.reason
+        moved = np.linalg.norm(seen.graph.nodes_px - pipeline.reference.pins_px, axis=1)
+        found.append(seen.found)
+        assert moved.max() > 4.0  # px: the pins of a sensor that is pressed 3 mm deep
+
+    loop = servo_loop(rig, servo, estimator, LoopSettings(STEPS, frame_timeout_s=10.0, give_up_s=10.0), look)
+    timing = loop.run(rig.placed.start_pose(servo.indent_mm))
+    assert timing.steps == STEPS
+    assert min(found) > 0.95 * 331
+    measures = measure(trajectory_of(loop.records, rig.mounting, rig.placed), indent_mm=3.0, angle_deg=0.0, wanted_mm=STEPS)
+    assert measures.lost_contacts == 0 and measures.hold_depth_mm < 0.2 and measures.completed > 0.5
+    assert_let_go(rig)
+    assert camera.sent > STEPS
+
+
+def test_a_frozen_camera_makes_the_arm_let_go(emulated):
+    rig, servo, camera, estimator, _ = emulated
+    loop = servo_loop(rig, servo, estimator, LoopSettings(1000, blocking=False, period_s=0.1, give_up_s=2.0))
+    loop.on_step = lambda record, frame, estimate: record.index == 3 and camera.faults.add("frozen")
+    with pytest.raises(DeviceError, match="holds still"):
+        loop.run(rig.placed.start_pose(servo.indent_mm))
+    assert_let_go(rig)

@@ -1,0 +1,196 @@
+"""The live commands in the twin, with a stand-in for a trained model that knows the simulated arm's pose."""
+
+import csv
+import json
+import sys
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import twin.cli.collect
+import twin.cli.live
+import twin.cli.servo
+import twin.cli.study  # noqa: F401  (each registers its commands)
+from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.twin import preview_of
+from hardware.live import LiveSession, Shower
+from hardware.mounting import Mounting
+from hardware.rig_geometry import PlacedObject
+from hardware.session import SessionSource
+from hardware.view.draw import draw_view, voronoi_map
+from hardware.view.server import BrowserView
+from scenes import load_experiment, load_object, load_sensor, load_servo
+from training.estimator import PoseEstimator
+from twin.camera import expose, record
+from twin.cli import app, servo_run
+from twin.cli.rig import build_rig, steps_round
+from twin.preprocess import Pipeline
+from twin.recordings import open_recording
+from twin.recordings.images import write_image
+from twin.types import Form, Frame
+
+sys.path.append(str(Path(__file__).parents[1] / "contract"))
+from noisy_camera import NoisyCamera, number_of  # noqa: E402
+from true_estimator import TrueEstimate, TrueEstimator  # noqa: E402
+
+STEPS = 6
+
+
+class StandIn:
+    """Looks like a ``PoseEstimator``; in the twin it knows the truth, elsewhere it tells the picture's mean level."""
+
+    def __init__(self) -> None:
+        self.sensor, self.form = load_sensor("mg400-331"), Form.RECORDING
+        self.pipeline = Pipeline(self.sensor, self.form)
+        self.true: TrueEstimator | None = None
+
+    def check(self, sensor, form) -> None:
+        assert form == self.form
+
+    def __call__(self, frame):
+        if self.true is not None:
+            return self.true(frame)
+        value = np.array([frame.image.mean(), frame.image.std()])
+        return TrueEstimate(("pose_2", "pose_6"), value, value - 1, value + 1)
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    model = StandIn()
+
+    def build(*arguments, **options):
+        rig = build_rig(*arguments, **options)
+        model.true = TrueEstimator(rig.arm, rig.placed, noise_mm=0.03, noise_deg=0.3)
+        return rig
+
+    monkeypatch.setattr(servo_run, "build_rig", build)
+    monkeypatch.setattr(PoseEstimator, "load", classmethod(lambda cls, run: model))
+    return model
+
+
+def run(*arguments) -> str:
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path):
+    out = tmp_path / "servo"
+    told = run("servo", "--object", "can", "--model", "any", "--out", out, "--steps", STEPS, "--plain-light", "--record")
+    assert f"{STEPS} steps" in told
+    with (out / "trajectory.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == STEPS
+    assert all(abs(float(row["true_depth_mm"]) - load_servo("surface").indent_mm) < 0.5 for row in rows)
+    content = json.loads((out / "measures.json").read_text())
+    assert content["failure"] == "" and content["measures"]["lost_contacts"] == 0 and content["model"] == "any"
+    assert (out / "trajectory.png").stat().st_size > 10_000
+    with SessionSource(out / "session") as session:
+        frames = [session.read() for _ in range(STEPS)]
+    # the frames show a contact: pins have moved, and the pipeline sees them
+    seen = stand_in.pipeline(frames[-1])
+    assert seen.valid
+    assert np.linalg.norm(seen.graph.nodes_px - stand_in.pipeline.reference.pins_px, axis=1).max() > 4.0
+
+
+def test_a_model_that_fails_is_a_result_of_the_study(stand_in, tmp_path, monkeypatch):
+    monkeypatch.setattr(servo_run, "GIVE_UP_S", 0.5)
+    calls = {"count": 0}
+    truth = StandIn.__call__
+
+    def fails_later(model, frame):
+        calls["count"] += 1
+        if calls["count"] > 3:
+            model.true.fail = "no pins"
+        return truth(model, frame)
+
+    StandIn.__call__ = fails_later
+    try:
+        told = run("study", "servo", "--model", "a/one", "--objects", "can", "--out", tmp_path, "--steps", STEPS, "--plain-light")
+    finally:
+        StandIn.__call__ = truth
+    assert "ended early" in told and "no pins" in told
+    with (tmp_path / "study.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["model"] == "one" and row["object"] == "can" and row["steps"] == "3"
+    assert (tmp_path / "one" / "can" / "trajectory.csv").is_file() and (tmp_path / "study.png").is_file()
+
+
+def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
+    arguments = (
+        "collect",
+        "--camera",
+        "twin",
+        "--arm",
+        "simulated",
+        "--sensor",
+        "mg400-331",
+        "--out",
+        tmp_path,
+        "--plain-light",
+        "--count",
+    )
+    assert "1 contacts" in run(*arguments, 1)
+    assert "(1 new)" in run(*arguments, 2)
+    sensor = load_sensor("mg400-331")
+    recording = open_recording(tmp_path, sensor)
+    assert recording.form is Form.RECORDING and len(recording) == 2 and not recording.problems
+    pipeline, rest = Pipeline(sensor, Form.RECORDING), recording.reference
+    without = pipeline(rest).graph.nodes_px
+    for frame in recording:
+        assert np.linalg.norm(pipeline(frame).graph.nodes_px - without, axis=1).max() > 2.0
+
+
+def test_live_records_and_replays_the_same(stand_in, tmp_path):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(5):
+        write_image(folder / f"frame_{k}.png", (rng.random((360, 360)) > 0.7).astype(np.uint8) * 255)
+    told = run("live", "--camera", folder, "--model", "any", "--headless", "--record", tmp_path / "s")
+    assert "5 steps" in told
+    assert "5 of 5 estimates" in run("live", "--replay", tmp_path / "s", "--model", "any", "--headless")
+
+
+def test_the_browser_shows_the_newest_annotated_frame_and_figures():
+    view = BrowserView("TacTip <live>")
+    with NoisyCamera(fps=50) as source:
+        session = LiveSession(source, lambda frame: TrueEstimate(("pose_2",), np.ones(1), np.zeros(1), np.full(1, 2.0)))
+        with Shower(session, lambda frame, _, lines: frame.image, view):
+            session.run(most=20)
+            page = urllib.request.urlopen(view.url, timeout=5).read().decode()
+            assert "TacTip &lt;live&gt;" in page and "stream.mjpg" in page
+            with MjpegCamera(view.url + "stream.mjpg") as watcher:
+                first = watcher.read(timeout_s=5)
+                session.run(most=60)
+                watcher.read_after(first.time_s, timeout_s=5)
+            stats = json.loads(urllib.request.urlopen(view.url + "stats.json", timeout=5).read())
+            assert "pose_2 +1.00 [+0.00, +2.00]" in stats["0"] and "frames/s" in stats["1"]
+    assert 0 <= number_of(first.image) < 20
+
+
+def test_a_view_draws_pins_graph_cells_and_text():
+    sensor = load_sensor("mg400-331")
+    preview = preview_of(sensor, Form.RECORDING)
+    image = record(expose(preview.render(), sensor, origin_px=preview.window_px[:2]), sensor.recording, origin_px=preview.window_px[:2])
+    pipeline = Pipeline(sensor, Form.RECORDING)
+    frame = Frame(image, Form.RECORDING, "rest")
+    seen = pipeline(frame)
+    assert seen.valid
+    same = voronoi_map(image.shape, seen, seen.graph.area_px2)
+    other = voronoi_map(image.shape, seen, 0.5 * seen.graph.area_px2)
+    inside = tuple(np.round(seen.graph.nodes_px[0]).astype(int)[::-1])
+    assert tuple(same[inside]) != tuple(other[inside])
+    picture = draw_view(frame, seen, pipeline.reference.area_px2, ["a line", "another"])
+    assert picture.shape[1] == 2 * image.shape[1] and picture.shape[0] > image.shape[0]
+
+
+def test_a_round_takes_the_tools_way():
+    sensor, servo = load_sensor("mg400-331"), load_servo("surface")
+    placed = PlacedObject(load_object("can"), servo.placement, Mounting.of(sensor, load_experiment(servo.experiment)))
+    steps, way_mm = steps_round(placed, servo, 1.0)
+    assert way_mm == pytest.approx(2 * np.pi * 33, rel=1e-3)
+    assert way_mm <= steps * servo.feed_mm < way_mm + 2 * np.pi * 5

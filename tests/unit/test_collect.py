@@ -1,0 +1,151 @@
+"""Collecting: the frame is exposed after the arm has confirmed where it stands, however slow the arm and late the camera."""
+
+import csv
+import json
+import time
+
+import numpy as np
+import pytest
+
+from hardware.arms.simulated import SimulatedArm, SimulatedFault
+from hardware.cameras.reader import LiveSource, Picture
+from hardware.collect import COLUMNS, Collection, WorkFrame, collect, draw_contact
+from hardware.errors import DeviceError
+from hardware.mounting import Mounting
+from hardware.rig_geometry import PlacedObject, matrix_of
+from scenes import PlacementSpec, load_experiment, load_object, load_sensor
+from twin.recordings import open_recording, read_image
+from twin.types import Form
+
+LATE_S = 0.15  # of the late camera: a frame arrives so long after its exposure
+SCALE = 1e-2  # mm a gray level in the pictures of ``PoseCamera``
+FAST = 20.0  # times the arm's speed
+
+
+class PoseCamera(LiveSource):
+    """Writes the arm's pose at the exposure into the picture, and delivers it late."""
+
+    def __init__(self, arm, *, late_s: float = 0.0) -> None:
+        super().__init__("pose camera", Form.RAW)
+        self._arm, self._late_s, self._number = arm, late_s, 0
+
+    def _open(self):
+        pass
+
+    def _close(self):
+        pass
+
+    def _grab(self):
+        exposed_s = time.monotonic()
+        time.sleep(0.005 + self._late_s)
+        self._number += 1
+        levels = np.round((self._arm.track.pose(exposed_s)[:3] + 500) / SCALE).astype(np.uint32)
+        image = np.zeros((16, 16), np.uint8)
+        image[0, :3], image[1, :3], image[2, :3] = levels >> 16, (levels >> 8) & 255, levels & 255
+        image[3:] = 100 + self._number % 100
+        return Picture(image, exposed_s)
+
+
+def seen_mm(image: np.ndarray) -> np.ndarray:
+    """The pose's place that a picture shows."""
+    high, middle, low = (image[k, :3].astype(int) for k in range(3))
+    return ((high << 16) + (middle << 8) + low) * SCALE - 500
+
+
+@pytest.fixture
+def rig():
+    sensor, experiment = load_sensor("mg400-331"), load_experiment("surface-2d")
+    placed = PlacedObject(load_object("plane"), PlacementSpec(), Mounting.of(sensor, experiment))
+    arm = SimulatedArm(axes=6, time_scale=FAST)
+    return experiment, placed, arm
+
+
+def run(rig, folder, count, *, late_s=0.0, about=None):
+    experiment, placed, arm = rig
+    camera = PoseCamera(arm, late_s=late_s)
+    with arm, camera:
+        return collect(
+            camera, arm, experiment, placed, Collection(folder, about or {"seed": 1}, Form.RAW), count, seed=1, speed=(100.0, 100.0)
+        )
+
+
+def rows(folder):
+    with (folder / "targets.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_frame_shows_the_confirmed_pose_with_a_slow_arm_and_a_late_camera(rig, tmp_path):
+    experiment, placed, arm = rig
+    arm.faults.add(SimulatedFault.SLOW)
+    assert run(rig, tmp_path, 3, late_s=LATE_S) == 3
+    frame_of = WorkFrame(experiment, placed)
+    for row in rows(tmp_path):
+        shown = seen_mm(read_image(tmp_path / "images" / row["image_name"])[0])
+        label = np.array([float(row[f"pose_{k}"]) for k in range(1, 7)])
+        stands = frame_of.base_pose(label + experiment.clear + experiment.tap, np.zeros(6))
+        np.testing.assert_allclose(shown, stands[:3], atol=SCALE)
+    for line in (tmp_path / "contacts.jsonl").read_text().splitlines():
+        log = json.loads(line)
+        assert log["frame_s"] > log["confirmed_s"]
+        assert log["moved_meanwhile_mm"] == 0.0
+
+
+def test_the_labels_are_those_that_were_drawn_and_the_twin_indents_as_they_say(rig, tmp_path):
+    experiment, placed, _ = rig
+    run(rig, tmp_path, 3)
+    for index, row in enumerate(rows(tmp_path)):
+        asked = draw_contact(experiment, 1, index)
+        got = np.array([float(row[name]) for name in COLUMNS[4:]])
+        np.testing.assert_allclose(got, [*asked.pose, *asked.move], atol=1e-6)
+        low, high = np.array(list(experiment.ranges().values())).T
+        assert (got >= low - 1e-6).all() and (got <= high + 1e-6).all()
+        stands = WorkFrame(experiment, placed).base_pose(got[:6] + experiment.clear + experiment.tap, np.zeros(6))
+        touch = placed.touch(stands)
+        assert placed.mounting.labels(touch.depth_mm, touch.angle_deg)[1] == pytest.approx(asked.pose[5])
+        # the frame's axes lean with the plate by half a degree, the way along it is up to 5 mm
+        assert placed.mounting.labels(touch.depth_mm, touch.angle_deg)[0] == pytest.approx(asked.pose[1], abs=0.06)
+
+
+def test_a_collection_is_gone_on_with(rig, tmp_path):
+    run(rig, tmp_path, 2)
+    first = rows(tmp_path)
+    with (tmp_path / "targets.csv").open("a") as file:
+        file.write("frame_2_0.png,frame_2,1")  # killed while the row was written
+    experiment, placed, _ = rig
+    again = (experiment, placed, SimulatedArm(axes=6, time_scale=FAST))
+    assert run(again, tmp_path, 4) == 4
+    assert rows(tmp_path)[:2] == first
+    assert [row["data_name"] for row in rows(tmp_path)] == [f"frame_{k}" for k in range(4)]
+
+
+def test_another_collection_is_not_mixed_in(rig, tmp_path):
+    run(rig, tmp_path, 1)
+    with pytest.raises(DeviceError, match="seed"):
+        Collection(tmp_path, {"seed": 2}, Form.RAW)
+
+
+def test_the_folder_is_a_recording(rig, tmp_path):
+    run(rig, tmp_path, 3)
+    recording = open_recording(tmp_path)
+    assert recording.names == [f"frame_{k}_0.png" for k in range(3)]
+    assert recording.reference is not None
+    assert set(COLUMNS[4:]) <= set(recording.labels)
+
+
+def test_an_arm_that_did_not_move_is_not_believed(rig, tmp_path):
+    rig[2].faults.add(SimulatedFault.IGNORE)
+    with pytest.raises(DeviceError, match="not executed"):
+        run(rig, tmp_path, 1)
+    assert rows(tmp_path) == []
+
+
+def test_the_approach_is_free_of_contact(rig, tmp_path):
+    """Nothing touches before the tap: along every way but tap, move and lift the dome stays clear of the plate."""
+    experiment, placed, arm = rig
+    run(rig, tmp_path, 2)
+    lifts = [piece for piece in arm.track._pieces if piece.linear]
+    starts = np.array([placed.touch(piece.pose(piece.start_s)).indent_mm for piece in lifts])
+    ends = np.array([placed.touch(piece.pose(piece.end_s)).indent_mm for piece in lifts])
+    across = np.array([np.linalg.norm((matrix_of(p.pose(p.end_s)) - matrix_of(p.pose(p.start_s)))[[0, 2], 3]) for p in lifts])
+    free = (starts < 0) & (across > 1.0)
+    assert free.any() and (ends[free] < 0.5).all()

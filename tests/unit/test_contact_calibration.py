@@ -1,0 +1,108 @@
+"""Calibration of contacts on frames of the twin itself, whose numbers are known."""
+
+import numpy as np
+import pytest
+from small_generation import EXPERIMENT, small_config
+
+from scenes import load_experiment
+from training.contact_calibration import PARAMETERS, fit_contact
+from training.contact_calibration.fit import expect, held_out_px
+from training.contact_calibration.parameters import changed, values_of
+from training.contact_calibration.simulate import Setup
+from training.generation.config import draw_label
+from training.validation.model import ContactModel, MeasuredFrames
+from twin.errors import FrameError
+from twin.types import Form
+
+FITTED = tuple(p for p in PARAMETERS if p.name in ("rig.contact_offset_mm", "rig.tcp_lateral_mm", "rig.image_turn_deg"))
+TRUTH = {"contact_offset_mm": 0.45, "tcp_lateral_mm": 1.1, "image_turn_deg": 84.0, "turn_sign": -1}
+NOISE_PX, FRAMES = 0.05, 7
+ACROSS = 6  # coarse, for both sides
+
+
+def telling(home):
+    """The small experiment with moves that show."""
+    file = home / "moved.toml"
+    file.write_text(EXPERIMENT.replace("move_1 = [-0.5, 0.5]", "move_1 = [-1.5, 1.5]").replace("-4.4, -3.8", "-4, -3.2"))
+    return file
+
+
+def frames(config, sensor, seeds, *, bad=()):
+    """Frames of a rig; every third move was not executed, of ``bad`` ones the pins are nonsense."""
+    model = ContactModel(sensor, config.experiment, config.object, Form.RECORDING, across=ACROSS)
+    labels, pins, done = [], [], []
+    for k, seed in enumerate(seeds):
+        label = draw_label(config.experiment, np.random.default_rng(seed))
+        moved = model.displacements_px(label)[int(k % 3 != 2)]
+        noise = np.random.default_rng([seed, 1]).normal(scale=NOISE_PX, size=moved.shape)
+        pins.append(model.rest_px + moved + noise + (3.0 if k in bad else 0.0))
+        labels.append(label)
+        done.append(k % 3 != 2)
+    pins = np.stack(pins)
+    pins[0, :3] = np.nan  # lost ones
+    return MeasuredFrames(Form.RECORDING, [f"f_{k}" for k in range(len(pins))], labels, pins, model.rest_px, []), np.array(done)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    home = tmp_path_factory.mktemp("calibration")
+    config = small_config(home, experiment=load_experiment(telling(home)))
+    true = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update=TRUTH)})
+    measured, done = frames(config, true, range(FRAMES), bad=(4,))
+    setup = Setup(config.sensor, config.experiment, config.object, Form.RECORDING, ACROSS, home / "contacts", parameters=FITTED)
+    fit = fit_contact(setup, measured)
+    held, _ = frames(config, true, range(100, 103))
+    return setup, measured, done, fit, held
+
+
+def test_numbers_and_sign_are_found_again_within_their_uncertainty(calibrated):
+    _, _, _, fit, _ = calibrated
+    truth = np.array([TRUTH[p.name.split(".")[1]] for p in FITTED])
+    assert fit.sensor.rig.turn_sign == TRUTH["turn_sign"]
+    assert (np.abs(fit.value - truth) < 3 * fit.sd).all() and (np.abs(fit.value - truth) < 0.2 * np.abs(fit.start - truth)).all()
+    assert fit.sensor.rig.contact_offset_mm == fit.value[0] and (fit.told > 0.9).all()
+
+
+def test_moves_that_were_not_executed_and_odd_frames_are_known(calibrated):
+    _, _, done, fit, _ = calibrated
+    good = np.arange(FRAMES) != 4
+    assert np.array_equal(fit.executed[good] > 0.5, done[good])
+    assert fit.trust[4] < 0.5 and (fit.trust[good] > 0.9).all()
+    assert np.nanmean(fit.after_px[good]) < 0.2 < np.nanmean(fit.before_px[good])
+
+
+def test_frames_that_were_not_fitted_are_met_as_well(calibrated):
+    setup, _, _, fit, held = calibrated
+    before, after = held_out_px(setup, fit, held)
+    assert after < 0.25 * before
+
+
+def test_taken_up_again_nothing_is_computed_twice(calibrated, monkeypatch):
+    setup, measured, _, fit, _ = calibrated
+    monkeypatch.setattr("training.contact_calibration.simulate._contact", None)  # not callable: a new contact would fail
+    again = fit_contact(setup, measured)
+    assert np.array_equal(again.value, fit.value) and np.array_equal(again.executed, fit.executed)
+
+
+def test_what_frames_do_not_tell_is_left_at_the_start():
+    """Frames of which neither story is likelier: the probability is the share, and nobody is sure."""
+    made = expect(np.array([[1.0, 1.0]] * 6))
+    assert np.allclose(made.executed, made.executed[0]) and made.share == pytest.approx(0.5, abs=0.05)
+    sure = expect(np.array([[0.1, 9.0], [9.0, 0.1], [9.0, 0.1], [np.nan, np.nan]]))
+    assert sure.executed[0] < 0.01 and (sure.executed[1:3] > 0.99).all() and sure.trust[3] == 0
+
+
+def test_values_go_into_the_specification_and_come_back(tmp_path):
+    config = small_config(tmp_path)
+    values = values_of(config.sensor, config.experiment)
+    moved = values + [0.1 * p.step for p in PARAMETERS]
+    there = changed(config.sensor, config.experiment, moved, 1)
+    assert np.allclose(values_of(there, config.experiment), moved)
+    assert there.rig.turn_offset_deg[:2] == (0, 0) and there.rig.turn_offset_deg[2] == pytest.approx(moved[3])
+
+
+def test_too_few_frames_are_refused(calibrated):
+    setup, measured, _, _, _ = calibrated
+    few = MeasuredFrames(measured.form, measured.names[:2], measured.labels[:2], measured.pins_px[:2], measured.no_contact_px, [])
+    with pytest.raises(FrameError, match="2 frames with pins are too few"):
+        fit_contact(setup, few)

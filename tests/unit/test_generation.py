@@ -1,0 +1,232 @@
+"""Simulated data sets: what they hold is right, and does not show how they were made."""
+
+import csv
+import json
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import zarr
+from small_generation import contents, small_config
+
+from scenes import load_sensor
+from training.dataset import load_dataset, split_rows
+from training.generation import DatasetError, generate
+from training.generation.config import draw_contact
+from training.recorded_contact import read_arm_labels
+from training.run import fold_rows
+from training.targets import read_executed
+from twin.errors import ContactError, RenderError
+from twin.geometry.solid import Resolution
+from twin.kinematics import arm_path, rig_of
+from twin.mechanics.solver import SkinSolver
+from twin.preprocess import nominal_reference
+from twin.preprocess.forms import raw_to_recording
+from twin.projection import project
+from twin.stimulus import build_stimulus
+from twin.types import Form
+
+COUNT = 4
+SAME_PX = 1e-4  # arrays are stored as float32
+NOISE_PX = 0.1
+SAME_STATE_PX = 0.03
+ARC_MM = 6e-3  # what a path's straight pieces miss of the arm's arc
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A data set of all states, made in one go."""
+    home = tmp_path_factory.mktemp("made")
+    config = small_config(home, states="all")
+    summary = generate(home / "set", config, COUNT)
+    return home / "set", config, summary
+
+
+def rows_of(folder, name):
+    with (folder / name).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_draw_depends_on_seed_and_number_alone(tmp_path):
+    config = small_config(tmp_path)
+    one, again, other = (draw_contact(config, k, 0) for k in (7, 7, 8))
+    assert np.array_equal(one.label.pose, again.label.pose) and one.values == again.values and one.image_seed == again.image_seed
+    assert not np.array_equal(one.label.pose, other.label.pose) and one.values != other.values
+    assert draw_contact(config, 7, 1).values != one.values
+    plain = draw_contact(small_config(tmp_path, randomisation=None), 7, 0)
+    assert np.array_equal(plain.label.pose, one.label.pose), "what is randomised beside the labels must not change them"
+
+
+def test_draws_keep_to_their_ranges(tmp_path):
+    config = small_config(tmp_path)
+    draws = [draw_contact(config, k, 0) for k in range(300)]
+    for label, (low, high) in config.experiment.ranges().items():
+        kind, axis = label.split("_")
+        values = [getattr(d.label, kind)[int(axis) - 1] for d in draws]
+        assert low <= min(values) and max(values) <= high
+        assert max(values) - min(values) > 0.95 * (high - low) or low == high
+    frictions = np.array([d.friction for d in draws])
+    assert 0.1 < np.mean(frictions == 0) < 0.3 and frictions.max() <= 1 and frictions[frictions > 0].min() >= 0.1
+    assert 0.5 < np.mean([d.label.executed for d in draws]) < 0.7
+    nominal = config.sensor.skin
+    assert all(abs(d.sensor.skin.thickness_mm - nominal.thickness_mm) <= 0.1 for d in draws)
+    assert all(0.8 <= d.sensor.skin.young_modulus_mpa / nominal.young_modulus_mpa <= 1.25 for d in draws)
+
+
+def test_the_table_and_the_truth_agree(made):
+    folder, config, summary = made
+    truth, rows = zarr.open_group(folder / "truth.zarr", mode="r"), rows_of(folder, "targets.csv")
+    assert summary.frames == len(rows) == truth["path_id"].shape[0] and summary.contacts == COUNT
+    assert [int(row["path_id"]) for row in rows] == truth["path_id"][:].tolist()
+    assert np.allclose([[float(row[f"pose_{k}"]) for k in range(1, 7)] for row in rows], truth["pose"][:])
+    executed = read_executed(folder, [])
+    assert [bool(executed[row["image_name"]]) for row in rows] == truth["executed"][:].tolist()
+    assert set(truth["path_id"][:]) == set(range(COUNT)) and len(rows_of(folder, "draws.csv")) == COUNT
+    meta = json.loads((folder / "meta.json").read_text())
+    assert meta["tap_move"] == [0, 5, 0, 0, 0, 0] and meta["num_poses"] == COUNT and meta["poses_rng"][1][1] == -4.4
+    noise = truth["pins_px"][:] - truth["caps_px"][:]
+    assert noise.std() == pytest.approx(NOISE_PX, rel=0.1) and abs(noise.mean()) < NOISE_PX / 10
+    pressed = truth["force_n"][:, 2] > 0
+    assert pressed.mean() > 0.9 and (truth["slipping_mm2"][:] <= truth["area_mm2"][:] + 1e-9).all()
+
+
+def test_a_state_on_the_way_is_the_end_of_its_own_label(tmp_path):
+    """The state at a part of tap or move, against a contact that ends there; without friction load steps leave no trace."""
+    config = small_config(tmp_path, states="all", randomisation=None, friction=0.0)
+    generate(tmp_path / "set", config, 2)
+    truth = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")
+    labels = read_arm_labels(_recording(tmp_path / "set", config))
+    path_of, fraction = truth["path_id"][:], truth["fraction"][:]
+    solver, stimulus = SkinSolver(config.sensor, resolution=Resolution(config.across)), build_stimulus(config.object)
+    for path in range(2):
+        rows = np.flatnonzero(path_of == path)
+        assert (np.diff(fraction[rows]) > 0).all() and fraction[rows[-1]] == 1
+        for row in rows[[1, -2]]:
+            way = arm_path(rig_of(config.sensor), config.experiment, config.sensor, stimulus, labels[row])
+            state = solver.press(stimulus, way.path, friction=0.0)
+            assert np.abs(state.T_sensor_object - truth["T_sensor_object"][row]).max() < ARC_MM
+            px = raw_to_recording(config.sensor, project(config.sensor, state.caps_mm))
+            assert np.abs(px - truth["caps_px"][row]).max() < SAME_STATE_PX
+
+
+def _recording(folder, config):
+    from training.simulated import open_simulated
+
+    return open_simulated(folder, config.sensor)[0]
+
+
+def test_pins_alone_are_read_like_frames_and_split_by_contact(made):
+    folder, config, summary = made
+    data = load_dataset(folder, load_sensor("mg400-127"), "surface-2d-shear")
+    assert len(data) == summary.frames and data.pins.form == Form.RECORDING
+    truth = zarr.open_group(folder / "truth.zarr", mode="r")
+    assert np.abs(data.pins.nodes_px - truth["pins_px"][:]).max() < SAME_PX
+    assert np.allclose(data.pins.reference.pins_px, nominal_reference(config.sensor, Form.RECORDING).pins_px)
+    assert np.isfinite(data.pins.area_px2).all() and np.array_equal(data.pins.lost, ~truth["visible"][:])
+    undone = data.targets.executed == 0
+    assert undone.any() and np.allclose(data.targets.corrected[undone, 2:], 0)
+    train, held = split_rows(len(data), 0, data.group)
+    assert not set(data.group[train]) & set(data.group[held]) and len(train) + len(held) == len(data)
+    watched, learnt = fold_rows(train, 0, 0, data.group)
+    assert len(watched) and not set(data.group[watched]) & set(data.group[learnt]) and set(watched) | set(learnt) == set(train)
+
+
+def test_a_broken_off_run_ends_with_the_same_bytes(made, tmp_path, monkeypatch):
+    """Broken off between contacts, while a record is written, and while the tables are."""
+    folder, config, _ = made
+    import training.generation.store as store
+
+    calls = []
+
+    def broken_at(limit):
+        def replace(source, target):
+            calls.append(target)
+            if len(calls) == limit:
+                raise KeyboardInterrupt
+            os.replace(source, target)
+
+        return SimpleNamespace(replace=replace, fsync=os.fsync)  # for this module alone
+
+    for limit in (3, 4, 6):  # in the second record, in the first table, in the last step of all
+        calls.clear()
+        monkeypatch.setattr(store, "os", broken_at(limit))
+        with pytest.raises(KeyboardInterrupt):
+            generate(tmp_path / "set", config, COUNT)
+        monkeypatch.undo()
+    assert generate(tmp_path / "set", config, COUNT).before == COUNT
+    assert contents(tmp_path / "set") == contents(folder)
+
+
+def test_a_larger_count_goes_on_where_a_smaller_one_ended(made, tmp_path):
+    folder, config, _ = made
+    generate(tmp_path / "set", config, 2)
+    with pytest.raises(DatasetError, match="holds contacts up to 1; give --count 2 or more"):
+        generate(tmp_path / "set", config, 1)
+    assert generate(tmp_path / "set", config, COUNT).before == 2
+    assert contents(tmp_path / "set") == contents(folder)
+
+
+def test_failed_contacts_are_listed_and_replaced(tmp_path, monkeypatch):
+    import training.generation.make as make
+
+    config, real = small_config(tmp_path), make.draw_contact
+
+    def draw(config, index, attempt):
+        if index == 1 and attempt < 2:
+            raise ContactError(f"planted {attempt}")
+        return real(config, index, attempt)
+
+    monkeypatch.setattr(make, "draw_contact", draw)
+    summary = generate(tmp_path / "set", config, 3)
+    assert summary.frames == 3 and summary.failed == 2
+    failures = [list(row.values()) for row in rows_of(tmp_path / "set", "failures.csv")]
+    assert failures == [["1", "0", "planted 0"], ["1", "1", "planted 1"]]
+    assert [row["attempt"] for row in rows_of(tmp_path / "set", "draws.csv")] == ["0", "2", "0"]
+    labels = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")["pose"][:]
+    assert np.array_equal(labels[1], real(config, 1, 2).label.pose)
+    monkeypatch.setattr(make, "draw_contact", lambda *_: (_ for _ in ()).throw(ContactError("always")))
+    with pytest.raises(DatasetError, match="contact 3: 20 draws failed one after another, the last: always"):
+        generate(tmp_path / "set", config, 4)
+
+
+def test_other_options_and_foreign_folders_are_refused(made, tmp_path):
+    folder, config, _ = made
+    with pytest.raises(DatasetError, match=r"made otherwise \(seed\)"):
+        generate(folder, config.model_copy(update={"seed": 5}), COUNT)
+    (tmp_path / "photo.txt").write_text("mine")
+    with pytest.raises(DatasetError, match="holds something else"):
+        generate(tmp_path, config, COUNT)
+    assert [p.name for p in tmp_path.iterdir()] == ["photo.txt"], "and left as they were"
+
+
+def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):
+    import training.generation.store as store
+
+    folder, config, _ = made
+
+    def full(number):
+        if len(list((tmp_path / "set" / "records").glob("*.npz"))) == 2:
+            raise OSError(28, "No space left on device")
+        os.fsync(number)
+
+    monkeypatch.setattr(store, "os", SimpleNamespace(replace=os.replace, fsync=full))
+    with pytest.raises(DatasetError, match=r"No space left on device\); 2 contacts are kept"):
+        generate(tmp_path / "set", config, COUNT)
+    assert not list(tmp_path.rglob("*.part"))
+    monkeypatch.undo()
+    generate(tmp_path / "set", config, COUNT)
+    assert contents(tmp_path / "set") == contents(folder)
+
+
+def test_pictures_are_those_of_the_states(tmp_path):
+    """A rendered frame's pins are found where the truth says."""
+    config = small_config(tmp_path, images="recording", quality="preview", randomisation=None)
+    try:
+        generate(tmp_path / "set", config, 1)
+    except RenderError as error:
+        pytest.skip(str(error))
+    data = load_dataset(tmp_path / "set", config.sensor)
+    truth = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")
+    assert len(data) == 1 and data.pins.form == Form.RECORDING and not data.problems
+    assert np.median(np.linalg.norm(data.pins.nodes_px - truth["caps_px"][:], axis=2)) < 0.5

@@ -1,0 +1,213 @@
+"""Decisions of safety: laws that hold for every target, and one example of every code."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hardware.arms.arm import ArmState
+from hardware.arms.kinematics import MG400
+from hardware.arms.simulated import SimulatedArm, SimulatedFault
+from hardware.errors import DeviceError
+from hardware.safe_arm import RefusedMoveError, SafeArm
+from hardware.safety import Action, Code, SafetyLimits, Sensed, decide, decide_joints, load_limits
+
+NOW_S = 1000.0
+HOME = np.array([300.0, 0, 0, 0, 0, 0])
+LIMITS = load_limits("mg400").model_copy(update={"step_mm": 5.0, "step_deg": 3.0})
+FREE = LIMITS.model_copy(update={"step_mm": None, "step_deg": None})
+WIDE = SafetyLimits(box_mm=((-500, 500),) * 3)
+RING = SafetyLimits(box_mm=((-500, 500),) * 3, annulus_mm=(200, 440))
+
+
+def state(pose=HOME, *, age_s=0.0, enabled=True, error=""):
+    pose = np.asarray(pose, float)
+    return ArmState(pose, MG400.inverse(pose), NOW_S - age_s, enabled, False, error)
+
+
+def decided(target, limits=FREE, *, at=HOME, sensed=None, **told):
+    return decide(target, state(at, **told), limits, now_s=NOW_S, kinematics=MG400, sensed=sensed)
+
+
+@pytest.mark.parametrize(
+    ("decision", "action", "code"),
+    [
+        (decided(HOME + 1), Action.MOVE, Code.OK),
+        (decided(HOME + [50, 0, 0, 0, 0, 0], LIMITS), Action.MOVE, Code.STEP_SHORTENED),
+        (decided(HOME * np.nan), Action.REFUSE, Code.NOT_A_NUMBER),
+        (decided(HOME, enabled=False), Action.REFUSE, Code.NOT_ENABLED),
+        (decided(HOME, error="alarm 17"), Action.HOLD, Code.ARM_ERROR),
+        (decided(HOME, age_s=1.1), Action.HOLD, Code.STALE_FEEDBACK),
+        (decided(HOME, sensed=Sensed(1.0, NOW_S - 0.6)), Action.HOLD, Code.STALE_FRAME),
+        (decided(HOME, sensed=Sensed(1.0, np.nan)), Action.HOLD, Code.STALE_FRAME),
+        (decided(HOME, sensed=Sensed(6.1, NOW_S)), Action.RETRACT, Code.TOO_DEEP),
+        (decided(HOME, sensed=Sensed(np.nan, NOW_S)), Action.MOVE, Code.OK),
+        (decided(HOME + [0, 0, 160, 0, 0, 0]), Action.REFUSE, Code.OUTSIDE_BOX),
+        (decided([400, 290, 0, 0, 0, 0]), Action.REFUSE, Code.OUTSIDE_ANNULUS),
+        (decided([30, 300, 0, 0, 0, 90], RING, at=[0, -300, 0, 0, 0, -90]), Action.REFUSE, Code.OUTSIDE_ANNULUS),
+        (decided([480.0, 0, 0, 0, 0, 0], WIDE), Action.REFUSE, Code.OUT_OF_REACH),
+        (decided([120.0, 0, 60, 0, 0, 0], WIDE), Action.REFUSE, Code.JOINT_LIMIT),
+        (decided(MG400.forward(np.array([0.0, 0, 61, 0])), WIDE), Action.REFUSE, Code.LINKAGE_LIMIT),
+        (decided([0, 250, 0, 0, 0, 90], WIDE, at=[-120, -220, 0, 0, 0, -110]), Action.REFUSE, Code.LINE_BLOCKED),
+    ],
+)
+def test_every_code(decision, action, code):
+    assert (decision.action, decision.code) == (action, code), decision
+    assert (decision.pose is not None) == (action is Action.MOVE)
+    assert decision.reason or code is Code.OK
+
+
+@given(st.tuples(*[st.floats(-500, 500)] * 3, *[st.floats(-180, 180)] * 3))
+def test_what_may_be_sent_keeps_every_limit(target):
+    decision = decided(np.array(target), LIMITS)
+    if decision.action is Action.MOVE:
+        sent = decision.pose
+        assert all(low <= value <= high for value, (low, high) in zip(sent[:3], LIMITS.box_mm, strict=True))
+        assert LIMITS.annulus_mm[0] <= np.hypot(*sent[:2]) <= LIMITS.annulus_mm[1]
+        assert np.linalg.norm(sent[:3] - HOME[:3]) <= LIMITS.step_mm + 1e-9
+        joints = MG400.inverse(MG400.nearest_pose(sent))
+        assert MG400.violation(joints) is None and joints[2] - joints[1] <= LIMITS.linkage_deg + 1e-6
+
+
+@given(st.floats(0.01, 200.0), st.floats(0, 2 * np.pi))
+def test_a_shortened_step_keeps_its_direction(length, angle):
+    target = HOME + [0, length * np.cos(angle), length * np.sin(angle), 0, 0, 0]
+    decision = decide(target, state(), LIMITS, now_s=NOW_S)
+    if decision.pose is not None:
+        went, wanted = decision.pose - HOME, target - HOME
+        assert np.linalg.norm(went) == pytest.approx(min(length, LIMITS.step_mm))
+        assert went @ wanted == pytest.approx(np.linalg.norm(went) * length)
+
+
+def test_a_long_turn_is_shortened_the_short_way_round():
+    decision = decide(HOME + [0, 0, 0, 0, 0, 350.0], state(), LIMITS, now_s=NOW_S)
+    assert decision.pose[5] == pytest.approx(-3.0)
+
+
+def test_the_turn_of_four_axes_is_not_wrapped():
+    at = np.array([265.0, 299.0, 9.0, 0, 0, 10.0])  # J1 at 48 deg: R = 208 is within J4's range, R = -152 is not
+    assert decided(at + [0, 0, 0, 0, 0, 198.0], LIMITS, at=at).pose[5] == pytest.approx(13.0)
+
+
+def test_joint_moves_are_checked_on_their_way():
+    def decided(joints, limits=FREE):
+        return decide_joints(np.asarray(joints, float), state(), limits, now_s=NOW_S, kinematics=MG400).code
+
+    here = MG400.inverse(HOME)
+    assert decided(here + [1, 0, 0, 0]) == Code.OK
+    assert decided(here + [0, 0, 0, 500]) == Code.JOINT_LIMIT
+    assert decided(here + [80, 0, 0, 0]) == Code.OUTSIDE_BOX
+    assert decided(here + [5, 0, 0, 0], LIMITS) == Code.STEP_TOO_LONG
+    assert decided([np.nan] * 4) == Code.NOT_A_NUMBER
+    outside_between = [*(-here[:1] + 100), *here[1:]]  # both ends may be allowed: the way between is looked at too
+    assert decided(outside_between) == Code.OUTSIDE_BOX
+
+
+def test_limits_are_checked_data(tmp_path):
+    for name in ("mg400", "magician", "simulated"):
+        assert load_limits(name).contact_mm > 0
+    path = tmp_path / "mine.toml"
+    for text in ("box_mm = [[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]", "boxmm = 1", "box_mm = 3", "no toml"):
+        path.write_text(text)
+        with pytest.raises(DeviceError, match="not valid limits"):
+            load_limits(path)
+    with pytest.raises(DeviceError, match="give one of magician, mg400, simulated"):
+        load_limits("mg40")
+
+
+@pytest.fixture
+def arm():
+    arm = SimulatedArm(axes=4, time_scale=20.0)
+    arm.connect()
+    arm.enable()
+    yield arm
+    if arm.is_connected:
+        arm.disconnect()
+
+
+def test_a_safe_arm_sends_what_is_allowed_and_logs_it(arm):
+    told = []
+    safe = SafeArm(arm, LIMITS, log=told.append)
+    assert np.allclose(safe.move_linear(HOME + [20, 0, 0, 0, 0, 0]), HOME + [5, 0, 0, 0, 0, 0])
+    with pytest.raises(RefusedMoveError, match="outside-box") as refused:
+        SafeArm(arm, FREE).move_linear(HOME + [0, 0, 500, 0, 0, 0])
+    assert refused.value.decision.code is Code.OUTSIDE_BOX
+    safe.set_speed(1e4, 1e4)
+    assert arm._speeds.linear_mm_s == LIMITS.linear_mm_s
+    assert [entry.decision.code for entry in told] == [Code.STEP_SHORTENED, Code.SPEED_CAPPED] == [e.decision.code for e in safe.decisions]
+
+
+def test_too_deep_a_contact_makes_it_retreat_along_the_normal(arm):
+    safe = SafeArm(arm, FREE, normal=(0, 1, 0))
+    safe.sense(depth_mm=7.0, frame_time_s=time.monotonic())
+    with pytest.raises(RefusedMoveError, match="too-deep"):
+        safe.move_linear(HOME)
+    assert np.allclose(arm.state().pose, HOME + [0, FREE.retreat_mm, 0, 0, 0, 0])
+
+
+def test_a_frame_that_grows_old_stops_it(arm):
+    safe = SafeArm(arm, FREE.model_copy(update={"frame_age_s": 0.05}))
+    safe.sense(depth_mm=1.0, frame_time_s=time.monotonic())
+    safe.set_speed(1.0, 1.0)
+    safe.move_linear(HOME + [0, 100, 0, 0, 0, 0], wait=False)
+    time.sleep(0.06)
+    assert arm.state().moving
+    with pytest.raises(RefusedMoveError, match="stale-frame"):
+        safe.move_linear(HOME)
+    assert not arm.state().moving
+
+
+def test_silent_feedback_stops_it(arm):
+    safe = SafeArm(arm, FREE.model_copy(update={"feedback_age_s": 0.05}))
+    safe.set_speed(1.0, 1.0)
+    arm.move_linear(HOME + [0, 100, 0, 0, 0, 0], wait=False)
+    arm.faults.add(SimulatedFault.SILENT)
+    assert arm.state().moving  # the last it tells
+    time.sleep(0.06)
+    with pytest.raises(RefusedMoveError, match="stale-feedback"):
+        safe.move_linear(HOME)
+    arm.faults.clear()
+    assert not arm.state().moving
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_any_exception_stops_retreats_and_disables(error):
+    arm = SimulatedArm(axes=4, time_scale=20.0)
+    with pytest.raises(error), SafeArm(arm, LIMITS, normal=(0, 0, 1)) as safe:
+        safe.enable()
+        raise error
+    assert np.allclose(arm.track.pose(np.inf), HOME + [0, 0, LIMITS.retreat_mm, 0, 0, 0])
+    assert not arm.is_connected
+    assert [entry.call for entry in safe.decisions][-3:] == ["shutdown", "retreat", "disconnect"]
+
+
+def test_a_retreat_stays_within_the_box():
+    arm = SimulatedArm(axes=4, time_scale=20.0, pose=HOME + [0, 0, 120, 0, 0, 0])
+    with pytest.raises(RuntimeError), SafeArm(arm, LIMITS) as safe:
+        safe.enable()
+        raise RuntimeError
+    assert 120 < arm.track.pose(np.inf)[2] <= LIMITS.box_mm[2][1]
+
+
+def test_stop_and_its_like_are_never_refused(arm):
+    safe = SafeArm(arm, FREE)
+    safe.sense(depth_mm=99.0, frame_time_s=-np.inf)
+    for call in (safe.stop, safe.clear_error, safe.disable, safe.disconnect):
+        call()
+    assert {entry.decision.code for entry in safe.decisions} == {Code.UNGATED} and not arm.is_connected
+
+
+def test_a_failed_stop_does_not_keep_it_from_disabling(arm, monkeypatch):
+    def broken():
+        raise DeviceError("stuck")
+
+    monkeypatch.setattr(arm, "stop", broken)
+    SafeArm(arm, FREE).shutdown("test")
+    assert not arm.state().enabled
+
+
+def test_limits_of_another_arm_are_refused():
+    with pytest.raises(DeviceError, match="6 joints"):
+        SafeArm(SimulatedArm(axes=6), LIMITS)

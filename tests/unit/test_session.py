@@ -1,0 +1,88 @@
+"""A session is readable up to its last complete step whenever it was cut off."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from hardware.errors import DeviceError
+from hardware.session import FRAMES, STEPS, SessionSource, SessionWriter, is_session, read_steps
+from twin.errors import FrameError
+from twin.types import Form, Frame
+
+WRITER = """
+import sys, numpy as np
+from hardware.session import SessionWriter
+from twin.types import Form, Frame
+rng = np.random.default_rng(0)
+with SessionWriter(sys.argv[1], {"camera": "none"}) as session:
+    print("ready", flush=True)
+    for k in range(100000):
+        image = rng.integers(0, 255, (120, 160), np.uint8)
+        session.append(Frame(image, Form.RAW, f"f{k}", float(k), k + 1), {"sum": int(image.sum()), "pose": np.arange(6.0)})
+"""
+
+
+def frame(k: int, image=None) -> Frame:
+    return Frame(np.full((8, 8), k, np.uint8) if image is None else image, Form.RECORDING, f"f{k}", 0.5 * k, k + 1)
+
+
+@pytest.mark.parametrize("after_s", [0.05, 0.21, 0.43])
+def test_killed_at_any_moment_it_is_whole_up_to_the_last_line(tmp_path, after_s):
+    process = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path / "s")], stdout=subprocess.PIPE, env=os.environ)
+    process.stdout.readline()
+    time.sleep(after_s)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    source = SessionSource(tmp_path / "s")
+    assert len(source.steps) > 3
+    with source:
+        for step in source.steps:
+            assert int(source.read().image.astype(int).sum()) == step["sum"]
+        with pytest.raises(EOFError):
+            source.read()
+
+
+def test_a_torn_last_line_is_left_out(tmp_path):
+    with SessionWriter(tmp_path / "s", {}) as session:
+        for k in range(3):
+            session.append(frame(k), {"k": k})
+    whole = (tmp_path / "s" / STEPS).read_bytes()
+    last = whole.rstrip(b"\n").rfind(b"\n") + 1
+    for cut in range(last, len(whole)):
+        (tmp_path / "s" / STEPS).write_bytes(whole[:cut])
+        assert [step["k"] for step in read_steps(tmp_path / "s")] == [0, 1]
+
+
+def test_a_frame_that_serves_several_steps_is_kept_once_and_comes_as_often(tmp_path):
+    with SessionWriter(tmp_path / "s", {}) as session:
+        for k in (0, 0, 1):
+            session.append(frame(k), {})
+    assert len(list((tmp_path / "s" / FRAMES).iterdir())) == 2
+    with SessionSource(tmp_path / "s") as source:
+        assert source.form is Form.RECORDING
+        assert [source.read().sequence for _ in range(3)] == [1, 1, 2]
+
+
+def test_what_is_no_number_becomes_null_and_lines_stay_json(tmp_path):
+    with SessionWriter(tmp_path / "s", {}) as session:
+        session.append(frame(0), {"value": np.array([1.0, np.nan]), "np": np.float32(2), "name": "x"})
+    line = (tmp_path / "s" / STEPS).read_text()
+    assert "NaN" not in line
+    step = json.loads(line)
+    assert step["value"] == [1.0, None] and step["np"] == 2.0
+
+
+def test_a_session_overwrites_nothing(tmp_path):
+    (tmp_path / "other.txt").write_text("mine")
+    with pytest.raises(DeviceError, match="not empty"):
+        SessionWriter(tmp_path, {})
+    assert not is_session(tmp_path)
+    with pytest.raises(FrameError, match="no recorded session"):
+        SessionSource(tmp_path)

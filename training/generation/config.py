@@ -1,0 +1,141 @@
+"""What a simulated data set is made of, and what is drawn for each of its contacts."""
+
+import json
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from scenes.base import NonNegative, Section
+from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
+from scenes.randomisation import FrictionSpread, RandomisationSpec, number_type
+from scenes.sensor import SensorSpec
+from twin.errors import ContactError, TwinError
+from twin.kinematics import ArmLabel, rig_of
+from twin.types import Form
+
+
+class DatasetError(TwinError):
+    """A data set can't be made, or not gone on with."""
+
+
+class GenerationConfig(Section):
+    """All that the frames of a data set depend on, but for how many there are.
+
+    Attributes
+    ----------
+    friction : float
+        Of every contact, unless the randomisation draws it.
+    images : {"raw", "gray", "recording", "none"}
+        The camera's frame, its luminance, the recordings' thresholded form, or pins alone without any rendering.
+    states : {"end", "all"}
+        Each contact's last state, or every converged state on its way.
+    across : int
+        Elements along each side of the skin's grid.
+    """
+
+    sensor: SensorSpec
+    object: ObjectSpec
+    experiment: ExperimentSpec
+    randomisation: RandomisationSpec | None = None
+    friction: NonNegative
+    seed: Annotated[int, Field(ge=0)] = 0
+    images: Literal["raw", "gray", "recording", "none"] = "raw"
+    states: Literal["end", "all"] = "end"
+    quality: Literal["preview", "standard", "high"] = "standard"
+    across: Annotated[int, Field(ge=6, le=64, multiple_of=2)] = 16
+
+    @property
+    def form(self) -> Form:
+        """Form whose pixels the pins are given in; without pictures that of the recordings, if the sensor has one."""
+        if self.images == "none":
+            return Form.RECORDING if self.sensor.recording else Form.RAW
+        return Form.RECORDING if self.images == "recording" else Form.RAW
+
+    @property
+    def image_folder(self) -> str:
+        """Where pictures of this kind lie in a recording's folder."""
+        return "frames_bw" if self.images == "recording" else "images"
+
+    def text(self) -> str:
+        """As JSON, the same for the same configuration."""
+        return json.dumps(self.model_dump(mode="json"), indent=1, sort_keys=True) + "\n"
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One contact as drawn.
+
+    Attributes
+    ----------
+    label : ArmLabel
+    sensor : SensorSpec
+        With the numbers drawn for this contact.
+    friction : float
+    values : dict of str to float
+        Those numbers, by key.
+    image_seed : int
+    noise : numpy.random.Generator
+        Of the stored pins.
+    """
+
+    label: ArmLabel
+    sensor: SensorSpec
+    friction: float
+    values: dict
+    image_seed: int
+    noise: np.random.Generator
+
+
+def draw_label(experiment: ExperimentSpec, rng: np.random.Generator, executed_share: float = 1.0) -> ArmLabel:
+    """Pose and move, each number even over its range."""
+    low, high = np.array(list(experiment.ranges().values())).T
+    numbers = rng.uniform(low, high)
+    return ArmLabel(numbers[:6], numbers[6:], bool(rng.random() < executed_share))
+
+
+def draw_contact(config: GenerationConfig, index: int, attempt: int) -> Draw:
+    """The ``attempt``-th draw of contact ``index``; depends on nothing else but the configuration.
+
+    Raises
+    ------
+    ContactError
+        The numbers drawn make no sensor.
+    """
+    streams = [np.random.default_rng([config.seed, index, attempt, part]) for part in range(5)]
+    how = config.randomisation
+    label = draw_label(config.experiment, streams[0], how.executed_share if how else 1.0)
+    friction = _friction(how.friction, streams[1]) if how and how.friction else config.friction
+    sensor, values = _sensor(config.sensor, how, streams[2]) if how and how.sensor else (config.sensor, {})
+    return Draw(label, sensor, friction, values, int(streams[3].integers(2**31)), streams[4])
+
+
+def _friction(spread: FrictionSpread, rng: np.random.Generator) -> float:
+    kind, value = rng.random(), float(np.exp(rng.uniform(np.log(spread.low), np.log(spread.high))))
+    if kind < spread.free_share:
+        return 0.0
+    return spread.stick if kind > 1 - spread.stick_share else value
+
+
+def _sensor(nominal: SensorSpec, how: RandomisationSpec, rng: np.random.Generator) -> tuple[SensorSpec, dict]:
+    """A copy of a sensor with numbers drawn, one for each key in alphabetical order."""
+    plain = nominal.model_dump(mode="json") | {"rig": rig_of(nominal).model_dump(mode="json")}
+    values = {}
+    for key, spread in sorted(how.sensor.items()):
+        section, name = key.split(".")
+        share, (low, high) = rng.random(), spread.ends
+        if plain[section] is None:
+            raise DatasetError(f"randomisation {how.name}: {nominal.name} has no [{section}], so '{key}' can't be drawn; leave it out")
+        if spread.scale:
+            value = plain[section][name] * (low ** (1 - share) * high**share)
+        else:
+            value = low + share * (high - low) + (plain[section][name] if spread.add else 0)
+        values[key] = plain[section][name] = int(round(value)) if number_type(key) is int else value
+    try:
+        return SensorSpec.model_validate(plain), values
+    except ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(map(str, problem["loc"])) or "sensor"
+        raise ContactError(f"the drawn numbers make no sensor: {where}: {problem['msg']}; narrow the randomisation") from error

@@ -1,0 +1,132 @@
+"""One contact of a data set, from its number to pictures and truth: what a worker does."""
+
+from dataclasses import dataclass
+from functools import cache, lru_cache
+
+import cv2
+import numpy as np
+
+from training.generation.config import DatasetError, Draw, GenerationConfig, draw_contact
+from twin.errors import ContactError, MeshError
+from twin.geometry.solid import Resolution
+from twin.kinematics import ArmLabel, arm_path, rig_of
+from twin.mechanics.solver import SkinSolver
+from twin.preprocess.forms import gray_levels
+from twin.simulator import Simulator
+from twin.stimulus import build_stimulus
+from twin.truth import cap_truth
+from twin.types import ContactState
+
+MOST_ATTEMPTS = 20  # draws for one contact
+REST = -1  # the number that stands for the no-contact frame
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one contact.
+
+    Attributes
+    ----------
+    index : int
+        Of the contact; ``REST`` for the no-contact frame.
+    images : list of bytes
+        PNG of each of the S states, empty where none were asked for.
+    arrays : dict of str to (S, ...) array
+        Truth and labels of each state.
+    draw : dict of str to float
+        What was drawn beside the label.
+    failures : list of str
+        Why earlier draws for this contact failed, in order.
+    """
+
+    index: int
+    images: list
+    arrays: dict
+    draw: dict
+    failures: list
+
+
+def make_contact(text: str, index: int) -> Outcome:
+    """Simulate contact ``index`` of the configuration given as JSON.
+
+    Raises
+    ------
+    DatasetError
+        No draw led to a contact.
+    RenderError
+        Nothing can be rendered here.
+    """
+    config = _config(text)
+    if index == REST:
+        nominal = _nominal(text)
+        return Outcome(REST, [_png(config, nominal, nominal.rest, 0)], {}, {}, [])
+    failures: list[str] = []
+    for attempt in range(MOST_ATTEMPTS):
+        try:
+            draw = draw_contact(config, index, attempt)
+            return _simulated(config, text, draw, index, failures)
+        except (ContactError, MeshError) as error:
+            failures.append(str(error))
+    raise DatasetError(
+        f"contact {index}: {MOST_ATTEMPTS} draws failed one after another, the last: {failures[-1]}; narrow the experiment's ranges"
+    )
+
+
+def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
+    simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, keep=False)
+    stimulus = build_stimulus(config.object)
+    way = arm_path(rig_of(draw.sensor), config.experiment, draw.sensor, stimulus, draw.label)
+    compliance = config.object.compliance_mm_per_n
+    found = list(simulator.solver.path(stimulus, way.path, friction=draw.friction, compliance_mm_per_n=compliance))
+    labels = [way.label(fraction) for fraction, _ in found[:-1]] + [draw.label]
+    kept = range(len(found)) if config.states == "all" else [len(found) - 1]
+    images, rows = [], []
+    for k in kept:
+        fraction, state = found[k]
+        if config.images != "none":
+            images.append(_png(config, simulator, state, draw.image_seed + k))
+        rows.append(_row(config, draw, simulator, state, labels[k]) | {"path_id": index, "fraction": fraction})
+    arrays = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+    return Outcome(index, images, arrays, {"friction": draw.friction, **draw.values}, failures)
+
+
+def _row(config: GenerationConfig, draw: Draw, simulator: Simulator, state: ContactState, label: ArmLabel) -> dict:
+    """Truth of one state; the keys are the arrays of the data set's ``truth.zarr`` (see ``training.generation.store``)."""
+    truth = cap_truth(draw.sensor, simulator.rest, state, config.form)
+    noise_px = config.randomisation.pin_noise_px if config.randomisation else 0.0
+    return {
+        "caps_mm": truth.caps_mm.astype(np.float32),
+        "caps_px": truth.caps_px.astype(np.float32),
+        "rest_px": truth.rest_px.astype(np.float32),
+        "pins_px": (truth.caps_px + noise_px * draw.noise.normal(size=truth.caps_px.shape)).astype(np.float32),
+        "visible": truth.visible,
+        "force_n": state.force_n,
+        "torque_nmm": state.torque_nmm,
+        "area_mm2": state.area_mm2,
+        "slipping_mm2": float(state.point_area_mm2[state.slipping].sum()),
+        "T_sensor_object": state.T_sensor_object,
+        "pose": label.pose,
+        "move": label.move,
+        "executed": label.executed,
+    }
+
+
+def _png(config: GenerationConfig, simulator: Simulator, state: ContactState, seed: int) -> bytes:
+    shot = simulator.shoot(state, form=config.form, seed=seed)
+    image = shot.frame.image if config.images != "gray" else gray_levels(shot.frame.image)
+    return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
+
+
+@cache
+def _config(text: str) -> GenerationConfig:
+    return GenerationConfig.model_validate_json(text)
+
+
+@lru_cache(maxsize=1)
+def _nominal(text: str) -> Simulator:
+    config = _config(text)
+    return _simulator(config, config.sensor, keep=True)
+
+
+def _simulator(config: GenerationConfig, sensor, *, keep: bool) -> Simulator:
+    return Simulator(sensor, quality=config.quality, solver=SkinSolver(sensor, resolution=Resolution(config.across), keep=keep))

@@ -1,0 +1,189 @@
+"""The folder of a simulated data set, written so that it can be ended at any moment and gone on with.
+
+A contact counts as done once its record lies in ``records/``: it is written last, whole or not at all, after the
+contact's pictures. When all are there, the tables and ``truth.zarr`` are put together from the records in the contacts'
+order, so that a data set does not show in which order, by how many workers and in how many sittings it was made.
+"""
+
+import csv
+import io
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from scenes.experiment import LABELS
+from training.generation.config import DatasetError, GenerationConfig
+from training.generation.make import REST, Outcome
+from training.generation.truth_file import TRUTH, TruthFile
+
+CONFIG, RECORDS = "generation.json", "records"
+FAILURE_COLUMNS = ("path_id", "attempt", "reason")
+
+
+class Store:
+    """A data set's folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing.
+    config : GenerationConfig
+
+    Raises
+    ------
+    DatasetError
+        The folder holds another data set or other files, or can't be written to.
+    """
+
+    def __init__(self, folder: Path, config: GenerationConfig) -> None:
+        self.folder, self.config = folder, config
+        self.pictures = folder / config.image_folder
+        self._check_config()
+        try:
+            for part in (*folder.glob(".*.part"), *(folder / RECORDS).glob(".*.part"), *self.pictures.glob(".*.part")):
+                shutil.rmtree(part) if part.is_dir() else part.unlink()
+            (folder / RECORDS).mkdir(exist_ok=True)
+            if config.images != "none":
+                self.pictures.mkdir(exist_ok=True)
+        except OSError as error:
+            raise DatasetError(f"{folder}: can't be written to ({error.strerror}); give another folder with --out") from error
+
+    def finished(self) -> set[int]:
+        """Numbers of the contacts that are done; ``REST`` among them where its frame is there, or none is wanted."""
+        done = {int(path.stem) for path in (self.folder / RECORDS).glob("*.npz")}
+        if self.config.images != "none":
+            done = {index for index in done if (self.pictures / image_name(index, 0)).is_file()}
+        if self.config.images == "none" or (self.folder / "init_0.png").is_file():
+            done.add(REST)
+        return done
+
+    def check_count(self, count: int) -> None:
+        """DatasetError if the folder holds contacts beyond the ``count`` wanted ones."""
+        highest = max(self.finished(), default=REST)
+        if highest >= count:
+            raise DatasetError(f"{self.folder}: holds contacts up to {highest}; give --count {highest + 1} or more, or another --out")
+
+    def add(self, outcome: Outcome) -> None:
+        """Keep what became of a contact.
+
+        Raises
+        ------
+        DatasetError
+            It can't be written: disk full, folder gone.
+        """
+        if outcome.index == REST:
+            self._write(self.folder / "init_0.png", outcome.images[0])
+            return
+        for state, image in enumerate(outcome.images):
+            self._write(self.pictures / image_name(outcome.index, state), image)
+        record = io.BytesIO()
+        notes = json.dumps({"draw": outcome.draw, "failures": outcome.failures})
+        np.savez(record, notes=np.array(notes), **outcome.arrays)
+        self._write(self.folder / RECORDS / f"{outcome.index:06d}.npz", record.getvalue())
+
+    def finish(self, count: int) -> int:
+        """Write tables and truth of the contacts 0 to ``count`` - 1; how many frames there are."""
+        tables = {"targets.csv": [], "move_executed.csv": [], "draws.csv": [], "failures.csv": []}
+        truth = TruthFile(self.folder / f".{TRUTH}.part")
+        try:
+            for index in range(count):
+                with np.load(self.folder / RECORDS / f"{index:06d}.npz") as file:
+                    arrays = {key: file[key] for key in file.files}
+                notes = json.loads(str(arrays.pop("notes")))
+                truth.append(arrays)
+                self._add_rows(tables, index, arrays, notes)
+            truth.close({"sensor": self.config.sensor.name, "form": str(self.config.form)})
+            self._write(self.folder / "meta.json", json.dumps(self._meta(count)).encode())
+            for name, rows in tables.items():
+                self._write(self.folder / name, _csv(rows, FAILURE_COLUMNS if name == "failures.csv" else None))
+            shutil.rmtree(self.folder / TRUTH, ignore_errors=True)
+            os.replace(truth.path, self.folder / TRUTH)
+        except OSError as error:
+            raise self._unwritten(self.folder / TRUTH, error) from error
+        return len(tables["targets.csv"])
+
+    def _add_rows(self, tables: dict, index: int, arrays: dict, notes: dict) -> None:
+        tables["draws.csv"].append({"path_id": index, "attempt": len(notes["failures"]), **notes["draw"]})
+        for attempt, reason in enumerate(notes["failures"]):
+            tables["failures.csv"].append(dict(zip(FAILURE_COLUMNS, (index, attempt, reason), strict=True)))
+        for state in range(len(arrays["path_id"])):
+            name = image_name(index, state)
+            labels = dict(zip(LABELS, (*arrays["pose"][state].tolist(), *arrays["move"][state].tolist()), strict=True))
+            head = {"image_name": name, "data_name": name.rpartition("_")[0], "obj_id": 1, "pose_id": index + 1}
+            tables["targets.csv"].append(head | labels | {"path_id": index, "fraction": float(arrays["fraction"][state])})
+            tables["move_executed.csv"].append({"image_name": name, "executed": int(arrays["executed"][state])})
+
+    def _meta(self, count: int) -> dict:
+        """``meta.json`` as the recordings have it."""
+        experiment, recording = self.config.experiment, self.config.sensor.recording
+        low, high = np.array(list(experiment.ranges().values())).T.tolist()
+        meta = {
+            "image_dir": self.config.image_folder,
+            "target_df_file": "targets.csv",
+            "tap_move": list(experiment.tap),
+            "poses_rng": [high[:6], low[:6]],
+            "moves_rng": [high[6:], low[6:]],
+            "num_poses": count,
+            "num_frames": 1,
+            "comments": f"simulated: {experiment.name}, {self.config.sensor.name}, {self.config.object.name}",
+        }
+        if recording and self.config.images == "recording":
+            meta["threshold"] = [recording.threshold_block_px, recording.threshold_offset]
+            meta["crop"] = list(recording.crop_px)
+            meta["size"] = [recording.width_px, recording.height_px]
+        return meta
+
+    def _check_config(self) -> None:
+        path, text = self.folder / CONFIG, self.config.text()
+        if path.is_file():
+            try:
+                before = json.loads(path.read_text())
+            except ValueError as error:
+                raise DatasetError(f"{path}: not readable ({error}); give another folder with --out") from error
+            now = json.loads(text)
+            if before != now:
+                other = ", ".join(key for key in now if before.get(key) != now[key])
+                raise DatasetError(f"{self.folder}: holds a data set made otherwise ({other}); repeat its options, or give another --out")
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            strange = [p.name for p in self.folder.iterdir() if p.name != f".{CONFIG}.part"]
+        except OSError as error:
+            raise DatasetError(f"{self.folder}: can't be written to ({error.strerror}); give another folder with --out") from error
+        if strange:
+            raise DatasetError(f"{self.folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with --out")
+        self._write(path, text.encode())
+
+    def _write(self, path: Path, data: bytes) -> None:
+        part = path.with_name(f".{path.name}.part")
+        try:
+            with part.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(part, path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise self._unwritten(path, error) from error
+
+    def _unwritten(self, path: Path, error: OSError) -> DatasetError:
+        done = len(self.finished() - {REST})
+        return DatasetError(
+            f"{path}: can't be written ({error.strerror}); {done} contacts are kept: free some space and give the same command again"
+        )
+
+
+def image_name(index: int, state: int) -> str:
+    """Name of a contact's picture, as recordings number them."""
+    return f"frame_{index}_{state}.png"
+
+
+def _csv(rows: list[dict], columns: tuple | None = None) -> bytes:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns or list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()

@@ -1,0 +1,77 @@
+"""``twin live``: a camera through a model, shown as it comes."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.cli import app
+from twin.cli.servo import Camera, Model
+
+HELP = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
+
+A window opens where there is a display and an OpenCV that can; else a page in the browser (its address is printed).
+With --record DIR every frame is kept, lossless, with its estimate; the folder is readable even if the program is killed.
+--replay DIR gives the same frames again, and says whether the estimates are the same.
+
+\b
+  twin live --camera /dev/video0 --model RUN
+  twin live --camera http://127.0.0.1:8081/stream.mjpg --model RUN --record out/session --headless --seconds 60
+  twin live --replay out/session --model RUN --headless
+"""
+
+
+@app.command("live", help=HELP)
+def live(
+    model: Model,
+    camera: Camera = "",
+    record: Annotated[Path | None, typer.Option("--record", metavar="DIR", help="new folder for the session")] = None,
+    replay: Annotated[Path | None, typer.Option("--replay", metavar="DIR", help="a recorded session instead of a camera")] = None,
+    headless: Annotated[bool, typer.Option("--headless", help="show nothing, print the figures at the end")] = False,
+    seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="stop after this time")] = None,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="stop after so many frames")] = None,
+    port: Annotated[int, typer.Option("--port", help="of the page; 0: a free one")] = 8080,
+) -> None:
+    from contextlib import ExitStack
+
+    from hardware.cameras.choose import open_camera
+    from hardware.errors import DeviceError
+    from hardware.live import LiveSession, Shower, same_estimates
+    from hardware.session import SessionSource, SessionWriter
+    from hardware.view.draw import draw_view
+    from hardware.view.server import BrowserView
+    from hardware.view.window import WindowView, has_window
+    from training.estimator import PoseEstimator
+    from twin.preprocess import Pipeline
+
+    if bool(camera) == (replay is not None):
+        raise DeviceError("give either --camera or --replay")
+    estimator = PoseEstimator.load(model)
+    source = SessionSource(replay) if replay else open_camera(camera, estimator.sensor, estimator.form)
+    estimator.check(estimator.sensor, source.form)
+    found: list = []
+    with ExitStack() as stack:
+        writer = None
+        if record is not None:
+            about = {"sensor": estimator.sensor.name, "form": str(source.form), "camera": source.name, "model": str(model)}
+            writer = stack.enter_context(SessionWriter(record, about))
+        stack.enter_context(source)
+        keep = (lambda frame, estimate: found.append(estimate)) if replay else None
+        session = LiveSession(source, estimator, writer, keep)
+        shower = None
+        if not headless:
+            pipeline = Pipeline(estimator.sensor, estimator.form, estimator.pipeline.reference)
+            rest_px2 = pipeline.reference.area_px2
+            title = f"{estimator.sensor.name}, {source.name}"
+            view = WindowView(title) if has_window() else BrowserView(title, port=port)
+            print(f"showing in {view.url}; Ctrl-C ends it", flush=True)
+            shower = stack.enter_context(Shower(session, lambda frame, _, lines: draw_view(frame, pipeline(frame), rest_px2, lines), view))
+        try:
+            session.run(most=count, seconds=seconds, going=lambda: shower is None or shower.open)
+        except KeyboardInterrupt:
+            print("ended")
+    print("\n".join(session.timing().lines()))
+    if replay is not None:
+        print(f"{same_estimates(source.steps, found)} of {len(found)} estimates are those that were recorded")
+    if record is not None:
+        print(f"wrote {record} ({writer.count} frames)")

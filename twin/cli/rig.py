@@ -1,0 +1,169 @@
+"""The composition root of live work: the one place that decides what is simulated, recorded or real."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hardware.arms.arm import Arm, ArmState
+from hardware.arms.open_arm import open_arm
+from hardware.arms.simulated import SimulatedArm
+from hardware.cameras.choose import open_camera
+from hardware.cameras.source import FrameSource
+from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
+from hardware.errors import DeviceError
+from hardware.loop import ServoLoop
+from hardware.mounting import Mounting
+from hardware.rig_geometry import PlacedObject
+from hardware.safe_arm import SafeArm
+from hardware.safety import SHIPPED_LIMITS, load_limits
+from hardware.step import Estimator, LoopSettings
+from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
+from scenes.experiment import ExperimentSpec
+from twin.cache import cached_arrays
+from twin.errors import RenderError
+from twin.optics.preview import Preview, Shading
+from twin.optics.render import Renderer
+from twin.types import Form
+
+TWIN = "twin"
+SHADING_QUALITY = "standard"
+
+
+@dataclass
+class Rig:
+    """A camera and an arm before an object, not yet connected.
+
+    Attributes
+    ----------
+    source : FrameSource
+    arm : Arm
+        A real or emulated one is a ``SafeArm``.
+    placed : PlacedObject
+    knows_truth : bool
+        Whether the object is where ``placed`` has it for certain: in the twin.
+    """
+
+    source: FrameSource
+    arm: Arm
+    placed: PlacedObject
+    knows_truth: bool
+
+    @property
+    def mounting(self) -> Mounting:
+        return self.placed.mounting
+
+    def __enter__(self) -> "Rig":
+        self.arm.connect()
+        try:
+            self.source.connect()
+        except BaseException:
+            self.arm.disconnect()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.source.disconnect()
+        self.arm.disconnect()
+
+
+def build_rig(
+    sensor: SensorSpec,
+    stimulus: ObjectSpec,
+    placement: PlacementSpec,
+    experiment: ExperimentSpec,
+    *,
+    camera: str,
+    arm: str,
+    form: Form | None = None,
+    limits: str | None = None,
+    seed: int = 0,
+    plain_light: bool = False,
+    at_once: bool = False,
+) -> Rig:
+    """A rig from what a user writes.
+
+    Parameters
+    ----------
+    camera : str
+        As for ``open_camera``.
+    arm : str
+        As for ``open_arm``.
+    form : Form, optional
+        Of the frames; that of the sensor's recordings where it has one.
+    limits : str, optional
+        Name or file; that of the arm's kind by default.
+    plain_light : bool
+        Draw the twin's frames with the lamps' direct light alone, without the path-traced frame that sets what comes on top.
+    at_once : bool
+        A simulated arm before the twin's camera takes no time: whoever waits for frames at each stop needs none.
+    """
+    form = form or (Form.RECORDING if sensor.recording else Form.RAW)
+    placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
+    device = open_arm(arm)
+    simulated = isinstance(device, SimulatedArm)
+    if simulated and camera == TWIN and at_once:
+        device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
+    if not simulated or limits is not None:
+        kind = arm.partition(":")[0]
+        device = SafeArm(device, load_limits(limits or kind)) if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file() else device
+    twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=drawn(sensor, form, plain_light)) if camera == TWIN else None
+    return Rig(open_camera(camera, sensor, form, twin=twin), device, placed, camera == TWIN)
+
+
+def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form: Form, *, fps: float, plain_light: bool) -> TwinCamera:
+    """The twin as a camera on an arm whose pose comes from elsewhere."""
+    return TwinCamera(sensor, placed, pose, form, fps=fps, preview=drawn(sensor, form, plain_light))
+
+
+def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
+    """The preview of a form's window, its shading from a path-traced frame at rest, which is kept between runs."""
+    preview = preview_of(sensor, form)
+    if plain_light:
+        return preview
+
+    def trace() -> dict[str, np.ndarray]:
+        shading = preview.calibrate(Renderer(sensor, quality=SHADING_QUALITY, window_px=preview.window_px))
+        return {"gain": shading.gain, "offset": shading.offset, "skin": shading.skin}
+
+    key = {"sensor": sensor.model_dump(mode="json"), "window_px": list(preview.window_px), "quality": SHADING_QUALITY}
+    try:
+        preview.shading = Shading(**cached_arrays("shading", key, trace))
+    except RenderError as error:
+        raise RenderError(f"{error}; or draw with --plain-light, which needs no path tracing") from error
+    return preview
+
+
+def servo_loop(rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopSettings, on_step=None) -> ServoLoop:
+    """The loop on a connected rig; a safe arm is told what the sensor feels, and retreats in its own way."""
+    loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[_no_full_turn(rig.arm)], on_step=on_step)
+    if isinstance(rig.arm, SafeArm):
+        loop.sense = lambda depth_mm, time_s: rig.arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
+
+        def retreat(away: np.ndarray) -> None:
+            rig.arm.normal = away
+            rig.arm.retreat()
+
+        loop.retreat = retreat
+    return loop
+
+
+def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[int, float]:
+    """Steps that ``rounds`` around the object take, and the outline's length in mm; a tool off the surface goes farther than that."""
+    outline = placed.outline()
+    length_mm = float(np.linalg.norm(np.diff(outline, axis=0), axis=1).sum())
+    tool_mm = placed.mounting.apex_mm @ placed.mounting.axis - servo.indent_mm  # of the tool from the surface
+    closed = bool(np.allclose(outline[0], outline[-1]))
+    way_mm = rounds * (length_mm + closed * 2 * np.pi * max(tool_mm, 0.0))
+    return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
+
+
+def _no_full_turn(arm: Arm):
+    """A guard: where an arm of four axes would have to turn back by a full turn in contact, it ends."""
+    kinematics = getattr(arm, "kinematics", None)
+
+    def guard(state: ArmState, target: np.ndarray) -> np.ndarray:
+        if kinematics is not None and abs(kinematics.nearest_pose(target)[5] - state.pose[5]) > 180.0:
+            raise DeviceError(f"{arm.name}: its last axis is at its end at {state.pose[5]:.0f} deg; give fewer --steps")
+        return target
+
+    return guard

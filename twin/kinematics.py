@@ -1,0 +1,154 @@
+"""From a label in robot coordinates to the object's way as the sensor sees it.
+
+Work frame of the robot: x, y, z. The sensor, unturned, looks along the approach a0; b0 is the direction across (robot x, or
+y where the approach is x) and appears in the image at the azimuth ``image_turn``. With R the static xyz rotation by
+``turn_sign (pose_4..6 + turn_offset)`` and p = ``pose_1..3``,
+
+    centre of the dome = p + R (tcp_to_dome a0 + tcp_lateral b0)
+
+and the object, whose frame has z along the approach, leans by ``plate_tilt`` and stands such that an unturned sensor at the
+robot's origin indents it by ``zero + contact_offset``. Arms tap along a0, then make the move in one straight line.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scenes.experiment import ExperimentSpec
+from scenes.rig import RigSpec
+from scenes.sensor import SensorSpec
+from twin.errors import ContactError
+from twin.mechanics.path import ContactPath, dome_directions
+
+MOST_TURN_DEG = 1.0  # of a move between two poses of the path: what straight pieces miss of the arm's arc is then some um
+TOUCH_TOLERANCE_MM = 1e-6
+TOUCH_POINTS = 20_000  # on the sphere: the dome bulges by less than 2 um between them
+MOST_MARCHES = 400
+CLEAR_MM = 10.0  # before the tap: recorded taps of 5 mm begin up to 0.4 mm inside the object
+
+_UNTURNED = {  # columns: the sensor's x (across), y and z (approach) in the work frame
+    "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "z": np.eye(3),
+}
+
+
+@dataclass(frozen=True)
+class ArmLabel:
+    """One contact as the recordings' tables give it.
+
+    Attributes
+    ----------
+    pose, move : (6,) float
+        x, y, z in mm and Rx, Ry, Rz in deg; the pose is the one after the move.
+    executed : bool
+        Whether the move had been made when the frame was taken.
+    """
+
+    pose: np.ndarray
+    move: np.ndarray
+    executed: bool = True
+
+
+@dataclass(frozen=True)
+class ArmPath:
+    """A contact's way, and what the arm's label would be on it.
+
+    Attributes
+    ----------
+    path : ContactPath
+    labels : list of ArmLabel
+        Of each pose of the path.
+    touches : bool
+        Whether the tap reaches the object.
+    """
+
+    path: ContactPath
+    labels: list
+    touches: bool
+
+    def label(self, fraction: float) -> ArmLabel:
+        """The label of a state at a fraction of the path: the tap or the move, as far as it has gone."""
+        progress = fraction * (len(self.labels) - 1)
+        leg = int(np.clip(np.floor(progress), 0, len(self.labels) - 2))
+        share, start, stop = progress - leg, self.labels[leg], self.labels[leg + 1]
+        pose, move = ((1 - share) * getattr(start, key) + share * getattr(stop, key) for key in ("pose", "move"))
+        return ArmLabel(pose, move)
+
+
+def rig_of(sensor: SensorSpec) -> RigSpec:
+    """The sensor's rig, or the plainest one: the tool point is the tip."""
+    return sensor.rig or RigSpec(tcp_to_dome_mm=-sensor.skin.outer_radius_mm)
+
+
+def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, radius_mm: float) -> np.ndarray:
+    """``T_sensor_object`` (4, 4) with the arm at a pose (6,), mm and deg."""
+    unturned = _UNTURNED[experiment.approach]
+    across, approach = unturned[:, 0], unturned[:, 2]
+    turn = Rotation.from_euler("xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True).as_matrix()
+    centre = pose[:3] + turn @ (rig.tcp_to_dome_mm * approach + rig.tcp_lateral_mm * across)
+    surface = (radius_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * approach
+    sensor = turn @ unturned
+    T = np.eye(4)
+    T[:3, :3] = sensor.T @ unturned @ Rotation.from_euler("y", -rig.plate_tilt_deg, degrees=True).as_matrix()
+    T[:3, 3] = sensor.T @ (surface - centre)
+    in_image = np.eye(4)
+    in_image[:3, :3] = Rotation.from_euler("z", rig.image_turn_deg, degrees=True).as_matrix()
+    return in_image @ T
+
+
+def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimulus, label: ArmLabel) -> ArmPath:
+    """The object's way relative to the sensor: first touch, tapped, and moved if the move was executed.
+
+    Parameters
+    ----------
+    stimulus : Stimulus
+        Its origin is a material point of the object, so that the way from pose to pose is also the way that friction sees.
+
+    Raises
+    ------
+    ContactError
+        The sensor is inside the object long before the tap.
+    """
+    radius_mm = sensor.skin.outer_radius_mm
+
+    def at(pose):
+        return object_pose(rig, experiment, pose, radius_mm)
+
+    tap = np.asarray(experiment.tap) * (1 + CLEAR_MM / experiment.tap[experiment.axis])
+    tapped = np.asarray(label.pose, float) - label.move
+    share, touches = _first_touch(stimulus, at(tapped - tap), at(tapped), radius_mm * dome_directions(sensor, TOUCH_POINTS))
+    still = np.zeros(6)
+    labels = [ArmLabel(tapped - (1 - share) * tap, still), ArmLabel(tapped, still)]
+    if label.executed:
+        pieces = max(1, int(np.ceil(np.abs(label.move[3:]).max() / MOST_TURN_DEG)))
+        labels += [ArmLabel(tapped + k / pieces * label.move, k / pieces * label.move) for k in range(1, pieces + 1)]
+    if not touches:
+        labels = labels[1:] if len(labels) > 2 else [replace(labels[1], pose=tapped - tap), labels[1]]
+    return ArmPath(ContactPath(np.stack([at(each.pose) for each in labels])), labels, touches)
+
+
+def _first_touch(stimulus, start: np.ndarray, stop: np.ndarray, dome_mm: np.ndarray) -> tuple[float, bool]:
+    """Share of the straight way from one pose to another at which the object touches the dome, and whether it does.
+
+    It goes on by its smallest distance to the dome, again and again, which never passes the first touch where distances are
+    exact (sphere tracing, Hart 1996).
+    """
+    turn, way = start[:3, :3], stop[:3, 3] - start[:3, 3]
+    length_mm = float(np.linalg.norm(way))
+    share, free = 0.0, None
+    for _ in range(MOST_MARCHES):
+        gap_mm = float(stimulus.distance((dome_mm - start[:3, 3] - share * way) @ turn).min())
+        if abs(gap_mm) <= TOUCH_TOLERANCE_MM:
+            return share, True
+        if gap_mm < 0:
+            if free is None:
+                raise ContactError(f"the object is in the sensor's way {CLEAR_MM:g} mm before the tap; begin it elsewhere")
+            share = (share + free) / 2  # a distance was too large (wires, far from a mesh): back half way
+            continue
+        free = share
+        share += gap_mm / length_mm
+        if share >= 1:
+            return 1.0, False
+    return free or 0.0, True

@@ -1,0 +1,144 @@
+"""A contact that goes on: its state and memory, and the step to the object's next pose."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import ContactError
+from twin.geometry.solid import Solid, pin_pose
+from twin.geometry.view import NodeView
+from twin.mechanics.balance import Balance, Body, LoadState
+from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
+from twin.mechanics.relaxation import History
+from twin.types import ContactState
+
+_PENALTY_MPA_MM = 30.0
+_SMALLEST_STRIDE = 1 / 64  # of a regular load step
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A solid, and what is derived from it."""
+
+    solid: Solid
+    body: Body
+    view: NodeView
+
+
+class OngoingContact:
+    """One contact from its first touch on: what friction and relaxation remember, carried from step to step.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    setting : Setting
+    T : (4, 4) float
+        The object's pose at the start, free of contact.
+    one_thread : callable
+        Gives a context in which BLAS keeps to one thread.
+    """
+
+    def __init__(self, spec: SensorSpec, setting: Setting, T: np.ndarray, one_thread: Callable[[], AbstractContextManager]):
+        self.setting, self._one_thread = setting, one_thread
+        self.stepper: LoadStepper | None = None  # set before the first step
+        body = setting.body
+        count = len(body.points.area_mm2)
+        self._state = LoadState(
+            control_mm=setting.solid.control_mm,
+            border=np.zeros(2),
+            anchor_mm=np.zeros((count, 3)),
+            held=np.zeros(count, bool),
+            slid_mm=np.zeros(count),
+            penalty_mpa_mm=_PENALTY_MPA_MM,
+            T=T,
+        )
+        self._terms = [spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation]
+        self._past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, self._terms, strict=True)]
+
+    def step(self, T: np.ndarray, span_s: float) -> ContactState:
+        """The converged state with the object at ``T`` (4, 4), ``span_s`` later; after ``NoConvergence`` the contact is where it was."""
+        kinds = self.setting.body.kinds
+        now = [p.before(kind, term, span_s) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
+        with self._one_thread():
+            self.stepper.follow(replace(self.setting.body, kinds=tuple(kind for kind, _ in now)))
+            self._state, balance, looked = self.stepper.step(self._state, T, [given for _, given in now])
+            result = contact_state(self.setting, self._state, balance, looked)
+        control_mm = self._state.control_mm
+        self._past = [p.after(kind, term, span_s, control_mm) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
+        return result
+
+    def advance(self, pose_at, start: float, stop: float, time_at, where: str):
+        """Go through one regular load step, in shorter ones where that does not converge.
+
+        Parameters
+        ----------
+        pose_at, time_at : callable
+            The object's pose (4, 4) and time (s) at a progress from ``start`` to ``stop``.
+        where : str
+            The load step, for the error's message.
+
+        Yields
+        ------
+        progress : float
+        state : ContactState
+
+        Raises
+        ------
+        ContactError
+            No convergence.
+        """
+        done, stride = 0.0, 1.0
+        while done < 1:
+            stride = min(stride, 1 - done)
+            before, at = start + done * (stop - start), start + (done + stride) * (stop - start)
+            try:
+                result = self.step(pose_at(at), time_at(at) - time_at(before))
+            except NoConvergence as failure:
+                stride /= 2
+                if stride >= _SMALLEST_STRIDE:
+                    continue
+                raise ContactError(
+                    f"no convergence in {where}: relative residual "
+                    f"{failure.relative:.1e}, needed {RESIDUAL_TOLERANCE:.0e}; try less indentation, shear or friction, "
+                    f"a rounder object, or another resolution"
+                ) from None
+            done += stride
+            stride = min(2 * stride, 1.0)
+            yield at, result
+
+
+def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: np.ndarray) -> ContactState:
+    """What others see of a converged load step; ``looked`` (q,) int are the contact points the balance speaks of."""
+    contact, points = balance.contact, setting.body.points
+    touched = np.flatnonzero(contact.penetration_mm > 0)
+    where = looked[touched]
+    turn = state.T[:3, :3]
+    at = points.positions(state.control_mm)[where]
+    normal = contact.normal[touched] @ turn.T
+    force = -balance.point_force_n[touched]
+    normal_n = contact.normal_n[touched]
+    base, axis, caps = pin_pose(setting.solid, state.control_mm)
+    pose = state.T.copy()
+    pose[2, 3] += state.border[0]
+    return ContactState(
+        nodes_mm=setting.view.nodes(state.control_mm),
+        base_mm=base,
+        axis=axis,
+        caps_mm=caps,
+        force_n=force.sum(axis=0),
+        torque_nmm=np.cross(at, force).sum(axis=0),
+        area_mm2=float(points.area_mm2[where].sum()),
+        contact_mm=at,
+        normal=normal,
+        normal_n=normal_n,
+        tangential_n=force + normal_n[:, None] * normal,
+        point_area_mm2=points.area_mm2[where],
+        slipping=contact.slipping[touched],
+        T_sensor_object=pose,
+        elastic_nmm=state.elastic_nmm,
+        dissipated_nmm=state.dissipated_nmm,
+        residual=balance.relative,
+    )

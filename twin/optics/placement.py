@@ -1,0 +1,34 @@
+"""Where samples are worth their time: on the pins, whose edges are noisy; dark bare skin is even after a few."""
+
+import cv2
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.projection import project
+
+SKIN_SAVING = 4  # samples on a pin for one on bare skin
+MARGIN_PX = 2.0  # what a pin's edge may be off
+SUBPIXEL_BITS = 4
+
+
+def near_pins(spec: SensorSpec, state, window_px: tuple[int, int, int, int]) -> np.ndarray:
+    """Pixels (H, W) bool of a window of the raw frame that may show a part of a pin, from its foot to its cap."""
+    pins, (x0, y0, x1, y1) = spec.pins, window_px
+    across = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    middle = project(spec, state.caps_mm)
+    reach_mm = 0.5 * pins.cap_diameter_mm * _largest_outline(spec)
+    sides = [project(spec, state.caps_mm + reach_mm * way) for way in (across, np.cross(state.axis, across))]
+    radius = np.max([np.linalg.norm(side - middle, axis=1) for side in sides], axis=0) + MARGIN_PX
+    feet = project(spec, state.base_mm)
+    mask, fine = np.zeros((y1 - y0, x1 - x0), np.uint8), 1 << SUBPIXEL_BITS
+    for foot, cap, wide in zip(feet - [x0, y0], middle - [x0, y0], radius, strict=True):
+        ends = [tuple(int(v) for v in np.rint(fine * end)) for end in (foot, cap)]
+        cv2.line(mask, *ends, 1, int(np.ceil(2 * wide)), cv2.LINE_8, SUBPIXEL_BITS)  # its ends are round
+    return mask.astype(bool)
+
+
+def _largest_outline(spec: SensorSpec) -> float:
+    """Of the caps' outlines, relative to a circle."""
+    shapes = np.array(spec.appearance.cap_shapes or [[0.0]])
+    return float(1 + np.abs(shapes).sum(axis=1).max())

@@ -4,10 +4,7 @@
 goes on, ``weights.pt`` when it is done. Every file is written whole or not at all.
 """
 
-import csv
-import io
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +18,7 @@ from training.dataset import Dataset, split_rows
 from training.loop import Loop, Rows
 from training.networks import build_network, parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
+from training.run_files import write_curves, write_tensors, write_text
 from twin.preprocess.forms import blob_spec
 
 FOLDS = 10  # each network of an ensemble watches another tenth of the training rows
@@ -56,7 +54,15 @@ class RunConfig:
     size: dict = field(default_factory=dict)
 
 
-def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float | None = None, progress: Callable | None = None) -> bool:
+def train_run(
+    config: RunConfig,
+    data: Dataset,
+    out: Path,
+    *,
+    max_minutes: float | None = None,
+    device: str = "cpu",
+    progress: Callable | None = None,
+) -> bool:
     """Train, or continue what ``out`` holds.
 
     Parameters
@@ -65,6 +71,8 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
         Called with (epochs done, epochs in all, the curve's last row) over all networks.
     max_minutes : float, optional
         Stop at the end of an epoch after that long; what is there by then is assembled all the same.
+    device : {"cpu", "cuda"}
+        Where the networks learn; what is kept runs anywhere.
 
     Returns
     -------
@@ -78,7 +86,7 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
     """
     started = monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    train, _ = (np.arange(len(data)), None) if config.split is None else split_rows(len(data), config.split, data.group)
+    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     inputs, aside = prepared_inputs(config.model, data, train)
@@ -88,7 +96,7 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
     all_epochs = config.recipe.members * config.recipe.epochs
     while len(done) < config.recipe.members:
         member = len(done)
-        loop = _member(config, data, inputs, scaled, train, member)
+        loop = _member(config, data, inputs, scaled, train, member, device)
         if state and state["loop"] is not None:
             loop.load(state["loop"])
         state, kept = None, monotonic()
@@ -108,6 +116,24 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
         _keep(out, resolved, done, None)
     _assemble(out, resolved, config, data, inputs, aside, train, done, (shift, scale))
     (out / "checkpoint.pt").unlink(missing_ok=True)
+    return True
+
+
+def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
+    """Whether a folder holds this very run, done.
+
+    Raises
+    ------
+    TrainingError
+        If it holds another one.
+    """
+    if not (out / "weights.pt").is_file() or (out / "checkpoint.pt").is_file():
+        return False
+    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
+    wanted = json.loads(json.dumps(resolve(config, data, train)))
+    found = json.loads((out / "config.json").read_text())
+    if _identity(wanted) != _identity({key: found.get(key) for key in wanted}):
+        raise TrainingError(f"{out}: holds a finished run with other settings or data; give another --out")
     return True
 
 
@@ -146,15 +172,18 @@ def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray) -> tuple[
     return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
 
 
-def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, train: np.ndarray, member: int) -> Loop:
+def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, train: np.ndarray, member: int, device: str) -> Loop:
     seed = 1000 * config.seed + member
     torch.manual_seed(seed)
     network = build_network(config.model, data.pins.reference, scaled.shape[1], config.size)
     held, learnt = fold_rows(train, config.seed, member, data.group)
     if hasattr(network, "prepare"):
         network.prepare(inputs.x[torch.from_numpy(train)])
+    network.to(device)
     weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
     executed = torch.from_numpy(data.targets.executed.astype(np.float32))
+    if config.model == "vgnn":  # each frame also as it is seen where the camera sits otherwise
+        scaled, executed, learnt = scaled.repeat(2, 1), executed.repeat(2), np.concatenate([learnt, len(data) + learnt])
     return Loop(network, config.recipe, Rows(inputs, scaled, weight, executed, torch.from_numpy(learnt), torch.from_numpy(held)), seed)
 
 
@@ -169,7 +198,11 @@ def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | Non
 
 def _finished(loop: Loop) -> dict:
     network = loop.result()
-    return {"weights": {key: value.clone() for key, value in network.state_dict().items()}, "held": loop.rows.held, "curves": loop.curves}
+    return {
+        "weights": {key: value.cpu().clone() for key, value in network.state_dict().items()},
+        "held": loop.rows.held,
+        "curves": loop.curves,
+    }
 
 
 def _assemble(
@@ -178,14 +211,14 @@ def _assemble(
     content = calibrate(config, data, inputs, train, networks, scaling)
     content |= {"aside": aside, "reference_px": data.pins.reference.pins_px}
     content["parameters"] = parameter_count(build_network(config.model, data.pins.reference, len(data.targets.names), config.size))
-    _write(out / "weights.pt", content)
-    _write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
-    _write_curves(out, [network["curves"] for network in networks])
+    write_tensors(out / "weights.pt", content)
+    write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
+    write_curves(out, [network["curves"] for network in networks])
 
 
 def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:
-    _write(out / "checkpoint.pt", {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
-    _write_curves(out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
+    write_tensors(out / "checkpoint.pt", {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
+    write_curves(out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
 
 
 def _opened(out: Path, resolved: dict) -> dict | None:
@@ -194,9 +227,9 @@ def _opened(out: Path, resolved: dict) -> dict | None:
     if not path.is_file():
         if (out / "weights.pt").is_file():
             raise TrainingError(f"{out}: holds a finished run; give another --out")
-        _write_text(out / "config.json", json.dumps(resolved, indent=1) + "\n")
+        write_text(out / "config.json", json.dumps(resolved, indent=1) + "\n")
         return None
-    state = torch.load(path, weights_only=True)
+    state = torch.load(path, weights_only=True, map_location="cpu")
     if state["identity"] != _identity(resolved):
         raise TrainingError(
             f"{out}: holds a run with other settings or data, begun and not finished; give another --out, or the same settings"
@@ -206,33 +239,3 @@ def _opened(out: Path, resolved: dict) -> dict | None:
 
 def _identity(resolved: dict) -> str:
     return json.dumps({key: value for key, value in resolved.items() if key not in ("problems", "data")}, sort_keys=True)
-
-
-def _write(path: Path, content: dict) -> None:
-    part = path.with_name(f".{path.name}.part")
-    torch.save(_as_tensors(content), part)
-    os.replace(part, path)
-
-
-def _as_tensors(value):
-    """The same with arrays as tensors, which are read back without running anything that a file may hold."""
-    if isinstance(value, np.ndarray):
-        return torch.from_numpy(value)
-    if isinstance(value, dict):
-        return {key: _as_tensors(part) for key, part in value.items()}
-    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
-
-
-def _write_text(path: Path, text: str) -> None:
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
-    os.replace(part, path)
-
-
-def _write_curves(out: Path, curves: list) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
-    for k, points in enumerate(curves):
-        writer.writerows([k, *point.values()] for point in points)
-    _write_text(out / "curves.csv", text.getvalue())

@@ -43,6 +43,7 @@ def main() -> None:
         robustness,
         servo,
         study,
+        study_tac_vgnn,
         train,
         tune,
         validate,

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
+from hardware.let_go import try_each
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 from scenes.experiment import LABELS, ExperimentSpec
-from twin.errors import TwinError
 from twin.recordings.images import write_image
 from twin.types import Form, Frame
 
@@ -175,12 +175,12 @@ def collect(
     Raises
     ------
     DeviceError
-        The arm did not come to stand where it was sent, or no frame came.
+        The source is not live, the arm did not come to stand where it was sent or could not be let go of, or no frame came.
     """
+    if not source.is_live:
+        raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
     frame_of = WorkFrame(experiment, placed)
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
-    arm.enable()
-    arm.set_speed(*speed)
 
     def go(label: np.ndarray, away_mm: float = 0.0) -> ArmState:
         state = arm.state()
@@ -196,8 +196,11 @@ def collect(
         _frame_after(source, state)
         return state
 
-    here = np.zeros(6)
+    here, begun = np.zeros(6), False
     try:
+        arm.enable()
+        arm.set_speed(*speed)
+        begun = True
         state = go(here, CLEAR_MM)
         if not collection.has_rest:
             collection.keep_rest(_frame_after(source, state))
@@ -225,7 +228,10 @@ def collect(
             if progress is not None:
                 progress(index + 1, count)
     finally:
-        _withdraw(arm, lambda: go(here, CLEAR_MM))
+        back = {"retreat": lambda: go(here, CLEAR_MM)} if begun else {}
+        failed = try_each(stop=arm.stop, **back, disable=arm.disable)
+    if failed:
+        raise DeviceError("; ".join(failed))
     return collection.count
 
 
@@ -234,11 +240,3 @@ def _frame_after(source: FrameSource, state: ArmState) -> Frame:
         return source.read_after(state.time_s, timeout_s=FRAME_TIMEOUT_S)
     except TimeoutError as error:
         raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
-
-
-def _withdraw(arm: Arm, back: Callable[[], ArmState]) -> None:
-    for act in (arm.stop, back, arm.disable):
-        try:
-            act()
-        except TwinError:  # the first error is on its way already; each of these is tried whatever became of the others
-            continue

@@ -11,6 +11,7 @@ from hardware.arm_track import ArmTrack
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
+from hardware.let_go import try_each
 from hardware.mounting import Mounting
 from hardware.rig_geometry import matrix_of, moved
 from hardware.safe_arm import RefusedMoveError
@@ -19,7 +20,6 @@ from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
 from hardware.timing import Spread, Timing
 from scenes.servo import ServoSpec
-from twin.errors import TwinError
 from twin.types import Frame
 
 MOST_PIECES, NEAR_MM = 200, 0.5
@@ -241,7 +241,7 @@ class ServoLoop:
         return moved(pose, -self.servo.clear_mm * self.mounting.axis)
 
     def _let_go(self, *, retreat: bool) -> None:
-        """Stop, retreat, disable; each is tried whatever became of the others."""
+        """Stop, retreat, disable."""
 
         def back() -> None:
             pose = self.arm.state().pose
@@ -250,11 +250,8 @@ class ServoLoop:
             else:
                 self.arm.move_linear(self._away_from(pose), wait=True, timeout_s=MOVE_TIMEOUT_S)
 
-        for name, act in (("stop", self.arm.stop), *((("retreat", back),) if retreat else ()), ("disable", self.arm.disable)):
-            try:
-                act()
-            except TwinError as error:
-                self.notes.append(f"{name} failed: {error}")
+        between = {"retreat": back} if retreat else {}
+        self.notes += try_each(stop=self.arm.stop, **between, disable=self.arm.disable)
 
 
 def _apart_mm(one: np.ndarray, other: np.ndarray) -> float:

@@ -24,7 +24,7 @@ def camera(
     sensor: Sensor,
     object_name: Object,
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", help="0: a free one")] = 8081,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one")] = 8081,
     fps: Annotated[float, typer.Option("--fps", min=0.1, help="no more pictures a second")] = 30.0,
     parameters: ServoName = "surface",
     fault: FaultOption = (),

@@ -22,6 +22,7 @@ from hardware.arms.mg400_wire import (
     MOTION_PORT,
     Mode,
     Reply,
+    require_ports,
     why_refused,
 )
 from hardware.errors import DeviceError, DeviceNotConnectedError
@@ -41,6 +42,7 @@ class Mg400Ports:
 
     def shifted(self, offset: int) -> "Mg400Ports":
         """All of them, so much higher."""
+        require_ports(offset)
         return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
 
 

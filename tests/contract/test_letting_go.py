@@ -64,9 +64,7 @@ def test_ctrl_c_during_the_retreat_still_disables(arm, placed):
         raise KeyboardInterrupt
 
     with NoisyCamera() as source:
-        loop = ServoLoop(
-            source, TrueEstimator(arm, placed), arm, load_servo("surface"), placed.mounting, LoopSettings(100), on_step=now
-        )
+        loop = ServoLoop(source, TrueEstimator(arm, placed), arm, load_servo("surface"), placed.mounting, LoopSettings(100), on_step=now)
         with pytest.raises(KeyboardInterrupt):
             loop.run(placed.start_pose(2.0))
     assert not arm.state().enabled
@@ -174,6 +172,14 @@ def test_a_signal_to_end_ends_as_ctrl_c_does(ended):
         os.kill(os.getpid(), ended)
         time.sleep(5.0)
     assert signal.getsignal(ended) is before
+
+
+def test_what_failed_is_printed_after_ctrl_c(capsys):
+    with pytest.raises(KeyboardInterrupt), signals_as_ctrl_c():
+        interrupt = KeyboardInterrupt()
+        interrupt.add_note("stop failed: press its emergency stop")
+        raise interrupt
+    assert "twin: note: stop failed: press its emergency stop" in capsys.readouterr().err
 
 
 class TestMg400:

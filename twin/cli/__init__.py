@@ -48,15 +48,15 @@ def main() -> None:
     try:
         app()
     except (TwinError, SpecError) as error:
-        _tell("error", str(error), error)
+        print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print_notes(error)
         sys.exit(1)
-    except KeyboardInterrupt as interrupt:
-        _tell("interrupted", "", interrupt)
+    except KeyboardInterrupt:
+        print("twin: interrupted", file=sys.stderr)
         sys.exit(130)
 
 
-def _tell(what: str, text: str, error: BaseException) -> None:
-    """A line on stderr, and one for each note: what went wrong on top of it, as an arm that could not be stopped."""
-    print(f"twin: {what}" + (f": {' '.join(text.split())}" if text else ""), file=sys.stderr)
+def print_notes(error: BaseException) -> None:
+    """A line on stderr for each note on an error: what went wrong on top of it, as an arm that could not be stopped."""
     for note in getattr(error, "__notes__", ()):
         print(f"twin: note: {' '.join(note.split())}", file=sys.stderr)

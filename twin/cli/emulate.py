@@ -42,7 +42,7 @@ def list_faults(faults: list[str], known: dict) -> None:
 @emulate.command("mg400")
 def mg400(
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
-    port_offset: Annotated[int, typer.Option("--port-offset", min=-28000, max=35000, help="added to 29999 and 30003 to 30006")] = 0,
+    port_offset: Annotated[int, typer.Option("--port-offset", help="added to 29999 and 30003 to 30006")] = 0,
     fault: FaultOption = (),
     firmware: Annotated[str, typer.Option("--firmware", help="version whose manners to have; below 1.5.6 bare echoes")] = "1.7.0",
     lenient: Annotated[bool, typer.Option("--lenient", help="as firmware 1.5.5: bare echoes, no reply to moves")] = False,

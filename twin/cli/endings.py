@@ -3,6 +3,8 @@
 import signal
 from contextlib import contextmanager
 
+from twin.cli import print_notes
+
 
 @contextmanager
 def signals_as_ctrl_c():
@@ -17,6 +19,9 @@ def signals_as_ctrl_c():
             signal.signal(ended, interrupt)
     try:
         yield
+    except KeyboardInterrupt as interrupt:
+        print_notes(interrupt)  # here, for typer ends without a word
+        raise
     finally:
         for ended, handler in before.items():
             signal.signal(ended, handler)

@@ -94,6 +94,12 @@ class ServoLoop:
             self._let_go(retreat=touching)
         return self.timing()
 
+    def require_labels(self, names: tuple) -> None:
+        """``DeviceError`` if a model that tells these has not what following needs; to be asked before anything moves."""
+        depth, angle = self.mounting.depth_label, self.mounting.angle_label
+        if not {depth, angle} <= set(names):
+            raise DeviceError(f"the model tells {', '.join(names)}; following a surface needs {depth} and {angle} (the experiment's)")
+
     def timing(self) -> Timing:
         """Figures of the steps so far."""
         fresh = [record for record in self.records if record.fresh]
@@ -191,14 +197,9 @@ class ServoLoop:
         """What an estimate means, and why it isn't to be believed ("" if it is)."""
         if not estimate.valid:
             return Reading(np.nan, np.nan), estimate.reason
+        self.require_labels(estimate.names)
         value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
-        try:
-            depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]
-        except KeyError as missing:
-            raise DeviceError(
-                f"the model tells {', '.join(estimate.names)}; following a surface needs {self.mounting.depth_label} and "
-                f"{self.mounting.angle_label} (the experiment's)"
-            ) from missing
+        depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]
         reading = Reading(self.mounting.depth_mm(depth), self.mounting.angle_deg(angle))
         for name, got, (low, high) in (
             ("mm deep", reading.depth_mm, self.servo.plausible_mm),

@@ -178,7 +178,8 @@ class Feedback:
             except OSError as error:
                 errors.append(f"{port}: {error.strerror or error}")
         raise DeviceNotConnectedError(
-            f"{self._name}: no feedback port of {self._host} takes connections ({'; '.join(errors)}); close other programs that use the arm"
+            f"{self._name}: no feedback port of {self._host} takes connections ({'; '.join(errors)}); check that it is on (without "
+            "an arm: 'twin emulate mg400'), and close other programs that use the arm"
         )
 
     def _read(self, connection: socket.socket, ended: Event) -> None:

@@ -22,7 +22,9 @@ def require_ports(offset: int) -> None:
     """``DeviceError`` if the arm's ports, so much higher, are no ports."""
     lowest, highest = DASHBOARD_PORT + offset, max(FEEDBACK_PERIOD_S) + offset
     if lowest < 1 or highest > LARGEST_PORT:
-        raise DeviceError(f"mg400: there are no ports {lowest} to {highest}; give a dashboard port between 1 and {LARGEST_PORT - 7}")
+        raise DeviceError(
+            f"mg400: no ports {lowest} to {highest}; give a dashboard port (29999 + the offset) between 1 and {LARGEST_PORT - 7}"
+        )
 
 
 class ErrorId(IntEnum):

@@ -170,7 +170,7 @@ class Mg400Emulator:
 
     def _run(self, target, *arguments) -> None:
         thread = Thread(target=target, args=arguments, daemon=True, name="mg400-emulator")
-        self._threads.append(thread)
+        self._threads = [*(one for one in self._threads if one.is_alive()), thread]
         thread.start()
 
     def _accept(self) -> None:

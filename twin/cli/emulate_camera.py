@@ -44,4 +44,4 @@ def camera(
     with FeedbackPose.of(arm) as pose:
         source = twin_camera(spec, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
         device = CameraEmulator(source, host=host, port=port, faults=tuple(fault))
-        run_until_told(device, lambda: f"camera {device.url}")
+        run_until_told(device, lambda: f"camera {device.url}", lambda: device.error)

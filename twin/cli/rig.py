@@ -23,7 +23,7 @@ from twin.cache import cached_arrays
 from twin.errors import RenderError
 from twin.optics.preview import Preview, Shading
 from twin.optics.render import Renderer
-from twin.types import Form
+from twin.types import Form, Frame
 
 TWIN = "twin"
 SHADING_QUALITY = "standard"
@@ -53,8 +53,8 @@ class Rig:
     def mounting(self) -> Mounting:
         return self.placed.mounting
 
-    def await_frame(self) -> None:
-        """Wait until the camera delivers.
+    def await_frame(self) -> Frame:
+        """The first frame, for which the camera is given time.
 
         Raises
         ------
@@ -62,7 +62,7 @@ class Rig:
             It does not.
         """
         try:
-            self.source.read(timeout_s=FIRST_FRAME_S)
+            return self.source.read(timeout_s=FIRST_FRAME_S)
         except (TimeoutError, EOFError) as error:
             raise DeviceError(f"{error}; check the camera") from error
 

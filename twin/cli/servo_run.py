@@ -128,10 +128,11 @@ def follow(
 
     failure, followed, session = "", None, None
     with rig:
-        rig.await_frame()
+        first = rig.await_frame()
+        loop = servo_loop(rig, run.servo, estimator, settings, on_step)
+        loop.require_labels(estimator(first).names)
         if run.record:
             session = SessionWriter(out / "session", told)
-        loop = servo_loop(rig, run.servo, estimator, settings, on_step)
         try:
             loop.run(rig.placed.start_pose(run.servo.indent_mm))
         except TwinError as error:

@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
+from hardware.let_go import try_each
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 from scenes.experiment import LABELS, ExperimentSpec
-from twin.errors import TwinError
 from twin.recordings.images import write_image
 from twin.types import Form, Frame
 
-CLEAR_MM, LIFT_MM = 50.0, 10.0
+CLEAR_MM, LIFT_MM, NEAR_MM = 50.0, 10.0, 0.5
 MOVE_TIMEOUT_S, FRAME_TIMEOUT_S = 30.0, 5.0
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
@@ -59,7 +59,10 @@ class Collection:
         self.folder.mkdir(parents=True, exist_ok=True)
         meta, about = self.folder / META, json.loads(json.dumps(self.about))
         if meta.is_file():
-            before = json.loads(meta.read_text())
+            try:
+                before = json.loads(meta.read_text())
+            except ValueError as error:
+                raise DeviceError(f"{meta}: not whole ({error}); remove it if the folder holds no contacts yet") from error
             if other := [key for key in about if before.get(key) != about[key]]:
                 raise DeviceError(
                     f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
@@ -69,10 +72,12 @@ class Collection:
         else:
             meta.write_text(json.dumps(about, indent=1) + "\n")
         self.pictures.mkdir(exist_ok=True)
-        table = self.folder / TABLE
-        if not table.is_file():
+        table, log = self.folder / TABLE, self.folder / LOG
+        for lines in (table, log):
+            if lines.is_file():
+                self._drop_torn_line(lines)
+        if not table.is_file() or not table.read_text():
             table.write_text(",".join(COLUMNS) + "\n")
-        self._drop_torn_line(table)
 
     @property
     def count(self) -> int:
@@ -102,10 +107,10 @@ class Collection:
             os.fsync(file.fileno())
 
     @staticmethod
-    def _drop_torn_line(table: Path) -> None:
-        text = table.read_text()
+    def _drop_torn_line(lines: Path) -> None:
+        text = lines.read_text()
         if not text.endswith("\n"):
-            table.write_text(text[: text.rfind("\n") + 1])
+            lines.write_text(text[: text.rfind("\n") + 1])
 
 
 def draw_contact(experiment: ExperimentSpec, seed: int, index: int) -> Contact:
@@ -175,12 +180,12 @@ def collect(
     Raises
     ------
     DeviceError
-        The arm did not come to stand where it was sent, or no frame came.
+        The source is not live, the arm did not come to stand where it was sent or could not be let go of, or no frame came.
     """
+    if not source.is_live:
+        raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
     frame_of = WorkFrame(experiment, placed)
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
-    arm.enable()
-    arm.set_speed(*speed)
 
     def go(label: np.ndarray, away_mm: float = 0.0) -> ArmState:
         state = arm.state()
@@ -188,6 +193,8 @@ def collect(
         for guard in guards:
             target = guard(state, target)
         sent = arm.move_linear(target, wait=False, timeout_s=MOVE_TIMEOUT_S)
+        if (short_mm := float(np.linalg.norm(sent[:3] - target[:3]))) > NEAR_MM:
+            raise DeviceError(f"{arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg")
         return arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
 
     def stop_at(label: np.ndarray) -> ArmState:
@@ -196,8 +203,11 @@ def collect(
         _frame_after(source, state)
         return state
 
-    here = np.zeros(6)
+    here, begun = np.zeros(6), False
     try:
+        arm.enable()
+        arm.set_speed(*speed)
+        begun = True
         state = go(here, CLEAR_MM)
         if not collection.has_rest:
             collection.keep_rest(_frame_after(source, state))
@@ -225,7 +235,10 @@ def collect(
             if progress is not None:
                 progress(index + 1, count)
     finally:
-        _withdraw(arm, lambda: go(here, CLEAR_MM))
+        back = {"retreat": lambda: go(here, CLEAR_MM)} if begun else {}
+        failed = try_each(stop=arm.stop, **back, disable=arm.disable)
+    if failed:
+        raise DeviceError("; ".join(failed))
     return collection.count
 
 
@@ -234,11 +247,3 @@ def _frame_after(source: FrameSource, state: ArmState) -> Frame:
         return source.read_after(state.time_s, timeout_s=FRAME_TIMEOUT_S)
     except TimeoutError as error:
         raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
-
-
-def _withdraw(arm: Arm, back: Callable[[], ArmState]) -> None:
-    for act in (arm.stop, back, arm.disable):
-        try:
-            act()
-        except TwinError:  # the first error is on its way already; each of these is tried whatever became of the others
-            continue

@@ -4,7 +4,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -135,29 +134,41 @@ class Shower:
         self._session, self._draw, self._view = session, draw, view
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+        self._error: Exception | None = None
 
     @property
     def open(self) -> bool:
-        """Whether the user has not closed the view."""
+        """Whether the user has not closed the view, and it has not broken."""
         return not self._end.is_set()
 
     def __enter__(self) -> "Shower":
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type | None, *_: object) -> None:
         self._end.set()
         self._thread.join(timeout=5.0)
+        if self._error is not None and kind is None:
+            raise DeviceError(f"the view broke ({self._error}); --headless goes without") from self._error
 
     def _run(self) -> None:
+        try:
+            self._show()
+        except Exception as error:
+            self._error = error
+            self._end.set()
+
+    def _show(self) -> None:
         shown = None
         with self._view as view:
             while not self._end.wait(SHOW_S):
                 newest = self._session.newest
                 if newest is None or newest is shown:
                     continue
-                shown = newest
-                with suppress(RuntimeError):  # the figures' queues grew while they were read; the next picture has them
+                try:
                     lines = self._session.lines(newest[1])
-                    if not view.show(self._draw(*newest, lines), {str(k): line for k, line in enumerate(lines)}):
-                        self._end.set()
+                except RuntimeError:  # the figures' queues grew while they were read
+                    continue
+                shown = newest
+                if not view.show(self._draw(*newest, lines), {str(k): line for k, line in enumerate(lines)}):
+                    self._end.set()

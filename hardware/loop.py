@@ -11,6 +11,7 @@ from hardware.arm_track import ArmTrack
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
+from hardware.let_go import try_each
 from hardware.mounting import Mounting
 from hardware.rig_geometry import matrix_of, moved
 from hardware.safe_arm import RefusedMoveError
@@ -19,7 +20,6 @@ from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
 from hardware.timing import Spread, Timing
 from scenes.servo import ServoSpec
-from twin.errors import TwinError
 from twin.types import Frame
 
 MOST_PIECES, NEAR_MM = 200, 0.5
@@ -93,6 +93,12 @@ class ServoLoop:
             self._ended_s = time.monotonic()
             self._let_go(retreat=touching)
         return self.timing()
+
+    def require_labels(self, names: tuple) -> None:
+        """``DeviceError`` if a model that tells these has not what following needs; to be asked before anything moves."""
+        depth, angle = self.mounting.depth_label, self.mounting.angle_label
+        if not {depth, angle} <= set(names):
+            raise DeviceError(f"the model tells {', '.join(names)}; following a surface needs {depth} and {angle} (the experiment's)")
 
     def timing(self) -> Timing:
         """Figures of the steps so far."""
@@ -191,14 +197,9 @@ class ServoLoop:
         """What an estimate means, and why it isn't to be believed ("" if it is)."""
         if not estimate.valid:
             return Reading(np.nan, np.nan), estimate.reason
+        self.require_labels(estimate.names)
         value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
-        try:
-            depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]
-        except KeyError as missing:
-            raise DeviceError(
-                f"the model tells {', '.join(estimate.names)}; following a surface needs {self.mounting.depth_label} and "
-                f"{self.mounting.angle_label} (the experiment's)"
-            ) from missing
+        depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]
         reading = Reading(self.mounting.depth_mm(depth), self.mounting.angle_deg(angle))
         for name, got, (low, high) in (
             ("mm deep", reading.depth_mm, self.servo.plausible_mm),
@@ -241,7 +242,7 @@ class ServoLoop:
         return moved(pose, -self.servo.clear_mm * self.mounting.axis)
 
     def _let_go(self, *, retreat: bool) -> None:
-        """Stop, retreat, disable; each is tried whatever became of the others."""
+        """Stop, retreat, disable."""
 
         def back() -> None:
             pose = self.arm.state().pose
@@ -250,11 +251,8 @@ class ServoLoop:
             else:
                 self.arm.move_linear(self._away_from(pose), wait=True, timeout_s=MOVE_TIMEOUT_S)
 
-        for name, act in (("stop", self.arm.stop), *((("retreat", back),) if retreat else ()), ("disable", self.arm.disable)):
-            try:
-                act()
-            except TwinError as error:
-                self.notes.append(f"{name} failed: {error}")
+        between = {"retreat": back} if retreat else {}
+        self.notes += try_each(stop=self.arm.stop, **between, disable=self.arm.disable)
 
 
 def _apart_mm(one: np.ndarray, other: np.ndarray) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
 from hardware.errors import DeviceError, StaleDataError
+from hardware.let_go import try_each
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
 
 KEPT_DECISIONS = 10_000
@@ -150,13 +151,10 @@ class SafeArm:
         return None
 
     def shutdown(self, why: str) -> None:
-        """Stop, retreat along the normal, disable: each is tried whatever became of the others."""
+        """Stop, retreat along the normal, disable."""
         self._note("shutdown", Decision(Action.RETRACT, Code.SHUTDOWN, why))
-        for step in (self.arm.stop, self.retreat, self.arm.disable):
-            try:
-                step()
-            except DeviceError as error:
-                self._note(f"shutdown: {step.__name__}", Decision(Action.HOLD, Code.SHUTDOWN, str(error)))
+        for failed in try_each(stop=self.arm.stop, retreat=self.retreat, disable=self.arm.disable):
+            self._note("shutdown", Decision(Action.HOLD, Code.SHUTDOWN, failed))
 
     def _newest_state(self, call: str) -> ArmState:
         try:

@@ -46,7 +46,11 @@ class LeRobotArm:
     def connect(self, calibrate: bool = True) -> None:
         """Connect and enable; there is nothing to calibrate."""
         self.arm.connect()
-        self.arm.enable()
+        try:
+            self.arm.enable()
+        except BaseException:
+            self.arm.disconnect()
+            raise
 
     def get_observation(self) -> dict[str, float]:
         state = self.arm.state()

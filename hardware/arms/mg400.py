@@ -22,6 +22,7 @@ from hardware.arms.mg400_wire import (
     MOTION_PORT,
     Mode,
     Reply,
+    require_ports,
     why_refused,
 )
 from hardware.errors import DeviceError, DeviceNotConnectedError
@@ -41,6 +42,7 @@ class Mg400Ports:
 
     def shifted(self, offset: int) -> "Mg400Ports":
         """All of them, so much higher."""
+        require_ports(offset)
         return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
 
 
@@ -93,10 +95,10 @@ class MG400(BaseArm):
             raise
 
     def disconnect(self) -> None:
-        if self._dashboard.is_open:
-            for request in ("ResetRobot()", "DisableRobot()"):
+        if self._in_use:
+            for act in (self.stop, self.disable):
                 with contextlib.suppress(DeviceError):
-                    self._dashboard.request(request)
+                    act()
         self._close()
 
     def enable(self) -> None:
@@ -108,8 +110,7 @@ class MG400(BaseArm):
         self._await_mode(lambda mode: mode in (Mode.ENABLED, Mode.RUNNING), "was not enabled; check its button and that no stop is pressed")
 
     def disable(self) -> None:
-        self._require_connected()
-        self._ask("DisableRobot()")
+        self._tell_in_any_case("DisableRobot()", "disabled")
 
     def clear_error(self) -> None:
         """Clear the alarms and forget the queue; after an emergency stop ``enable`` brings the arm back."""
@@ -121,14 +122,7 @@ class MG400(BaseArm):
         self._alarm_text = None
 
     def stop(self) -> None:
-        if not self._in_use:
-            self._require_connected()
-        try:
-            if not self._dashboard.is_open:  # lost: the arm may still move, so try once more to reach it
-                self._dashboard.open()
-            self._ask("ResetRobot()")
-        except DeviceNotConnectedError as error:
-            raise DeviceNotConnectedError(f"{self.name}: can't be told to stop. Press its emergency stop! {error}") from error
+        self._tell_in_any_case("ResetRobot()", "stopped")
 
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
         self._require_connected()
@@ -266,6 +260,18 @@ class MG400(BaseArm):
                 ids = [int(text) for group in groups for text in re.findall(r"-?\d+", group)]
             self._alarm_text = explain(ids)
         return self._alarm_text
+
+    def _tell_in_any_case(self, request: str, what: str) -> None:
+        """Needs the dashboard alone; lost, it is tried once more to reach it, for the arm may still move."""
+        if not self._in_use:
+            self._require_connected()
+        try:
+            if not self._dashboard.is_open:
+                self._dashboard.open()
+            self._ask(request)
+        except DeviceError as error:
+            kind = DeviceNotConnectedError if isinstance(error, DeviceNotConnectedError) else DeviceError
+            raise kind(f"{self.name}: can't be {what}. Press its emergency stop! {error}") from error
 
     def _ask(self, request: str) -> Reply:
         reply = self._dashboard.request(request)

@@ -138,8 +138,8 @@ class Feedback:
             No port lets us, or nothing comes.
         """
         connection = self._connect()
-        self._ended.clear()
-        self._thread = Thread(target=self._read, args=(connection,), daemon=True, name="mg400-feedback")
+        self._ended = Event()  # a new one: a reader before that has not ended yet still will
+        self._thread = Thread(target=self._read, args=(connection, self._ended), daemon=True, name="mg400-feedback")
         self._thread.start()
         with self._arrived:
             if not self._arrived.wait_for(lambda: self._newest is not None, CONNECT_TIMEOUT_S):
@@ -178,24 +178,26 @@ class Feedback:
             except OSError as error:
                 errors.append(f"{port}: {error.strerror or error}")
         raise DeviceNotConnectedError(
-            f"{self._name}: no feedback port of {self._host} takes connections ({'; '.join(errors)}); close other programs that use the arm"
+            f"{self._name}: no feedback port of {self._host} takes connections ({'; '.join(errors)}); check that it is on (without "
+            "an arm: 'twin emulate mg400'), and close other programs that use the arm"
         )
 
-    def _read(self, connection: socket.socket) -> None:
-        while not self._ended.is_set():
+    def _read(self, connection: socket.socket, ended: Event) -> None:
+        while not ended.is_set():
             with contextlib.suppress(OSError):
-                self._read_until_silent(connection)
+                self._read_until_silent(connection, ended)
             connection.close()
-            if self._ended.wait(RECONNECT_S):
+            if ended.wait(RECONNECT_S):
                 return
             with contextlib.suppress(DeviceNotConnectedError):
                 connection = self._connect()
                 self.reconnects += 1
+        connection.close()
 
-    def _read_until_silent(self, connection: socket.socket) -> None:
+    def _read_until_silent(self, connection: socket.socket, ended: Event) -> None:
         connection.settimeout(SILENCE_S / 4)
         buffer, valid_s = b"", time.monotonic()
-        while not self._ended.is_set() and time.monotonic() - valid_s < SILENCE_S:
+        while not ended.is_set() and time.monotonic() - valid_s < SILENCE_S:
             try:
                 data = connection.recv(BACKLOG_BYTES)
             except TimeoutError:

@@ -6,13 +6,25 @@ from enum import IntEnum
 
 import numpy as np
 
+from hardware.errors import DeviceError
+
 DASHBOARD_PORT, MOTION_PORT = 29999, 30003
 FEEDBACK_PERIOD_S = {30004: 0.008, 30005: 0.2, 30006: 0.05}
+LARGEST_PORT = 65535
 DEFAULT_HOSTS = {"LAN1": "192.168.1.6", "LAN2": "192.168.2.6", "Wi-Fi": "192.168.9.1"}
 
 # Speed at SpeedL and SpeedJ of 100 %. The vendor's figures have not been verified on an arm: taken high, so
 # that an arm never moves faster than it was asked to.
 MAX_LINEAR_MM_S, MAX_JOINT_DEG_S = 1000.0, 300.0
+
+
+def require_ports(offset: int) -> None:
+    """``DeviceError`` if the arm's ports, so much higher, are no ports."""
+    lowest, highest = DASHBOARD_PORT + offset, max(FEEDBACK_PERIOD_S) + offset
+    if lowest < 1 or highest > LARGEST_PORT:
+        raise DeviceError(
+            f"mg400: no ports {lowest} to {highest}; give a dashboard port (29999 + the offset) between 1 and {LARGEST_PORT - 7}"
+        )
 
 
 class ErrorId(IntEnum):

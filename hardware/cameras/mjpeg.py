@@ -36,8 +36,12 @@ class MjpegCamera(LiveSource):
     def __init__(self, url: str, spec: SensorSpec | None = None, form: Form = Form.RAW) -> None:
         super().__init__(url, form)
         self._spec = spec
-        parts = urlsplit(url)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
+        try:
+            parts = urlsplit(url)
+            usable = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+        except ValueError:  # a port that is none
+            usable = False
+        if not usable:
             raise DeviceError(f"{url}: not the address of a stream; expected http://host:port/path")
         self._parts, self._connection, self._stream, self._last = parts, None, None, None
 

@@ -9,6 +9,7 @@ from hardware.cameras.capture import capture
 from hardware.cameras.reader import LiveSource, Picture, ReadFailed
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
+from twin.recordings.quiet import quiet
 from twin.types import Form
 
 MANUAL_EXPOSURE = 1  # V4L2; 3 is automatic
@@ -57,7 +58,8 @@ class UvcCamera(LiveSource):
         self._device: cv2.VideoCapture | None = None
 
     def _open(self) -> None:
-        device = cv2.VideoCapture(self._node, cv2.CAP_V4L2)
+        with quiet():
+            device = cv2.VideoCapture(self._node, cv2.CAP_V4L2)
         if not device.isOpened():
             raise DeviceError(
                 f"{self.name}: can't be opened; see 'twin doctor' for the cameras there are, and whether another program uses it"

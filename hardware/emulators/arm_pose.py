@@ -4,7 +4,7 @@ import numpy as np
 
 from hardware.arms.arm import ArmState
 from hardware.arms.mg400_link import Feedback
-from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S
+from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, require_ports
 from hardware.errors import DeviceError
 
 MAX_AGE_S = 1.0
@@ -31,6 +31,7 @@ class FeedbackPose:
         if kind != "mg400" or not host or (port and not port.isdecimal()):
             raise DeviceError(f"--arm {spec}: expected mg400:ADDRESS, for example mg400:127.0.0.1 with 'twin emulate mg400' running")
         offset = int(port) - DASHBOARD_PORT if port else 0
+        require_ports(offset)
         return cls(host, tuple(number + offset for number in FEEDBACK_PERIOD_S))
 
     def __enter__(self) -> "FeedbackPose":

@@ -9,7 +9,7 @@ from threading import Event, Lock, Thread, Timer
 
 import numpy as np
 
-from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT, ErrorId
+from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT, ErrorId, require_ports
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller
@@ -84,6 +84,7 @@ class Mg400Emulator:
             version = parse_firmware(firmware)
         except ValueError as error:
             raise TwinError(str(error)) from error
+        require_ports(port_offset or 0)
         self.host, self._port_offset = host, port_offset
         self.faults = Faults(FAULTS, faults)
         self.arm = Mg400Controller(self.faults, joints_deg=joints_deg, time_scale=time_scale)
@@ -169,7 +170,7 @@ class Mg400Emulator:
 
     def _run(self, target, *arguments) -> None:
         thread = Thread(target=target, args=arguments, daemon=True, name="mg400-emulator")
-        self._threads.append(thread)
+        self._threads = [*(one for one in self._threads if one.is_alive()), thread]
         thread.start()
 
     def _accept(self) -> None:

@@ -1,5 +1,6 @@
 """The emulated MG400's commands, by port: what each wants and answers."""
 
+import math
 import re
 from collections.abc import Callable
 
@@ -103,8 +104,9 @@ class Mg400Commands:
             index, values = int(request.values[0]), [float(text) for text in request.values[1].strip("{}").split(",")]
         except ValueError as error:
             raise RefusedError(ErrorId.PARAMETER_TYPE - 2) from error
-        if not 1 <= index <= 9 or len(values) not in (4, 6):  # frame 0 is the arm's own
-            raise RefusedError(ErrorId.PARAMETER_RANGE - (1 if len(values) in (4, 6) else 2))
+        whole = len(values) in (4, 6) and all(map(math.isfinite, values))
+        if not 1 <= index <= 9 or not whole:  # frame 0 is the arm's own
+            raise RefusedError(ErrorId.PARAMETER_RANGE - (1 if whole else 2))
         frames[index] = PlanarFrame(*values[:3], values[3] if len(values) == 4 else values[5])
         return ""
 

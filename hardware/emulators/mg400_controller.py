@@ -146,6 +146,7 @@ class Mg400Controller:
     def reset(self) -> None:
         """Stop and forget the queue."""
         with self.lock:
+            self.update()  # an alarm that has come stays
             self._hold(time.monotonic())
             self._held.clear()
             self.paused = False
@@ -221,6 +222,7 @@ class Mg400Controller:
         """Move along an axis (``J1+``, ``X-``, ...) until the arm can't, or until ``MoveJog()``; the limit is an alarm."""
         sign = {"+": 1.0, "-": -1.0}[axis[-1]]
         with self.lock:
+            self.update()
             if self.alarms or not self.enabled:
                 raise RefusedError(ErrorId.FAILED)
             self.reset()

@@ -1,5 +1,6 @@
 """The MG400's requests: ``Name(p1,p2,Key=v)``. Taken from a stream, and checked against what a command wants."""
 
+import math
 import re
 from dataclasses import dataclass
 
@@ -80,6 +81,6 @@ def _number(text: str, parameter: Parameter, n: int) -> float:
         number = int(text) if parameter.integer else float(text)
     except ValueError as error:
         raise RefusedError(ErrorId.PARAMETER_TYPE - n) from error
-    if not parameter.low <= number <= parameter.high:  # also where it is not a number
+    if not (math.isfinite(number) and parameter.low <= number <= parameter.high):
         raise RefusedError(ErrorId.PARAMETER_RANGE - n)
     return number

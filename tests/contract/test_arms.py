@@ -105,10 +105,9 @@ def test_stop_ends_a_move_and_what_is_queued(ready):
 
 def test_without_wait_it_returns_at_once_and_settles_later(ready):
     ready.arm.set_speed(SLOW_MM_S, SLOW_MM_S)
-    target = ready.home + [0, 20, 0, 0, 0, 0]
-    begun = time.monotonic()
+    target = ready.home + [0, 60, 0, 0, 0, 0]
     ready.arm.move_linear(target, wait=False)
-    assert time.monotonic() - begun < 0.15
+    assert np.linalg.norm(ready.arm.state().pose[:3] - target[:3]) > SETTLED_MM  # the way takes most of a second
     state = ready.arm.wait_settled(target)
     assert np.linalg.norm(state.pose[:3] - target[:3]) < SETTLED_MM and not state.moving
 
@@ -200,7 +199,7 @@ def test_what_is_not_there_is_one_clear_error(spec, remedy):
     assert not arm.is_connected
 
 
-@pytest.mark.parametrize("spec", ["", "ur5", "simulated:5", "mg400:host:port"])
+@pytest.mark.parametrize("spec", ["", "ur5", "simulated:5", "mg400:host:port", "mg400:127.0.0.1:65535", "mg400:127.0.0.1:0"])
 def test_what_is_no_arm_names_those_that_are(spec):
     with pytest.raises(DeviceError, match="mg400"):
         open_arm(spec)

@@ -265,6 +265,11 @@ class TestStream:
         with pytest.raises(DeviceError, match="http"):
             MjpegCamera("rtsp://somewhere/stream")
 
+    @pytest.mark.parametrize("url", ["http://127.0.0.1:99999/x", "http://127.0.0.1:port/x", "http://[::1/x", "ftp://127.0.0.1/x"])
+    def test_what_is_no_address_says_so(self, url):
+        with pytest.raises(DeviceError, match="expected http"):
+            MjpegCamera(url)
+
     def test_opencv_opens_the_emulators_stream_too(self, stream):
         emulator, _ = stream
         capture = cv2.VideoCapture(emulator.url, cv2.CAP_FFMPEG)

@@ -176,3 +176,24 @@ def test_twin_emulate_lists_its_faults(device):
     command = [sys.executable, "-c", "from twin.cli import main; main()", "emulate", device, "--fault", "help"]
     listed = subprocess.check_output(command, text=True)
     assert "slow=0.1" in listed and "ignore-moves" in listed
+
+
+def test_numbers_that_are_none_are_out_of_range():
+    with Mg400Emulator(port_offset=None) as emulator:
+        client = PlainClient(emulator, 30004)
+        for text, answer in (("MovL(inf,0,0,0)", -40001), ("JointMovJ(0,-inf,0,0)", -40002), ("MovL(0,0,nan,0)", -40003)):
+            assert client.ask(client.motion, text) == f"{answer},{{}},{text};"
+        assert client.ask(client.dashboard, "SetUser(1,{1,2,inf,0})") == "-40002,{},SetUser(1,{1,2,inf,0});"
+        client.close()
+
+
+def test_an_alarm_that_came_before_a_reset_is_told_without_anyone_listening_to_the_feedback():
+    with Mg400Emulator(port_offset=None) as emulator:
+        dashboard, motion = (socket.create_connection(("127.0.0.1", emulator.ports[port]), timeout=5) for port in (29999, 30003))
+        for connection, text in ((dashboard, "EnableRobot()"), (motion, "MovL(900,0,0,0)"), (dashboard, "ResetRobot()")):
+            connection.sendall(text.encode())
+            assert connection.recv(1024).startswith(b"0,")
+        dashboard.sendall(b"GetErrorID()")
+        assert dashboard.recv(1024).startswith(b"0,{[[17]")
+        dashboard.close()
+        motion.close()

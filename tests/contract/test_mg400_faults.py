@@ -11,6 +11,7 @@ from arms import mg400_of
 
 from hardware.arms import kinematics as arms
 from hardware.arms.mg400 import Mg400Ports
+from hardware.arms.mg400_link import Feedback
 from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet
 from hardware.emulators.mg400 import FAULTS, Mg400Emulator
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
@@ -216,6 +217,34 @@ def test_after_a_lost_connection_it_connects_again_and_reads_once():
         arm.move_linear(AWAY)
         assert sum(thread.name == "mg400-feedback" for thread in set(threading.enumerate()) - others) == 1
         arm.disconnect()
+
+
+def test_a_reader_that_ends_late_does_not_live_on():
+    """A reader that was connecting anew when it was told to end must end, though another one has begun."""
+    others = set(threading.enumerate())
+    with emulated() as emulator:
+        feedback = Feedback("arm", "127.0.0.1", (emulator.ports[30004],))
+        connect, slow = feedback._connect, threading.Event()
+
+        def slowly():
+            slow.wait(5.0)
+            return connect()
+
+        feedback.open()
+        feedback._connect = slowly
+        emulator.faults.add("silent-feedback=0")
+        time.sleep(2.0)  # silence is noticed, the reader connects anew
+        first = feedback._thread
+        feedback._thread = None  # as after a join that took too long
+        feedback.close()
+        emulator.faults.clear()
+        feedback._connect = connect
+        feedback.open()
+        slow.set()
+        first.join(timeout=5.0)
+        assert not first.is_alive()
+        feedback.close()
+    assert not [thread for thread in set(threading.enumerate()) - others if thread.name == "mg400-feedback"]
 
 
 def test_the_default_ports_are_the_arms():

@@ -2,8 +2,12 @@
 
 import csv
 import json
+import signal
+import subprocess
 import sys
+import time
 import urllib.request
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +18,11 @@ import twin.cli.collect
 import twin.cli.live
 import twin.cli.servo
 import twin.cli.study  # noqa: F401  (each registers its commands)
+from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.twin import preview_of
+from hardware.emulators.mg400 import Mg400Emulator
+from hardware.errors import DeviceError
 from hardware.live import LiveSession, Shower
 from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
@@ -26,7 +33,9 @@ from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimator import PoseEstimator
 from twin.camera import expose, record
 from twin.cli import app, servo_run
+from twin.cli.emulate import run_until_told
 from twin.cli.rig import build_rig, steps_round
+from twin.errors import TwinError
 from twin.preprocess import Pipeline
 from twin.recordings import open_recording
 from twin.recordings.images import write_image
@@ -103,7 +112,7 @@ def test_a_model_that_fails_is_a_result_of_the_study(stand_in, tmp_path, monkeyp
 
     def fails_later(model, frame):
         calls["count"] += 1
-        if calls["count"] > 3:
+        if calls["count"] > 4:  # one before anything moves
             model.true.fail = "no pins"
         return truth(model, frame)
 
@@ -194,3 +203,55 @@ def test_a_round_takes_the_tools_way():
     steps, way_mm = steps_round(placed, servo, 1.0)
     assert way_mm == pytest.approx(2 * np.pi * 33, rel=1e-3)
     assert way_mm <= steps * servo.feed_mm < way_mm + 2 * np.pi * 5
+
+
+def refused(*arguments) -> str:
+    """The one line that a command ends with."""
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert result.exit_code and isinstance(result.exception, TwinError), result.exception
+    return str(result.exception)
+
+
+def test_what_is_not_attached_leaves_no_session_in_the_way(stand_in, tmp_path):
+    common = ("--model", "any", "--record")
+    told = refused("servo", "--object", "can", "--arm", "mg400:127.0.0.1:1", "--plain-light", "--out", tmp_path / "servo", *common)
+    assert "twin emulate mg400" in told and not (tmp_path / "servo" / "session").exists()
+    told = refused("live", "--camera", "http://127.0.0.1:1/", "--headless", *common, tmp_path / "live")
+    assert "start the stream" in told and not (tmp_path / "live").exists()
+
+
+def test_a_model_that_tells_something_else_is_refused_before_anything_moves(stand_in, tmp_path, monkeypatch):
+    enabled = []
+    monkeypatch.setattr(SimulatedArm, "enable", lambda arm: enabled.append(arm))
+    other = TrueEstimate(("pose_3",), np.zeros(1), np.zeros(1), np.zeros(1))
+    monkeypatch.setattr(StandIn, "__call__", lambda model, frame: other)
+    told = refused("servo", "--object", "can", "--model", "any", "--out", tmp_path, "--steps", 3, "--plain-light")
+    assert "pose_3" in told and "pose_2" in told and not enabled
+
+
+def test_a_view_that_breaks_ends_the_session_with_its_error():
+    session = LiveSession(NoisyCamera(fps=50), lambda frame: TrueEstimate(("pose_2",), *np.zeros((3, 1))))
+    view = BrowserView("live")
+    shower = Shower(session, lambda *_: (_ for _ in ()).throw(ValueError("no such colour")), view)
+    with session.source, pytest.raises(DeviceError, match="no such colour.*--headless"), shower:
+        session.run(seconds=30.0, going=lambda: shower.open)
+    assert session.timing().steps < 1000  # it did not go on for half a minute
+
+
+def test_an_emulator_that_fails_ends_with_its_error():
+    with pytest.raises(DeviceError, match="the arm is gone"):
+        run_until_told(nullcontext(), lambda: "a device", failure=lambda: DeviceError("the arm is gone"))
+
+
+@pytest.mark.slow
+def test_sigterm_makes_a_command_let_go_of_its_arm(tmp_path):
+    port = 29999 + 3300
+    with Mg400Emulator(port_offset=3300) as arm:
+        options = ["--camera", "twin", "--arm", f"mg400:127.0.0.1:{port}", "--sensor", "mg400-331", "--plain-light", "--out", str(tmp_path)]
+        command = [sys.executable, "-c", "from twin.cli import main; main()", "collect", *options]
+        with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
+            while not arm.arm.busy() and process.poll() is None:
+                time.sleep(0.01)
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=60) == 130
+        assert not arm.arm.enabled and not arm.arm.busy()

@@ -149,3 +149,32 @@ def test_the_approach_is_free_of_contact(rig, tmp_path):
     across = np.array([np.linalg.norm((matrix_of(p.pose(p.end_s)) - matrix_of(p.pose(p.start_s)))[[0, 2], 3]) for p in lifts])
     free = (starts < 0) & (across > 1.0)
     assert free.any() and (ends[free] < 0.5).all()
+
+
+def test_what_was_being_written_when_it_was_killed_spoils_nothing(rig, tmp_path):
+    run(rig, tmp_path, 1)
+    with (tmp_path / "contacts.jsonl").open("a") as file:
+        file.write('{"image_name": "frame_1_0.png", "ask')
+    experiment, placed, _ = rig
+    assert run((experiment, placed, SimulatedArm(axes=6, time_scale=FAST)), tmp_path, 2) == 2
+    assert [json.loads(line)["image_name"] for line in (tmp_path / "contacts.jsonl").open()] == ["frame_0_0.png", "frame_1_0.png"]
+
+
+def test_killed_before_the_first_row_it_begins_anew(rig, tmp_path):
+    for torn in ("image_na", ""):
+        (tmp_path / "targets.csv").write_text(torn)
+        (tmp_path / "meta.json").write_text('{"seed": 1}')
+        assert Collection(tmp_path, {"seed": 1}, Form.RAW).count == 0
+    (tmp_path / "meta.json").write_text('{"se')
+    with pytest.raises(DeviceError, match="meta.json"):
+        Collection(tmp_path, {"seed": 1}, Form.RAW)
+
+
+def test_limits_that_shorten_its_moves_are_refused(rig, tmp_path):
+    """A contact that the arm stops short of is not the one that was asked for."""
+    experiment, placed, arm = rig
+    move = arm.move_linear
+    arm.move_linear = lambda pose, **options: move(0.5 * (arm.state().pose + pose), **options)
+    with pytest.raises(DeviceError, match="--limits"):
+        run(rig, tmp_path, 1)
+    assert rows(tmp_path) == []

@@ -16,6 +16,7 @@ from twin.preprocess import nominal_reference
 from twin.preprocess.batch import preprocess_recording
 from twin.preprocess.overlay import overlay_name
 from twin.recordings import natural_key, open_recording, read_image
+from twin.recordings.images import write_image
 from twin.types import Form
 
 
@@ -419,3 +420,12 @@ def test_frames_without_pins_are_one_error_with_the_files_written(tmp_path, spec
     assert [bad["image_name"] for bad in summary["invalid"]] == ["a.png", "b.png"] and summary["exact_fraction"] == 0
     with np.load(tmp_path / "out" / "pins.npz", allow_pickle=False) as arrays:
         assert arrays["valid"].tolist() == [False, False]
+
+
+def test_a_picture_that_can_not_be_written_is_an_error_and_leaves_no_half_of_it(tmp_path, pictures):
+    with pytest.raises(FrameError, match="can't be written"):
+        write_image(tmp_path / "missing" / "frame.png", pictures[0])
+    (tmp_path / "frame.png").mkdir()
+    with pytest.raises(FrameError, match="can't be written"):
+        write_image(tmp_path / "frame.png", pictures[0])
+    assert [path.name for path in tmp_path.iterdir()] == ["frame.png"]

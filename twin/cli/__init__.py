@@ -53,7 +53,14 @@ def main() -> None:
         app()
     except (TwinError, SpecError) as error:
         print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print_notes(error)
         sys.exit(1)
     except KeyboardInterrupt:
         print("twin: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def print_notes(error: BaseException) -> None:
+    """A line on stderr for each note on an error: what went wrong on top of it, as an arm that could not be stopped."""
+    for note in getattr(error, "__notes__", ()):
+        print(f"twin: note: {' '.join(note.split())}", file=sys.stderr)

@@ -40,10 +40,10 @@ def collect_command(
 ) -> None:
     from hardware.collect import Collection, collect
     from scenes import load_experiment, load_object, load_sensor, load_servo
+    from twin.cli.endings import signals_as_ctrl_c
     from twin.cli.options import writable_folder
     from twin.cli.progress import count_bar
     from twin.cli.rig import build_rig
-    from twin.cli.servo_run import FIRST_FRAME_S
 
     asked, spec, servo = load_experiment(experiment), load_sensor(sensor), load_servo(parameters)
     stimulus = load_object(object_name or asked.object)
@@ -80,8 +80,8 @@ def collect_command(
     collection = Collection(writable_folder(out), about, rig.source.form)
     begun = collection.count
     if begun < count:
-        with rig, count_bar("contacts") as progress:
-            rig.source.read(timeout_s=FIRST_FRAME_S)
+        with signals_as_ctrl_c(), rig, count_bar("contacts") as progress:
+            rig.await_frame()
             speed = (servo.linear_mm_s, servo.angular_deg_s)
             collect(rig.source, rig.arm, asked, rig.placed, collection, count, seed=seed, speed=speed, progress=progress)
     print(f"{collection.count} contacts in {out} ({collection.count - begun} new)")

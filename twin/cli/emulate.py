@@ -13,20 +13,24 @@ emulate = typer.Typer(
 )
 app.add_typer(emulate, name="emulate")
 
+CHECK_S = 0.5
+
 FaultOption = Annotated[
     list[str], typer.Option("--fault", metavar="NAME[=VALUE]", help="switch a fault on; '--fault help' lists them; may be repeated")
 ]
 TimeScale = Annotated[float, typer.Option("--time-scale", help="how much faster than the real arm it moves", min=1e-3)]
 
 
-def run_until_told(device, ready) -> None:
-    """Run a device (a context manager) and print ``ready()`` once it listens; end on SIGTERM or Ctrl-C."""
+def run_until_told(device, ready, failure=lambda: None) -> None:
+    """Run a device (a context manager) and print ``ready()`` once it listens; end on SIGTERM or Ctrl-C, or with its ``failure()``."""
     ends = {signal.SIGTERM, signal.SIGINT}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # waited for, not handled: nothing is ever interrupted halfway
     try:
         with device:
             print(f"ready {ready()}", flush=True)
-            signal.sigwait(ends)
+            while signal.sigtimedwait(ends, CHECK_S) is None:
+                if (error := failure()) is not None:
+                    raise error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 

@@ -24,7 +24,7 @@ def camera(
     sensor: Sensor,
     object_name: Object,
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", help="0: a free one")] = 8081,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one")] = 8081,
     fps: Annotated[float, typer.Option("--fps", min=0.1, help="no more pictures a second")] = 30.0,
     parameters: ServoName = "surface",
     fault: FaultOption = (),
@@ -44,4 +44,4 @@ def camera(
     with FeedbackPose.of(arm) as pose:
         source = twin_camera(spec, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
         device = CameraEmulator(source, host=host, port=port, faults=tuple(fault))
-        run_until_told(device, lambda: f"camera {device.url}")
+        run_until_told(device, lambda: f"camera {device.url}", lambda: device.error)

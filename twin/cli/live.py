@@ -30,7 +30,7 @@ def live(
     headless: Annotated[bool, typer.Option("--headless", help="show nothing, print the figures at the end")] = False,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="stop after this time")] = None,
     count: Annotated[int | None, typer.Option("--count", min=1, help="stop after so many frames")] = None,
-    port: Annotated[int, typer.Option("--port", help="of the page; 0: a free one")] = 8080,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="of the page; 0: a free one")] = 8080,
 ) -> None:
     from contextlib import ExitStack
 
@@ -42,6 +42,7 @@ def live(
     from hardware.view.server import BrowserView
     from hardware.view.window import WindowView, has_window
     from training.estimator import PoseEstimator
+    from twin.cli.endings import signals_as_ctrl_c
     from twin.preprocess import Pipeline
 
     if bool(camera) == (replay is not None):
@@ -51,19 +52,22 @@ def live(
     estimator.check(estimator.sensor, source.form)
     found: list = []
     with ExitStack() as stack:
+        stack.enter_context(signals_as_ctrl_c())
+        stack.enter_context(source)
+        view = None
+        if not headless:
+            title = f"{estimator.sensor.name}, {source.name}"
+            view = WindowView(title) if has_window() else BrowserView(title, port=port)
         writer = None
-        if record is not None:
+        if record is not None:  # last: a folder is begun only where there is something to keep
             about = {"sensor": estimator.sensor.name, "form": str(source.form), "camera": source.name, "model": str(model)}
             writer = stack.enter_context(SessionWriter(record, about))
-        stack.enter_context(source)
         keep = (lambda frame, estimate: found.append(estimate)) if replay else None
         session = LiveSession(source, estimator, writer, keep)
         shower = None
-        if not headless:
+        if view is not None:
             pipeline = Pipeline(estimator.sensor, estimator.form, estimator.pipeline.reference)
             rest_px2 = pipeline.reference.area_px2
-            title = f"{estimator.sensor.name}, {source.name}"
-            view = WindowView(title) if has_window() else BrowserView(title, port=port)
             print(f"showing in {view.url}; Ctrl-C ends it", flush=True)
             shower = stack.enter_context(Shower(session, lambda frame, _, lines: draw_view(frame, pipeline(frame), rest_px2, lines), view))
         try:

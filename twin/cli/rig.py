@@ -23,10 +23,11 @@ from twin.cache import cached_arrays
 from twin.errors import RenderError
 from twin.optics.preview import Preview, Shading
 from twin.optics.render import Renderer
-from twin.types import Form
+from twin.types import Form, Frame
 
 TWIN = "twin"
 SHADING_QUALITY = "standard"
+FIRST_FRAME_S = 120.0  # kernels may have to be compiled
 
 
 @dataclass
@@ -52,6 +53,19 @@ class Rig:
     def mounting(self) -> Mounting:
         return self.placed.mounting
 
+    def await_frame(self) -> Frame:
+        """The first frame, for which the camera is given time.
+
+        Raises
+        ------
+        DeviceError
+            It does not.
+        """
+        try:
+            return self.source.read(timeout_s=FIRST_FRAME_S)
+        except (TimeoutError, EOFError) as error:
+            raise DeviceError(f"{error}; check the camera") from error
+
     def __enter__(self) -> "Rig":
         self.arm.connect()
         try:
@@ -62,8 +76,10 @@ class Rig:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.source.disconnect()
-        self.arm.disconnect()
+        try:
+            self.arm.disconnect()
+        finally:
+            self.source.disconnect()
 
 
 def build_rig(
@@ -141,7 +157,8 @@ def servo_loop(rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopS
 
         def retreat(away: np.ndarray) -> None:
             rig.arm.normal = away
-            rig.arm.retreat()
+            if rig.arm.retreat() is None:
+                raise DeviceError(f"the limits allow no way back: {rig.arm.decisions[-1].decision.reason}; free the sensor by hand")
 
         loop.retreat = retreat
     return loop

@@ -50,6 +50,7 @@ def servo(
 ) -> None:
     from scenes import load_object, load_servo
     from training.estimator import PoseEstimator
+    from twin.cli.endings import signals_as_ctrl_c
     from twin.cli.options import writable_folder
     from twin.cli.progress import count_bar
     from twin.cli.servo_run import ServoRun, follow
@@ -70,7 +71,7 @@ def servo(
         plain_light=plain_light,
         known_place=known_place,
     )
-    with count_bar(f"following the {object_name}") as progress:
+    with signals_as_ctrl_c(), count_bar(f"following the {object_name}") as progress:
         followed = follow(run, estimator, writable_folder(out), about={"model": str(model)}, progress=progress)
     print("\n".join(followed.lines()))
     for name in followed.written:

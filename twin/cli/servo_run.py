@@ -18,7 +18,6 @@ from twin.cli.rig import build_rig, servo_loop, steps_round
 from twin.errors import TwinError
 from twin.types import Form
 
-FIRST_FRAME_S = 120.0  # kernels may have to be compiled
 GIVE_UP_S = 5.0
 TWIN_FRAME_S = 60.0  # the twin may take its time over a frame while a simulated arm stands
 
@@ -113,7 +112,6 @@ def follow(
         "servo": run.servo.model_dump(),
         **(about or {}),
     }
-    session = SessionWriter(out / "session", told) if run.record else None
     settings = LoopSettings(
         steps,
         blocking=run.stream_hz is None,
@@ -128,10 +126,13 @@ def follow(
         if progress is not None:
             progress(record.index + 1, steps)
 
-    failure, followed = "", None
+    failure, followed, session = "", None, None
     with rig:
-        rig.source.read(timeout_s=FIRST_FRAME_S)
+        first = rig.await_frame()
         loop = servo_loop(rig, run.servo, estimator, settings, on_step)
+        loop.require_labels(estimator(first).names)
+        if run.record:
+            session = SessionWriter(out / "session", told)
         try:
             loop.run(rig.placed.start_pose(run.servo.indent_mm))
         except TwinError as error:

@@ -33,8 +33,20 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
 
 
 def write_image(path: Path, image: np.ndarray) -> Path:
-    """Write a gray or RGB frame as PNG; the path."""
-    cv2.imwrite(str(path), image if image.ndim == 2 else image[..., ::-1])
+    """Write a gray or RGB frame as PNG, whole or not at all; the path.
+
+    Raises
+    ------
+    FrameError
+        It can't be written.
+    """
+    part = path.with_name(f"{path.name}.part")
+    try:
+        part.write_bytes(cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes())
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise FrameError(f"{path}: can't be written ({error.strerror}); make room, or give another folder") from error
     return path
 
 

@@ -3,6 +3,10 @@
 Intervals are conformal (Vovk et al. 2005; Barber et al. 2021 for ensembles): every training row that some network held out
 gets the prediction it would have without itself, and the 90 % quantile of its error over its expected scale widens or
 narrows the stated intervals. Such a prediction misses the rest of the ensemble, so intervals are rather too wide than too narrow.
+
+The other labels of the same rows (raw where corrected ones were learnt) get intervals of their own. Raw labels err by the
+whole move where it was not executed, so frames that look executed and frames that don't have quantiles of their own
+(Mondrian conformal prediction, Vovk et al. 2005, 4.5): a narrow and a wide interval instead of one that is wrong for both.
 """
 
 from dataclasses import dataclass
@@ -19,6 +23,7 @@ from twin.preprocess.forms import frame_size
 from twin.preprocess.reference import Reference
 
 COVERAGE = 0.9
+SMALL_GROUP = 30  # rows, below which a quantile of their own says little
 BLENDS = np.linspace(0, 1, 21)
 KERNEL_MODES = 30  # of the displacement; all modes of the areas
 
@@ -30,13 +35,16 @@ class Prediction:
     Attributes
     ----------
     mean, half_width : (B, K) float
-        mm and deg; half of the 90 % interval.
+        mm and deg; half of the 90 % interval, of the labels that were learnt.
+    half_width_raw : (B, K) float
+        The same for the labels as published, whose moves may not have been executed.
     executed : (B,) float
         Probability that the shear move was executed; NaN where the model doesn't tell.
     """
 
     mean: np.ndarray
     half_width: np.ndarray
+    half_width_raw: np.ndarray
     executed: np.ndarray
 
 
@@ -56,24 +64,35 @@ class Ensemble:
             network = build_network(model, reference, len(self.shift), size)
             network.load_state_dict(weights)
             self.networks.append(network.eval())
-        self.kernel = KernelHead(**content["kernel"]) if content["kernel"] else None
+        self.kernels = [KernelHead(**kernel) for kernel in content["kernels"]]  # of frames as they are, and displaced ones
         self.kernel_labels = list(content["kernel_labels"])
         self.blend, self.quantile = np.asarray(content["blend"]), np.asarray(content["quantile"])
+        self.raw_quantile = np.asarray(content["raw_quantile"])
 
     def outputs(self, inputs, rows: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Standardised mean and scale (B, K) and the probability (B,) of an executed move."""
         outs = [predict_rows(network, inputs, rows) for network in self.networks]
         mean = np.mean([out["mean"].double().numpy() for out in outs], axis=0)
-        if self.kernel is not None:
+        if self.kernels:
             chosen = self.kernel_labels
-            also = self.kernel(kernel_inputs(self.networks[0], inputs, rows)).numpy()
+            also = self._kernels_say(inputs, rows)
             mean[:, chosen] = self.blend[chosen] * also + (1 - self.blend[chosen]) * mean[:, chosen]
         return mean, *_scale_and_move(outs)
+
+    def _kernels_say(self, inputs: PinInputs, rows: torch.Tensor) -> np.ndarray:
+        seen, share = kernel_inputs(self.networks[0], inputs, rows), inputs.displaced[rows, None]
+        said = torch.zeros(1)
+        for kernel, part in zip(self.kernels, (1 - share, share), strict=True):
+            if bool(part.any()):
+                said = said + part * kernel(seen)
+        return said.numpy()
 
     def __call__(self, inputs, rows: torch.Tensor) -> Prediction:
         """Labels of some rows."""
         mean, scale, executed = self.outputs(inputs, rows)
-        return Prediction(self.shift + self.scale * mean, self.scale * self.quantile * scale, executed)
+        scale = self.scale * scale
+        raw = self.raw_quantile[undone(executed)]
+        return Prediction(self.shift + self.scale * mean, self.quantile * scale, raw * scale, executed)
 
 
 def _scale_and_move(outs: list) -> tuple[np.ndarray, np.ndarray]:
@@ -96,11 +115,21 @@ def kernel_inputs(network, inputs: PinInputs, rows: torch.Tensor) -> torch.Tenso
 
 
 def prepared_inputs(model: str, data, train: np.ndarray) -> tuple[object, dict]:
-    """Inputs of all rows for a model, and what of their making was learnt from the training rows."""
+    """Inputs of all rows for a model, and what of their making was learnt from the training rows.
+
+    For ``vgnn`` there are twice as many: row M + k is frame k with all of its similarity's difference taken out.
+    """
     pins = data.pins
     if model == "vgnn":
-        registration = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
-        return pin_inputs(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference), {"registration": registration.arrays()}
+        registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
+        nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
+        seated = pin_inputs(registration, nodes_px, area_px2, pins.lost, pins.reference)
+        taken = registration.difference(nodes_px)
+        taken[train] = left
+        displaced = pin_features(*registration.take_out(nodes_px, area_px2, taken), pins.reference)
+        both = np.concatenate([seated.x.numpy(), displaced])
+        share = np.repeat([0.0, 1.0], len(pins))
+        return PinInputs(both, np.concatenate([pins.lost, pins.lost]), share), {"registration": registration.arrays()}
     if model in ("cnn-v1", "cnn-v2"):
         return image_inputs(data), {}
     return graph_inputs(model, pins, frame_width(pins)), {}
@@ -111,14 +140,19 @@ def frame_width(pins) -> int:
     return frame_size(pins.sensor, pins.form)[0]
 
 
-def pin_inputs(registration: Registration, nodes_px, area_px2, lost, reference: Reference, *, together: bool = False) -> PinInputs:
-    """Dense features of frames whose camera displacement is taken out; lost pins are put where the others' modes say."""
+def filled(registration: Registration, nodes_px, area_px2, lost, reference: Reference) -> tuple[np.ndarray, np.ndarray]:
+    """Pins (M, N, 2) and areas (M, N) with lost pins (M, N) where the others' modes put them."""
     nodes_px, area_px2 = nodes_px.copy(), area_px2.copy()
     for k in np.flatnonzero(lost.any(axis=1)):
         nodes_px[k] = registration.fill(nodes_px[k], lost[k])
         area_px2[k] = make_graph("voronoi", nodes_px[k], outmost=reference.outmost).area_px2
-    nodes, area, _ = registration(nodes_px, area_px2, together=together)
-    return PinInputs(pin_features(nodes, area, reference), lost)
+    return nodes_px, area_px2
+
+
+def pin_inputs(registration: Registration, nodes_px, area_px2, lost, reference: Reference, *, together: bool = False) -> PinInputs:
+    """Dense features of frames (see ``filled``) whose camera displacement is taken out."""
+    nodes, area, _, share = registration(nodes_px, area_px2, together=together)
+    return PinInputs(pin_features(nodes, area, reference), lost, share)
 
 
 def calibrate(config, data, inputs, train: np.ndarray, networks: list, scaling: tuple) -> dict:
@@ -127,40 +161,52 @@ def calibrate(config, data, inputs, train: np.ndarray, networks: list, scaling: 
     Returns
     -------
     dict
-        ``networks``, ``kernel``, ``shift``, ``scale``, ``blend``, ``quantile``: what ``Ensemble`` takes.
+        ``networks``, ``kernels``, ``shift``, ``scale``, ``blend``, ``quantile``, ``raw_quantile``: what ``Ensemble`` takes.
     """
     shift, scale = scaling
     labels = data.targets.corrected if config.labels == "corrected" else data.targets.raw
     y = (labels - shift) / scale
     k = y.shape[1]
-    content = {"networks": [network["weights"] for network in networks], "kernel": None, "shift": shift, "scale": scale}
+    content = {"networks": [network["weights"] for network in networks], "kernels": [], "shift": shift, "scale": scale}
     main = [j for j, name in enumerate(data.targets.names) if name not in config.helpers]  # the kernel head's labels
-    content |= {"blend": np.zeros(k), "quantile": np.ones(k), "kernel_labels": main}
+    content |= {"blend": np.zeros(k), "quantile": np.ones(k), "raw_quantile": np.ones((2, k)), "kernel_labels": main}
+    raw = (data.targets.raw - shift) / scale
     single = [
         Ensemble(config.model, data.pins.reference, content | {"networks": [weights]}, config.size) for weights in content["networks"]
     ]
     left_out = np.full(y.shape, np.nan)
     if config.recipe.kernel:
-        amplitudes = kernel_inputs(single[0].networks[0], inputs, torch.from_numpy(train))
-        kernel, left = fit_kernel(amplitudes, torch.from_numpy(y[np.ix_(train, main)]), seed=config.seed)
-        content["kernel"] = kernel.arrays()
-        left_out[np.ix_(train, main)] = left.numpy()
-    means, scales, truths, kernels = [], [], [], []
+        for first in (0, len(data)):
+            amplitudes = kernel_inputs(single[0].networks[0], inputs, torch.from_numpy(first + train))
+            kernel, left = fit_kernel(amplitudes, torch.from_numpy(y[np.ix_(train, main)]), seed=config.seed)
+            content["kernels"].append(kernel.arrays())
+            if not first:
+                left_out[np.ix_(train, main)] = left.numpy()
+    parts: list[tuple] = []
     for ensemble, network in zip(single, networks, strict=True):
-        mean, spread, _ = ensemble.outputs(inputs, network["held"])
         held = network["held"].numpy()
-        for parts, part in zip((means, scales, truths, kernels), (mean, spread, y[held], left_out[held]), strict=True):
-            parts.append(part)
-    mean, spread, truth = np.concatenate(means), np.concatenate(scales), np.concatenate(truths)
+        parts.append((*ensemble.outputs(inputs, network["held"]), y[held], raw[held], left_out[held]))
+    mean, spread, executed, truth, published, kernel = (np.concatenate(part) for part in zip(*parts, strict=True))
     if not len(mean):
         return content
     if config.recipe.kernel:
-        kernel = np.concatenate(kernels)
         errors = [np.abs(b * kernel + (1 - b) * mean - truth).mean(axis=0) for b in BLENDS]
         content["blend"][main] = BLENDS[np.argmin(errors, axis=0)][main]
         mean = np.where(content["blend"] > 0, content["blend"] * kernel + (1 - content["blend"]) * mean, mean)
     content["quantile"] = conformal_quantile(np.abs(mean - truth) / spread)
+    content["raw_quantile"] = group_quantiles(np.abs(mean - published) / spread, undone(executed))
     return content
+
+
+def undone(executed: np.ndarray) -> np.ndarray:
+    """1 where a move was more likely not executed than executed, else 0; 0 where the model doesn't tell (NaN)."""
+    return (np.nan_to_num(executed, nan=1.0) < 0.5).astype(int)
+
+
+def group_quantiles(scores: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Conformal quantiles (2, K) of scores (n, K), for each group (n,) of 0 and 1 its own; of all where a group is small."""
+    parts = [scores[group == k] for k in (0, 1)]
+    return np.stack([conformal_quantile(part if len(part) >= SMALL_GROUP else scores) for part in parts])
 
 
 def conformal_quantile(scores: np.ndarray, coverage: float = COVERAGE) -> np.ndarray:

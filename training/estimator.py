@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from scenes.sensor import SensorSpec
-from training.assemble import Ensemble, Prediction, pin_inputs
+from training.assemble import Ensemble, Prediction, filled, pin_inputs
 from training.dataset import PinTable
 from training.inputs import ImageInputs, graph_inputs, small_image
 from training.recipes import TrainingError
@@ -144,6 +144,7 @@ class PoseEstimator:
     def _of_pins(self, nodes_px: np.ndarray, area_px2: np.ndarray, lost: np.ndarray, name: str, *, together: bool = False) -> Prediction:
         reference = self.pipeline.reference
         if self.model == "vgnn":
+            nodes_px, area_px2 = filled(self.registration, nodes_px, area_px2, lost, reference)
             inputs = pin_inputs(self.registration, nodes_px, area_px2, lost, reference, together=together)
         else:
             count = len(nodes_px)

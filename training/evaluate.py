@@ -59,13 +59,14 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
     found: dict = {"frames": len(rows), "without_prediction": int((~np.isfinite(made.mean)).any(axis=1).sum())}
     for kind in ("raw", "corrected"):
         error = np.abs(made.mean - getattr(targets, kind))
-        inside = error <= made.half_width
+        half_width = made.half_width_raw if kind == "raw" else made.half_width
+        inside = error <= half_width
         found[kind] = {
             name: {
                 "mae": float(error[:, k].mean()),
                 "median": float(np.median(error[:, k])),
                 "coverage_90": float(inside[:, k].mean()),
-                "half_width_90": float(made.half_width[:, k].mean()),
+                "half_width_90": float(half_width[:, k].mean()),
             }
             for k, name in enumerate(targets.names)
         }
@@ -136,6 +137,7 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
     """``predictions.csv``, ``metrics.json`` and ``errors.png``; truth in the table is the chosen label set."""
     targets = data.targets.rows(rows)
     truth = getattr(targets, labels)
+    half_width = made.half_width_raw if labels == "raw" else made.half_width
     path = out / "predictions.csv"
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -145,7 +147,7 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
             cells = [
                 f"{v:.6g}"
                 for k in range(len(targets.names))
-                for v in (truth[m, k], made.mean[m, k], made.mean[m, k] - made.half_width[m, k], made.mean[m, k] + made.half_width[m, k])
+                for v in (truth[m, k], made.mean[m, k], made.mean[m, k] - half_width[m, k], made.mean[m, k] + half_width[m, k])
             ]
             writer.writerow([data.pins.image_name[row], *cells, f"{made.executed[m]:.4g}", int(np.isfinite(made.mean[m]).all())])
     (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")

@@ -33,10 +33,17 @@ def pixel_features(nodes_px: np.ndarray, area_px2: np.ndarray | None, width_px: 
 
 
 class PinInputs:
-    """Dense features of every frame: ``batch`` gives (B, N, 3) and lost pins (B, N)."""
+    """Dense features of every frame: ``batch`` gives (B, N, 3) and lost pins (B, N).
 
-    def __init__(self, features: np.ndarray, lost: np.ndarray) -> None:
+    ``displaced`` (M,) is the part of a frame's difference from the expected camera that was taken out.
+    """
+
+    def __init__(self, features: np.ndarray, lost: np.ndarray, displaced: np.ndarray | None = None) -> None:
         self.x, self.lost = torch.from_numpy(features.astype(np.float32)), torch.from_numpy(lost)
+        self.displaced = torch.from_numpy(np.zeros(len(lost)) if displaced is None else displaced)
+
+    def __len__(self) -> int:
+        return len(self.x)
 
     def batch(self, rows: torch.Tensor) -> tuple:
         """Arguments of the network for some rows."""
@@ -52,6 +59,9 @@ class GraphInputs:
         self.forward: GraphRows = graph_rows(edges, nodes)
         self.back: GraphRows = self.forward if symmetric else graph_rows(edges, nodes, transposed=True)
 
+    def __len__(self) -> int:
+        return len(self.x)
+
     def batch(self, rows: torch.Tensor) -> tuple:
         """Arguments of the network for some rows."""
         chosen = rows.numpy()
@@ -64,6 +74,9 @@ class ImageInputs:
 
     def __init__(self, images: np.ndarray) -> None:
         self.images = torch.from_numpy(images)
+
+    def __len__(self) -> int:
+        return len(self.images)
 
     def batch(self, rows: torch.Tensor) -> tuple:
         """Arguments of the network for some rows."""

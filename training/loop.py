@@ -7,7 +7,7 @@ from time import perf_counter
 import torch
 from torch import nn
 
-from training.networks import predict_rows
+from training.networks import device_of, predict_rows
 from training.recipes import Recipe
 
 RISE_STEPS = 100  # over which the cosine schedule's rate rises to its full size
@@ -56,10 +56,12 @@ class Loop:
     def __post_init__(self) -> None:
         recipe = self.recipe
         parameters = list(self.network.parameters())
+        self.device = device_of(self.network)
         if recipe.decay:
             self.optimiser = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
         else:
             self.optimiser = torch.optim.Adam(parameters, lr=recipe.rate)
+        self.plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(self.optimiser, factor=0.5, patience=PLATEAU_PATIENCE)
         self.generator = torch.Generator().manual_seed(self.seed)
         self.averaged = [p.detach().clone() for p in parameters]
         self.best_weights = {key: value.clone() for key, value in self.network.state_dict().items()}
@@ -75,10 +77,11 @@ class Loop:
         """Go once through the training rows; returns the row of the learning curve."""
         started = perf_counter()
         self.network.train()
-        total = 0.0
+        total, loss = 0.0, math.nan
         shuffled = self.rows.train[torch.randperm(len(self.rows.train), generator=self.generator)]
         for chosen in shuffled.split(self.recipe.batch):
-            total += self._step(chosen) * len(chosen)
+            loss = self._step(chosen)
+            total += loss * len(chosen)
         seconds = perf_counter() - started
         self.epochs_done += 1
         held = self._watch()
@@ -88,9 +91,8 @@ class Loop:
             self.best_weights = {key: value.clone() for key, value in self.network.state_dict().items()}
         else:
             self.since_best += 1
-        if self.recipe.schedule == "plateau" and self.since_best and self.since_best % (PLATEAU_PATIENCE + 1) == 0:
-            for group in self.optimiser.param_groups:
-                group["lr"] *= 0.5
+        if self.recipe.schedule == "plateau":
+            self.plateau.step(loss)  # of the last batch, as the published code does
         point = {"epoch": self.epochs_done, "loss": total / len(shuffled), "held_out_error": held, "rate": rate, "seconds": seconds}
         self.curves.append(point)
         return point
@@ -110,6 +112,7 @@ class Loop:
         return {key: getattr(self, key) for key in keys} | {
             "network": self.network.state_dict(),
             "optimiser": self.optimiser.state_dict(),
+            "plateau": self.plateau.state_dict(),
             "generator": self.generator.get_state(),
             "torch": torch.get_rng_state(),
         }
@@ -118,9 +121,11 @@ class Loop:
         """Continue from a state."""
         self.network.load_state_dict(state["network"])
         self.optimiser.load_state_dict(state["optimiser"])
+        self.plateau.load_state_dict(state["plateau"])
         self.generator.set_state(state["generator"])
         torch.set_rng_state(state["torch"])
-        for key in ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves"):
+        self.averaged = [value.to(self.device) for value in state["averaged"]]
+        for key in ("best_weights", "steps", "epochs_done", "best", "since_best", "curves"):
             setattr(self, key, state[key])
 
     def _step(self, chosen: torch.Tensor) -> float:
@@ -128,8 +133,11 @@ class Loop:
             along = self.steps / (self.recipe.epochs * self.steps_of_epoch)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.recipe.rate * min(1.0, (self.steps + 1) / RISE_STEPS) * 0.5 * (1 + math.cos(math.pi * along))
-        out = self.network(*self.rows.inputs.batch(chosen))
-        loss = row_loss(out, self.rows.labels[chosen], self.rows.executed[chosen], self.rows.weight, self.recipe.loss)
+        out = self.network(*(part.to(self.device) for part in self.rows.inputs.batch(chosen)))
+        labels, executed, weight = (
+            part.to(self.device) for part in (self.rows.labels[chosen], self.rows.executed[chosen], self.rows.weight)
+        )
+        loss = row_loss(out, labels, executed, weight, self.recipe.loss)
         if hasattr(self.network, "penalty"):
             loss = loss + self.network.penalty()
         self.optimiser.zero_grad()

@@ -7,6 +7,7 @@ from torch import nn
 from training.models.cnn import Cnn
 from training.models.gcn import Gcn
 from training.models.vgnn import Vgnn, VgnnSize
+from training.recipes import TrainingError
 from twin.preprocess.reference import Reference
 from twin.preprocess.voronoi import directed_edges, triangulate
 
@@ -48,12 +49,33 @@ def parameter_count(network: nn.Module) -> int:
     return sum(p.numel() for p in network.parameters())
 
 
+def device_of(network: nn.Module) -> torch.device:
+    """Where a network's numbers lie."""
+    return next(network.parameters()).device
+
+
+def choose_device(name: str) -> str:
+    """``cpu`` or ``cuda`` for ``auto`` (a GPU where there is one), ``cpu`` or ``cuda``.
+
+    Raises
+    ------
+    TrainingError
+        For another name, or ``cuda`` where PyTorch finds none.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise TrainingError(f"--device must be auto, cpu or cuda, got {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise TrainingError("--device cuda: PyTorch finds no GPU here; give --device cpu, or install a PyTorch built for your GPU")
+    return "cuda" if name != "cpu" and torch.cuda.is_available() else "cpu"
+
+
 def predict_rows(network: nn.Module, inputs, rows: torch.Tensor, batch: int = 256) -> dict[str, torch.Tensor]:
-    """The network's outputs for some rows, in evaluation mode."""
+    """The network's outputs for some rows, in evaluation mode, on the CPU."""
     if network.training:
         network.eval()
     parts: list[dict] = []
     with torch.no_grad():
         for chosen in rows.split(batch):
-            parts.append(network(*inputs.batch(chosen)))
+            out = network(*(part.to(device_of(network)) for part in inputs.batch(chosen)))
+            parts.append({key: value.cpu() for key, value in out.items()})
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}

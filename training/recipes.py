@@ -21,7 +21,8 @@ class Recipe:
     rate : float
         Adam's learning rate at the start.
     schedule : {"cosine", "plateau", "constant"}
-        Cosine to 0 over all epochs after a short rise; halved after three epochs without gain; or kept.
+        Cosine to 0 over all epochs after a short rise; halved after three epochs in which the last training batch's loss
+        (which the published code watches) did not fall; or kept.
     patience : int
         Epochs without gain on the held-out fold until training stops; 0 never stops early and keeps the last, averaged weights.
     decay : float
@@ -38,7 +39,7 @@ class Recipe:
     """
 
     inputs: str = "pins"
-    epochs: int = 180
+    epochs: int = 100
     batch: int = 256
     rate: float = 2e-3
     schedule: str = "cosine"
@@ -51,8 +52,8 @@ class Recipe:
     kernel: bool = True
 
 
-# the release's settings (its plateau watches the last training batch; here the held-out fold); the same with more and
-# smaller steps that end at a rate of 0, where the paper says nothing; PoseNet's (Lepora 2020)
+# the release's settings; the same with more and smaller steps that end at a rate of 0, where the paper says nothing;
+# PoseNet's (Lepora 2020)
 _RELEASE = Recipe("graphs", 200, 512, 1.5e-3, "plateau", 30, 0.0, 0.0, "l1", "none", 1, False)
 _GRAPHS = Recipe("graphs", 150, 128, 2e-3, "cosine", 0, 0.0, 0.0, "l1", "none", 1, False)
 _POSENET = Recipe("images", 100, 16, 1e-4, "constant", 10, 0.0, 0.0, "l2", "unit", 1, False)

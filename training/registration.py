@@ -4,6 +4,9 @@ Contact moves the pins too, but not freely: what is left of the pins after the b
 been taken out tells how large that similarity has to be. Where the one observed differs from the one expected by far more
 than it ever does in training, the difference is the camera's, and it is taken out of the frame. Frames of one recording
 share a camera: there the median over many frames tells its displacement far better than one frame can.
+
+What is taken out takes a little of the contact with it. A model that also learns from training frames with all of the
+difference taken out knows such frames, and loses little on them.
 """
 
 from dataclasses import dataclass
@@ -38,7 +41,7 @@ class Registration:
     weight: np.ndarray
     usual: np.ndarray
 
-    def __call__(self, nodes_px: np.ndarray, area_px2: np.ndarray, *, together: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def __call__(self, nodes_px: np.ndarray, area_px2: np.ndarray, *, together: bool = False) -> tuple:
         """Frames with the camera's part taken out.
 
         Parameters
@@ -54,8 +57,10 @@ class Registration:
             As given where the camera sits as in training.
         taken : (M, 4) float
             Log scale, turn (rad), shift (px) taken out.
+        share : (M,) float
+            Part of the frame's own difference that was taken out, 0 to 1.
         """
-        difference = self._difference(nodes_px)
+        difference = self.difference(nodes_px)
         common = np.zeros(4)
         if together and len(nodes_px) >= MANY:
             middle = np.median(difference, axis=0)
@@ -63,10 +68,14 @@ class Registration:
         far = np.abs((difference - common) / self.usual).max(axis=1)
         share = np.clip((far - FREE) / (FULL - FREE), 0, 1)
         taken = common + (difference - common) * share[:, None]
+        return *self.take_out(nodes_px, area_px2, taken), taken, share
+
+    def take_out(self, nodes_px: np.ndarray, area_px2: np.ndarray, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Frames (M, N, 2) and areas (M, N) without the similarities ``taken`` (M, 4)."""
         middle = self.rest_px.mean(axis=0)
         z = (nodes_px - middle - taken[:, None, 2:]) @ [1, 1j]
         z = z * np.exp(-taken[:, :1] - 1j * taken[:, 1:2])
-        return np.stack([z.real, z.imag], axis=-1) + middle, area_px2 * np.exp(-2 * taken[:, :1]), taken
+        return np.stack([z.real, z.imag], axis=-1) + middle, area_px2 * np.exp(-2 * taken[:, :1])
 
     def fill(self, nodes_px: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """One frame's pins (N, 2) with the lost ones (N,) where the modes that the others show put them."""
@@ -83,7 +92,8 @@ class Registration:
             nodes_px = np.where(lost[:, None], filled, nodes_px)
         return nodes_px
 
-    def _difference(self, nodes_px: np.ndarray) -> np.ndarray:
+    def difference(self, nodes_px: np.ndarray) -> np.ndarray:
+        """By how much the similarities (M, 4) of frames differ from those that their contact lets expect."""
         aligned, observed = align(nodes_px, self.rest_px)
         return observed - _terms(self._modes(aligned)) @ self.weight
 
@@ -95,8 +105,15 @@ class Registration:
         return {key: getattr(self, key) for key in ("rest_px", "mean", "components", "weight", "usual")}
 
 
-def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> Registration:
-    """Learn what similarity contact brings, from frames (M, N, 2) of one camera position."""
+def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registration, np.ndarray]:
+    """Learn what similarity contact brings, from frames (M, N, 2) of one camera position.
+
+    Returns
+    -------
+    Registration
+    left : (M, 4) float
+        Each frame's difference as if it had not been fitted to.
+    """
     aligned, observed = align(nodes_px, rest_px)
     flat = aligned.reshape(len(aligned), -1)
     mean = flat.mean(axis=0)
@@ -107,9 +124,9 @@ def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> Registration:
     inverse = np.linalg.inv(terms.T @ terms + RIDGE * np.eye(terms.shape[1]))
     weight = inverse @ terms.T @ observed
     leverage = np.einsum("mi,ij,mj->m", terms, inverse, terms, optimize=True)
-    left = (observed - terms @ weight) / (1 - leverage)[:, None]  # of each frame as if it had not been fitted to
+    left = (observed - terms @ weight) / (1 - leverage)[:, None]
     usual = np.sqrt(np.mean(left**2, axis=0)) + 1e-9
-    return Registration(rest_px, mean, components, weight, usual)
+    return Registration(rest_px, mean, components, weight, usual), left
 
 
 def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -56,7 +56,15 @@ class RunConfig:
     size: dict = field(default_factory=dict)
 
 
-def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float | None = None, progress: Callable | None = None) -> bool:
+def train_run(
+    config: RunConfig,
+    data: Dataset,
+    out: Path,
+    *,
+    max_minutes: float | None = None,
+    device: str = "cpu",
+    progress: Callable | None = None,
+) -> bool:
     """Train, or continue what ``out`` holds.
 
     Parameters
@@ -65,6 +73,8 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
         Called with (epochs done, epochs in all, the curve's last row) over all networks.
     max_minutes : float, optional
         Stop at the end of an epoch after that long; what is there by then is assembled all the same.
+    device : {"cpu", "cuda"}
+        Where the networks learn; what is kept runs anywhere.
 
     Returns
     -------
@@ -78,7 +88,7 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
     """
     started = monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    train, _ = (np.arange(len(data)), None) if config.split is None else split_rows(len(data), config.split, data.group)
+    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     inputs, aside = prepared_inputs(config.model, data, train)
@@ -88,7 +98,7 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
     all_epochs = config.recipe.members * config.recipe.epochs
     while len(done) < config.recipe.members:
         member = len(done)
-        loop = _member(config, data, inputs, scaled, train, member)
+        loop = _member(config, data, inputs, scaled, train, member, device)
         if state and state["loop"] is not None:
             loop.load(state["loop"])
         state, kept = None, monotonic()
@@ -108,6 +118,24 @@ def train_run(config: RunConfig, data: Dataset, out: Path, *, max_minutes: float
         _keep(out, resolved, done, None)
     _assemble(out, resolved, config, data, inputs, aside, train, done, (shift, scale))
     (out / "checkpoint.pt").unlink(missing_ok=True)
+    return True
+
+
+def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
+    """Whether a folder holds this very run, done.
+
+    Raises
+    ------
+    TrainingError
+        If it holds another one.
+    """
+    if not (out / "weights.pt").is_file() or (out / "checkpoint.pt").is_file():
+        return False
+    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
+    wanted = json.loads(json.dumps(resolve(config, data, train)))
+    found = json.loads((out / "config.json").read_text())
+    if _identity(wanted) != _identity({key: found.get(key) for key in wanted}):
+        raise TrainingError(f"{out}: holds a finished run with other settings or data; give another --out")
     return True
 
 
@@ -146,15 +174,18 @@ def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray) -> tuple[
     return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
 
 
-def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, train: np.ndarray, member: int) -> Loop:
+def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, train: np.ndarray, member: int, device: str) -> Loop:
     seed = 1000 * config.seed + member
     torch.manual_seed(seed)
     network = build_network(config.model, data.pins.reference, scaled.shape[1], config.size)
     held, learnt = fold_rows(train, config.seed, member, data.group)
     if hasattr(network, "prepare"):
         network.prepare(inputs.x[torch.from_numpy(train)])
+    network.to(device)
     weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
     executed = torch.from_numpy(data.targets.executed.astype(np.float32))
+    if config.model == "vgnn":  # each frame also as it is seen where the camera sits otherwise
+        scaled, executed, learnt = scaled.repeat(2, 1), executed.repeat(2), np.concatenate([learnt, len(data) + learnt])
     return Loop(network, config.recipe, Rows(inputs, scaled, weight, executed, torch.from_numpy(learnt), torch.from_numpy(held)), seed)
 
 
@@ -169,7 +200,11 @@ def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | Non
 
 def _finished(loop: Loop) -> dict:
     network = loop.result()
-    return {"weights": {key: value.clone() for key, value in network.state_dict().items()}, "held": loop.rows.held, "curves": loop.curves}
+    return {
+        "weights": {key: value.cpu().clone() for key, value in network.state_dict().items()},
+        "held": loop.rows.held,
+        "curves": loop.curves,
+    }
 
 
 def _assemble(
@@ -196,7 +231,7 @@ def _opened(out: Path, resolved: dict) -> dict | None:
             raise TrainingError(f"{out}: holds a finished run; give another --out")
         _write_text(out / "config.json", json.dumps(resolved, indent=1) + "\n")
         return None
-    state = torch.load(path, weights_only=True)
+    state = torch.load(path, weights_only=True, map_location="cpu")
     if state["identity"] != _identity(resolved):
         raise TrainingError(
             f"{out}: holds a run with other settings or data, begun and not finished; give another --out, or the same settings"

@@ -5,10 +5,6 @@ Graphs and features are built once, before the clock starts.
 """
 
 import argparse
-import gc
-import threading
-import time
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,9 +12,7 @@ import torch
 from scenes import load_sensor
 from training.dataset import PinTable
 from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features
-from training.loop import Loop, Rows
-from training.networks import build_network, parameter_count
-from training.recipes import recipe_of
+from training.study.efficiency import measure_training
 from twin.preprocess import make_graph, nominal_reference
 from twin.preprocess.forms import frame_size
 from twin.types import Form
@@ -42,51 +36,11 @@ def drawn_table(sensor: str, frames: int) -> PinTable:
 
 def inputs_of(model: str, pins: PinTable):
     if model == "vgnn":
-        return PinInputs(pin_features(pins.nodes_px, pins.area_px2, pins.reference), pins.lost)
+        features = pin_features(pins.nodes_px, pins.area_px2, pins.reference)
+        return PinInputs(np.concatenate([features, features]), np.concatenate([pins.lost, pins.lost]))  # it sees each frame in two ways
     if model.startswith("cnn"):
         return ImageInputs(np.random.default_rng(0).integers(0, 256, (len(pins), 128, 128), dtype=np.uint8))
     return graph_inputs(model, pins, frame_size(pins.sensor, pins.form)[0])
-
-
-class PeakMemory:
-    """The process's largest resident set while it is watched, in MB, above what it was at the start."""
-
-    def __enter__(self):
-        gc.collect()
-        self.start, self.peak, self.watching = self._now(), 0.0, True
-        self.thread = threading.Thread(target=self._watch, daemon=True)
-        self.thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self.watching = False
-        self.thread.join()
-
-    def _watch(self):
-        while self.watching:
-            self.peak = max(self.peak, self._now() - self.start)
-            time.sleep(0.01)
-
-    @staticmethod
-    def _now() -> float:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
-
-
-def measure(model: str, pins: PinTable, inputs, batch: int, rows: int) -> tuple[float, float]:
-    """Seconds for an epoch over all frames (from ``rows`` of them), and peak MB."""
-    torch.manual_seed(0)
-    network = build_network(model, pins.reference, 2)
-    if hasattr(network, "prepare"):
-        network.prepare(inputs.x[:500])
-    labels = torch.randn(len(pins), 2)
-    executed = torch.full((len(pins),), torch.nan)
-    recipe = recipe_of(model, batch=batch)
-    none = torch.zeros(0, dtype=torch.long)
-    loop = Loop(network, recipe, Rows(inputs, labels, torch.ones(2), executed, torch.arange(min(rows, len(pins))), none), 0)
-    with PeakMemory() as memory:
-        loop.epoch()
-        point = loop.epoch()
-    return point["seconds"] * len(pins) / min(rows, len(pins)), memory.peak
 
 
 def main() -> None:
@@ -99,19 +53,17 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     pins = drawn_table(given.sensor, given.frames)
-    print(f"{given.sensor}, {given.frames} frames, {given.threads} threads; cnn-v1 timed on two batches, others on whole epochs")
+    print(f"{given.sensor}, {given.frames} frames, {given.threads} threads; of convolutional networks some batches are timed")
     baseline = {}
     for model in sorted(given.models, key=lambda name: name != "tac-vgnn"):
         inputs = inputs_of(model, pins)
         for batch in given.batches:
-            rows = {"cnn-v1": 2 * batch, "cnn-v2": 4 * batch}.get(model, len(pins))
-            seconds, peak = measure(model, pins, inputs, batch, rows)
-            baseline.setdefault(batch, seconds)
-            count = parameter_count(build_network(model, pins.reference, 2))
-            print(
-                f"{model:10} {count:8} parameters, batch {batch:4}: {seconds:7.2f} s an epoch, {peak:6.0f} MB, "
-                f"{seconds / baseline[batch]:.2f} times tac-vgnn (paper: {PAPER_RATIO.get(model, '-')})"
-            )
+            found = measure_training(model, pins, inputs, batch)
+            ms = found["ms_per_frame"]
+            baseline.setdefault(batch, ms)
+            epoch = "" if found["s_per_epoch"] is None else f" ({found['s_per_epoch']:.2f} s an epoch)"
+            cost = f"{ms:8.3f} ms a frame{epoch}, {found['memory_mib']:6.0f} MiB, {ms / baseline[batch]:.2f} times tac-vgnn"
+            print(f"{model:10} {found['parameters']:8} parameters, batch {batch:4}: {cost} (paper: {PAPER_RATIO.get(model, '-')})")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ FRAMES = 70
 
 
 def twin(*arguments):
-    from twin.cli import audit, evaluate, predict, train  # noqa: F401  (each registers its command)
+    from twin.cli import audit, evaluate, predict, study_tac_vgnn, train  # noqa: F401  (each registers its command)
 
     done = CliRunner().invoke(app, [str(a) for a in arguments])
     if isinstance(done.exception, TwinError):
@@ -59,7 +59,8 @@ def run(recording, tmp_path_factory):
 
 
 def test_a_trained_run_is_judged_and_used(recording, run, tmp_path):
-    said = twin("evaluate", run, "--data", recording, "--out", tmp_path)
+    said = twin("evaluate", run, "--data", recording, "--out", tmp_path, "--robustness")
+    assert "2 px shift: pose_2" in said and len(list(csv.DictReader((tmp_path / "robustness.csv").open()))) == 5
     assert "pose_2: mean error" in said and "ms per frame" in said
     rows = list(csv.DictReader((tmp_path / "predictions.csv").open()))
     assert len(rows) == FRAMES / 5 and all(float(row["pose_2_lo90"]) < float(row["pose_2_hi90"]) and row["valid"] == "1" for row in rows)
@@ -75,6 +76,23 @@ def test_the_papers_models_take_the_same_way(model, recording, tmp_path):
     twin("train", "--model", model, "--sensor", "mg400-127", *common, tmp_path / "run", "--epochs", 1)
     twin("evaluate", tmp_path / "run", *common, tmp_path / "judged", "--labels", "raw")
     assert "pose_6" in twin("predict", tmp_path / "run", recording / "frames_bw" / "f_3.png")
+
+
+def test_the_papers_comparison_is_one_command_and_goes_on_where_it_was(recording, tmp_path):
+    command = ("study", "tac-vgnn", "--data", recording, "--sensor", "mg400-127", "--out", tmp_path, "--epochs", 1, "--no-contacts")
+    said = twin(*command, "--models", "gnn,vgnn-without-graph", "--batches", "16")
+    assert "gnn, seed 0: finished, pose_2" in said
+    weights = tmp_path / "runs" / "gnn-raw-0" / "weights.pt"
+    written = weights.stat().st_mtime_ns
+    twin(*command, "--models", "gnn,vgnn-without-graph", "--batches", "", "--max-minutes", 0)
+    assert weights.stat().st_mtime_ns == written
+    rows = list(csv.DictReader((tmp_path / "models.csv").open()))
+    assert [row["state"] for row in rows] == ["finished"] * 2 and all(float(row["pose_6_raw"]) > 0 for row in rows)
+    page = (tmp_path / "index.html").read_text()
+    assert "vgnn-without-graph" in page and "[-2, 2] mm" in page
+    assert {"graphs.csv", "efficiency.csv", "efficiency.png", "contacts.csv", "contacts.png", "curves.png"} <= {
+        p.name for p in tmp_path.iterdir()
+    }
 
 
 def test_an_audit_writes_labels_that_training_reads(recording, tmp_path):

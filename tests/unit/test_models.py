@@ -1,10 +1,12 @@
 """Networks obey the laws of what they work on: pins, graphs, rows."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 
-from training.assemble import conformal_quantile
+from training.assemble import conformal_quantile, group_quantiles
 from training.inputs import frame_edges
 from training.kernel import fit_kernel
 from training.loop import row_loss
@@ -82,22 +84,41 @@ def test_a_batch_of_graphs_says_what_each_says_alone(layout):
     assert torch.allclose(together, torch.cat(alone), atol=1e-5)
 
 
-def test_averaging_is_kipf_and_wellings_with_its_gradient(layout):
-    from training.models.gcn import _Average
-
-    _, edges = layout
-    dense = torch.eye(PINS, dtype=torch.float64)
-    dense[edges[:, 1], edges[:, 0]] = 1
-    root = dense.sum(1).rsqrt()
-    dense = root[:, None] * dense * root
-    matrix = graph_rows([edges], PINS).batch(np.array([0]))
-    back = graph_rows([edges], PINS, transposed=True).batch(np.array([0]))
-    x = torch.randn(PINS, 3, requires_grad=True)
-    out = _Average.apply(matrix, back, x)
-    assert torch.allclose(out.double(), dense @ x.double(), atol=1e-6)
-    pull = torch.randn(PINS, 3)
-    out.backward(pull)
-    assert torch.allclose(x.grad.double(), dense.T @ pull.double(), atol=1e-6)
+def test_a_convolution_with_its_norm_is_kipf_and_wellings_with_torchs_norm(layout):
+    """Values, gradients and running statistics are those of the dense formula, with the bias that the norm cancels."""
+    rest, edges = layout
+    for kind in ("delaunay", "knn"):  # symmetric, and not
+        edges = frame_edges(kind, rest)
+        rows = np.array([0, 0])
+        matrices = [graph_rows([edges], PINS, transposed=t).batch(rows) for t in (False, True)]
+        torch.manual_seed(0)
+        network = Gcn(3, 2)
+        for norm in network.norms:
+            torch.nn.init.normal_(norm.weight), torch.nn.init.normal_(norm.bias)
+        x = (pin_rows(frames=2) * torch.tensor([80.0, 80.0, 30.0]) + torch.tensor([0, 0, 400.0])).requires_grad_()
+        plain = copy.deepcopy(network)
+        dense = torch.eye(PINS)
+        dense[edges[:, 1], edges[:, 0]] = 1
+        root = dense.sum(1).rsqrt()
+        dense = root[:, None] * dense * root
+        pull = torch.randn(2, 2)
+        grads = {}
+        for here in (network, plain):
+            x.grad = None
+            if here is network:
+                out = network(x, *matrices)["mean"]
+            else:
+                h = x
+                for layer, norm in zip(plain.convolutions, plain.norms, strict=True):
+                    h = torch.nn.functional.leaky_relu(norm((layer(dense @ h) + 3.0).flatten(0, 1))).view(2, PINS, -1)
+                out = plain.dense(h.mean(dim=1))
+            out.backward(pull)
+            grads[here] = [out.detach(), x.grad.clone(), *(p.grad for p in here.parameters())]
+        for a, b in zip(grads[network], grads[plain], strict=True):
+            assert torch.allclose(a, b, atol=2e-4 * float(b.abs().max()))
+        for a, b in zip(network.norms, plain.norms, strict=True):
+            assert torch.allclose(a.running_mean, b.running_mean - 0.3, rtol=1e-4, atol=1e-4)
+            assert torch.allclose(a.running_var, b.running_var, rtol=1e-4)
 
 
 @pytest.mark.parametrize("layers", [0, 2])
@@ -124,7 +145,7 @@ def test_duplicated_rows_do_not_change_the_loss():
 def test_layers_are_the_papers():
     assert CHANNELS == (16, 32, 48, 64, 96)
     count = {variant: sum(p.numel() for p in Gcn(3, 2, variant).parameters()) for variant in ("paper", "release")}
-    assert count["release"] == 37522  # as the release's network
+    assert count["release"] + sum(CHANNELS) == 37522  # as the release's network, less the biases that batch norm cancels
     assert count["paper"] < count["release"]
     filters = [[m.out_channels for m in Cnn(name, 2).convolutions if hasattr(m, "out_channels")] for name in ("cnn-v1", "cnn-v2")]
     assert filters == [[256] * 5, [48] * 5]
@@ -137,6 +158,18 @@ def test_intervals_cover_what_they_promise():
     inside = (scores[1000:] <= quantile).mean(axis=0)
     assert (np.abs(inside - 0.9) < 0.03).all()
     assert conformal_quantile(scores[:5]).tolist() == scores[:5].max(axis=0).tolist()
+
+
+def test_intervals_of_two_kinds_of_frames_cover_both():
+    """Errors of two sizes, as raw labels have them: each group is covered, not only their mixture."""
+    rng = np.random.default_rng(5)
+    group = (rng.random(4000) < 0.3).astype(int)
+    scores = np.where(group, 5 * rng.random(4000), np.abs(rng.normal(0, 0.1, 4000)))[:, None]
+    found = group_quantiles(scores[:2000], group[:2000])
+    inside = scores[2000:] <= found[group[2000:]]
+    assert all(abs(inside[group[2000:] == k].mean() - 0.9) < 0.03 for k in (0, 1))
+    few = np.where(np.arange(2000) < 5, 1, 0)
+    assert np.array_equal(group_quantiles(scores[:2000], few)[1], conformal_quantile(scores[:2000]))
 
 
 def test_the_kernel_head_leaves_rows_out_as_fitting_without_them_does():
@@ -160,15 +193,15 @@ def test_the_cameras_own_motion_is_taken_out_and_contact_is_left():
     bump = np.exp(-(((rest - 128) / 60) ** 2).sum(axis=1))[:, None]
     frames = rest + states[:, :1, None] * 6 * bump + states[:, 1:, None] * 8 * bump * [1, 0.2] + rng.normal(0, 0.05, (400, 60, 2))
     area = np.ones((400, 60))
-    registration = fit_registration(frames[:300], rest)
-    nodes, _, taken = registration(frames[300:], area[300:])
+    registration, _ = fit_registration(frames[:300], rest)
+    nodes, _, taken, _ = registration(frames[300:], area[300:])
     assert (taken == 0).all(axis=1).mean() > 0.95
     turn = np.exp(1j * np.radians(1.0)) * 1.01
     z = ((frames[300:] - 128) @ [1, 1j]) * turn + (2 - 1j)
     moved = np.stack([z.real, z.imag], axis=-1) + 128
-    back, shrunk, taken = registration(moved, 1.01**2 * area[300:])
+    back, shrunk, taken, share = registration(moved, 1.01**2 * area[300:])
     assert np.abs(back - frames[300:]).max() < 0.4 and np.abs(moved - frames[300:]).mean() > 1.5
-    assert np.allclose(shrunk, 1, atol=0.01)
+    assert np.allclose(shrunk, 1, atol=0.01) and (share == 1).all()
 
 
 def test_lost_pins_continue_what_the_others_do():
@@ -176,7 +209,7 @@ def test_lost_pins_continue_what_the_others_do():
     rest = rng.uniform(-100, 100, (60, 2)) + 128
     waves = np.stack([np.sin((rest - 128) / 50), np.cos((rest[:, ::-1] - 128) / 70)])
     frames = rest + np.einsum("mk,knd->mnd", rng.normal(0, 3, (300, 2)), waves)
-    registration = fit_registration(frames[:250], rest)
+    registration, _ = fit_registration(frames[:250], rest)
     lost = np.zeros(60, bool)
     lost[[4, 17, 30]] = True
     spoilt = np.where(lost[:, None], frames[270] + 5, frames[270])
@@ -189,7 +222,7 @@ def test_frames_of_one_camera_tell_its_displacement_together():
     rest = rng.uniform(-100, 100, (60, 2)) + 128
     bump = np.exp(-(((rest - 128) / 60) ** 2).sum(axis=1))[:, None] * [3.0, 1.0]
     frames = rest + rng.uniform(-1, 1, (400, 1, 1)) * bump + rng.normal(0, 0.05, (400, 60, 2))
-    registration = fit_registration(frames[:300], rest)
+    registration, _ = fit_registration(frames[:300], rest)
     small = frames[300:] + 4 * registration.usual[2] * np.array([1.0, 0.0])  # too little to be told from one frame
     alone = registration(small, np.ones((100, 60)))[2]
     together = registration(small, np.ones((100, 60)), together=True)[2]

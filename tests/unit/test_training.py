@@ -65,7 +65,7 @@ def trained(data, tmp_path_factory):
     return out
 
 
-@pytest.mark.parametrize("model", ["vgnn", "tac-vgnn"])
+@pytest.mark.parametrize("model", ["vgnn", "tac-vgnn-release"])
 def test_a_run_taken_up_again_ends_as_if_never_ended(data, tmp_path, model):
     config = config_of(model, epochs=3, batch=32, members=2, kernel=False)
     train_run(config, data, tmp_path / "whole")
@@ -157,8 +157,8 @@ def test_a_model_that_reads_the_clock_is_found_out(data):
     from training.assemble import Prediction
 
     undone = data.targets.executed < 0.5
-    honest = Prediction(data.targets.corrected, np.ones((FRAMES, 2)), np.full(FRAMES, np.nan))
-    clock = Prediction(data.targets.corrected + 0.5 * np.column_stack([np.zeros(FRAMES), data.targets.move[:, 1]]), *[None] * 2)
+    honest = Prediction(data.targets.corrected, np.ones((FRAMES, 2)), np.ones((FRAMES, 2)), np.full(FRAMES, np.nan))
+    clock = Prediction(data.targets.corrected + 0.5 * np.column_stack([np.zeros(FRAMES), data.targets.move[:, 1]]), *[None] * 3)
     assert undone.any() and abs(leak_slope(honest, data.targets)) < 1e-9 and leak_slope(clock, data.targets) == pytest.approx(0.5)
 
 

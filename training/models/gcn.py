@@ -14,6 +14,7 @@ from torch import nn
 
 CHANNELS = (16, 32, 48, 64, 96)
 DENSE = {"paper": (96, 64), "release": (128, 96)}
+SLOPE = 0.01  # of the leaky ReLU below 0
 
 
 @dataclass(frozen=True)
@@ -72,17 +73,53 @@ def graph_rows(edges: list, nodes: int, *, transposed: bool = False) -> GraphRow
     )
 
 
-class _Average(torch.autograd.Function):
-    """A product with a constant sparse matrix, whose transpose is at hand for the way back."""
+class GraphConvolution(torch.autograd.Function):
+    """``leaky_relu(batch_norm(A h W^T))`` in training, with the statistics of the batch (Ioffe and Szegedy 2015).
+
+    The norm is linear once its statistics are known, and they follow from the mean and the covariance S of ``a = A h``:
+    output channel c has the mean ``W_c m`` and the variance ``W_c S W_c^T``. So norm and weights are one product with
+    ``K W``, ``K = diag(gain / deviation)``, and no pass over the wider output is needed. A bias before the norm would
+    cancel and is left out. The way back is the derivative of the same formulas, with the transpose of A at hand.
+    """
 
     @staticmethod
-    def forward(ctx, matrix, transpose, x):
+    def forward(ctx, matrix, transpose, h, weight, gain, offset, eps):
+        around = _product(matrix, h)
+        mean = around.mean(dim=0)
+        around.sub_(mean)
+        spread = weight @ (around.T @ around).div_(len(around))  # W S
+        variance = (spread * weight).sum(dim=1)
+        inverse = (variance + eps).rsqrt()
+        out = torch.addmm(offset, around, ((gain * inverse)[:, None] * weight).T)
+        out = nn.functional.leaky_relu_(out, SLOPE)
         ctx.transpose = transpose
-        return matrix @ x
+        ctx.save_for_backward(around, out, weight, gain, spread, inverse)
+        mean = weight @ mean
+        ctx.mark_non_differentiable(mean, variance)
+        return out, mean, variance
 
     @staticmethod
-    def backward(ctx, gradient):
-        return None, None, ctx.transpose @ gradient.contiguous()
+    def backward(ctx, gradient, *_):
+        around, out, weight, gain, spread, inverse = ctx.saved_tensors
+        size = gain * inverse
+        of_norm = torch.ops.aten.leaky_relu_backward(gradient, out, SLOPE, True)  # of the norm's output
+        of_offset = (of_norm.new_ones(1, len(of_norm)) @ of_norm)[0]
+        pull = of_norm.T @ around
+        of_gain = (pull * weight).sum(dim=1) * inverse
+        of_weight = size[:, None] * (pull - (of_gain * inverse)[:, None] * spread)
+        of_h = None
+        if ctx.needs_input_grad[2]:
+            share = size * of_gain * inverse / len(out)
+            of_around = torch.addmm(-(size * of_offset / len(out)) @ weight, of_norm, size[:, None] * weight)
+            of_around.addmm_(around, weight.T @ (share[:, None] * weight), alpha=-1)
+            of_h = _product(ctx.transpose, of_around)
+        return None, None, of_h, of_weight, of_gain, of_offset, None
+
+
+def _product(matrix: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """Sparse times dense, written straight to where it belongs (``@`` would fill that with zeros and copy it first)."""
+    out = x.new_empty(matrix.shape[0], x.shape[1])
+    return torch.addmm(out, matrix, x, beta=0, out=out)
 
 
 class Gcn(nn.Module):
@@ -100,11 +137,10 @@ class Gcn(nn.Module):
         super().__init__()
         self.features, self.outputs, self.variant = features, outputs, variant
         widths = (features, *CHANNELS)
-        self.convolutions = nn.ModuleList([nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)])
+        self.convolutions = nn.ModuleList([nn.Linear(a, b, bias=False) for a, b in zip(widths[:-1], widths[1:], strict=True)])
         self.norms = nn.ModuleList([nn.BatchNorm1d(c) for c in CHANNELS])
         for layer in self.convolutions:
             nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
         dense: list[nn.Module] = []
         width = CHANNELS[-1]
         for units in DENSE[variant]:
@@ -130,8 +166,19 @@ class Gcn(nn.Module):
         graphs, nodes = x.shape[:2]
         h = x.reshape(graphs * nodes, -1)
         for layer, norm in zip(self.convolutions, self.norms, strict=True):
-            h = nn.functional.leaky_relu(norm(layer(_Average.apply(matrix, transpose, h))), inplace=True)
+            h = self._convolved(h, matrix, transpose, layer.weight, norm)
         return {"mean": self.dense(h.view(graphs, nodes, -1).mean(dim=1))}
+
+    def _convolved(self, h, matrix, transpose, weight, norm: nn.BatchNorm1d) -> torch.Tensor:
+        if not self.training:
+            size = norm.weight * (norm.running_var + norm.eps).rsqrt()
+            out = torch.addmm(norm.bias - size * norm.running_mean, matrix @ h, (size[:, None] * weight).T)
+            return nn.functional.leaky_relu_(out, SLOPE)
+        out, mean, variance = GraphConvolution.apply(matrix, transpose, h, weight, norm.weight, norm.bias, norm.eps)
+        with torch.no_grad():
+            norm.running_mean.lerp_(mean, norm.momentum)
+            norm.running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), norm.momentum)
+        return out
 
     def configuration(self) -> dict:
         """What builds the same network again."""

@@ -133,7 +133,7 @@ class Vgnn(nn.Module):
         away = moved.flatten() / self.scale[0] - self.mode_mean
         gone = lost.repeat_interleave(2)
         known = directions[~gone]
-        normal = known.T @ known + FILL_RIDGE * torch.eye(known.shape[1])
+        normal = known.T @ known + FILL_RIDGE * torch.eye(known.shape[1], device=known.device)
         found = self.mode_mean + directions @ torch.linalg.solve(normal, known.T @ away[~gone])
         return torch.where(lost[:, None], (found * self.scale[0]).view(-1, 2), moved)
 

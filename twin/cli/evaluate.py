@@ -18,6 +18,9 @@ HELP = """Judge a trained model on a labelled recording.
 Writes predictions.csv (image_name, and for every label <label>_true, _pred, _lo90, _hi90; executed_probability, valid),
 metrics.json (mean absolute errors against raw and corrected labels, overall and by depth, angle and shear; coverage of the
 90 % intervals; slope of the angle's error on move_6 over frames whose move was not executed; ms per frame), errors.png.
+
+With --robustness also robustness.csv: errors of single frames when the image itself is changed (1 % scale, 2 px shift, 1 deg
+turn, 5 pins erased, each in a random direction), and by which part they are larger than those of the same frames unchanged.
 """
 
 
@@ -28,11 +31,13 @@ def evaluate(
     out: Out,
     rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
     labels: Annotated[str, typer.Option("--labels", help="truth in predictions.csv and errors.png: corrected or raw")] = "corrected",
+    robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
 ) -> None:
     from training.dataset import load_dataset
     from training.estimator import PoseEstimator
     from training.evaluate import judge, predict_rows_of, rows_to_judge, time_frames, write_evaluation
     from training.recipes import TrainingError
+    from training.robustness import judge_changes, write_changes
     from twin.cli.progress import count_bar
 
     for value, allowed, option in ((rows, ("validation", "all"), "--rows"), (labels, ("corrected", "raw"), "--labels")):
@@ -51,11 +56,19 @@ def evaluate(
         raw, corrected = metrics["raw"][name], metrics["corrected"][name]
         print(
             f"{name}: mean error {corrected['mae']:.4g} {unit} against corrected labels, {raw['mae']:.4g} against raw; "
-            f"{100 * corrected['coverage_90']:.1f} % inside the 90 % interval"
+            f"{100 * corrected['coverage_90']:.1f} % and {100 * raw['coverage_90']:.1f} % inside the 90 % intervals for them"
         )
     if metrics["leak_slope"] is not None:
         print(f"slope of the angle's error on move_6 where it was not executed: {metrics['leak_slope']:+.3f}")
     ms = metrics["ms_per_frame"]
     print(f"{len(chosen)} frames" + ("" if ms is None else f", {ms:.1f} ms per frame (median, one thread)"))
-    for path in write_evaluation(out, made, found, chosen, metrics, labels):
+    written = write_evaluation(out, made, found, chosen, metrics, labels)
+    if robustness:
+        with count_bar("changed frames") as progress:
+            changes = judge_changes(estimator, found, chosen, progress=progress)
+        for row in changes:
+            said = (f"{name} {row[f'{name}_mae']:.4g} ({100 * row[f'{name}_more']:+.1f} %)" for name in estimator.names)
+            print(f"{row['change']}: {', '.join(said)}; {row['not_valid']} frames not valid")
+        written.append(write_changes(out / "robustness.csv", changes))
+    for path in written:
         print(f"wrote {path}")

@@ -11,6 +11,8 @@ Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name 
 Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
 FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; told by size and content if not given")]
+Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
+Target = Annotated[str, typer.Option("--target", help="preset, or label columns with commas between")]
 Pair = tuple[float, float]
 
 
@@ -26,3 +28,10 @@ def writable_folder(path: Path) -> Path:
     except OSError as error:
         raise TwinError(f"{path}: can't write there ({error.strerror}); give another folder with --out") from error
     return path
+
+
+def columns_of(target: str) -> str | tuple:
+    """What ``load_dataset`` takes: the name of a preset, or the columns themselves."""
+    from training.targets import PRESETS
+
+    return target if target in PRESETS else tuple(name.strip() for name in target.split(","))

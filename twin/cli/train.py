@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, Sensor
+from twin.cli.options import Device, FormOrAuto, Sensor, Target, columns_of
 
 HELP = """Train a model that tells the pose from a frame.
 
@@ -35,7 +35,7 @@ def train(
     sensor: Sensor,
     data: Annotated[Path, typer.Option("--data", metavar="DIR", help="labelled recording")],
     out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
-    target: Annotated[str, typer.Option("--target", help="preset, or label columns with commas between")] = "surface-2d",
+    target: Target = "surface-2d",
     labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
     seed: Annotated[int, typer.Option("--seed", help="of weights and order")] = 0,
     split: Annotated[int, typer.Option("--split", help="seed of the fifth kept out of training; -1: none")] = 0,
@@ -44,15 +44,16 @@ def train(
     members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
     max_minutes: Annotated[float | None, typer.Option("--max-minutes", help="stop after the epoch that passes this time")] = None,
     threads: Annotated[int | None, typer.Option("--threads", help="CPU threads")] = None,
+    device: Device = "auto",
     form: FormOrAuto = None,
 ) -> None:
     import torch
 
     from scenes import load_sensor
     from training.dataset import load_dataset
+    from training.networks import choose_device
     from training.recipes import TrainingError, recipe_of
     from training.run import RunConfig, train_run
-    from training.targets import PRESETS
     from twin.cli.progress import count_bar, epoch_bar
 
     if labels not in ("corrected", "raw"):
@@ -60,7 +61,8 @@ def train(
     recipe = recipe_of(model, epochs=epochs, batch=batch, members=members)
     if threads:
         torch.set_num_threads(threads)
-    columns = target if target in PRESETS else tuple(name.strip() for name in target.split(","))
+    device = choose_device(device)
+    columns = columns_of(target)
     with count_bar("frames") as progress:
         found = load_dataset(data, load_sensor(sensor), columns, form=form, progress=progress)
     for problem in found.problems:
@@ -69,7 +71,7 @@ def train(
     config = RunConfig(model, recipe, labels, seed, None if split < 0 else split, helpers)
     print(f"{len(found)} usable frames; labels {', '.join(found.targets.names)} ({labels})")
     with epoch_bar(model) as progress:
-        finished = train_run(config, found, out, max_minutes=max_minutes, progress=progress)
+        finished = train_run(config, found, out, max_minutes=max_minutes, device=device, progress=progress)
     if not finished:
         print(f"time is up: the weights so far are in {out}; the same command goes on from here")
     for name in ("config.json", "curves.csv", "weights.pt"):

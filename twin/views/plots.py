@@ -52,10 +52,10 @@ def draw_pins(ax: Axes, observation: Observation) -> None:
         ax.plot(*observation.extra_px.T, "+", color=EXTRA, markersize=6)
 
 
-def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title: str) -> None:
-    """Voronoi cells coloured by their relative change of area against no contact (percent)."""
+def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title: str, *, limit: float | None = None) -> None:
+    """Voronoi cells coloured by their relative change of area against no contact (percent), up to ``limit`` (default: their own)."""
     change = 100 * (graph.area_px2 / rest_area_px2 - 1)
-    limit = max(5.0, float(np.nanpercentile(np.abs(change), 99)))
+    limit = limit or max(5.0, float(np.nanpercentile(np.abs(change), 99)))
     cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors="#00000030", linewidths=0.4)
     ax.add_collection(cells)
     _pixel_axes(ax, graph.nodes_px, title)

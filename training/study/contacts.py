@@ -1,0 +1,142 @@
+"""The paper's interpretability figure: where and how deep the sensor is touched, read off the Voronoi areas by eye.
+
+Rendered in the twin: a flat surface and an edge under the middle, and a surface that reaches only the top or only the
+bottom of the sensor, each 2 and 4 mm beyond first touch. Beside them recorded frames of about these depths.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from scenes import load_object
+from scenes.sensor import SensorSpec
+from training.dataset import Dataset
+from twin.errors import TwinError
+from twin.mechanics.path import ContactPath, ContactPose, plan_path
+from twin.preprocess import Pipeline, make_graph
+from twin.simulator import Simulator
+from twin.stimulus import build_stimulus
+from twin.types import Form, PinGraph
+from twin.views.plots import draw_area_change, new_figure
+
+DEPTHS_MM = (2.0, 4.0)
+TAP_MM = 5.0  # of the published recordings (their meta.json: tap_move)
+ASIDE_MM = 6.0  # from the middle to the border of the surface that touches one side only
+# object, turn of the whole contact about the sensor's axis (x towards y, deg), offset before turning (mm); image y is down
+CONTACTS = {
+    "centre, surface": ("plane", 0.0, 0.0),
+    "centre, edge": ("edge", 0.0, 0.0),
+    "top, surface": ("edge", -90.0, ASIDE_MM),
+    "bottom, surface": ("edge", 90.0, ASIDE_MM),
+}
+USUAL = {"depth_mm": 0.25, "angle_deg": 1.5, "shear_mm": 0.5, "shear_deg": 0.7}  # distances that weigh the same in the choice of a frame
+
+
+@dataclass(frozen=True)
+class AreaChange:
+    """The areas of one contact.
+
+    Attributes
+    ----------
+    name : str
+    depth_mm : float
+        Beyond first touch.
+    graph : PinGraph
+        Voronoi.
+    rest_area_px2 : (N,) float
+    source : str
+        ``twin``, or the recorded frame's name.
+    """
+
+    name: str
+    depth_mm: float
+    graph: PinGraph
+    rest_area_px2: np.ndarray
+    source: str = "twin"
+
+    def figures(self) -> dict:
+        """Percent by which areas grew, where (px from the middle, weighted by growth), and of how many pins."""
+        change = 100 * (self.graph.area_px2 / self.rest_area_px2 - 1)
+        grown = np.maximum(change, 0)
+        place = self.graph.nodes_px - self.graph.nodes_px.mean(axis=0)
+        where = grown @ place / max(grown.sum(), 1e-9)
+        return {
+            "contact": self.name,
+            "depth_mm": self.depth_mm,
+            "source": self.source,
+            "largest_growth_percent": float(np.percentile(change, 99)),
+            "mean_size_of_change_percent": float(np.abs(change).mean()),
+            "growth_x_px": float(where[0]),
+            "growth_y_px": float(where[1]),
+        }
+
+
+def twin_contacts(spec: SensorSpec, form: Form, *, depths_mm=DEPTHS_MM, names=tuple(CONTACTS), progress=None) -> list[AreaChange]:
+    """Press, render, find pins, tessellate: every contact at every depth.
+
+    Raises
+    ------
+    TwinError
+        If the pins of a rendered frame are not found.
+    """
+    simulator, pipeline = Simulator(spec), Pipeline(spec, form)
+    rest = pipeline(simulator.shoot_rest(form).frame)
+    if not rest.valid:
+        raise TwinError(f"{spec.name}: pins of the rendered frame without contact not found: {rest.reason}")
+    found = []
+    for name in names:
+        stimulus, turn_deg, aside_mm = CONTACTS[name]
+        thing = load_object(stimulus)
+        for depth in depths_mm:
+            poses = plan_path(spec, build_stimulus(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
+            state = [state for _, state in simulator.solver.path(thing, ContactPath(_turned(turn_deg) @ poses))][-1]
+            seen = pipeline(simulator.shoot(state, form=form).frame)
+            if not seen.valid:
+                raise TwinError(f"{spec.name}, {name}, {depth:g} mm: {seen.reason}")
+            found.append(AreaChange(name, depth, seen.graph, rest.graph.area_px2))
+            if progress:
+                progress(len(found), len(names) * len(depths_mm))
+    return found
+
+
+def recorded_contacts(data: Dataset) -> list[AreaChange]:
+    """Recorded frames nearest to a straight press of these depths; none where the labels don't tell depth, angle and moves.
+
+    Depth beyond first touch is ``pose_2`` + tap + the rig's contact offset (0 where it was never calibrated).
+    """
+    targets = data.targets
+    if not {"pose_2", "pose_6"} <= set(targets.names) or not np.isfinite(targets.move).all():
+        return []
+    rig = data.pins.sensor.rig
+    offset_mm, offset_deg = (rig.contact_offset_mm, rig.turn_offset_deg[2]) if rig else (0.0, 0.0)
+    depth = targets.corrected[:, targets.names.index("pose_2")] + TAP_MM + offset_mm
+    angle = targets.corrected[:, targets.names.index("pose_6")] + offset_deg
+    shear = targets.move * np.nan_to_num(targets.executed, nan=1.0)[:, None]
+    found = []
+    for wanted in DEPTHS_MM:
+        away = np.column_stack([depth - wanted, angle, shear]) / list(USUAL.values())
+        k = int(np.square(away).sum(axis=1).argmin())
+        graph = make_graph("voronoi", data.pins.nodes_px[k], outmost=data.pins.reference.outmost)
+        rest = data.pins.reference.area_px2
+        found.append(AreaChange("centre, recorded", float(depth[k]), graph, rest, str(data.pins.image_name[k])))
+    return found
+
+
+def _turned(turn_deg: float) -> np.ndarray:
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    T = np.eye(4)
+    T[:2, :2] = [[c, -s], [s, c]]
+    return T
+
+
+def contacts_figure(contacts: list[AreaChange]) -> Figure:
+    """One column for each contact, shallow above deep, all in the same colours."""
+    limit = max(contact.figures()["largest_growth_percent"] for contact in contacts)
+    names = list(dict.fromkeys(contact.name for contact in contacts))
+    figure, axes = new_figure(len(names), len(DEPTHS_MM), panel_inch=3.8)
+    for column, name in enumerate(names):
+        for row, contact in enumerate(contact for contact in contacts if contact.name == name):
+            title = f"{name}, {contact.depth_mm:.1f} mm" + ("" if contact.source == "twin" else f"\n{contact.source}")
+            draw_area_change(axes[row * len(names) + column], contact.graph, contact.rest_area_px2, title, limit=limit)
+    return figure

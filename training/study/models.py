@@ -1,0 +1,140 @@
+"""The paper's second table: every model trained on the same rows, and judged on the same others."""
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+
+from training.dataset import Dataset
+from training.estimator import PoseEstimator
+from training.evaluate import judge, predict_rows_of, rows_to_judge
+from training.recipes import TrainingError, recipe_of
+from training.run import RunConfig, is_finished, train_run
+
+# errors (mm, deg) of Table II, on depth [-2, 2] mm and angle [-30, 30] deg
+PAPER = {"cnn-v1": (0.06, 1.20), "cnn-v2": (0.07, 1.25), "gnn": (0.07, 1.16), "tac-vgnn": (0.05, 1.02), "tac-vgnn-release": (0.05, 1.02)}
+WITHOUT = {"graph": {"layers": 0}, "modes": {"modes": 0, "area_modes": 0}, "kernel": {}}  # what vgnn can be trained without
+
+SHOWN = ("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters", "frames", "without_prediction",
+         "leak_slope", "paper_mm", "paper_deg")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One run of the study.
+
+    Attributes
+    ----------
+    name : str
+        A model, or ``vgnn-without-graph``, ``-without-modes``, ``-without-kernel``.
+    config : RunConfig
+    """
+
+    name: str
+    config: RunConfig
+
+    @property
+    def folder(self) -> str:
+        """Name of the run's folder."""
+        return f"{self.name}-{self.config.labels}-{self.config.seed}"
+
+
+def plan_run(name: str, *, labels: str, seed: int, split: int, epochs: int | None = None) -> Plan:
+    """What a model's name stands for.
+
+    Raises
+    ------
+    TrainingError
+        For a name that stands for nothing.
+    """
+    model, _, part = name.partition("-without-")
+    if part and (model != "vgnn" or part not in WITHOUT):
+        raise TrainingError(f"no model '{name}'; vgnn can be trained without {', '.join(WITHOUT)}")
+    recipe = recipe_of(model, epochs=epochs, kernel=False if part in ("kernel", "modes") else None)  # the kernel sees the modes only
+    return Plan(name, RunConfig(model, recipe, labels, seed, split, size=WITHOUT.get(part, {})))
+
+
+def train_all(
+    plans: list[Plan], data: Dataset, out: Path, *, max_minutes: float | None, device: str = "cpu", bar: Callable
+) -> dict[str, float]:
+    """Train every run, or continue it; the time left is shared evenly among the runs still to come.
+
+    Parameters
+    ----------
+    bar : callable
+        ``bar(title)`` is a context that yields ``train_run``'s ``progress``.
+
+    Returns
+    -------
+    dict
+        Minutes spent here on each run's folder; runs for which no time was left are missing.
+    """
+    started, spent = monotonic(), {}
+    for k, plan in enumerate(plans):
+        folder = out / plan.folder
+        if is_finished(plan.config, data, folder):
+            spent[plan.folder] = 0.0
+            continue
+        share = None
+        if max_minutes is not None:
+            share = (max_minutes - (monotonic() - started) / 60) / (len(plans) - k)
+            if share <= 0:
+                continue
+        begun = monotonic()
+        with bar(plan.name) as progress:
+            train_run(plan.config, data, folder, max_minutes=share, device=device, progress=progress)
+        spent[plan.folder] = (monotonic() - begun) / 60
+    return spent
+
+
+def table_row(plan: Plan, data: Dataset, out: Path, minutes: float | None) -> dict:
+    """What became of one run: errors on the rows kept out of training, or only that there was no time for it."""
+    folder = out / plan.folder
+    row: dict = {"model": plan.name, "seed": plan.config.seed, "labels": plan.config.labels, "minutes_now": minutes, "state": "not begun"}
+    if not (folder / "weights.pt").is_file():
+        return row
+    estimator = PoseEstimator.load(folder)
+    rows = rows_to_judge(estimator, data, "validation")
+    metrics = judge(predict_rows_of(estimator, data, rows), data, rows)
+    curves = read_curves(folder)
+    row |= {
+        "state": "ended early" if (folder / "checkpoint.pt").exists() else "finished",
+        "parameters": json.loads((folder / "config.json").read_text())["parameters"],
+        "epochs": len(curves),
+        "epochs_allowed": plan.config.recipe.epochs * plan.config.recipe.members,
+        "training_minutes": sum(point["seconds"] for point in curves) / 60,
+        "s_per_epoch": float(np.median([point["seconds"] for point in curves])),
+        "frames": metrics["frames"],
+        "without_prediction": metrics["without_prediction"],
+        "leak_slope": metrics["leak_slope"],
+    }
+    for kind in ("raw", "corrected"):
+        for name in data.targets.names:
+            row[f"{name}_{kind}"] = metrics[kind][name]["mae"]
+            row[f"{name}_{kind}_inside_90"] = metrics[kind][name]["coverage_90"]
+    paper = PAPER.get(plan.config.model if plan.name == plan.config.model else "", (None, None))
+    return row | {"paper_mm": paper[0], "paper_deg": paper[1]}
+
+
+def error_columns(data: Dataset) -> list[str]:
+    """Columns of a row that hold errors."""
+    return [f"{name}_{kind}" for kind in ("raw", "corrected") for name in data.targets.names]
+
+
+def read_curves(folder: Path) -> list[dict]:
+    """The learning curve of a run: one dict of numbers an epoch, networks one after the other."""
+    with (folder / "curves.csv").open(newline="") as file:
+        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+def ordering(rows: list[dict], key: str) -> list[tuple[str, float, float]]:
+    """Models by their mean over seeds of a column, best first: name, mean, spread between seeds (largest less least)."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        if row.get(key) is not None:
+            values.setdefault(row["model"], []).append(row[key])
+    return sorted(((name, float(np.mean(v)), float(np.ptp(v))) for name, v in values.items()), key=lambda item: item[1])

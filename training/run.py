@@ -17,7 +17,9 @@ import numpy as np
 import torch
 
 from training.assemble import calibrate, prepared_inputs
+from training.correction import corrected_content
 from training.dataset import Dataset, split_rows
+from training.estimator import PoseEstimator
 from training.loop import Loop, Rows
 from training.networks import build_network, parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
@@ -216,6 +218,30 @@ def _assemble(
     _write(out / "weights.pt", content)
     _write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
     _write_curves(out, [network["curves"] for network in networks])
+
+
+def save_corrected(run: Path, out: Path, pins, targets, about: dict) -> list:
+    """Write the finished run ``run`` to ``out`` with its labels corrected by labelled frames that it has not seen.
+
+    Parameters
+    ----------
+    pins, targets : PinTable, Targets
+    about : dict
+        Said of the correction in ``config.json``.
+
+    Returns
+    -------
+    list of dict
+        What kind of correction was chosen for each label.
+    """
+    estimator = PoseEstimator.load(run)
+    config = estimator.config
+    content = torch.load(run / "weights.pt", weights_only=True)
+    content, chosen = corrected_content(estimator, content, pins, targets, config["labels"])
+    out.mkdir(parents=True, exist_ok=True)
+    _write(out / "weights.pt", content)
+    _write_text(out / "config.json", json.dumps(config | {"correction": about | {"chosen": chosen}}, indent=1) + "\n")
+    return chosen
 
 
 def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:

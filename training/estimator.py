@@ -14,7 +14,7 @@ from scenes.sensor import SensorSpec
 from training.assemble import Ensemble, Prediction, filled, pin_inputs
 from training.correction import Correction
 from training.dataset import PinTable
-from training.inputs import ImageInputs, graph_inputs, small_image
+from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features, small_image
 from training.recipes import TrainingError
 from training.registration import Registration
 from twin.errors import FrameError
@@ -183,6 +183,8 @@ class PoseEstimator:
             return graph_inputs(self.model, pins, self.pipeline.size_px[0]), rows
         pins = pins.seen_from(self.trained) if pins.measured else pins
         nodes_px, area_px2 = filled(self.registration, pins.nodes_px, pins.area_px2, pins.lost, self.trained)
+        if pins.measured:  # the no-contact frame told where the camera sits
+            return PinInputs(pin_features(nodes_px, area_px2, self.trained), pins.lost), rows
         return pin_inputs(self.registration, nodes_px, area_px2, pins.lost, self.trained, together=together), rows
 
     def _estimate(self, made: Prediction, started: float) -> PoseEstimate:

@@ -41,6 +41,7 @@ def main() -> None:
         render,
         servo,
         study,
+        study_sim_to_real,
         study_tac_vgnn,
         train,
         validate,

@@ -15,6 +15,7 @@ from training.assemble import Ensemble, Prediction, filled, pin_inputs
 from training.correction import Correction
 from training.dataset import PinTable
 from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features, small_image
+from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.recipes import TrainingError
 from training.registration import Registration
 from twin.errors import FrameError
@@ -78,24 +79,30 @@ class PoseEstimator:
 
     @classmethod
     def load(cls, run: str | Path) -> "PoseEstimator":
-        """Load the folder of a finished run.
+        """Load the folder of a finished run, or of its small copy.
+
+        Parameters
+        ----------
+        run : path
+            Where there is no such folder, the name of a sensor whose weights go with the package.
 
         Raises
         ------
         TrainingError
             If it holds none.
         """
-        run = Path(run)
-        if not (run / "weights.pt").is_file():
+        run = SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
+        packed = (run / WEIGHTS).is_file()
+        if not packed and not (run / "weights.pt").is_file():
             hint = (
                 "it was begun and not finished; continue it with 'twin train'"
                 if (run / "checkpoint.pt").is_file()
-                else "'twin train' writes one"
+                else f"'twin train' writes one; weights for {', '.join(shipped_names())} go with the package: give the name instead"
             )
             raise TrainingError(f"{run}: holds no trained model: {hint}")
         try:
             config = json.loads((run / "config.json").read_text())
-            content = torch.load(run / "weights.pt", weights_only=True)
+            content = unpack(config, run / WEIGHTS) if packed else torch.load(run / "weights.pt", weights_only=True)
             return cls(config, content)
         except (OSError, ValueError, KeyError, RuntimeError, UnpicklingError) as error:
             raise TrainingError(f"{run}: not a run of this version, or a damaged one ({error}); train again") from error

@@ -35,6 +35,7 @@ def main() -> None:
         evaluate,
         graph,
         live,
+        pack,
         predict,
         preprocess,
         realism,

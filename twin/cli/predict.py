@@ -16,7 +16,7 @@ frame without contact (init_0.png) tells where its pins are at rest.
 
 @app.command("predict", help=HELP)
 def predict(
-    run: Annotated[Path, typer.Argument(help="folder of a training run")],
+    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights go with the package")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
 ) -> None:
     from training.estimator import PoseEstimator

@@ -38,6 +38,8 @@ def pack(run: Path, out: Path) -> int:
     TrainingError
         The run is another one.
     """
+    if not (run / "weights.pt").is_file():
+        raise TrainingError(f"{run}: a small copy already; give the run that it was made of")
     config = json.loads((run / "config.json").read_text())
     content = torch.load(run / "weights.pt", weights_only=True)
     if config["model"] != "vgnn" or content["kernels"]:

@@ -24,7 +24,7 @@ Writes to --out: trajectory.csv, trajectory.png, measures.json (smoothness S as 
 and angle errors, jerk, share of the way, lost contacts; rate, latency and age of the frames), session/ with --record.
 """
 
-Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a training run, or a sensor whose weights go with the package")]
+Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights go with the package")]
 SHIPPED_MODEL = Path("mg400-331")  # its weights go with the package
 Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
 ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400:ADDRESS, magician:PORT")]

@@ -4,10 +4,7 @@
 goes on, ``weights.pt`` when it is done. Every file is written whole or not at all.
 """
 
-import csv
-import io
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +14,11 @@ import numpy as np
 import torch
 
 from training.assemble import calibrate, prepared_inputs
-from training.correction import corrected_content
 from training.dataset import Dataset, split_rows
-from training.estimator import PoseEstimator
 from training.loop import Loop, Rows
 from training.networks import build_network, parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
+from training.run_files import write_curves, write_tensors, write_text
 from twin.preprocess.forms import blob_spec
 
 FOLDS = 10  # each network of an ensemble watches another tenth of the training rows
@@ -215,38 +211,14 @@ def _assemble(
     content = calibrate(config, data, inputs, train, networks, scaling)
     content |= {"aside": aside, "reference_px": data.pins.reference.pins_px}
     content["parameters"] = parameter_count(build_network(config.model, data.pins.reference, len(data.targets.names), config.size))
-    _write(out / "weights.pt", content)
-    _write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
-    _write_curves(out, [network["curves"] for network in networks])
-
-
-def save_corrected(run: Path, out: Path, pins, targets, about: dict) -> list:
-    """Write the finished run ``run`` to ``out`` with its labels corrected by labelled frames that it has not seen.
-
-    Parameters
-    ----------
-    pins, targets : PinTable, Targets
-    about : dict
-        Said of the correction in ``config.json``.
-
-    Returns
-    -------
-    list of dict
-        What kind of correction was chosen for each label.
-    """
-    estimator = PoseEstimator.load(run)
-    config = estimator.config
-    content = torch.load(run / "weights.pt", weights_only=True)
-    content, chosen = corrected_content(estimator, content, pins, targets, config["labels"])
-    out.mkdir(parents=True, exist_ok=True)
-    _write(out / "weights.pt", content)
-    _write_text(out / "config.json", json.dumps(config | {"correction": about | {"chosen": chosen}}, indent=1) + "\n")
-    return chosen
+    write_tensors(out / "weights.pt", content)
+    write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
+    write_curves(out, [network["curves"] for network in networks])
 
 
 def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:
-    _write(out / "checkpoint.pt", {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
-    _write_curves(out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
+    write_tensors(out / "checkpoint.pt", {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
+    write_curves(out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
 
 
 def _opened(out: Path, resolved: dict) -> dict | None:
@@ -255,7 +227,7 @@ def _opened(out: Path, resolved: dict) -> dict | None:
     if not path.is_file():
         if (out / "weights.pt").is_file():
             raise TrainingError(f"{out}: holds a finished run; give another --out")
-        _write_text(out / "config.json", json.dumps(resolved, indent=1) + "\n")
+        write_text(out / "config.json", json.dumps(resolved, indent=1) + "\n")
         return None
     state = torch.load(path, weights_only=True, map_location="cpu")
     if state["identity"] != _identity(resolved):
@@ -267,33 +239,3 @@ def _opened(out: Path, resolved: dict) -> dict | None:
 
 def _identity(resolved: dict) -> str:
     return json.dumps({key: value for key, value in resolved.items() if key not in ("problems", "data")}, sort_keys=True)
-
-
-def _write(path: Path, content: dict) -> None:
-    part = path.with_name(f".{path.name}.part")
-    torch.save(_as_tensors(content), part)
-    os.replace(part, path)
-
-
-def _as_tensors(value):
-    """The same with arrays as tensors, which are read back without running anything that a file may hold."""
-    if isinstance(value, np.ndarray):
-        return torch.from_numpy(value)
-    if isinstance(value, dict):
-        return {key: _as_tensors(part) for key, part in value.items()}
-    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
-
-
-def _write_text(path: Path, text: str) -> None:
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
-    os.replace(part, path)
-
-
-def _write_curves(out: Path, curves: list) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
-    for k, points in enumerate(curves):
-        writer.writerows([k, *point.values()] for point in points)
-    _write_text(out / "curves.csv", text.getvalue())

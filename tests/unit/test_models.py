@@ -204,6 +204,19 @@ def test_the_cameras_own_motion_is_taken_out_and_contact_is_left():
     assert np.allclose(shrunk, 1, atol=0.01) and (share == 1).all()
 
 
+def test_with_all_of_a_difference_taken_out_a_displaced_frame_is_the_same():
+    rng = np.random.default_rng(10)
+    rest = rng.uniform(-100, 100, (60, 2)) + 128
+    bump = np.exp(-(((rest - 128) / 60) ** 2).sum(axis=1))[:, None]
+    frames = rest + rng.uniform(-1, 1, (400, 1, 1)) * 6 * bump + rng.normal(0, 0.05, (400, 60, 2))
+    registration, left = fit_registration(frames, rest)
+    z = ((frames - 128) @ [1, 1j]) * 1.01 * np.exp(1j * np.radians(1.0)) + (2 - 1j)
+    moved, area = np.stack([z.real, z.imag], axis=-1) + 128, np.ones((400, 60))
+    here, there = (registration.take_out(nodes, area, registration.difference(nodes))[0] for nodes in (frames, moved))
+    assert np.abs(there - here).max() < 0.1 and np.abs(moved - frames).mean() > 1.5  # px; the orders of shift and scale differ a little
+    assert (np.abs(left) >= np.abs(registration.difference(frames)) - 1e-9).all()  # what was not fitted to lies further off
+
+
 def test_lost_pins_continue_what_the_others_do():
     rng = np.random.default_rng(8)
     rest = rng.uniform(-100, 100, (60, 2)) + 128

@@ -11,8 +11,8 @@ from training.correction import KINDS, fit_terms, terms
 from training.estimator import PoseEstimator
 from training.packed import pack, read_arrays, shipped_names, write_arrays
 from training.recipes import TrainingError
-from training.run import save_corrected, train_run
-from training.sim_to_real.study import choose_frames, quadratic_row
+from training.run import train_run
+from training.sim_to_real.study import choose_frames, correct, quadratic_row
 from twin.preprocess import make_reference
 
 SAME = 1e-6  # mm or deg: rounding of the areas' logarithms
@@ -57,12 +57,12 @@ def test_a_correction_uses_what_helps_frames_left_out_and_nothing_else():
 def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, tmp_path):  # noqa: F811
     off = replace(data.targets, corrected=data.targets.corrected + [1.0, -3.0])  # another sensor's labels
     few, rest = np.arange(40), np.arange(40, 90)
-    chosen = save_corrected(run, tmp_path / "plus", data.pins.rows(few), off.rows(few), {"frames": 40})
+    chosen = correct(run, tmp_path / "plus", replace(data, targets=off), few)
     assert all(found["kind"] != "none" for found in chosen)
     plain, plus = (PoseEstimator.load(path).predict_table(data.pins.rows(rest)) for path in (run, tmp_path / "plus"))
     before, after = (np.abs(made.mean - off.corrected[rest]).mean(axis=0) for made in (plain, plus))
     assert (after < 0.6 * before).all()
-    assert json.loads((tmp_path / "plus" / "config.json").read_text())["correction"]["frames"] == 40
+    assert json.loads((tmp_path / "plus" / "config.json").read_text())["correction"]["frames"] == data.pins.image_name[:40].tolist()
 
 
 def test_a_small_copy_says_the_same(data, run, tmp_path):  # noqa: F811

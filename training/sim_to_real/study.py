@@ -1,16 +1,20 @@
 """What the twin is worth on real frames: trained in it, with a few labelled frames beside it, and without it."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from training.correction import corrected_content
 from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_slope, predict_rows_of
 from training.recipes import TrainingError, recipe_of
-from training.run import RunConfig, is_finished, save_corrected, train_run
+from training.run import RunConfig, is_finished, train_run
+from training.run_files import write_tensors, write_text
 
 MANY = 500  # labelled frames: a morning's work with the rig
 MODES, RIDGES = 20, 10.0 ** np.arange(-4, 3.1, 0.5)  # of the quadratic regression
@@ -66,9 +70,21 @@ def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, pr
 
 
 def correct(run: Path, out: Path, real: Dataset, few: np.ndarray) -> list:
-    """The run ``sim_plus_real``: the run in the twin with its labels corrected by the labelled frames."""
-    part = real.rows(few)
-    return save_corrected(run, out, part.pins, part.targets, {"data": str(real.folder), "frames": part.pins.image_name.tolist()})
+    """Write the finished run ``run`` to ``out``, its labels corrected by some frames of a recording that it has not seen.
+
+    Returns
+    -------
+    list of dict
+        ``kind`` and ``ridge`` of the correction of each label.
+    """
+    estimator, part = PoseEstimator.load(run), real.rows(few)
+    content = torch.load(run / "weights.pt", weights_only=True)
+    content, chosen = corrected_content(estimator, content, part.pins, part.targets, estimator.config["labels"])
+    about = {"data": str(real.folder), "frames": part.pins.image_name.tolist(), "chosen": chosen}
+    out.mkdir(parents=True, exist_ok=True)
+    write_tensors(out / "weights.pt", content)
+    write_text(out / "config.json", json.dumps(estimator.config | {"correction": about}, indent=1) + "\n")
+    return chosen
 
 
 def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict:

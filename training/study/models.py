@@ -19,8 +19,10 @@ from training.run import RunConfig, is_finished, train_run
 PAPER = {"cnn-v1": (0.06, 1.20), "cnn-v2": (0.07, 1.25), "gnn": (0.07, 1.16), "tac-vgnn": (0.05, 1.02), "tac-vgnn-release": (0.05, 1.02)}
 WITHOUT = {"graph": {"layers": 0}, "modes": {"modes": 0, "area_modes": 0}, "kernel": {}}  # what vgnn can be trained without
 
-SHOWN = ("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters", "frames", "without_prediction",
-         "leak_slope", "paper_mm", "paper_deg")  # fmt: skip
+SHOWN = (
+    *("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters"),
+    *("frames", "without_prediction", "leak_slope", "paper_mm", "paper_deg"),
+)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,42 @@
+"""The files of a training run, each written whole or not at all."""
+
+import csv
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+
+
+def write_tensors(path: Path, content: dict) -> None:
+    """A dict of numbers, text, lists, arrays and tensors, as ``torch.load`` reads it with ``weights_only``."""
+    part = path.with_name(f".{path.name}.part")
+    torch.save(_as_tensors(content), part)
+    os.replace(part, path)
+
+
+def _as_tensors(value):
+    """The same with arrays as tensors, which are read back without running anything that a file may hold."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value)
+    if isinstance(value, dict):
+        return {key: _as_tensors(part) for key, part in value.items()}
+    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
+
+
+def write_text(path: Path, text: str) -> None:
+    """Text, whole or not at all."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text)
+    os.replace(part, path)
+
+
+def write_curves(out: Path, curves: list) -> None:
+    """``curves.csv`` of networks one after the other."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
+    for k, points in enumerate(curves):
+        writer.writerows([k, *point.values()] for point in points)
+    write_text(out / "curves.csv", text.getvalue())

@@ -9,6 +9,7 @@ whole move where it was not executed, so frames that look executed and frames th
 (Mondrian conformal prediction, Vovk et al. 2005, 4.5): a narrow and a wide interval instead of one that is wrong for both.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,9 +56,11 @@ class Ensemble:
     ----------
     content : dict
         As ``calibrate`` gives it and ``weights.pt`` holds it.
+    correction : callable, optional
+        Gives what is added to standardised labels (B, K) of frames with amplitudes (B, D): see ``training.correction``.
     """
 
-    def __init__(self, model: str, reference: Reference, content: dict, size: dict) -> None:
+    def __init__(self, model: str, reference: Reference, content: dict, size: dict, correction: Callable | None = None) -> None:
         self.shift, self.scale = np.asarray(content["shift"]), np.asarray(content["scale"])
         self.networks = []
         for weights in content["networks"]:
@@ -68,6 +71,7 @@ class Ensemble:
         self.kernel_labels = list(content["kernel_labels"])
         self.blend, self.quantile = np.asarray(content["blend"]), np.asarray(content["quantile"])
         self.raw_quantile = np.asarray(content["raw_quantile"])
+        self.correction = correction
 
     def outputs(self, inputs, rows: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Standardised mean and scale (B, K) and the probability (B,) of an executed move."""
@@ -90,6 +94,8 @@ class Ensemble:
     def __call__(self, inputs, rows: torch.Tensor) -> Prediction:
         """Labels of some rows."""
         mean, scale, executed = self.outputs(inputs, rows)
+        if self.correction is not None:
+            mean = mean + self.correction(mean, kernel_inputs(self.networks[0], inputs, rows).numpy())
         scale = self.scale * scale
         raw = self.raw_quantile[undone(executed)]
         return Prediction(self.shift + self.scale * mean, self.quantile * scale, raw * scale, executed)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from training.targets import Targets, choose_targets
 from twin.cache import cached_arrays
 from twin.errors import FrameError
 from twin.preprocess import Pipeline, make_graph, make_reference, nominal_reference
-from twin.preprocess.batch import recording_reference
+from twin.preprocess.batch import UNMEASURED, recording_reference
 from twin.preprocess.reference import Reference
 from twin.recordings import Recording, open_recording
 from twin.types import Form
@@ -41,6 +41,8 @@ class PinTable:
     lost : (M, N) bool
         Pins without a blob of their own.
     valid : (M,) bool
+    measured : bool
+        Whether the reference is that of these very frames' own camera, and not only the specification's.
     """
 
     sensor: SensorSpec
@@ -51,6 +53,7 @@ class PinTable:
     area_px2: np.ndarray
     lost: np.ndarray
     valid: np.ndarray
+    measured: bool = False
 
     def __len__(self) -> int:
         return len(self.image_name)
@@ -58,7 +61,13 @@ class PinTable:
     def rows(self, index: np.ndarray) -> "PinTable":
         """The same table with only some rows, or rows in another order."""
         parts = {key: getattr(self, key)[index] for key in ("image_name", "nodes_px", "area_px2", "lost", "valid")}
-        return PinTable(self.sensor, self.form, self.reference, **parts)
+        return PinTable(self.sensor, self.form, self.reference, **parts, measured=self.measured)
+
+    def seen_from(self, reference: Reference) -> "PinTable":
+        """The same motion of the pins from another no-contact layout: displacements and the areas' growth are kept."""
+        nodes_px = reference.pins_px + (self.nodes_px - self.reference.pins_px)
+        area_px2 = reference.area_px2 * (self.area_px2 / self.reference.area_px2)
+        return replace(self, reference=reference, nodes_px=nodes_px, area_px2=area_px2)
 
 
 @dataclass(frozen=True)
@@ -86,6 +95,11 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.pins)
+
+    def rows(self, index: np.ndarray) -> "Dataset":
+        """The same data set with only some rows."""
+        group = None if self.group is None else self.group[index]
+        return replace(self, pins=self.pins.rows(index), targets=self.targets.rows(index), group=group)
 
 
 def load_dataset(
@@ -146,9 +160,13 @@ def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[
 
 
 def simulated_table(recording: Recording, spec: SensorSpec, truth: dict[str, np.ndarray], *, progress: Callable | None = None) -> PinTable:
-    """The table that a pipeline without a fault would make of simulated frames, from their pins; hidden caps count as lost."""
+    """The table that a pipeline without a fault would make of simulated frames, from their pins; hidden caps count as lost.
+
+    Each contact may have a sensor of its own (longer pins, a thinner skin): its pins are counted from where they are at rest
+    there, as those of a real sensor are from its own no-contact frame.
+    """
     reference = nominal_reference(spec, recording.form)
-    nodes = truth["pins_px"].astype(float)
+    nodes = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])
 
     def compute() -> dict[str, np.ndarray]:
         areas = np.empty(nodes.shape[:2])
@@ -160,7 +178,9 @@ def simulated_table(recording: Recording, spec: SensorSpec, truth: dict[str, np.
 
     area_px2 = cached_arrays("simulated-areas", {"pins": nodes.tobytes(), "sensor": spec.name}, compute)["area_px2"]
     seen = np.ones(len(nodes), bool)
-    return PinTable(spec, recording.form, reference, np.array(recording.names, str), nodes, area_px2, ~truth["visible"], seen)
+    return PinTable(
+        spec, recording.form, reference, np.array(recording.names, str), nodes, area_px2, ~truth["visible"], seen, measured=True
+    )
 
 
 def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progress: Callable | None = None) -> PinTable:
@@ -171,7 +191,7 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progres
 
     def compute() -> dict[str, np.ndarray]:
         notes: list[str] = []
-        reference, _ = recording_reference(spec, recording, notes)
+        reference, named = recording_reference(spec, recording, notes)
         pipeline = Pipeline(spec, recording.form, reference)
         n = spec.pins.count
         names, nodes, areas, lost, valid = [], [], [], [], []
@@ -195,12 +215,13 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progres
             "lost": np.reshape(lost, (-1, n)).astype(bool),
             "valid": np.array(valid, bool),
         }
-        return {"image_name": np.array(names, str), "rest_px": reference.pins_px, "notes": np.array(notes, str)} | arrays
+        about = {"rest_px": reference.pins_px, "measured": np.array(named != UNMEASURED), "notes": np.array(notes, str)}
+        return {"image_name": np.array(names, str)} | about | arrays
 
-    found = cached_arrays("recorded-pins", _key(recording, spec), compute)
+    found = cached_arrays("recorded-pins-2", _key(recording, spec), compute)
     problems += found.pop("notes").tolist()
     reference = make_reference(found.pop("rest_px"), spec.pins.rings)
-    return PinTable(spec, recording.form, reference, **found)
+    return PinTable(spec, recording.form, reference, measured=bool(found.pop("measured")), **found)
 
 
 def _key(recording: Recording, spec: SensorSpec) -> dict:

@@ -1,6 +1,7 @@
 """A trained model, its sensor and its pipeline in one: frame in, pose out. The one thing a live loop calls."""
 
 import json
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -11,12 +12,14 @@ import torch
 
 from scenes.sensor import SensorSpec
 from training.assemble import Ensemble, Prediction, filled, pin_inputs
+from training.correction import Correction
 from training.dataset import PinTable
-from training.inputs import ImageInputs, graph_inputs, small_image
+from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features, small_image
+from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.recipes import TrainingError
 from training.registration import Registration
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, make_reference
+from twin.preprocess import Pipeline, make_reference, measure_reference
 from twin.types import Form, Frame
 
 
@@ -67,35 +70,57 @@ class PoseEstimator:
         self.sensor = SensorSpec.model_validate(config["sensor"])
         self.form = Form(config["pipeline"]["form"])
         self.names, self.units = tuple(config["columns"]), tuple(config["units"])
-        reference = make_reference(content["reference_px"].numpy(), self.sensor.pins.rings)
-        self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
-        self.ensemble = Ensemble(self.model, reference, content, config["size"])
+        self.trained = make_reference(content["reference_px"].numpy(), self.sensor.pins.rings)
+        self.pipeline = Pipeline(self.sensor, self.form, self.trained, graph=config["pipeline"]["graph"])
+        correction = Correction(content["correction"]["weight"].numpy()) if "correction" in content else None
+        self.ensemble = Ensemble(self.model, self.trained, content, config["size"], correction)
         aside = content["aside"]
         self.registration = Registration(**{key: value.numpy() for key, value in aside["registration"].items()}) if aside else None
 
     @classmethod
     def load(cls, run: str | Path) -> "PoseEstimator":
-        """Load the folder of a finished run.
+        """Load the folder of a finished run, or of its small copy.
+
+        Parameters
+        ----------
+        run : path
+            Where there is no such folder, the name of a sensor whose weights go with the package.
 
         Raises
         ------
         TrainingError
             If it holds none.
         """
-        run = Path(run)
-        if not (run / "weights.pt").is_file():
+        run = SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
+        packed = (run / WEIGHTS).is_file()
+        if not packed and not (run / "weights.pt").is_file():
             hint = (
                 "it was begun and not finished; continue it with 'twin train'"
                 if (run / "checkpoint.pt").is_file()
-                else "'twin train' writes one"
+                else f"'twin train' writes one; weights for {', '.join(shipped_names())} go with the package: give the name instead"
             )
             raise TrainingError(f"{run}: holds no trained model: {hint}")
         try:
             config = json.loads((run / "config.json").read_text())
-            content = torch.load(run / "weights.pt", weights_only=True)
+            content = unpack(config, run / WEIGHTS) if packed else torch.load(run / "weights.pt", weights_only=True)
             return cls(config, content)
         except (OSError, ValueError, KeyError, RuntimeError, UnpicklingError) as error:
             raise TrainingError(f"{run}: not a run of this version, or a damaged one ({error}); train again") from error
+
+    def at_rest(self, frame: Frame) -> "PoseEstimator":
+        """The same model for the sensor in hand, whose frame without contact is given: pins are counted from where it shows them.
+
+        Raises
+        ------
+        FrameError
+            The layout can't be found in the frame, or the model knows no pins to count.
+        """
+        if self.model != "vgnn":
+            raise FrameError(f"a no-contact frame serves vgnn only, this is a {self.model}; leave it out")
+        found = copy(self)
+        reference = measure_reference(self.sensor, self.form, frame)
+        found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
+        return found
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Refuse another sensor or form than the model was trained for.
@@ -128,10 +153,24 @@ class PoseEstimator:
             none = np.full(len(self.names), np.nan)
             return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, seen.reason, _ms(started))
         lost = np.isnan(seen.pins_px[None, :, 0])
-        return self._estimate(self._of_pins(seen.graph.nodes_px[None], seen.graph.area_px2[None], lost, frame.name), started)
+        pins = PinTable(
+            self.sensor,
+            self.form,
+            self.pipeline.reference,
+            np.array([frame.name]),
+            seen.graph.nodes_px[None],
+            seen.graph.area_px2[None],
+            lost,
+            np.ones(1, bool),
+            measured=self.pipeline.reference is not self.trained,
+        )
+        return self._estimate(self._of_pins(pins, together=False), started)
 
     def predict_table(self, pins: PinTable) -> Prediction:
-        """Labels of many valid frames of one camera at once; where it sits otherwise than in training, their median tells.
+        """Labels of many valid frames of one camera at once.
+
+        Where the camera sits otherwise than in training, the table's own no-contact frame tells, or without one the median of
+        the frames.
 
         Raises
         ------
@@ -139,18 +178,21 @@ class PoseEstimator:
             The frames are of another sensor or form.
         """
         self.check(pins.sensor, pins.form)
-        return self._of_pins(pins.nodes_px, pins.area_px2, pins.lost, "", together=True)
+        return self._of_pins(pins, together=not pins.measured)
 
-    def _of_pins(self, nodes_px: np.ndarray, area_px2: np.ndarray, lost: np.ndarray, name: str, *, together: bool = False) -> Prediction:
-        reference = self.pipeline.reference
-        if self.model == "vgnn":
-            nodes_px, area_px2 = filled(self.registration, nodes_px, area_px2, lost, reference)
-            inputs = pin_inputs(self.registration, nodes_px, area_px2, lost, reference, together=together)
-        else:
-            count = len(nodes_px)
-            table = PinTable(self.sensor, self.form, reference, np.full(count, name), nodes_px, area_px2, lost, np.ones(count, bool))
-            inputs = graph_inputs(self.model, table, self.pipeline.size_px[0])
-        return self.ensemble(inputs, torch.arange(len(nodes_px)))
+    def _of_pins(self, pins: PinTable, *, together: bool) -> Prediction:
+        return self.ensemble(*self.inputs_of(pins, together=together))
+
+    def inputs_of(self, pins: PinTable, *, together: bool) -> tuple:
+        """What the networks see of a table's frames, and the rows of all of them."""
+        rows = torch.arange(len(pins))
+        if self.model != "vgnn":
+            return graph_inputs(self.model, pins, self.pipeline.size_px[0]), rows
+        pins = pins.seen_from(self.trained) if pins.measured else pins
+        nodes_px, area_px2 = filled(self.registration, pins.nodes_px, pins.area_px2, pins.lost, self.trained)
+        if pins.measured:  # the no-contact frame told where the camera sits
+            return PinInputs(pin_features(nodes_px, area_px2, self.trained), pins.lost), rows
+        return pin_inputs(self.registration, nodes_px, area_px2, pins.lost, self.trained, together=together), rows
 
     def _estimate(self, made: Prediction, started: float) -> PoseEstimate:
         value, half = made.mean[0], made.half_width[0]

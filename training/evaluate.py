@@ -71,14 +71,14 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
             for k, name in enumerate(targets.names)
         }
         found[kind]["bins"] = _bins(error, targets)
-    found["leak_slope"] = leak_slope(made, targets)
+    found["leak_slope"] = leak_slope(made.mean, targets)
     known = np.isfinite(targets.executed) & np.isfinite(made.executed) & (np.abs(targets.move).max(axis=1) > LARGE_MOVE)
     if known.any():
         found["executed_agreement"] = float(((made.executed > 0.5) == (targets.executed > 0.5))[known].mean())
     return found
 
 
-def leak_slope(made: Prediction, targets) -> float | None:
+def leak_slope(mean: np.ndarray, targets) -> float | None:
     """Slope of (angle predicted - corrected) on ``move_6`` over frames whose move was not executed; None where there are none.
 
     A model that reads the contact has 0; one that reads the time of the frame, by which the rows are sorted, has not.
@@ -87,7 +87,7 @@ def leak_slope(made: Prediction, targets) -> float | None:
     if "pose_6" not in targets.names or undone.sum() < 3:
         return None
     k = targets.names.index("pose_6")
-    return float(np.polyfit(targets.move[undone, 1], (made.mean - targets.corrected)[undone, k], 1)[0])
+    return float(np.polyfit(targets.move[undone, 1], (mean - targets.corrected)[undone, k], 1)[0])
 
 
 def _bins(error: np.ndarray, targets) -> dict:

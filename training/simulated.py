@@ -23,7 +23,7 @@ def is_pins_only(folder: Path) -> bool:
 
 
 def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str, np.ndarray]]:
-    """A data set without pictures: its table, and its arrays ``pins_px`` (M, N, 2) and ``visible`` (M, N).
+    """A data set without pictures: its table, and its arrays ``pins_px`` and ``rest_px`` (M, N, 2) and ``visible`` (M, N).
 
     Raises
     ------
@@ -39,7 +39,7 @@ def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str,
         raise FrameError(f"{folder}: no {TABLE} of a finished data set; give the command that made it once more")
     _, labels = order_by_table([folder / TABLE], [folder / name for name in table.name_lists[0]], problems)
     names = table.name_lists[0]
-    arrays = {key: truth[key][:] for key in ("pins_px", "visible")}
+    arrays = {key: truth[key][:] for key in ("pins_px", "rest_px", "visible")}
     if len(names) != len(arrays["pins_px"]) or arrays["pins_px"].shape[1] != spec.pins.count:
         raise FrameError(f"{folder}: {len(names)} rows in the table, pins {arrays['pins_px'].shape} in {TRUTH}; make the data set again")
     form = Form(truth.attrs["form"])

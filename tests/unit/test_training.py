@@ -159,7 +159,7 @@ def test_a_model_that_reads_the_clock_is_found_out(data):
     undone = data.targets.executed < 0.5
     honest = Prediction(data.targets.corrected, np.ones((FRAMES, 2)), np.ones((FRAMES, 2)), np.full(FRAMES, np.nan))
     clock = Prediction(data.targets.corrected + 0.5 * np.column_stack([np.zeros(FRAMES), data.targets.move[:, 1]]), *[None] * 3)
-    assert undone.any() and abs(leak_slope(honest, data.targets)) < 1e-9 and leak_slope(clock, data.targets) == pytest.approx(0.5)
+    assert undone.any() and abs(leak_slope(honest.mean, data.targets)) < 1e-9 and leak_slope(clock.mean, data.targets) == pytest.approx(0.5)
 
 
 def test_unknown_models_and_settings_are_named():

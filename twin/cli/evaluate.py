@@ -26,7 +26,7 @@ turn, 5 pins erased, each in a random direction), and by which part they are lar
 
 @app.command("evaluate", help=HELP)
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="folder of a training run")],
+    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights go with the package")],
     data: Annotated[Path, typer.Option("--data", metavar="DIR", help="labelled recording")],
     out: Out,
     rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",

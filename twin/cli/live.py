@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.servo import Camera, Model
+from twin.cli.servo import SHIPPED_MODEL, Camera, Model
 
 HELP = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
 
@@ -23,7 +23,7 @@ With --record DIR every frame is kept, lossless, with its estimate; the folder i
 
 @app.command("live", help=HELP)
 def live(
-    model: Model,
+    model: Model = SHIPPED_MODEL,
     camera: Camera = "",
     record: Annotated[Path | None, typer.Option("--record", metavar="DIR", help="new folder for the session")] = None,
     replay: Annotated[Path | None, typer.Option("--replay", metavar="DIR", help="a recorded session instead of a camera")] = None,

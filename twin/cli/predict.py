@@ -9,13 +9,14 @@ from twin.cli import app
 
 HELP = """Tell the pose in a frame, or in every frame of a folder or video, with its 90 % interval.
 
-The model carries its sensor and pipeline; a frame of another sensor is refused.
+The model carries its sensor and pipeline; a frame of another sensor is refused. A recording with a
+frame without contact (init_0.png) tells where its pins are at rest.
 """
 
 
 @app.command("predict", help=HELP)
 def predict(
-    run: Annotated[Path, typer.Argument(help="folder of a training run")],
+    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights go with the package")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
 ) -> None:
     from training.estimator import PoseEstimator
@@ -23,6 +24,8 @@ def predict(
 
     estimator = PoseEstimator.load(run)
     recording = open_recording(frame, estimator.sensor, estimator.form)
+    if recording.reference is not None and estimator.model == "vgnn":
+        estimator = estimator.at_rest(recording.reference)
     for picture in recording:
         made = estimator(picture)
         if not made.valid:

@@ -24,7 +24,8 @@ Writes to --out: trajectory.csv, trajectory.png, measures.json (smoothness S as 
 and angle errors, jerk, share of the way, lost contacts; rate, latency and age of the frames), session/ with --record.
 """
 
-Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a training run")]
+Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights go with the package")]
+SHIPPED_MODEL = Path("mg400-331")  # its weights go with the package
 Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
 ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400:ADDRESS, magician:PORT")]
 PlainLight = Annotated[bool, typer.Option("--plain-light", help="twin: lamps' direct light alone, no path tracing at the start")]
@@ -34,8 +35,8 @@ ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the o
 @app.command("servo", help=HELP)
 def servo(
     object_name: Annotated[str, typer.Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
-    model: Model,
     out: Out,
+    model: Model = SHIPPED_MODEL,
     camera: Camera = "twin",
     arm: ArmOption = "simulated",
     parameters: ServoName = "surface",

@@ -42,6 +42,10 @@ def train(
     epochs: Annotated[int | None, typer.Option("--epochs", help="instead of the model's own number")] = None,
     batch: Annotated[int | None, typer.Option("--batch", help="instead of the model's own size")] = None,
     members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
+    kernel: Annotated[
+        bool | None,
+        typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows"),
+    ] = None,
     max_minutes: Annotated[float | None, typer.Option("--max-minutes", help="stop after the epoch that passes this time")] = None,
     threads: Annotated[int | None, typer.Option("--threads", help="CPU threads")] = None,
     device: Device = "auto",
@@ -58,7 +62,7 @@ def train(
 
     if labels not in ("corrected", "raw"):
         raise TrainingError(f"--labels must be corrected or raw, got {labels!r}")
-    recipe = recipe_of(model, epochs=epochs, batch=batch, members=members)
+    recipe = recipe_of(model, epochs=epochs, batch=batch, members=members, kernel=kernel)
     if threads:
         torch.set_num_threads(threads)
     device = choose_device(device)

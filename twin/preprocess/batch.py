@@ -17,6 +17,8 @@ from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import Recording, open_recording
 from twin.types import Form, Observation
 
+UNMEASURED = "specification"  # in place of a no-contact frame's name
+
 
 def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
     """The recording's own no-contact layout and its frame's name; where there is none or it is no use, the specification's.
@@ -28,7 +30,7 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
             return measure_reference(spec, recording.form, recording.reference), recording.reference.name
         except FrameError as error:
             problems.append(str(error))
-    return nominal_reference(spec, recording.form), "specification"
+    return nominal_reference(spec, recording.form), UNMEASURED
 
 
 def _write(path: Path, write: Callable) -> None:

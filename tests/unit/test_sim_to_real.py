@@ -1,0 +1,107 @@
+"""From simulated pins to a real sensor: other rest pins, a few labelled frames, small copies."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_training import config_of, data  # noqa: F401  (a fixture)
+
+from training.correction import KINDS, fit_terms, terms
+from training.estimator import PoseEstimator
+from training.packed import pack, read_arrays, shipped_names, write_arrays
+from training.recipes import TrainingError
+from training.run import train_run
+from training.sim_to_real.study import choose_frames, correct, quadratic_row
+from twin.preprocess import make_reference
+
+SAME = 1e-6  # mm or deg: rounding of the areas' logarithms
+HALF = 0.02  # of a label's spread: what half precision may change
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):  # noqa: F811
+    out = tmp_path_factory.mktemp("run")
+    train_run(config_of("vgnn", epochs=30, members=1, batch=16, kernel=False), data, out)
+    return out
+
+
+def other_camera(pins):
+    """The same frames by a camera that sits otherwise, with its own no-contact layout."""
+    moved = pins.reference.pins_px + [3.0, -2.0] + 0.3 * np.random.default_rng(5).normal(size=(127, 2))
+    return replace(pins, measured=True).seen_from(make_reference(moved, pins.sensor.pins.rings))
+
+
+def test_pins_are_counted_from_the_no_contact_frame_in_hand(data, run):  # noqa: F811
+    estimator, pins = PoseEstimator.load(run), replace(data.pins, measured=True)
+    here, there = estimator.predict_table(pins), estimator.predict_table(other_camera(pins))
+    assert np.abs(here.mean - there.mean).max() < SAME
+    unknown = estimator.predict_table(replace(other_camera(pins), measured=False))
+    assert np.abs(here.mean - unknown.mean).max() > 100 * SAME
+
+
+def test_a_correction_uses_what_helps_frames_left_out_and_nothing_else():
+    rng = np.random.default_rng(0)
+    mean, amplitudes = rng.normal(size=(40, 2)), rng.normal(size=(40, 12))
+    parts = terms(mean, amplitudes)
+    missing = np.column_stack([0.5 - 0.3 * mean[:, 0], rng.normal(size=40) - 1e-3])
+    weight, left_out, chosen = fit_terms(parts, missing)
+    assert chosen[0]["kind"] in KINDS[1:] and np.abs(left_out[:, 0] - missing[:, 0]).mean() < 0.01
+    assert np.abs(left_out[:, 1] - missing[:, 1]).mean() <= np.abs(missing[:, 1]).mean()
+    rows = np.arange(40) != 7  # closed form against leaving one out
+    again, _, _ = fit_terms({key: part[rows] for key, part in parts.items()}, missing[rows, :1])
+    everything = np.concatenate(list(parts.values()), axis=1)
+    assert everything[7] @ again[:, 0] == pytest.approx(left_out[7, 0], abs=0.02)
+
+
+def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, tmp_path):  # noqa: F811
+    off = replace(data.targets, corrected=data.targets.corrected + [1.0, -3.0])  # another sensor's labels
+    few, rest = np.arange(40), np.arange(40, 90)
+    chosen = correct(run, tmp_path / "plus", replace(data, targets=off), few)
+    assert all(found["kind"] != "none" for found in chosen)
+    plain, plus = (PoseEstimator.load(path).predict_table(data.pins.rows(rest)) for path in (run, tmp_path / "plus"))
+    before, after = (np.abs(made.mean - off.corrected[rest]).mean(axis=0) for made in (plain, plus))
+    assert (after < 0.6 * before).all()
+    assert json.loads((tmp_path / "plus" / "config.json").read_text())["correction"]["frames"] == data.pins.image_name[:40].tolist()
+
+
+def test_a_small_copy_says_the_same(data, run, tmp_path):  # noqa: F811
+    size = pack(run, tmp_path)
+    assert size < 0.5 * (run / "weights.pt").stat().st_size
+    whole, small = (PoseEstimator.load(path).predict_table(data.pins) for path in (run, tmp_path))
+    assert (np.abs(whole.mean - small.mean).max(axis=0) < HALF * data.targets.corrected.std(axis=0)).all()
+    assert "data" not in json.loads((tmp_path / "config.json").read_text())
+    cut = (tmp_path / "weights.safetensors").read_bytes()[:-100]
+    (tmp_path / "weights.safetensors").write_bytes(cut)
+    with pytest.raises(TrainingError, match="damaged"):
+        PoseEstimator.load(tmp_path)
+
+
+def test_arrays_come_back_as_they_were(tmp_path):
+    arrays = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array(3, np.int64), "c": np.zeros((0, 4), np.float16)}
+    write_arrays(tmp_path / "x", arrays)
+    found = read_arrays(tmp_path / "x")
+    assert all(found[key].dtype == value.dtype and np.array_equal(found[key], value) for key, value in arrays.items())
+
+
+def test_shipped_weights_load_by_name():
+    assert shipped_names()
+    for name in shipped_names():
+        assert PoseEstimator.load(name).sensor.name == name
+    with pytest.raises(TrainingError, match=shipped_names()[0]):
+        PoseEstimator.load("no-such-run")
+
+
+def test_frames_that_are_judged_on_are_never_learnt():
+    frames = choose_frames(1000, 40, 3)
+    assert len(frames.test) == 200 and len(frames.few) == 40 and len(frames.trained["500"]) == 500
+    for rows in frames.trained.values():
+        assert not set(rows) & set(frames.test) and set(frames.few) <= set(rows)
+    assert not np.array_equal(frames.few, choose_frames(1000, 40, 4).few)
+    with pytest.raises(TrainingError, match="80 frames"):
+        choose_frames(100, 90, 0)
+
+
+def test_the_quadratic_regression_learns(data):  # noqa: F811
+    row = quadratic_row("real", data, np.arange(60), np.arange(60, 90))
+    assert row["pose_2_corrected"] < 0.4 * np.abs(data.targets.corrected[:, 0] - data.targets.corrected[:, 0].mean()).mean()

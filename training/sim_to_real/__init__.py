@@ -1,0 +1,1 @@
+"""Trained in the twin, tested on real frames."""

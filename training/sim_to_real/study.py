@@ -1,0 +1,127 @@
+"""What the twin is worth on real frames: trained in it, with a few labelled frames beside it, and without it."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from training.correction import corrected_content
+from training.dataset import Dataset, split_rows
+from training.estimator import PoseEstimator
+from training.evaluate import judge, leak_slope, predict_rows_of
+from training.recipes import TrainingError, recipe_of
+from training.run import RunConfig, is_finished, train_run
+from training.run_files import write_tensors, write_text
+
+MANY = 500  # labelled frames: a morning's work with the rig
+MODES, RIDGES = 20, 10.0 ** np.arange(-4, 3.1, 0.5)  # of the quadratic regression
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Which frames of a recording serve what.
+
+    Attributes
+    ----------
+    test : (t,) int
+        The random fifth that every model is judged on and none has seen.
+    few : (n,) int
+        The labelled frames, drawn at random from the others.
+    trained : dict of str to (m,) int
+        Frames to train on without the twin: ``few`` itself, more, and all others; each holds the ones before it.
+    """
+
+    test: np.ndarray
+    few: np.ndarray
+    trained: dict
+
+
+def choose_frames(count: int, labels: int, seed: int) -> Frames:
+    """Draw the frames of a recording of ``count``.
+
+    Raises
+    ------
+    TrainingError
+        There are not so many.
+    """
+    rest, test = split_rows(count, seed)
+    if labels > len(rest):
+        raise TrainingError(f"--labels {labels}: the recording has {len(rest)} frames beside those that are judged on")
+    order = np.random.default_rng([seed, labels]).permutation(rest)
+    trained = {str(n): np.sort(order[:n]) for n in (labels, MANY) if n < len(rest)}
+    return Frames(test, np.sort(order[:labels]), trained | {"all": rest})
+
+
+def train_in_twin(sim: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Callable | None = None) -> None:
+    """The run ``sim_only``, or what is left of it to do."""
+    config = RunConfig("vgnn", recipe_of("vgnn", members=1, epochs=epochs, kernel=False), seed=seed, split=seed)
+    if not is_finished(config, sim, out):
+        train_run(config, sim, out, progress=progress)
+
+
+def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Callable | None = None) -> None:
+    """A run on real frames alone, all of those given."""
+    config = RunConfig("vgnn", recipe_of("vgnn", epochs=epochs), seed=seed, split=None)
+    if not is_finished(config, real, out):
+        train_run(config, real, out, progress=progress)
+
+
+def correct(run: Path, out: Path, real: Dataset, few: np.ndarray) -> list:
+    """Write the finished run ``run`` to ``out``, its labels corrected by some frames of a recording that it has not seen.
+
+    Returns
+    -------
+    list of dict
+        ``kind`` and ``ridge`` of the correction of each label.
+    """
+    estimator, part = PoseEstimator.load(run), real.rows(few)
+    content = torch.load(run / "weights.pt", weights_only=True)
+    content, chosen = corrected_content(estimator, content, part.pins, part.targets, estimator.config["labels"])
+    about = {"data": str(real.folder), "frames": part.pins.image_name.tolist(), "chosen": chosen}
+    out.mkdir(parents=True, exist_ok=True)
+    write_tensors(out / "weights.pt", content)
+    write_text(out / "config.json", json.dumps(estimator.config | {"correction": about}, indent=1) + "\n")
+    return chosen
+
+
+def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict:
+    """A row of the study's table: mean errors of a run on the frames that are judged on."""
+    estimator = PoseEstimator.load(run)
+    found = judge(predict_rows_of(estimator, real, test), real, test)
+    row = {"trained_on": name, "labelled_frames": labelled, "model": estimator.model}
+    for kind in ("corrected", "raw"):
+        row |= {f"{label}_{kind}": found[kind][label]["mae"] for label in real.targets.names}
+    inside = {f"{label}_inside_90": found["corrected"][label]["coverage_90"] for label in real.targets.names}
+    return row | inside | {"leak_slope": found["leak_slope"]}
+
+
+def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) -> dict:
+    """The same of the plainest model: ridge regression on the displacements' first modes and their products."""
+    moved = (real.pins.nodes_px - real.pins.reference.pins_px).reshape(len(real), -1)
+    middle = moved[rows].mean(axis=0)
+    _, sizes, directions = np.linalg.svd(moved[rows] - middle, full_matrices=False)
+    keep = min(MODES, len(rows) - 1)
+    modes = (moved - middle) @ directions[:keep].T * np.sqrt(len(rows)) / sizes[0]
+    i, j = np.triu_indices(keep)
+    x = np.concatenate([np.ones((len(real), 1)), modes, modes[:, i] * modes[:, j]], axis=1)
+    known, shift = real.targets.corrected[rows], real.targets.corrected[rows].mean(axis=0)
+    made = np.empty((len(test), known.shape[1]))
+    left, sizes, right = np.linalg.svd(x[rows], full_matrices=False)
+    for k in range(known.shape[1]):
+        y, best = known[:, k] - shift[k], np.inf
+        for ridge in RIDGES:
+            shrunk = sizes**2 / (sizes**2 + ridge)
+            fitted = left @ (shrunk * (left.T @ y))
+            error = np.abs((y - fitted) / (1 - (left**2) @ shrunk)).mean()  # each frame left out
+            if error < best:
+                best = error
+                made[:, k] = x[test] @ (right.T @ (shrunk / sizes * (left.T @ y))) + shift[k]
+    row = {"trained_on": name, "labelled_frames": len(rows), "model": "quadratic regression"}
+    targets = real.targets.rows(test)
+    for kind in ("corrected", "raw"):
+        errors = np.abs(made - getattr(targets, kind)).mean(axis=0)
+        row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}
+    return row | {"leak_slope": leak_slope(made, targets)}

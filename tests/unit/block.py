@@ -116,9 +116,17 @@ def rotation(axis, angle_rad: float) -> np.ndarray:
 class Watched(SkinSolver):
     """A solver that keeps what a contact state doesn't tell: controls, contact points, material at the last state."""
 
-    def _contact_state(self, setting, state, balance, looked):
-        self.setting, self.state = setting, state
-        return super()._contact_state(setting, state, balance, looked)
+    def begin(self, *args, **options):
+        self._contact = super().begin(*args, **options)
+        return self._contact
+
+    @property
+    def setting(self):
+        return self._contact.setting
+
+    @property
+    def state(self):
+        return self._contact.load
 
     def elastic_forces(self) -> np.ndarray:
         """Gradient of the elastic energy of the last state, (n, 3) in N, of an elastic sensor."""

@@ -55,6 +55,7 @@ def calibrated(tmp_path_factory):
     return setup, measured, done, fit, held
 
 
+@pytest.mark.slow
 def test_numbers_and_sign_are_found_again_within_their_uncertainty(calibrated):
     _, _, _, fit, _ = calibrated
     truth = np.array([TRUTH[p.name.split(".")[1]] for p in FITTED])

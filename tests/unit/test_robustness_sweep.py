@@ -158,7 +158,7 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
     assert all(case.title in page for case in plan.cases) and "Narrower" in page or "narrower in none" in page
     assert counts[0] == (0, 7) and counts[-1] == (7, 7)  # severity 0 is one cell for all
     assert all(e.severity > 0 for e in envelopes if e.pipeline == "twin")
-    assert all(e.reached for e in envelopes if e.case.name in ("hot-pixels", "noise+jpeg"))
+    assert all(e.reached for e in envelopes if e.case.name in ("wrong-crop", "noise+jpeg"))
     cells = sorted((tmp_path / "cells").iterdir())
     kept = cells[0].stat().st_mtime_ns
     cells[1].write_text("{ torn")

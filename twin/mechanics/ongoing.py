@@ -39,6 +39,11 @@ class OngoingContact:
         The object's pose at the start, free of contact.
     one_thread : callable
         Gives a context in which BLAS keeps to one thread.
+
+    Attributes
+    ----------
+    load : LoadState
+        The last converged one, of all controls.
     """
 
     def __init__(self, spec: SensorSpec, setting: Setting, T: np.ndarray, one_thread: Callable[[], AbstractContextManager]):
@@ -46,7 +51,7 @@ class OngoingContact:
         self.stepper: LoadStepper | None = None  # set before the first step
         body = setting.body
         count = len(body.points.area_mm2)
-        self._state = LoadState(
+        self.load = LoadState(
             control_mm=setting.solid.control_mm,
             border=np.zeros(2),
             anchor_mm=np.zeros((count, 3)),
@@ -64,9 +69,9 @@ class OngoingContact:
         now = [p.before(kind, term, span_s) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
         with self._one_thread():
             self.stepper.follow(replace(self.setting.body, kinds=tuple(kind for kind, _ in now)))
-            self._state, balance, looked = self.stepper.step(self._state, T, [given for _, given in now])
-            result = contact_state(self.setting, self._state, balance, looked)
-        control_mm = self._state.control_mm
+            self.load, balance, looked = self.stepper.step(self.load, T, [given for _, given in now])
+            result = contact_state(self.setting, self.load, balance, looked)
+        control_mm = self.load.control_mm
         self._past = [p.after(kind, term, span_s, control_mm) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
         return result
 

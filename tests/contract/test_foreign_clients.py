@@ -153,15 +153,18 @@ def test_published_clients_drive_the_emulated_magician(packages, script):
 @pytest.mark.parametrize("device", ["mg400", "magician"])
 def test_twin_emulate_says_when_it_is_ready_and_ends_on_sigterm(device, tmp_path):
     link = tmp_path / "arm"
-    options = ["--port-offset", "2000"] if device == "mg400" else ["--link", str(link)]
+    offset = 2000 + os.getpid() % 30000  # tests run beside each other
+    options = ["--port-offset", str(offset)] if device == "mg400" else ["--link", str(link)]
     command = [sys.executable, "-c", "from twin.cli import main; main()", "emulate", device, *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             line = process.stdout.readline().split()
-            expected = ["127.0.0.1", "31999", "32003", "32004", "32005", "32006"] if device == "mg400" else [str(link)]
+            expected = (
+                ["127.0.0.1", *(str(port + offset) for port in (29999, 30003, 30004, 30005, 30006))] if device == "mg400" else [str(link)]
+            )
             assert line == ["ready", device, *expected]
             if device == "mg400":
-                socket.create_connection(("127.0.0.1", 31999), timeout=5).close()
+                socket.create_connection(("127.0.0.1", 29999 + offset), timeout=5).close()
             else:
                 assert link.is_symlink()
             process.send_signal(signal.SIGTERM)

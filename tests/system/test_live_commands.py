@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -245,8 +246,9 @@ def test_an_emulator_that_fails_ends_with_its_error():
 
 @pytest.mark.slow
 def test_sigterm_makes_a_command_let_go_of_its_arm(tmp_path):
-    port = 29999 + 3300
-    with Mg400Emulator(port_offset=3300) as arm:
+    offset = 3300 + os.getpid() % 30000  # tests run beside each other
+    port = 29999 + offset
+    with Mg400Emulator(port_offset=offset) as arm:
         options = ["--camera", "twin", "--arm", f"mg400:127.0.0.1:{port}", "--sensor", "mg400-331", "--plain-light", "--out", str(tmp_path)]
         command = [sys.executable, "-c", "from twin.cli import main; main()", "collect", *options]
         with subprocess.Popen(command, stderr=subprocess.PIPE) as process:

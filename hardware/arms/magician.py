@@ -14,8 +14,9 @@ from serial.tools import list_ports
 from hardware.arms.arm import ArmState
 from hardware.arms.base import POLL_S, BaseArm
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import MAGICIAN, OutOfReachError
+from hardware.arms.kinematics import MAGICIAN
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
+from hardware.arms.targets import joint_target, linear_target, require_possible
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 REPLY_TIMEOUT_S = 0.3  # a reply takes some 10 ms
@@ -133,27 +134,18 @@ class Magician(BaseArm):
         self._request(Id.PTP_JOINT_PARAMS, struct.pack("<8f", *joints), ctrl=WRITE)
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent = self.kinematics.nearest_pose(pose)
-        try:
-            joints = self.kinematics.inverse(sent) if np.isfinite(sent).all() else np.full(4, np.nan)
-        except OutOfReachError as error:
-            raise DeviceError(f"{self.name}: {error}; nothing was sent") from error
+        sent, joints = linear_target(self.name, self.kinematics, pose)
         self._move(Ptp.MOVL_XYZ, sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent = np.array(joints_deg, float)
-        if sent.shape != (4,):
-            raise DeviceError(f"{self.name}: {sent.size} joint angles; it has 4 joints")
+        sent = joint_target(self.name, joints_deg)
         self._move(Ptp.MOVJ_ANGLE, sent, sent, self.kinematics.forward(sent), wait=wait, timeout_s=timeout_s)
         return sent
 
     def _move(self, mode: Ptp, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray, *, wait: bool, timeout_s: float) -> None:
         self._require_enabled()
-        if not np.isfinite(joints).all():
-            raise DeviceError(f"{self.name}: the target {numbers} is not a number; nothing was sent")
-        if violation := self.kinematics.violation(joints):
-            raise DeviceError(f"{self.name}: {violation.text}; nothing was sent. Choose a target within reach and limits")
+        require_possible(self.name, self.kinematics, numbers, joints)
         if alarms := self._alarms():
             raise DeviceError(f"{self.name}: {explain(alarms)}")
         begun_s = time.monotonic()

@@ -11,7 +11,7 @@ from hardware.arms import kinematics as arms
 from hardware.arms.arm import ArmState
 from hardware.arms.base import POLL_S, BaseArm
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import LinkageKinematics, OutOfReachError
+from hardware.arms.kinematics import LinkageKinematics
 from hardware.arms.mg400_link import SILENCE_S, CommandPort, Feedback
 from hardware.arms.mg400_wire import (
     DASHBOARD_PORT,
@@ -25,6 +25,7 @@ from hardware.arms.mg400_wire import (
     require_ports,
     why_refused,
 )
+from hardware.arms.targets import joint_target, linear_target, require_possible
 from hardware.errors import DeviceError, DeviceNotConnectedError
 
 ENABLE_TIMEOUT_S = 5.0
@@ -155,18 +156,12 @@ class MG400(BaseArm):
                 self._ask(f"{name}({int(np.clip(np.floor(percent + 1e-9), 1, 100))})")
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent = self.kinematics.nearest_pose(pose)
-        try:
-            joints = self.kinematics.inverse(sent) if np.isfinite(sent).all() else np.full(4, np.nan)
-        except OutOfReachError as error:
-            raise DeviceError(f"{self.name}: {error}; nothing was sent") from error
+        sent, joints = linear_target(self.name, self.kinematics, pose)
         self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent = np.array(joints_deg, float)
-        if sent.shape != (4,):
-            raise DeviceError(f"{self.name}: {sent.size} joint angles; it has 4 joints")
+        sent = joint_target(self.name, joints_deg)
         self._move("JointMovJ", sent, sent, None, wait=wait, timeout_s=timeout_s)
         return sent
 
@@ -174,10 +169,7 @@ class MG400(BaseArm):
         self, command: str, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float
     ) -> None:
         self._require_connected()
-        if not np.isfinite(joints).all():
-            raise DeviceError(f"{self.name}: the target {numbers} is not a number; nothing was sent")
-        if violation := self.kinematics.violation(joints):
-            raise DeviceError(f"{self.name}: {violation.text}; nothing was sent. Choose a target within reach and limits")
+        require_possible(self.name, self.kinematics, numbers, joints)
         packet, _ = self._feedback.newest(SILENCE_S)  # old firmware would not tell
         if int(packet["mode"]) == Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")

@@ -36,8 +36,7 @@ def fit_rim(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray]) ->
         table += np.array(ring.rim.light) / RIM_UNIT
     total = np.maximum(np.bincount(cell.ravel(), weight.ravel(), minlength=AZIMUTHS * RADII), 1e-6)
     for _ in range(ROUNDS):
-        light_of = RimSpec(inner_mm=inner, outer_mm=outer, light=np.rint(RIM_UNIT * table).astype(int).tolist())
-        spec = revised(spec, housing={"rim": light_of.model_dump()})
+        spec = _with_rim(spec, inner, outer, table)
         more = static_layer(spec, window)[0] - before
         more = more if spec.camera.channels == "color" else more.mean(axis=2)
         missing = np.mean([_missing(spec, frame, np.maximum(lit + more, 0)) for frame, lit in zip(frames, light, strict=True)], axis=0)
@@ -46,8 +45,13 @@ def fit_rim(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray]) ->
             table[..., k] += GAIN * (
                 np.bincount(cell.ravel(), (weight * flat[:, None]).ravel(), minlength=AZIMUTHS * RADII) / total
             ).reshape(AZIMUTHS, RADII)
-    light_of = RimSpec(inner_mm=inner, outer_mm=outer, light=np.rint(RIM_UNIT * table).astype(int).tolist())
-    return revised(spec, housing={"rim": light_of.model_dump()})
+    return _with_rim(spec, inner, outer, table)
+
+
+def _with_rim(spec: SensorSpec, inner_mm: float, outer_mm: float, table: np.ndarray) -> SensorSpec:
+    """The specification with a table (A, R, 3) of linear light as its rim."""
+    rim = RimSpec(inner_mm=inner_mm, outer_mm=outer_mm, light=np.rint(RIM_UNIT * table).astype(int).tolist())
+    return revised(spec, housing={"rim": rim.model_dump()})
 
 
 def _missing(spec: SensorSpec, frame: Aligned, light: np.ndarray) -> np.ndarray:

@@ -9,10 +9,12 @@ import numpy as np
 
 import twin.preprocess
 from scenes.sensor import SensorSpec
+from training.recorded_contact import read_arm_labels
 from training.simulated import is_pins_only, open_simulated
-from training.targets import Targets, choose_targets
+from training.targets import DEPTH_PER_MOVE, Targets, choose_targets
 from twin.cache import cached_arrays
 from twin.errors import FrameError
+from twin.kinematics import rig_of
 from twin.preprocess import Pipeline, make_graph, make_reference, nominal_reference
 from twin.preprocess.batch import UNMEASURED, recording_reference
 from twin.preprocess.reference import Reference
@@ -103,7 +105,13 @@ class Dataset:
 
 
 def load_dataset(
-    folder: str | Path, spec: SensorSpec, columns: str | tuple = "surface-2d", *, form: Form | None = None, progress: Callable | None = None
+    folder: str | Path,
+    spec: SensorSpec,
+    columns: str | tuple = "surface-2d",
+    *,
+    form: Form | None = None,
+    missing: Callable | None = None,
+    progress: Callable | None = None,
 ) -> Dataset:
     """Read a labelled recording, real or simulated.
 
@@ -113,6 +121,9 @@ def load_dataset(
         Anything ``open_recording`` takes that has a table of labels, or a simulated data set without pictures.
     columns : str or tuple of str
         A name of ``training.targets.PRESETS``, or the table's columns themselves.
+    missing : callable, optional
+        Called with labels (list of S ``ArmLabel``), displacements (S, N, 2) and contacts (S,) of a simulated data set without
+        pictures; what it gives (S, N, 2), px, is added to the displacements.
     progress : callable, optional
         Called with (done, total) while the pipeline runs.
 
@@ -124,13 +135,15 @@ def load_dataset(
     problems: list[str] = []
     if is_pins_only(Path(folder)):
         recording, truth = open_simulated(Path(folder), spec)
-        pins = simulated_table(recording, spec, truth, progress=progress)
+        pins = simulated_table(recording, spec, truth, missing, progress=progress)
+        depth_per_move = np.tan(np.radians(rig_of(spec).plate_tilt_deg))
     else:
+        depth_per_move = DEPTH_PER_MOVE.get(spec.name, 0.0)
         recording = open_recording(folder, spec, form)
         pins = pin_table(recording, spec, problems=problems, progress=progress)
     row_of = {name: k for k, name in enumerate(recording.names)}
     rows = np.array([row_of[name] for name in pins.image_name], int)
-    targets = choose_targets(recording, spec, columns, rows, problems)
+    targets = choose_targets(recording, columns, rows, depth_per_move, problems)
     unseen = ~pins.valid
     if unseen.any():
         problems.append(f"{_named(pins.image_name[unseen])}: pins not found; left out of training")
@@ -159,14 +172,24 @@ def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[
     return np.sort(shuffled[held:]), shuffled[:held]
 
 
-def simulated_table(recording: Recording, spec: SensorSpec, truth: dict[str, np.ndarray], *, progress: Callable | None = None) -> PinTable:
+def simulated_table(
+    recording: Recording,
+    spec: SensorSpec,
+    truth: dict[str, np.ndarray],
+    missing: Callable | None = None,
+    *,
+    progress: Callable | None = None,
+) -> PinTable:
     """The table that a pipeline without a fault would make of simulated frames, from their pins; hidden caps count as lost.
 
     Each contact may have a sensor of its own (longer pins, a thinner skin): its pins are counted from where they are at rest
-    there, as those of a real sensor are from its own no-contact frame.
+    there, as those of a real sensor are from its own no-contact frame. ``missing`` as in ``load_dataset``.
     """
     reference = nominal_reference(spec, recording.form)
-    nodes = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])
+    moved_px = truth["pins_px"].astype(float) - truth["rest_px"]
+    if missing:
+        moved_px = moved_px + missing(read_arm_labels(recording), moved_px, recording.labels[GROUP_COLUMN].astype(int))
+    nodes = reference.pins_px + moved_px
 
     def compute() -> dict[str, np.ndarray]:
         areas = np.empty(nodes.shape[:2])

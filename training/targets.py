@@ -1,8 +1,8 @@
 """Which labels a model learns: columns of a recording's table, as published and corrected.
 
 Corrected: in the published Tac-VGNN recordings the shear move had not been executed in about a third of the frames when
-the frame was taken. There both shears are zero, the angle is ``pose_6 - move_6``, and, as the plate is slightly tilted,
-the depth is ``pose_2 + c move_1``.
+the frame was taken. There both shears are zero, the angle is ``pose_6 - move_6``, and, as the plate is slightly tilted, the
+depth is ``pose_2 + c move_1``; on the way of a tap at ``pose_1`` it is ``pose_2 - c pose_1``: what it would be before the middle.
 """
 
 import csv
@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.recordings import Recording
 
@@ -75,8 +74,8 @@ def unit_of(name: str) -> str:
     return {"force": "N", "torque": "Nmm"}.get(kind, "")
 
 
-def choose_targets(recording: Recording, spec: SensorSpec, columns: str | tuple, rows: np.ndarray, problems: list) -> Targets:
-    """Labels of the recording's frames ``rows`` (M,).
+def choose_targets(recording: Recording, columns: str | tuple, rows: np.ndarray, depth_per_move: float, problems: list) -> Targets:
+    """Labels of the recording's frames ``rows`` (M,); ``depth_per_move`` is c above.
 
     Raises
     ------
@@ -101,18 +100,24 @@ def choose_targets(recording: Recording, spec: SensorSpec, columns: str | tuple,
     known = read_executed(recording.path, problems) if both else {}
     if known:
         executed = np.array([known.get(recording.names[row], np.nan) for row in rows])
-    return Targets(names, raw, corrected(names, raw, executed, move, DEPTH_PER_MOVE.get(spec.name, 0.0)), executed, move)
+    x_mm = _numbers(recording.labels["pose_1"], "pose_1", [])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))
+    return Targets(names, raw, corrected(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm)), executed, move)
 
 
-def corrected(names: tuple, raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float) -> np.ndarray:
-    """Labels (M, K) with the moves (M, 2) that were not executed taken out; an unknown ``executed`` (M,) counts as executed."""
+def corrected(
+    names: tuple, raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float, x_mm: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """Labels (M, K) with the moves (M, 2) that were not executed taken out; an unknown ``executed`` (M,) counts as executed.
+
+    ``x_mm`` (M,) is the table's ``pose_1``: 0 in the published recordings.
+    """
     undone = 1.0 - np.where(np.isnan(executed), 1.0, executed)
     out = raw.copy()
     for k, name in enumerate(names):
         if name == "pose_6":
             out[:, k] -= undone * np.nan_to_num(move[:, 1])
         elif name == "pose_2":
-            out[:, k] += undone * depth_per_move * np.nan_to_num(move[:, 0])
+            out[:, k] += depth_per_move * (undone * np.nan_to_num(move[:, 0]) - x_mm)
         elif name in ("move_1", "move_6"):
             out[:, k] *= 1 - undone
     return out

@@ -86,6 +86,13 @@ def test_moves_that_were_not_executed_are_taken_out():
     assert np.allclose(out, [[-2, 10, 3, 4], [-1.97, 6, 0, 0], [-2, 10, 3, 4]])
 
 
+def test_a_tilted_plate_is_as_deep_on_the_way_of_a_tap_as_where_the_move_was_not_executed():
+    """A tap at pose_1 = -3, and the same frame labelled as if it had been moved by 3 to the middle, are one contact."""
+    names, move = ("pose_2", "pose_6"), np.array([[0.0, 0.0], [3.0, 0.0]])
+    out = corrected(names, np.array([[-2.0, 10], [-2.0, 10]]), np.array([1.0, 0.0]), move, 0.01, np.array([-3.0, 0.0]))
+    assert np.allclose(out, [[-1.97, 10], [-1.97, 10]])
+
+
 def test_a_fifth_is_held_out_at_random():
     train, held = split_rows(3763, 1)
     assert np.array_equal(held, np.random.default_rng(1).permutation(3763)[:753]) and len(train) + len(held) == 3763

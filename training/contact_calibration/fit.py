@@ -101,24 +101,24 @@ def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Callable | 
     prior = np.array([p.prior for p in setup.parameters])
     value = start.copy()
     moved = simulate(setup, measured, [value], sign, progress)[0]
-    weights = expect(_squared(moved, target))
+    weights = expect(mean_squared(moved, target))
     for _ in range(ROUNDS):
         slopes = _slopes(setup, measured, value, sign, moved, progress)
         matrix, force = _normal(slopes, target[:, None] - moved, weights)
         step = np.linalg.solve(matrix + np.diag(prior**-2), force + (start - value) / prior**2)
-        squared = _squared(moved, target)
+        squared = mean_squared(moved, target)
         now, solved = weights.cost(squared) + np.sum(((value - start) / prior) ** 2), np.isfinite(squared).sum()
         length = 1.0
         while length >= SHORTEST:
             tried = value + length * step
             there = simulate(setup, measured, [tried], sign, progress)[0]
-            squared = _squared(there, target)
+            squared = mean_squared(there, target)
             cost = weights.cost(squared) + np.sum(((tried - start) / prior) ** 2)
             if cost < now and np.isfinite(squared).sum() >= solved:
                 value, moved = tried, there
                 break
             length /= 2
-        weights = expect(_squared(moved, target))
+        weights = expect(mean_squared(moved, target))
         if length < SHORTEST:
             break
     slopes = _slopes(setup, measured, value, sign, moved, progress)
@@ -208,7 +208,7 @@ def _slopes(setup: Setup, measured: MeasuredFrames, value: np.ndarray, sign: int
     return np.nan_to_num((there - moved) / np.diag(steps)[:, None, None, None, None])
 
 
-def _squared(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
+def mean_squared(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
     """(M, 2) mean squared pin error, px^2, of displacements (M, 2, N, 2); lost pins are left out, a failed contact is NaN."""
     seen = np.isfinite(target[:, None, :, 0])
     each = np.sum((moved - target[:, None]) ** 2, axis=-1)

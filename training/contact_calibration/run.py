@@ -15,7 +15,7 @@ from training.contact_calibration.report import summary_of, write_calibration
 from training.contact_calibration.simulate import Setup
 from training.validation.model import MeasuredFrames, measure_frames
 from twin.kinematics import rig_of
-from twin.types import Form
+from twin.types import FINE, Form
 
 MOST_HELD_OUT = 20
 
@@ -31,7 +31,7 @@ def calibrate_contact(
     *,
     parameters: tuple = PARAMETERS,
     workers: int = 1,
-    across: int | None = None,
+    across: int = FINE,
     form: Form | None = None,
     progress: Callable | None = None,
 ) -> tuple[SensorSpec, dict, Path]:

@@ -31,7 +31,7 @@ class Setup:
     experiment: ExperimentSpec
     touched: ObjectSpec
     form: Form
-    across: int | None
+    across: int
     folder: Path
     workers: int = 1
     parameters: tuple = PARAMETERS

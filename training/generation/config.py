@@ -14,7 +14,7 @@ from scenes.randomisation import FrictionSpread, RandomisationSpec, number_type
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError, TwinError
 from twin.kinematics import ArmLabel, rig_of
-from twin.types import Form
+from twin.types import FINE, Form
 
 
 class DatasetError(TwinError):
@@ -45,7 +45,7 @@ class GenerationConfig(Section):
     images: Literal["raw", "gray", "recording", "none"] = "raw"
     states: Literal["end", "all"] = "end"
     quality: Literal["preview", "standard", "high"] = "standard"
-    across: Annotated[int, Field(ge=6, le=64, multiple_of=2)] = 16
+    across: Annotated[int, Field(ge=6, le=64, multiple_of=2)] = FINE
 
     @property
     def form(self) -> Form:

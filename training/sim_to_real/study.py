@@ -13,8 +13,11 @@ from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_slope, predict_rows_of
 from training.recipes import TrainingError, recipe_of
+from training.recorded_contact import read_arm_labels
 from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors, write_text
+from training.validation.model import MeasuredFrames
+from twin.recordings import open_recording
 
 MANY = 500  # labelled frames: a morning's work with the rig
 MODES, RIDGES = 20, 10.0 ** np.arange(-4, 3.1, 0.5)  # of the quadratic regression
@@ -53,6 +56,15 @@ def choose_frames(count: int, labels: int, seed: int) -> Frames:
     order = np.random.default_rng([seed, labels]).permutation(rest)
     trained = {str(n): np.sort(order[:n]) for n in (labels, MANY) if n < len(rest)}
     return Frames(test, np.sort(order[:labels]), trained | {"all": rest})
+
+
+def measured_of(real: Dataset, rows: np.ndarray) -> MeasuredFrames:
+    """Some frames of a recording with the arm's labels, as contacts are fitted to them."""
+    recording = open_recording(real.folder, real.pins.sensor, real.pins.form)
+    labels = dict(zip(recording.names, read_arm_labels(recording), strict=True))
+    names = real.pins.image_name[rows].tolist()
+    pins_px = np.where(real.pins.lost[rows, :, None], np.nan, real.pins.nodes_px[rows])
+    return MeasuredFrames(real.pins.form, names, [labels[name] for name in names], pins_px, real.pins.reference.pins_px, [])
 
 
 def train_in_twin(sim: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Callable | None = None) -> None:

@@ -24,7 +24,7 @@ from twin.preprocess.forms import from_raw
 from twin.projection import project
 from twin.recordings import open_recording
 from twin.stimulus import build_stimulus
-from twin.types import Form
+from twin.types import FINE, Form
 
 _SAME = 1e-9  # of the way: fractions that mean the same pose
 
@@ -100,14 +100,14 @@ class ContactModel:
     ----------
     form : Form
         Whose pixels the pins are in.
-    across : int, optional
+    across : int
         Elements along each side of the skin's grid.
     """
 
-    def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int | None = None) -> None:
+    def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
         self.spec, self.experiment, self.form = spec, experiment, form
         self.rig, self.stimulus = rig_of(spec), build_stimulus(touched)
-        self.solver = SkinSolver(spec, resolution=Resolution(across) if across else None, keep=False)
+        self.solver = SkinSolver(spec, resolution=Resolution(across), keep=False)
         self.rest_px = self._pixels(self.solver.rest().caps_mm)
 
     def displacement_px(self, label: ArmLabel, friction: float | None = None) -> np.ndarray:

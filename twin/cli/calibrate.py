@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, Sensor
+from twin.cli.options import Across, FormOrAuto, Sensor
+from twin.types import FINE
 
 calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(calibrate_app, name="calibrate")
@@ -102,7 +103,7 @@ def contact(
     ] = None,
     hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="leave this parameter as it is; may be repeated")] = None,
     workers: Annotated[int, typer.Option("--workers", min=1, metavar="N", help="processes on this machine")] = 1,
-    across: Annotated[int | None, typer.Option("--across", min=6, max=64, help="elements along each side of the skin's grid; even")] = None,
+    across: Across = FINE,
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor

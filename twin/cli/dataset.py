@@ -6,8 +6,9 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Out, Sensor
+from twin.cli.options import Across, Out, Sensor
 from twin.cli.render import Quality
+from twin.types import FINE
 
 HELP = """Simulate a labelled data set: the contacts of an experiment, in the recordings' own format, with ground truth.
 
@@ -82,16 +83,14 @@ def dataset(
     workers: Annotated[int, typer.Option("--workers", min=1, metavar="N", help="processes on this machine")] = 1,
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="of a running Dask scheduler, whose workers do it")] = "",
     quality: Annotated[Quality, typer.Option(help="samples per pixel")] = Quality.STANDARD,
-    across: Annotated[int, typer.Option("--across", min=6, max=64, help="elements along each side of the skin's grid; even")] = 16,
+    across: Across = FINE,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
-    from training.generation import DatasetError, GenerationConfig, generate
+    from training.generation import GenerationConfig, generate
     from twin.cli.progress import rate_bar
     from twin.kinematics import rig_of
     from twin.preprocess.forms import frame_size
 
-    if across % 2:
-        raise DatasetError(f"--across {across}: give an even number")
     spec, plan = load_sensor(sensor), load_experiment(experiment)
     touched = load_object(object_ or plan.object)
     config = GenerationConfig(

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from twin.errors import TwinError
 from twin.types import Form
 
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
@@ -16,10 +17,17 @@ Target = Annotated[str, typer.Option("--target", help="preset, or label columns 
 Pair = tuple[float, float]
 
 
+def _even(value: int) -> int:
+    if value % 2:
+        raise TwinError(f"--across {value}: give an even number")
+    return value
+
+
+Across = Annotated[int, typer.Option("--across", min=6, max=64, callback=_even, help="elements along each side of the skin's grid; even")]
+
+
 def writable_folder(path: Path) -> Path:
     """Make the folder, or say in one line why it can't be written to."""
-    from twin.errors import TwinError
-
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".write-probe"

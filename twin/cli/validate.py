@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, Out, Sensor, writable_folder
+from twin.cli.options import Across, FormOrAuto, Out, Sensor, writable_folder
+from twin.types import FINE
 
 HELP = """Compare the twin's pins with those of labelled real frames.
 
@@ -38,7 +39,7 @@ def validate(
         int, typer.Option("--friction-frames", min=0, metavar="N", help="frames for which their own friction is sought, 9 contacts each")
     ] = 5,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the choice of frames")] = 0,
-    across: Annotated[int | None, typer.Option("--across", min=6, max=64, help="elements along each side of the skin's grid; even")] = None,
+    across: Across = FINE,
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor

@@ -1,0 +1,79 @@
+"""What a twin misses, learnt from a few frames: it is found where it is smooth, distrusted where it isn't, and nothing at rest."""
+
+import numpy as np
+import pytest
+
+from training.sim_to_real.discrepancy import Discrepancy, Residuals, label_axes
+from twin.kinematics import ArmLabel
+
+PINS = 30
+RECOVERED = 0.25  # of what was missing may be left, on labels between those that were learnt from
+
+
+def labels_of(rng, count):
+    poses, moves = np.zeros((count, 6)), np.zeros((count, 6))
+    poses[:, 1], poses[:, 5] = rng.uniform(-4, 0, count), rng.uniform(-20, 20, count)
+    moves[:, 0] = rng.uniform(-5, 5, count)
+    return [ArmLabel(pose, move, bool(done)) for pose, move, done in zip(poses, moves, rng.random(count) < 0.7, strict=True)]
+
+
+def moved_of(labels):
+    """Displacements of a made-up sensor: outwards with depth, sideways with the move."""
+    place = np.linspace(-1, 1, 2 * PINS).reshape(PINS, 2)
+    return np.stack([(label.pose[1] + 5) * place + 0.4 * label.executed * label.move[0] for label in labels])
+
+
+def missed_by(labels, moved, scatter=0.0, seed=9):
+    """2 % and a bend with the angle; with ``scatter``, something that no label tells."""
+    rng = np.random.default_rng(seed)
+    rms = np.sqrt((moved**2).sum(-1).mean(-1))[:, None, None]
+    bend = np.array([np.sin(label.pose[5] / 12) for label in labels])[:, None, None] * np.cos(np.arange(2 * PINS)).reshape(PINS, 2)
+    return 0.02 * moved + rms * (0.03 * bend + scatter * rng.normal(size=(len(labels), 1, 1)))
+
+
+@pytest.fixture(scope="module")
+def rng():
+    return np.random.default_rng(1)
+
+
+def learnt(rng, scatter=0.0, count=40):
+    labels = labels_of(rng, count)
+    moved = moved_of(labels)
+    return Discrepancy(Residuals(label_axes(labels), moved, missed_by(labels, moved, scatter)))
+
+
+def test_a_smooth_miss_is_recovered_on_other_labels(rng):
+    found, labels = learnt(rng), labels_of(rng, 50)
+    moved = moved_of(labels)
+    missed = missed_by(labels, moved)
+    left = missed - found.mean_px(labels, moved)
+    assert np.abs(left).mean() < RECOVERED * np.abs(missed).mean()
+
+
+def test_what_no_label_tells_is_drawn_as_widely_as_it_was_seen(rng):
+    found, labels = learnt(rng, scatter=0.05), labels_of(rng, 200)
+    moved = moved_of(labels)
+    missed = missed_by(labels, moved, scatter=0.05, seed=10)
+    drawn = found.draw_px(labels, moved, np.arange(len(labels)), seed=0)
+    ratio = np.std((drawn - found.mean_px(labels, moved)).mean(axis=(1, 2))) / np.std(
+        (missed - found.mean_px(labels, moved)).mean(axis=(1, 2))
+    )
+    assert 0.6 < ratio < 1.6
+    assert found.summary()[0]["told"] < 0.9
+
+
+def test_states_of_one_contact_share_one_function_and_the_draw_repeats(rng):
+    found, label = learnt(rng, scatter=0.05), labels_of(rng, 1)[0]
+    twice = [label, ArmLabel(label.pose + [0, 1e-3, 0, 0, 0, 0], label.move, label.executed)]
+    moved = moved_of([label, label])
+    together = found.draw_px(twice, moved, np.array([4, 4]), seed=2)
+    apart = found.draw_px(twice, moved, np.array([4, 5]), seed=2)
+    assert np.abs(together[0] - together[1]).max() < 0.1 * np.abs(apart[0] - apart[1]).max()
+    assert np.array_equal(together, found.draw_px(twice, moved, np.array([4, 4]), seed=2))
+
+
+def test_it_grows_with_the_displacement(rng):
+    """A contact that moves the pins half as far misses half as much."""
+    found, labels = learnt(rng), labels_of(rng, 5)
+    moved = 2 * moved_of(labels)
+    assert found.mean_px(labels, moved / 2) == pytest.approx(found.mean_px(labels, moved) / 2)

@@ -1,0 +1,156 @@
+"""What a calibrated twin's pins still miss on a real sensor, learnt from a few labelled frames (Kennedy & O'Hagan 2001).
+
+A frame's residual, real less simulated displacement, is divided by the rms of the simulated displacement (where nothing
+moves, nothing is missed) and written in the residuals' own modes; each mode's amplitude is a Gaussian process of the label,
+
+    a(l) ~ GP(0, c^2 + s^2 exp(-sum_i (l_i - l'_i)^2 / 2 w_i^2) + n^2 [same frame])
+
+(Higdon et al. 2008). c, s, w and n maximise the marginal likelihood; l is the pose of the tap and the move as far as it was
+executed. Drawn for simulated contacts, one function of the posterior for each, it teaches a model what the twin is known to
+miss, and how little it is to be trusted where the frames don't tell.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+from training.contact_calibration.fit import expect, mean_squared
+from training.contact_calibration.simulate import Setup
+from training.recipes import TrainingError
+from training.validation.model import MeasuredFrames
+from twin.kinematics import ArmLabel, rig_of
+
+FEWEST = 8  # frames that both stories could be simulated of
+LEAST_PX = 0.5  # of the rms displacement that residuals are divided by
+VARIES = 1e-6  # mm or deg: sd of a label's axis from which on it counts
+MODES_SHARE = 0.97  # of the residuals' variance that the modes hold
+LENGTHS = (1.0, 30.0)  # bounds of w, in sd of the label
+SIZES = (1e-3, 10.0)  # bounds of c and s, in rms of the amplitude
+NOISES = (0.05, 1.0)  # bounds of n^2: some tens of frames would be explained to the last by so many lengths
+TRUSTED = 0.5
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What a twin misses on K frames with N pins.
+
+    Attributes
+    ----------
+    axes : (K, 12) float
+        See ``label_axes``.
+    moved_px : (K, N, 2) float
+        Simulated displacements.
+    missing_px : (K, N, 2) float
+        Real less simulated; 0 for lost pins.
+    """
+
+    axes: np.ndarray
+    moved_px: np.ndarray
+    missing_px: np.ndarray
+
+    @property
+    def error_px(self) -> float:
+        """Mean distance of a real pin from its simulated place."""
+        return float(np.linalg.norm(self.missing_px, axis=-1).mean())
+
+
+def label_axes(labels: list[ArmLabel]) -> np.ndarray:
+    """(K, 12) the pose that was tapped at, and the move as far as it was executed: mm and deg."""
+    return np.stack([np.concatenate([label.pose - label.move, label.move * label.executed]) for label in labels])
+
+
+def measure_residuals(setup: Setup, measured: MeasuredFrames, progress: Callable | None = None) -> Residuals:
+    """Simulate labelled frames after the tap and after the move; the likelier story of each is compared.
+
+    Raises
+    ------
+    TrainingError
+        Too few frames that the twin can simulate and half explain.
+    """
+    labels, real_px = measured.labels, measured.pins_px - measured.no_contact_px
+    jobs = [(np.zeros(0), rig_of(setup.sensor).turn_sign, row) for row in range(len(labels))]
+    moved = setup.displacements(jobs, labels, progress)
+    weights = expect(mean_squared(moved, real_px))
+    good = np.flatnonzero(np.isfinite(moved).all(axis=(1, 2, 3)) & (weights.trust > TRUSTED))
+    if len(good) < FEWEST:
+        raise TrainingError(f"{len(good)} of {len(labels)} labelled frames fit the twin, {FEWEST} must; give more --labels, or --calibrate")
+    executed = weights.executed[good] > 0.5
+    told = [replace(labels[k], executed=bool(done)) for k, done in zip(good, executed, strict=True)]
+    simulated = moved[good, executed.astype(int)]
+    return Residuals(label_axes(told), simulated, np.nan_to_num(real_px[good] - simulated))
+
+
+class Discrepancy:
+    """Gaussian processes of the residuals' modes.
+
+    Parameters
+    ----------
+    residuals : Residuals
+    """
+
+    def __init__(self, residuals: Residuals) -> None:
+        axes = residuals.axes
+        self.used = axes.std(axis=0) > VARIES
+        self.middle, self.spread = axes[:, self.used].mean(axis=0), axes[:, self.used].std(axis=0)
+        relative = residuals.missing_px.reshape(len(axes), -1) / _rms_px(residuals.moved_px)[:, None]
+        left, sizes, self.modes = np.linalg.svd(relative, full_matrices=False)
+        kept = np.searchsorted(np.cumsum(sizes**2) / (sizes**2).sum(), MODES_SHARE) + 1
+        amplitudes = left * sizes
+        self.rest = amplitudes[:, kept:] @ self.modes[kept:] / np.sqrt(len(axes))  # random combinations of what the modes leave
+        self.modes = self.modes[:kept]
+        self.sizes = np.sqrt((amplitudes[:, :kept] ** 2).mean(axis=0))
+        self.processes = [_process(self._scaled(axes), column) for column in (amplitudes[:, :kept] / self.sizes).T]
+
+    def mean_px(self, labels: list[ArmLabel], moved_px: np.ndarray) -> np.ndarray:
+        """(S, N, 2) what S simulated displacements (S, N, 2) are expected to miss."""
+        scaled = self._scaled(label_axes(labels))
+        amplitudes = np.stack([process.predict(scaled) for process in self.processes], axis=1)
+        return self._fields(amplitudes, moved_px)
+
+    def draw_px(self, labels: list[ArmLabel], moved_px: np.ndarray, contact: np.ndarray, seed: int) -> np.ndarray:
+        """(S, N, 2) what S simulated displacements may miss: for the states of each contact (S,) one function of the posterior."""
+        scaled = self._scaled(label_axes(labels))
+        amplitudes = np.empty((len(scaled), len(self.modes)))
+        shares = np.empty((len(scaled), len(self.rest)))
+        for number in np.unique(contact):
+            rows = np.flatnonzero(contact == number)
+            rng = np.random.default_rng([seed, int(number)])
+            for k, process in enumerate(self.processes):
+                mean, covariance = process.predict(scaled[rows], return_cov=True)
+                noise = process.kernel_.k2.noise_level
+                own = np.sqrt(noise) * rng.normal()  # of the frame, the same for all states of a contact
+                smooth = covariance - noise * np.eye(len(rows))
+                amplitudes[rows, k] = rng.multivariate_normal(mean, smooth, method="eigh") + own
+            shares[rows] = rng.normal(size=len(self.rest))
+        return self._fields(amplitudes, moved_px, shares @ self.rest)
+
+    def summary(self) -> list[dict]:
+        """Of each mode: its share of the residuals, and of its variance the part that the label tells."""
+        share = self.sizes**2 / ((self.sizes**2).sum() + (self.rest**2).sum())
+        noise = [process.kernel_.k2.noise_level for process in self.processes]
+        return [{"share": float(a), "told": float(max(0.0, 1 - n))} for a, n in zip(share, noise, strict=True)]
+
+    def _scaled(self, axes: np.ndarray) -> np.ndarray:
+        return (axes[:, self.used] - self.middle) / self.spread
+
+    def _fields(self, amplitudes: np.ndarray, moved_px: np.ndarray, rest: np.ndarray | float = 0.0) -> np.ndarray:
+        relative = (amplitudes * self.sizes) @ self.modes + rest
+        return (relative * _rms_px(moved_px)[:, None]).reshape(moved_px.shape)
+
+
+def _process(axes: np.ndarray, amplitude: np.ndarray) -> GaussianProcessRegressor:
+    smooth = ConstantKernel(0.5, np.square(SIZES)) * RBF(np.full(axes.shape[1], 2.0), LENGTHS)
+    kernel = ConstantKernel(0.5, np.square(SIZES)) + smooth + WhiteKernel(0.3, NOISES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # at a bound: an axis that doesn't matter, a mode without noise
+        return GaussianProcessRegressor(kernel).fit(axes, amplitude)
+
+
+def _rms_px(moved_px: np.ndarray) -> np.ndarray:
+    """(S,) of displacements (S, N, 2), with a floor."""
+    return np.maximum(np.sqrt((moved_px**2).sum(axis=-1).mean(axis=-1)), LEAST_PX)

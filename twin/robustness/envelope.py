@@ -9,6 +9,7 @@ from twin.robustness.measures import MEASURES, POSE_MEASURES, Measure
 
 DRAWS = 400  # of the bootstrap over the frames
 BAND = (5, 95)  # percentiles
+SHORT = 0.75  # of the rendered margin: less is a sensor that has lost some of it
 
 
 @dataclass(frozen=True)
@@ -49,12 +50,15 @@ class Envelope:
         At which the first measure crosses its limit; inf if none does up to the severest.
     measure : str
         That one; "" if none.
+    interval : (2,) float
+        Severities at which the ends of that measure's 90 % band cross; inf where one does not.
     """
 
     case: Case
     pipeline: str
     severity: float
     measure: str
+    interval: tuple[float, float] = (np.inf, np.inf)
 
     @property
     def reached(self) -> bool:
@@ -69,7 +73,29 @@ class Envelope:
     @property
     def label(self) -> str:
         """In the parameter's unit."""
-        return self.case.label(self.severity) if self.reached else f"> {self.case.label(1.0)}"
+        if not self.reached:
+            return f"> {self.case.label(1.0)}"
+        return self.case.label(self.severity) if self.severity > 0 else "fails undegraded"
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of the margin that rendered frames have the real ones of a sensor have."""
+
+    real: Envelope
+    rendered: Envelope
+
+    @property
+    def value(self) -> float:
+        """Ratio of the severities; a bound where either does not fail within the range."""
+        if self.rendered.width > 0:
+            return self.real.width / self.rendered.width
+        return np.inf if self.real.width > 0 else 1.0
+
+    @property
+    def short(self) -> bool:
+        """The real sensor lives on the bad side of the envelope."""
+        return self.value < SHORT
 
 
 def crossing(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndarray) -> float:
@@ -105,8 +131,15 @@ def envelopes_of(curves: list[Curve], cases: tuple[Case, ...]) -> list[Envelope]
         for pipeline in dict.fromkeys(c.pipeline for c in curves if c.case == case.name):
             first = min((c for c in curves if c.case == case.name and c.pipeline == pipeline), key=lambda c: c.crossing)
             reached = np.isfinite(first.crossing)
-            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else ""))
+            ends = sorted(crossing(first.measure, first.limit, first.severity, edge) for edge in (first.low, first.high))
+            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else "", tuple(ends)))
     return found
+
+
+def shares_of(real: list[Envelope], rendered: list[Envelope], pipeline: str) -> list[Share]:
+    """Real envelopes of one pipeline beside the rendered ones of the same cases, least share first."""
+    beside = {e.case.name: e for e in rendered if e.pipeline == pipeline}
+    return sorted((Share(e, beside[e.case.name]) for e in real if e.pipeline == pipeline), key=lambda share: share.value)
 
 
 def _curve(case: str, pipeline: str, measure: Measure, limit: float, rows: list[dict]) -> Curve:

@@ -10,15 +10,15 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.detectors import METHODS, DetectorSpec, load_detector, shipped_detector, tune, write_detector
 from twin.errors import TwinError
-from twin.preprocess.reference import nominal_reference
 from twin.recordings import open_recording
 from twin.robustness.condition import Case
 from twin.robustness.contacts import CONTACTS
-from twin.robustness.envelope import Envelope, curves_of, envelopes_of
+from twin.robustness.envelope import Envelope
+from twin.robustness.judgement import judge_sweep
 from twin.robustness.real import consensus
 from twin.robustness.report import write_report
-from twin.robustness.shots import RealSource, RenderedSource
-from twin.robustness.sweep import Plan, run_sweep
+from twin.robustness.shots import RenderedSource
+from twin.robustness.sweep import Models, Plan
 from twin.types import Form, Frame
 
 
@@ -64,9 +64,22 @@ def rendered_study(spec: SensorSpec, pipelines: list[str], cases: tuple[Case, ..
 
 
 def real_study(
-    spec: SensorSpec, path: Path, limit: int, pipelines: list[str], cases: tuple[Case, ...], severities: tuple, out: Path, bar, **options
+    spec: SensorSpec,
+    path: Path,
+    limit: int,
+    pipelines: list[str],
+    cases: tuple[Case, ...],
+    severities: tuple,
+    out: Path,
+    bar: Callable,
+    *,
+    beside: bool = True,
+    **options,
 ):
-    """A study on a folder of real frames: image-level conditions only; options and results as `study`."""
+    """A study on a folder of real frames: image-level conditions only; options and results as `study`.
+
+    ``beside``: raw frames are shown on the envelope of rendered ones, which are swept too.
+    """
     recording = open_recording(path, spec)
     frames = [recording.read(int(k)) for k in np.unique(np.linspace(0, len(recording) - 1, min(limit, len(recording))).round())]
     with bar("tuning") as progress:
@@ -78,7 +91,8 @@ def real_study(
         raise TwinError("none of the conditions can be applied to frames that are already there; leave --frames out to render them")
     if left := [c.name for c in cases if c not in usable]:
         notes.append(f"left out, as they can't be applied to frames that are already there: {', '.join(left)}")
-    return study(Plan(source, detectors, usable, severities), path.name, out, bar, notes=notes, **options)
+    rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
+    return study(Plan(source, detectors, usable, severities), path.name, out, bar, notes=notes, rendered=rendered, **options)
 
 
 def _on_frames(case: Case) -> bool:
@@ -87,7 +101,16 @@ def _on_frames(case: Case) -> bool:
 
 
 def study(
-    plan: Plan, source: str, out: Path, bar: Callable, *, jobs: int = 1, models=None, model_names: tuple = (), notes: list | None = None
+    plan: Plan,
+    source: str,
+    out: Path,
+    bar: Callable,
+    *,
+    jobs: int = 1,
+    models: Models | None = None,
+    model_names: tuple[str, ...] = (),
+    notes: list[str] | None = None,
+    rendered: RenderedSource | None = None,
 ) -> tuple[list[Envelope], list[Path]]:
     """Sweep, judge and write; the envelopes and the files written, the page first.
 
@@ -105,14 +128,14 @@ def study(
         As `Plan` takes them.
     notes : list of str, optional
         For the page.
+    rendered : RenderedSource, optional
+        Frames of the same sensor to sweep likewise (in ``out/rendered``) and to show the plan's beside.
     """
     plan = replace(plan, models=models, model_names=model_names)
     with bar("conditions x steps") as progress:
-        rows = run_sweep(plan, out, jobs=jobs, progress=progress)
-    curves = curves_of(rows, plan.cases, _pitch_px(plan.source))
-    envelopes = envelopes_of(curves, plan.cases)
-    return envelopes, write_report(out, plan, rows, curves, envelopes, source=source, notes=notes or [])
-
-
-def _pitch_px(source: RenderedSource | RealSource) -> float:
-    return float(np.mean(nominal_reference(source.spec, source.form).spacing_px))
+        judged = judge_sweep(plan, out, jobs=jobs, progress=progress)
+    beside = None
+    if rendered is not None:
+        with bar("the same, rendered") as progress:
+            beside = judge_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=progress)
+    return judged.envelopes, write_report(out, judged, source=source, notes=notes or [], rendered=beside)

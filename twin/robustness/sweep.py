@@ -18,7 +18,7 @@ from twin.robustness.measures import judge
 from twin.robustness.shots import RealSource, RenderedSource, Shot
 from twin.types import Frame
 
-FORMAT = 1  # raised whenever older cells must not be read
+FORMAT = 2  # raised whenever older cells must not be read: the file's content or the pipeline has changed
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 Models = Callable[[], dict]  # gives {name: estimate}, estimate(frame) -> (values, units, valid)
 

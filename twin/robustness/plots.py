@@ -22,13 +22,13 @@ def plot_case(path: Path, case: Case, curves: list[Curve], rendered: list[Curve]
     figure = Figure(figsize=(3.1 * len(names), 2.7), layout="constrained")
     single = len(case.conditions) == 1
     for ax, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
-        for curve in (c for c in (*curves, *rendered) if c.measure.name == name):
-            at = np.array([case.conditions[0].value(s) for s in curve.severity]) if single else curve.severity
-            color, beside = f"C{pipelines.index(curve.pipeline)}", curve in rendered
-            label = f"{curve.pipeline}, rendered" if beside else curve.pipeline
-            ax.plot(at, curve.mean, "--" if beside else ".-", label=label, color=color, lw=1.0 if beside else 1.2)
-            if not beside:
-                ax.fill_between(at, curve.low, curve.high, color=color, alpha=0.2)
+        for group, line, note in ((curves, ".-", ""), (rendered, "--", ", rendered")):
+            for curve in (c for c in group if c.measure.name == name):
+                at = np.array([case.conditions[0].value(s) for s in curve.severity]) if single else curve.severity
+                color = f"C{pipelines.index(curve.pipeline)}"
+                ax.plot(at, curve.mean, line, label=curve.pipeline + note, color=color, lw=1.2)
+                if group is curves:
+                    ax.fill_between(at, curve.low, curve.high, color=color, alpha=0.2)
         ax.axhline(curve.limit, color="0.4", lw=0.8, ls=":")
         ax.set_title(TITLES[name], fontsize=9)
         ax.set_xlabel(f"{case.conditions[0].parameter} {case.conditions[0].unit}".strip() if single else "severity of both", fontsize=8)

@@ -73,13 +73,17 @@ def robustness(
     from scenes import load_sensor
     from twin.cli.progress import count_bar
     from twin.robustness.plan import SweepPlan, load_plan
-    from twin.robustness.run import real_study, rendered_study
+    from twin.robustness.run import check_pipelines, real_study, rendered_study
 
     spec, plan = load_sensor(sensor), load_plan(conditions) if conditions else SweepPlan()
+    cases, names = plan.cases(), pipeline or ["twin", "legacy"]
+    check_pipelines(names)
     writable_folder(out)
     runs = tuple(model or ())
     options = {"jobs": jobs, "models": partial(load_models, runs, spec) if runs else None, "model_names": tuple(run.name for run in runs)}
-    sweep = (pipeline or ["twin", "legacy"], plan.cases(), plan.severities(), out, count_bar)
+    if runs:
+        load_models(runs, spec)  # each process loads its own: what can't be is told here, and once
+    sweep = (names, cases, plan.severities(), out, count_bar)
     if frames is None:
         envelopes, written = rendered_study(spec, *sweep, **options)
     else:

@@ -10,6 +10,7 @@ from twin.robustness.envelope import Curve, Share
 from twin.robustness.measures import MEASURES, POSE_MEASURES
 
 DPI = 80
+ACROSS = 6  # plots in a row
 SHOWN = ("valid", "recall", "precision", "centroid_px", "area_error", "edges", *(m.name for m in POSE_MEASURES))
 TITLES = {m.name: m.title + (f", {m.unit}" if m.unit else "") for m in (*MEASURES, *POSE_MEASURES)}
 
@@ -19,21 +20,25 @@ def plot_case(path: Path, case: Case, curves: list[Curve], rendered: list[Curve]
     curves, rendered = ([c for c in group if c.case == case.name] for group in (curves, rendered))
     names = [name for name in SHOWN if any(c.measure.name == name for c in curves)]
     pipelines = list(dict.fromkeys(c.pipeline for c in curves))
-    figure = Figure(figsize=(3.1 * len(names), 2.7), layout="constrained")
-    single = len(case.conditions) == 1
-    for ax, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
+    rows, columns = -(-len(names) // ACROSS), min(ACROSS, len(names))
+    figure = Figure(figsize=(3.1 * columns, 2.7 * rows), layout="constrained")
+    single, drawn = len(case.conditions) == 1, {}
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax in axes[len(names) :]:
+        ax.axis("off")
+    for ax, name in zip(axes, names, strict=False):
         for group, line, note in ((curves, ".-", ""), (rendered, "--", ", rendered")):
             for curve in (c for c in group if c.measure.name == name):
                 at = np.array([case.conditions[0].value(s) for s in curve.severity]) if single else curve.severity
                 color = f"C{pipelines.index(curve.pipeline)}"
-                ax.plot(at, curve.mean, line, label=curve.pipeline + note, color=color, lw=1.2)
+                drawn[curve.pipeline + note] = ax.plot(at, curve.mean, line, color=color, lw=1.2)[0]
                 if group is curves:
                     ax.fill_between(at, curve.low, curve.high, color=color, alpha=0.2)
         ax.axhline(curve.limit, color="0.4", lw=0.8, ls=":")
         ax.set_title(TITLES[name], fontsize=9)
         ax.set_xlabel(f"{case.conditions[0].parameter} {case.conditions[0].unit}".strip() if single else "severity of both", fontsize=8)
         ax.tick_params(labelsize=7)
-    ax.legend(fontsize=7)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=len(drawn), fontsize=8)
     figure.savefig(path, dpi=DPI)
 
 

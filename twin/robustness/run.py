@@ -28,7 +28,7 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
     Raises
     ------
     TwinError
-        A name is neither a method nor a file.
+        A file can't be read; `check_pipelines` tells so sooner.
     """
     folder.mkdir(parents=True, exist_ok=True)
     chosen, digest = [], zlib.crc32(b"".join(frame.image.tobytes() for frame in frames))
@@ -41,14 +41,20 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
             if not kept.is_file():
                 write_detector(kept, tune(frames, spec, name).detector, "Tuned on undegraded frames.")
             chosen.append(load_detector(kept).model_copy(update={"name": name}))
-        elif Path(name).suffix == ".toml":
-            chosen.append(load_detector(Path(name)))
         else:
-            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a file written by 'twin tune'")
+            chosen.append(load_detector(Path(name)))
         progress(k + 1, len(names))
-    if len({d.name for d in chosen}) < len(chosen):
-        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(d.name for d in chosen)}; rename the files")
     return tuple(chosen)
+
+
+def check_pipelines(names: list[str]) -> None:
+    """Raise ``TwinError`` where a name is neither a method nor a readable file, or two are alike: before anything is solved or drawn."""
+    for name in names:
+        if name not in METHODS and Path(name).suffix != ".toml":
+            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
+    called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
+    if len(set(called)) < len(called):
+        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
 
 
 def rendered_study(spec: SensorSpec, pipelines: list[str], cases: tuple[Case, ...], severities: tuple, out: Path, bar: Callable, **options):

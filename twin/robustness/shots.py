@@ -39,12 +39,15 @@ class Shot:
     caps_px : (N, 2) float
     visible : (N,) bool
         The cap is there, within the frame, and nothing stands before it.
+    touched : bool
+        Something is in contact; taken for granted in real frames.
     """
 
     name: str
     frame: Frame
     caps_px: np.ndarray
     visible: np.ndarray
+    touched: bool = True
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,8 @@ class RenderedSource:
             view = replace(view, caps_px=film.truth.caps_px)
             light = case.on_light(film.light, severity, view, film.draw)
             image = case.on_frame(expose(light, spec, np.random.default_rng(film.draw)), severity, view, film.draw)
-            shots.append(_shot(film.contact.name, image, self.form, case, severity, view, film.truth.visible))
+            shot = _shot(film.contact.name, image, self.form, case, severity, view, film.truth.visible)
+            shots.append(replace(shot, touched=film.contact.pose.indent_mm > 0))
         return shots
 
 

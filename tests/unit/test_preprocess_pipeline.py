@@ -113,6 +113,17 @@ def test_a_threshold_that_does_not_suit_the_frame_is_replaced(levels, offset):
         assert Pipeline(spec, Form.RAW, second_look=False)(Frame(image, Form.RAW)).found == 0
 
 
+def test_noise_that_a_lax_threshold_takes_for_blobs_costs_no_frame():
+    spec = load_sensor("mg400-127")
+    blob = spec.pipeline.raw.model_copy(update={"threshold": -2.0})
+    spec = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": blob})})
+    rest = nominal_reference(spec, Form.RAW).pins_px
+    frame = drawn_frame(spec, Form.RAW, rest, noise_sd=30.0, rng=np.random.default_rng(2))
+    assert len(Pipeline(spec, Form.RAW, second_look=False)(frame).extra_px) > 0.5 * len(rest)
+    seen = Pipeline(spec, Form.RAW)(frame)
+    assert seen.valid and seen.found == len(rest) and len(seen.extra_px) < 0.05 * len(rest)
+
+
 def test_a_displaced_view_keeps_its_pins(pipeline):
     shift = np.array([9.0, -7.0])
     truth = smooth_warp(pipeline.reference.pins_px, 0.5 * pitch_px(pipeline), np.random.default_rng(1)) + shift

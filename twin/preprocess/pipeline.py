@@ -24,8 +24,9 @@ MAX_RIM_SCALE = 1.2  # of the clamped rim, to its size at rest; contact changes 
 MAX_SHIFT = 0.5  # of the layout's radius: a frame displaced further isn't this sensor's view
 MAX_BLOB_PITCHES2 = 3.0  # area of a component, in squared pitches: larger is housing or glare
 SPLIT_ROUNDS = 3
-ENOUGH = 0.985  # of the pins: where fewer are found, the frame is looked at again ...
+ENOUGH = 0.985  # of the pins: where fewer are found, or MAX_EXTRA further blobs, the frame is looked at again ...
 OWN_SHARES = (1.0, 0.3)  # ... by thresholds half way between its caps and skin, and low enough for caps much darker than most
+EXTRA_COST = 0.05  # pins that a further blob costs, where looks are compared: noise and clutter make hundreds
 REMASK_PX = 2.0  # a frame displaced by more gets its mask displaced likewise ...
 MASK_MARGIN = 0.5  # ... when a pin is this close to the mask's edge, in spacings
 
@@ -42,7 +43,7 @@ class Pipeline:
         No-contact layout; by default the specification's own.
     graph : {"voronoi", "delaunay", "knn"}
     second_look : bool
-        Where pins are lost under an adaptive threshold, look again by those that the frame's own contrast gives.
+        Where an adaptive threshold loses pins, or finds much else, look again by those that the frame's own contrast gives.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class Pipeline:
         ms: dict[str, float] = {}
         blobs, found = self._look(frame, self.blob_spec, ms)
         now = perf_counter()
-        if self.second_look and self.blob_spec.threshold_block_px and not self._nearly_all(found):
+        if self.second_look and self.blob_spec.threshold_block_px and not self._clear(blobs, found):
             blobs, found = self._with_own_threshold(frame, blobs, found)
         paired = found.blob >= 0
         pins_px = np.full_like(self.reference.pins_px, np.nan)
@@ -122,18 +123,20 @@ class Pipeline:
         return blobs, found
 
     def _with_own_threshold(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
-        """Look again by thresholds of this frame's own contrast, until nearly all pins are found; the best labelling of all looks."""
+        """Look again by thresholds of this frame's own contrast, until all is clear; the best labelling of all looks."""
         own = own_threshold(self._window(frame, self._mask), self._mask.disc, self.blob_spec)
         best = blobs, found
         for share in OWN_SHARES:
             again = self._look(frame, self.blob_spec.model_copy(update={"threshold": share * own}), {})
-            best = max(best, again, key=lambda look: look[1].score)
-            if self._nearly_all(best[1]):
+            best = max(best, again, key=lambda look: look[1].score - EXTRA_COST * _extra(*look))
+            if self._clear(*best):
                 break
         return best
 
-    def _nearly_all(self, found: Match) -> bool:
-        return (found.blob >= 0).sum() >= ENOUGH * len(found.blob)
+    def _clear(self, blobs: Blobs, found: Match) -> bool:
+        """Nearly all pins are found, and little else."""
+        n = len(found.blob)
+        return (found.blob >= 0).sum() >= ENOUGH * n and _extra(blobs, found) <= MAX_EXTRA * n
 
     def _window(self, frame: Frame, mask: Mask) -> np.ndarray:
         window = gray_levels(np.ascontiguousarray(frame.image[mask.window]))
@@ -213,6 +216,11 @@ class Pipeline:
         if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         return ""
+
+
+def _extra(blobs: Blobs, found: Match) -> int:
+    """Blobs that are no pins."""
+    return len(blobs.px) - int((found.blob >= 0).sum())
 
 
 def _mean_radius(px: np.ndarray) -> float:

@@ -18,7 +18,7 @@ from twin.robustness.sweep import Plan, run_sweep
 from twin.types import Form
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}
-COMPARED = ("noise", "defocus", "jpeg", "exposure-low", "resolution")
+COMPARED = ("noise", "defocus", "jpeg", "exposure-low", "resolution", "motion-blur", "room-light")
 STEPS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 0.95, 1.0)
 FRAMES = 4
 AGREEMENT = 1.25  # ratio of the real and the rendered failing severity

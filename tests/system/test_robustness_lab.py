@@ -18,7 +18,7 @@ from twin.robustness.sweep import Plan, run_sweep
 from twin.types import Form
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}
-COMPARED = ("noise", "defocus", "jpeg", "exposure-low", "resolution")
+COMPARED = ("noise", "defocus", "jpeg", "exposure-low", "resolution", "motion-blur", "room-light")
 STEPS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 0.95, 1.0)
 FRAMES = 4
 AGREEMENT = 1.25  # ratio of the real and the rendered failing severity
@@ -56,11 +56,15 @@ def test_tune_check_and_robustness_from_the_command_line(tmp_path):
     assert swept.returncode == 0, swept.stderr
     assert "hot-pixels" in swept.stdout and "caps-faded" in (tmp_path / "out" / "index.html").read_text()  # named as left out
     assert (tmp_path / "out" / "envelope.csv").read_text().count("hot-pixels") == 2
+    assert "This sensor on the rendered envelope" in (tmp_path / "out" / "index.html").read_text()
+    assert (tmp_path / "out" / "real-on-rendered.csv").read_text().count("hot-pixels") == 1
 
 
 def test_errors_are_one_line_and_say_what_to_do(tmp_path):
     unknown = run("robustness", "--sensor", "mg400-127", "--pipeline", "magic", "--frames", tmp_path, "--out", tmp_path / "out")
     assert unknown.returncode == 1 and unknown.stderr.count("\n") <= 2 and "error" in unknown.stderr
+    nothing = run("robustness", "--sensor", "mg400-127", "--model", tmp_path / "none", "--out", tmp_path / "out")
+    assert nothing.returncode == 1 and "holds no trained model" in nothing.stderr and "Traceback" not in nothing.stderr
     listed = run("robustness", "--sensor", "mg400-127", "--list", "--out", tmp_path / "out")
     assert listed.returncode == 0 and all(name in listed.stdout for name in CONDITIONS)
 

@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 from plain_sensor import changed, plain
 
+from scenes import load_sensor
+from twin.geometry.pins import rest_pins
 from twin.health import Verdict, examine
 from twin.health.drift import drift_of
 from twin.mechanics.path import ContactPose
 from twin.preprocess.reference import nominal_reference
 from twin.robustness.condition import Case
 from twin.robustness.conditions import CONDITIONS
-from twin.robustness.contacts import Contact
+from twin.robustness.contacts import CONTACTS, Contact, pins_under
 from twin.robustness.shots import RenderedSource
+from twin.truth import cap_truth
 from twin.types import Form, Frame
 
 
@@ -70,5 +73,18 @@ def test_drift_is_the_planted_similarity():
     pins[rim[:10]] = np.nan
     drift = drift_of(pins, rest, rim)
     assert drift.shift_px == pytest.approx([4.0, -2.0]) and drift.turn_deg == pytest.approx(3.0) and drift.scale == pytest.approx(1.05)
+    assert drift.contact < 1e-9 and drift.scale_at_rest == pytest.approx(drift.scale)
     pins[rim[: len(rim) // 2 + 1]] = np.nan
     assert drift_of(pins, rest, rim) is None
+
+
+@pytest.mark.parametrize("contact", CONTACTS[1:], ids=lambda contact: contact.name)
+def test_a_contact_is_not_taken_for_a_nearer_camera(contact):
+    """The gel bulges at the rim by 1 to 4 %; what is left of the scale is within the limit of a well sensor, a zoomed camera is not."""
+    spec = load_sensor("mg400-331")
+    reference = nominal_reference(spec, Form.RAW)
+    seen = cap_truth(spec, rest_pins(spec), pins_under(spec, contact), Form.RAW).caps_px
+    drift = drift_of(seen, reference.pins_px, reference.outmost)
+    assert drift.scale > 1.008 and abs(drift.scale_at_rest - 1) < 0.01
+    zoomed = drift_of(1.05 * seen, reference.pins_px, reference.outmost)
+    assert zoomed.scale_at_rest == pytest.approx(1.05 * drift.scale_at_rest, rel=0.01)

@@ -9,7 +9,7 @@ from scenes import load_sensor
 from twin.camera import record
 from twin.errors import FrameError
 from twin.preprocess import Pipeline, measure_reference, nominal_reference, raw_to_recording
-from twin.preprocess.blobs import find_blobs
+from twin.preprocess.blobs import SPECK_LEVELS, despeckled, find_blobs
 from twin.preprocess.legacy import LegacyPipeline
 from twin.preprocess.mask import circular_mask
 from twin.preprocess.matching import match, rematch
@@ -80,6 +80,48 @@ def test_raw_centroids_over_a_noise_ladder():
     ladder = [rms(errors_px(pipeline(draw(pipeline, truth, noise_sd=sd, rng=rng)), truth)) for sd in (0.0, 2.0, 6.0, 12.0)]
     assert ladder[0] < 0.02 and ladder[-1] < 0.1
     assert ladder[1] < ladder[2] < ladder[3]
+
+
+def test_hot_and_dead_pixels_are_put_right_and_nothing_else():
+    """A frame without them stays as it is, bit for bit, noise or not; with them no pixel of it is off by more than its surroundings."""
+    spec = load_sensor("mg400-331")
+    rest, rng = nominal_reference(spec, Form.RAW).pins_px, np.random.default_rng(4)
+    clean = drawn_frame(spec, Form.RAW, rest).image
+    for sd in (0.0, 8.0, 30.0):
+        noisy = np.clip(clean + rng.normal(0, sd, clean.shape), 0, 255).astype(np.uint8)
+        assert np.mean(despeckled(noisy) != noisy) < 1e-3
+    odd = rng.random(clean.shape) < 0.03
+    damaged = np.where(odd, rng.choice([0, 255], clean.shape), clean).astype(np.uint8)
+    assert np.mean(np.abs(despeckled(damaged).astype(int) - clean) > SPECK_LEVELS) < 0.03 * odd.mean()
+    seen = Pipeline(spec, Form.RAW)(Frame(damaged, Form.RAW))
+    assert seen.found == len(rest) and rms(errors_px(seen, rest)) < 0.15
+
+
+@pytest.mark.parametrize("levels", [(15, 21), (15, 200), (120, 128)])
+@pytest.mark.parametrize("offset", [-60.0, -12.0, 40.0])
+def test_a_threshold_that_does_not_suit_the_frame_is_replaced(levels, offset):
+    """Too strict, too lax, or a frame too dim for it: the frame's own contrast finds every pin."""
+    spec = load_sensor("mg400-331")
+    blob = spec.pipeline.raw.model_copy(update={"threshold": offset})
+    spec = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": blob})})
+    rest = nominal_reference(spec, Form.RAW).pins_px
+    radius = cap_radii_px(spec, Form.RAW)
+    image = draw_discs((spec.camera.width_px, spec.camera.height_px), rest, radius, level=levels, blur_px=0.8)
+    seen = Pipeline(spec, Form.RAW)(Frame(image, Form.RAW))
+    assert seen.found == len(rest) and rms(errors_px(seen, rest)) < 0.6
+    if offset == -60.0 and levels[1] < 200:
+        assert Pipeline(spec, Form.RAW, second_look=False)(Frame(image, Form.RAW)).found == 0
+
+
+def test_noise_that_a_lax_threshold_takes_for_blobs_costs_no_frame():
+    spec = load_sensor("mg400-127")
+    blob = spec.pipeline.raw.model_copy(update={"threshold": -2.0})
+    spec = spec.model_copy(update={"pipeline": spec.pipeline.model_copy(update={"raw": blob})})
+    rest = nominal_reference(spec, Form.RAW).pins_px
+    frame = drawn_frame(spec, Form.RAW, rest, noise_sd=30.0, rng=np.random.default_rng(2))
+    assert len(Pipeline(spec, Form.RAW, second_look=False)(frame).extra_px) > 0.5 * len(rest)
+    seen = Pipeline(spec, Form.RAW)(frame)
+    assert seen.valid and seen.found == len(rest) and len(seen.extra_px) < 0.05 * len(rest)
 
 
 def test_a_displaced_view_keeps_its_pins(pipeline):

@@ -13,12 +13,12 @@ from twin.errors import TwinError
 from twin.preprocess.reference import nominal_reference
 from twin.robustness.condition import Case
 from twin.robustness.conditions import CONDITIONS
-from twin.robustness.envelope import crossing, curves_of, envelopes_of
+from twin.robustness.envelope import Envelope, crossing, curves_of, envelopes_of, shares_of
 from twin.robustness.measures import MEASURES, judge
 from twin.robustness.plan import SweepPlan, load_plan
 from twin.robustness.real import consensus
 from twin.robustness.report import compare
-from twin.robustness.run import study
+from twin.robustness.run import check_pipelines, study
 from twin.robustness.shots import RealSource, Shot
 from twin.robustness.sweep import Plan, cells_of, run_sweep
 from twin.types import Form, Frame
@@ -115,10 +115,11 @@ def test_poses_are_judged_against_the_undegraded_frame():
             "case": "noise",
             "severity": s,
             "pipeline": "run",
-            "frame": "x",
-            "pose": {"values": [v, 5.0], "units": ["mm", "deg"], "valid": s < 1},
+            "frame": frame,
+            "pose": {"values": [v, 5.0], "units": ["mm", "deg"], "valid": s < 1, "touched": frame == "x"},
         }
         for s, v in ((0.0, 1.0), (0.5, 1.3), (1.0, np.nan))
+        for frame in ("x", "no contact")
     ]
     curves = {c.measure.name: c for c in curves_of(rows, (case,), pitch_px=10.0)}
     assert curves["pose_mm"].mean[:2] == pytest.approx([0.0, 0.3]) and np.isnan(curves["pose_mm"].mean[2])
@@ -210,6 +211,50 @@ def test_a_sweep_can_be_read_from_a_file(tmp_path):
     path.write_text('[[condition]]\nname = "nois"\n')
     with pytest.raises(TwinError, match="did you mean 'noise'"):
         load_plan(path).cases()
+    for text, says in (
+        ('[[condition]]\nname = "noise"\nsevere = 3\n', "not between 0 .* and 0.4"),
+        ('[[condition]]\nname = "resolution"\nsevere = 0.5\n', "not between 1 .* and 9 px"),
+        ('[[condition]]\nname = "noise"\n[[condition]]\nname = "noise"\n', "named twice: noise"),
+        ('pairs = [["noise", "jpeg"], ["jpeg", "noise"]]\n', "named twice: jpeg\\+noise"),
+        ('pairs = [["noise", "noise"]]\n', "with itself"),
+    ):
+        path.write_text(text)
+        with pytest.raises(TwinError, match=says):
+            load_plan(path).cases()
+    with pytest.raises(TwinError, match="No such file.*--help"):
+        load_plan(tmp_path / "none.toml")
     path.write_text("stepps = [1]\n")
     with pytest.raises(TwinError, match="stepps"):
         load_plan(path)
+
+
+def test_what_was_not_looked_at_is_not_claimed(tmp_path):
+    """A pipeline that never fails is as wide as the severest step, not as the condition's range."""
+    case = Case((CONDITIONS["noise"],))
+    rows = [
+        {"case": "noise", "severity": s, "pipeline": "a", "frame": "x", **dict.fromkeys(("valid", "precision", "edges", "recall"), 1.0)}
+        | {"centroid_px": 0.1, "swaps": 0.0, "area_error": 0.0}
+        for s in (0.0, 0.35)
+    ]
+    (found,) = envelopes_of(curves_of(rows, (case,), pitch_px=10.0), (case,))
+    assert not found.reached and found.width == 0.35 and found.label == "> 0.14"
+    assert replace(found, severity=0.0, measure="recall").label == "fails undegraded"
+
+
+def test_shares_tell_the_bad_side():
+    case = Case((CONDITIONS["noise"],))
+    whole, half = Envelope(case, "a", 0.8, "recall"), Envelope(case, "a", 0.4, "recall")
+    assert shares_of([half], [whole], "a")[0].short and shares_of([half], [whole], "a")[0].value == 0.5
+    assert not shares_of([whole], [half], "a")[0].short
+    nothing = Envelope(case, "a", 0.0, "recall")
+    assert shares_of([nothing], [nothing], "a")[0].value == 1.0 and shares_of([whole], [nothing], "a")[0].value == np.inf
+
+
+def test_pipelines_are_checked_before_the_work(tmp_path):
+    for names, says in (
+        (["magic"], "magic: give one of twin"),
+        ([str(tmp_path / "none.toml")], "No such file"),
+        (["twin", "twin"], "a name of its own"),
+    ):
+        with pytest.raises(TwinError, match=says):
+            check_pipelines(names)

@@ -22,11 +22,14 @@ Writes:
   envelope.csv    severity and parameter at which each measure's limit is crossed
   curves.csv      every measure against severity, with its 90 % interval
   frames.csv      every frame
+  real-on-rendered.csv  with --frames: where real and rendered frames fail, and their ratio
   cells/          finished work: an interrupted run goes on where it was
 
 \b
 With --frames DIR real frames take the place of rendered ones: conditions that act on a frame
-alone, the pins on which several detectors agree as the truth.
+alone, the pins on which several detectors agree as the truth. Raw frames are shown on the
+envelope of rendered ones: how much of a sound sensor's margin has this one left? That sweeps
+rendered frames too; --no-rendered leaves it out.
 
 \b
 A file for --conditions:
@@ -57,6 +60,7 @@ def robustness(
     ] = None,
     frames: Annotated[Path | None, typer.Option("--frames", metavar="DIR", help="real frames instead of rendered ones")] = None,
     limit: Annotated[int, typer.Option("--limit", min=2, metavar="N", help="at most N of the real frames, evenly spread")] = 12,
+    rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
     jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = os.cpu_count() or 1,
     show: Annotated[bool, typer.Option("--list", help="list the conditions and stop")] = False,
 ) -> None:
@@ -69,17 +73,21 @@ def robustness(
     from scenes import load_sensor
     from twin.cli.progress import count_bar
     from twin.robustness.plan import SweepPlan, load_plan
-    from twin.robustness.run import real_study, rendered_study
+    from twin.robustness.run import check_pipelines, real_study, rendered_study
 
     spec, plan = load_sensor(sensor), load_plan(conditions) if conditions else SweepPlan()
+    cases, names = plan.cases(), pipeline or ["twin", "legacy"]
+    check_pipelines(names)
     writable_folder(out)
     runs = tuple(model or ())
     options = {"jobs": jobs, "models": partial(load_models, runs, spec) if runs else None, "model_names": tuple(run.name for run in runs)}
-    names = pipeline or ["twin", "legacy"]
+    if runs:
+        load_models(runs, spec)  # each process loads its own: what can't be is told here, and once
+    sweep = (names, cases, plan.severities(), out, count_bar)
     if frames is None:
-        envelopes, written = rendered_study(spec, names, plan.cases(), plan.severities(), out, count_bar, **options)
+        envelopes, written = rendered_study(spec, *sweep, **options)
     else:
-        envelopes, written = real_study(spec, frames, limit, names, plan.cases(), plan.severities(), out, count_bar, **options)
+        envelopes, written = real_study(spec, frames, limit, *sweep, beside=rendered, **options)
     for found in sorted(envelopes, key=lambda e: (e.pipeline, e.width)):
         print(f"{found.pipeline:10} {found.case.name:18} {found.label}{f' ({found.measure})' if found.measure else ''}")
     for file in written:

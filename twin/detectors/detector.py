@@ -55,8 +55,10 @@ class Detector(Protocol):
         """The graph that its method makes of pins (N, 2) in the specification's order, areas in its own unit."""
 
 
-def make_detector(sensor: SensorSpec, detector: DetectorSpec) -> Detector:
+def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bool = True) -> Detector:
     """A detector ready for frames.
+
+    ``second_look`` as `Pipeline` takes it: whoever judges thresholds by what they find wants none.
 
     Raises
     ------
@@ -72,16 +74,18 @@ def make_detector(sensor: SensorSpec, detector: DetectorSpec) -> Detector:
     reference = (
         make_reference(np.array(detector.pins_px), sensor.pins.rings) if detector.pins_px else nominal_reference(sensor, detector.form)
     )
-    return TwinDetector(sensor, detector, reference) if detector.method == "twin" else PlainDetector(sensor, detector, reference)
+    if detector.method == "twin":
+        return TwinDetector(sensor, detector, reference, second_look=second_look)
+    return PlainDetector(sensor, detector, reference)
 
 
 class TwinDetector:
     """This program's pipeline."""
 
-    def __init__(self, sensor: SensorSpec, spec: DetectorSpec, reference: Reference) -> None:
+    def __init__(self, sensor: SensorSpec, spec: DetectorSpec, reference: Reference, *, second_look: bool = True) -> None:
         self.spec = spec
         section = sensor.pipeline.model_copy(update={str(spec.form): spec.blob})
-        self._pipeline = Pipeline(sensor.model_copy(update={"pipeline": section}), spec.form, reference)
+        self._pipeline = Pipeline(sensor.model_copy(update={"pipeline": section}), spec.form, reference, second_look=second_look)
 
     def __call__(self, frame: Frame) -> Found:
         seen = self._pipeline(frame)

@@ -90,7 +90,11 @@ def load_detector(path: Path) -> DetectorSpec:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         return DetectorSpec.model_validate({"name": path.stem} | data)
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise FrameError(
+            f"{path}: can't be read ({error.strerror}); give a file written by 'twin tune', or one of {', '.join(METHODS)}"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise FrameError(
             f"{path}: not readable as TOML ({error}); give a file written by 'twin tune', or one of {', '.join(METHODS)}"
         ) from error

@@ -68,11 +68,11 @@ def tune(frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, pr
     tried, judged = list(_settings(start, reference, seen, sensor, binary)), frames
     if method in SLOW:
         judged = frames[:: max(len(frames) // SLOW_TUNED_ON, 1)][:SLOW_TUNED_ON]
-    rates = [_rate(make_detector(sensor, detector), judged[::GLANCE], sensor.pins.count) for detector in tried]
+    rates = [_rate(make_detector(sensor, detector, second_look=False), judged[::GLANCE], sensor.pins.count) for detector in tried]
     hopeful = max(map(sum, rates)) - HOPELESS
     for k, detector in enumerate(tried):
         if sum(rates[k]) >= hopeful:
-            rates[k] = _rate(make_detector(sensor, detector), judged, sensor.pins.count)
+            rates[k] = _rate(make_detector(sensor, detector, second_look=False), judged, sensor.pins.count)
         if progress:
             progress(len(frames) + k + 1, len(frames) + len(tried))
     best = _middle_of_plateau(tried, rates)

@@ -25,6 +25,8 @@ SATURATED_LEVEL = 250
 STEADY = 0.5  # of the frames: a pin lost, or a spot seen, in so many is a fault of the sensor, not of a contact
 SAME_SPOT = 0.3  # pitches
 CAPS_MEASURED = 3  # frames at most, evenly spread: light and focus hardly differ between them
+LEAST_DEFORMED = 0.3  # of the frames, those with the least contact, tell the camera's place
+TOLD_BULGE = 0.002  # of the size: a smaller part of the contact in it is not mentioned
 LISTED = 8  # numbers of pins in a sentence
 
 
@@ -134,7 +136,7 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
 
 
 def _place(seen: list[Observation], spec: SensorSpec, form: Form) -> list[Finding]:
-    """Where the rim of pins is, against where the specification's camera would see it."""
+    """Where the rim of pins is, against where the specification's camera would see it, in the frames that a contact deforms least."""
     nominal = Pipeline(spec, form).reference
     pitch = float(np.mean(nominal.spacing_px))
     found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost))]
@@ -144,14 +146,16 @@ def _place(seen: list[Observation], spec: SensorSpec, form: Form) -> list[Findin
                 "place", Verdict.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first"
             )
         ]
+    found = sorted(found, key=lambda d: d.contact)[: max(round(LEAST_DEFORMED * len(found)), 1)]
     shift = np.median([d.shift_px for d in found], axis=0)
-    turn, scale = float(np.median([d.turn_deg for d in found])), float(np.median([d.scale for d in found]))
+    turn, scale, seen_scale = (float(np.median([getattr(d, name) for d in found])) for name in ("turn_deg", "scale_at_rest", "scale"))
+    bulge = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
     away = float(np.linalg.norm(shift))
     again = "fix the camera, or calibrate again ('twin calibrate optics'); 'twin tune' moves the mask"
     return [
         _finding("shift", away / pitch, (0.2, 1.0), f"displaced by ({shift[0]:.1f}, {shift[1]:.1f}) px, {away / pitch:.2f} pitches", again),
         _finding("turn", abs(turn), (1.5, 6.0), f"turned by {turn:.2f} deg", again),
-        _finding("scale", abs(scale - 1), (0.02, 0.1), f"{scale:.3f} times its calibrated size", again),
+        _finding("scale", abs(scale - 1), (0.02, 0.1), f"{scale:.3f} times its calibrated size{bulge}", again),
     ]
 
 

@@ -10,6 +10,9 @@ from scenes.sensor import BlobSpec
 from twin.preprocess.mask import Mask
 
 GROWTH_PX = 4  # at most, of a component over its box
+SPECK_LEVELS = 48  # gray levels from the median of its 3 x 3 pixels: a pixel further away is the chip's fault, not the scene's ...
+SPECK_USUAL, SPECK_RATIO = 0.8, 4.0  # ... but for noise: nor is one within so many times what that part of the pixels keeps to
+MOST_ABOVE = 98  # percentile of the levels above the local mean: brighter ones (glare, LEDs) count as that
 NOISE_SIGMA_PX = 0.7  # smoothing before an adaptive threshold: halves white noise, leaves a cap of 6 px its edge
 
 
@@ -58,21 +61,45 @@ class Blobs:
         return np.stack([columns, rows], axis=1) + self.corner_px, self.gray[rows, columns]
 
 
-def threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> np.ndarray:
-    """(h, w) uint8 of 0 and 255: bright pixels inside the disc.
+def despeckled(gray: np.ndarray) -> np.ndarray:
+    """Gray levels (h, w) uint8 with hot and dead pixels at the median of their neighbourhood; all others, and mere noise, as they are."""
+    median = cv2.medianBlur(gray, 3)
+    away = cv2.absdiff(gray, median)
+    usual = int(np.searchsorted(np.cumsum(cv2.calcHist([away], [0], None, [256], [0, 256])), SPECK_USUAL * gray.size))
+    odd = cv2.compare(away, float(max(SPECK_LEVELS, SPECK_RATIO * usual)), cv2.CMP_GT)
+    return cv2.copyTo(median, odd, gray.copy())
 
-    Before an adaptive threshold all that lies outside the disc (housing, LEDs) is set to the disc's
-    median, so that light from there doesn't raise the local mean near the rim.
-    """
+
+def threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> np.ndarray:
+    """(h, w) uint8 of 0 and 255: bright pixels inside the disc."""
     if not blob.threshold_block_px:
         _, binary = cv2.threshold(gray, blob.threshold, 255, cv2.THRESH_BINARY)
         return cv2.bitwise_and(binary, disc)
+    smooth = _smoothed(gray, disc)
+    binary = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, blob.threshold_block_px | 1, blob.threshold)
+    return cv2.bitwise_and(binary, disc)
+
+
+def own_threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> float:
+    """The adaptive threshold that separates a frame's bright and dark pixels best (Otsu 1979, of the level above the local mean)."""
+    smooth = _smoothed(gray, disc)
+    block = blob.threshold_block_px | 1
+    above = cv2.subtract(smooth, cv2.blur(smooth, (block, block), borderType=cv2.BORDER_REPLICATE))[disc > 0]
+    level, _ = cv2.threshold(np.minimum(above, np.percentile(above, MOST_ABOVE)).astype(np.uint8), 0, 255, cv2.THRESH_OTSU)
+    return -max(level, 1.0)
+
+
+def _smoothed(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
+    """A window as an adaptive threshold takes it.
+
+    All that lies outside the disc (housing, LEDs) is set to the disc's median, so that light from there doesn't raise the
+    local mean near the rim.
+    """
     histogram = cv2.calcHist([gray], [0], disc, [256], [0, 256]).ravel()
     median = int(np.searchsorted(np.cumsum(histogram), histogram.sum() / 2))
     smooth = cv2.GaussianBlur(gray, (3, 3), NOISE_SIGMA_PX)
     smooth[disc == 0] = min(median, 255)
-    binary = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, blob.threshold_block_px | 1, blob.threshold)
-    return cv2.bitwise_and(binary, disc)
+    return smooth
 
 
 @njit(cache=True)

@@ -4,9 +4,9 @@ from time import perf_counter
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
-from twin.preprocess.blobs import Blobs, find_blobs
+from twin.preprocess.blobs import Blobs, despeckled, find_blobs, own_threshold
 from twin.preprocess.forms import blob_spec, frame_size, gray_levels
 from twin.preprocess.graph import GraphKind, make_graph
 from twin.preprocess.mask import Mask, circular_mask
@@ -24,6 +24,9 @@ MAX_RIM_SCALE = 1.2  # of the clamped rim, to its size at rest; contact changes 
 MAX_SHIFT = 0.5  # of the layout's radius: a frame displaced further isn't this sensor's view
 MAX_BLOB_PITCHES2 = 3.0  # area of a component, in squared pitches: larger is housing or glare
 SPLIT_ROUNDS = 3
+ENOUGH = 0.985  # of the pins: where fewer are found, or MAX_EXTRA further blobs, the frame is looked at again ...
+OWN_SHARES = (1.0, 0.3)  # ... by thresholds half way between its caps and skin, and low enough for caps much darker than most
+EXTRA_COST = 0.05  # pins that a further blob costs, where looks are compared: noise and clutter make hundreds
 REMASK_PX = 2.0  # a frame displaced by more gets its mask displaced likewise ...
 MASK_MARGIN = 0.5  # ... when a pin is this close to the mask's edge, in spacings
 
@@ -39,10 +42,20 @@ class Pipeline:
     reference : Reference, optional
         No-contact layout; by default the specification's own.
     graph : {"voronoi", "delaunay", "knn"}
+    second_look : bool
+        Where an adaptive threshold loses pins, or finds much else, look again by those that the frame's own contrast gives.
     """
 
-    def __init__(self, spec: SensorSpec, form: Form, reference: Reference | None = None, *, graph: GraphKind = "voronoi") -> None:
-        self.spec, self.form, self.graph = spec, Form(form), graph
+    def __init__(
+        self,
+        spec: SensorSpec,
+        form: Form,
+        reference: Reference | None = None,
+        *,
+        graph: GraphKind = "voronoi",
+        second_look: bool = True,
+    ) -> None:
+        self.spec, self.form, self.graph, self.second_look = spec, Form(form), graph, second_look
         self.size_px = frame_size(spec, self.form)
         self.blob_spec = blob_spec(spec, self.form)
         self.reference = nominal_reference(spec, self.form) if reference is None else reference
@@ -63,14 +76,10 @@ class Pipeline:
         self.check(frame)
         started = perf_counter()
         ms: dict[str, float] = {}
-        blobs = self._detect(frame, self._mask)
-        ms["detect"], now = _since(started)
-        found = match(self.reference, blobs.px, blobs.area_px2)
-        ms["match"], now = _since(now)
-        if self._plausible(found):
-            blobs, found = self._with_displaced_mask(frame, blobs, found)
-        if (found.blob < 0).any() and self._plausible(found):
-            blobs, found = self._with_split_caps(blobs, found)
+        blobs, found = self._look(frame, self.blob_spec, ms)
+        now = perf_counter()
+        if self.second_look and self.blob_spec.threshold_block_px and not self._clear(blobs, found):
+            blobs, found = self._with_own_threshold(frame, blobs, found)
         paired = found.blob >= 0
         pins_px = np.full_like(self.reference.pins_px, np.nan)
         pins_px[paired] = blobs.px[found.blob[paired]]
@@ -100,14 +109,46 @@ class Pipeline:
         if frame.form != self.form:
             raise FrameError(f"{where}: expected a {self.form} frame, got a {frame.form} one; make a Pipeline of that form for it")
 
-    def _detect(self, frame: Frame, mask: Mask) -> Blobs:
+    def _look(self, frame: Frame, blob: BlobSpec, ms: dict[str, float]) -> tuple[Blobs, Match]:
+        """Blobs and their labelling, by one threshold; times of the stages go into ``ms``."""
+        started = perf_counter()
+        blobs = self._detect(frame, self._mask, blob)
+        ms["detect"], now = _since(started)
+        found = match(self.reference, blobs.px, blobs.area_px2)
+        ms["match"], _ = _since(now)
+        if self._plausible(found):
+            blobs, found = self._with_displaced_mask(frame, blob, blobs, found)
+        if (found.blob < 0).any() and self._plausible(found):
+            blobs, found = self._with_split_caps(blobs, found)
+        return blobs, found
+
+    def _with_own_threshold(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
+        """Look again by thresholds of this frame's own contrast, until all is clear; the best labelling of all looks."""
+        own = own_threshold(self._window(frame, self._mask), self._mask.disc, self.blob_spec)
+        best = blobs, found
+        for share in OWN_SHARES:
+            again = self._look(frame, self.blob_spec.model_copy(update={"threshold": share * own}), {})
+            best = max(best, again, key=lambda look: look[1].score - EXTRA_COST * _extra(*look))
+            if self._clear(*best):
+                break
+        return best
+
+    def _clear(self, blobs: Blobs, found: Match) -> bool:
+        """Nearly all pins are found, and little else."""
+        n = len(found.blob)
+        return (found.blob >= 0).sum() >= ENOUGH * n and _extra(blobs, found) <= MAX_EXTRA * n
+
+    def _window(self, frame: Frame, mask: Mask) -> np.ndarray:
         window = gray_levels(np.ascontiguousarray(frame.image[mask.window]))
-        return split_chains(find_blobs(window, mask, self.blob_spec, max_area_px2=self._max_area_px2))
+        return despeckled(window) if self.blob_spec.threshold_block_px else window
+
+    def _detect(self, frame: Frame, mask: Mask, blob: BlobSpec) -> Blobs:
+        return split_chains(find_blobs(self._window(frame, mask), mask, blob, max_area_px2=self._max_area_px2))
 
     def _plausible(self, found: Match) -> bool:
         return (found.blob >= 0).sum() > 0.5 * len(found.blob)
 
-    def _with_displaced_mask(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
+    def _with_displaced_mask(self, frame: Frame, blob: BlobSpec, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
         """Look again where the whole view is displaced and its mask cuts into pins, or near them."""
         paired = found.blob >= 0
         rim = self.reference.outmost[paired[self.reference.outmost]]
@@ -118,7 +159,7 @@ class Pipeline:
         if np.linalg.norm(shift) < REMASK_PX:
             return blobs, found
         center = np.asarray(self.blob_spec.mask_center_px) + shift
-        displaced = self._detect(frame, circular_mask(self.size_px, tuple(center), self.blob_spec.mask_radius_px))
+        displaced = self._detect(frame, circular_mask(self.size_px, tuple(center), self.blob_spec.mask_radius_px), blob)
         again = match(self.reference, displaced.px, displaced.area_px2)
         return (displaced, again) if again.score > found.score else (blobs, found)
 
@@ -175,6 +216,11 @@ class Pipeline:
         if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         return ""
+
+
+def _extra(blobs: Blobs, found: Match) -> int:
+    """Blobs that are no pins."""
+    return len(blobs.px) - int((found.blob >= 0).sum())
 
 
 def _mean_radius(px: np.ndarray) -> float:

@@ -13,6 +13,7 @@ MIN_AREA_SHARE = 0.65  # of the areas expected of all claimants: less is one cap
 MIN_SEPARATION = 0.6  # of two parts, in cap diameters
 MIN_PART = 0.4  # of the weight of the smallest part, to an equal share
 ROUNDS = 12
+MANY, ROUNDS_OF_MANY = 24, 3  # parts of a net that scratches or glare make: it is large, and each round takes its time
 MIN_ELONGATION = 2.0  # of a chain: two touching discs have 5
 ODD_ELONGATION = 1.5  # of a chain, to the median of the blobs around: all caps near the rim are long
 MIN_CAPS, MAX_CAPS = 1.35, 5.0  # area of a chain, in median areas of its neighbours
@@ -59,18 +60,20 @@ def _parts(blobs: Blobs, label: int, seeds_px: np.ndarray) -> tuple[np.ndarray, 
     """Weighted k-means of a component's pixels from seeds: centres (n, 2) px of the frame, shares of the weight (n,)."""
     pixels, level = blobs.pixels(label)
     weight = _weight(level)
-    centers = seeds_px + (np.average(pixels, axis=0, weights=weight) - seeds_px.mean(axis=0))
+    middle = np.average(pixels, axis=0, weights=weight)
+    pixels = pixels - middle
+    centers = seeds_px - seeds_px.mean(axis=0)
     share = np.zeros(len(centers))
-    for _ in range(ROUNDS):
-        owner = ((pixels[:, None] - centers) ** 2).sum(axis=2).argmin(axis=1)
+    for _ in range(ROUNDS if len(centers) < MANY else ROUNDS_OF_MANY):
+        owner = ((centers**2).sum(axis=1) - 2 * pixels @ centers.T).argmin(axis=1)  # nearest; a large component has many of both
         share = np.bincount(owner, weight, len(centers))
         if (share <= 0).any():
-            return centers, share / weight.sum()
+            break
         moved = np.stack([np.bincount(owner, weight * pixels[:, axis], len(centers)) / share for axis in (0, 1)], axis=1)
         if np.abs(moved - centers).max() < 1e-3:
             break
         centers = moved
-    return centers, share / weight.sum()
+    return middle + centers, share / weight.sum()
 
 
 def _with_parts(blobs: Blobs, split: list[int], px: list, area_px2: list, label: list) -> Blobs:

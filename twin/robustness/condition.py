@@ -203,3 +203,9 @@ def chosen(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
     mask = np.zeros(count, bool)
     mask[rng.permutation(count)[: round(share * count)]] = True
     return mask
+
+
+def over_channels(plane: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """A plane (H, W) as float32 that broadcasts over light (H, W) or (H, W, 3)."""
+    plane = np.asarray(plane, np.float32)
+    return plane[..., None] if light.ndim == 3 else plane

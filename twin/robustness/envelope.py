@@ -9,6 +9,7 @@ from twin.robustness.measures import MEASURES, POSE_MEASURES, Measure
 
 DRAWS = 400  # of the bootstrap over the frames
 BAND = (5, 95)  # percentiles
+SHORT = 0.75  # of the rendered margin: less is a sensor that has lost some of it
 
 
 @dataclass(frozen=True)
@@ -49,12 +50,18 @@ class Envelope:
         At which the first measure crosses its limit; inf if none does up to the severest.
     measure : str
         That one; "" if none.
+    looked : float
+        The severest step.
+    interval : (2,) float
+        Severities at which the ends of that measure's 90 % band cross; inf where one does not.
     """
 
     case: Case
     pipeline: str
     severity: float
     measure: str
+    looked: float = 1.0
+    interval: tuple[float, float] = (np.inf, np.inf)
 
     @property
     def reached(self) -> bool:
@@ -63,13 +70,35 @@ class Envelope:
 
     @property
     def width(self) -> float:
-        """Severity, at most 1: a lower bound where it does not fail."""
-        return min(self.severity, 1.0)
+        """Severity, at most the severest step: a lower bound where it does not fail."""
+        return min(self.severity, self.looked)
 
     @property
     def label(self) -> str:
         """In the parameter's unit."""
-        return self.case.label(self.severity) if self.reached else f"> {self.case.label(1.0)}"
+        if not self.reached:
+            return f"> {self.case.label(self.looked)}"
+        return self.case.label(self.severity) if self.severity > 0 else "fails undegraded"
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of the margin that rendered frames have the real ones of a sensor have."""
+
+    real: Envelope
+    rendered: Envelope
+
+    @property
+    def value(self) -> float:
+        """Ratio of the severities; a bound where either does not fail within the range."""
+        if self.rendered.width > 0:
+            return self.real.width / self.rendered.width
+        return np.inf if self.real.width > 0 else 1.0
+
+    @property
+    def short(self) -> bool:
+        """The real sensor lives on the bad side of the envelope."""
+        return self.value < SHORT
 
 
 def crossing(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndarray) -> float:
@@ -93,7 +122,7 @@ def curves_of(rows: list[dict], cases: tuple[Case, ...], pitch_px: float) -> lis
         for pipeline in dict.fromkeys(row["pipeline"] for row in mine):
             own = [row for row in mine if row["pipeline"] == pipeline]
             for measure in POSE_MEASURES if "pose_valid" in own[0] else MEASURES:
-                limit = measure.limit * pitch_px if measure.name == "centroid_px" else measure.limit
+                limit = measure.limit * pitch_px if measure.in_pitches else measure.limit
                 curves.append(_curve(case.name, pipeline, measure, limit, own))
     return curves
 
@@ -105,8 +134,16 @@ def envelopes_of(curves: list[Curve], cases: tuple[Case, ...]) -> list[Envelope]
         for pipeline in dict.fromkeys(c.pipeline for c in curves if c.case == case.name):
             first = min((c for c in curves if c.case == case.name and c.pipeline == pipeline), key=lambda c: c.crossing)
             reached = np.isfinite(first.crossing)
-            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else ""))
+            ends = sorted(crossing(first.measure, first.limit, first.severity, edge) for edge in (first.low, first.high))
+            looked = float(first.severity.max())
+            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else "", looked, tuple(ends)))
     return found
+
+
+def shares_of(real: list[Envelope], rendered: list[Envelope], pipeline: str) -> list[Share]:
+    """Real envelopes of one pipeline beside the rendered ones of the same cases, least share first."""
+    beside = {e.case.name: e for e in rendered if e.pipeline == pipeline}
+    return sorted((Share(e, beside[e.case.name]) for e in real if e.pipeline == pipeline), key=lambda share: share.value)
 
 
 def _curve(case: str, pipeline: str, measure: Measure, limit: float, rows: list[dict]) -> Curve:
@@ -123,7 +160,10 @@ def _curve(case: str, pipeline: str, measure: Measure, limit: float, rows: list[
 
 
 def _poses_against_nominal(rows: list[dict]) -> list[dict]:
-    """Rows of models with the mean absolute change of their lengths and angles against the same frame undegraded."""
+    """Rows of models with the mean absolute change of their lengths and angles against the same frame undegraded.
+
+    A frame without contact has no pose that could be wrong: NaN.
+    """
     nominal = {(r["case"], r["pipeline"], r["frame"]): r["pose"] for r in rows if "pose" in r and r["severity"] == 0}
     table = []
     for row in rows:
@@ -132,7 +172,7 @@ def _poses_against_nominal(rows: list[dict]) -> list[dict]:
             change = np.abs(np.array(now["values"]) - np.array(first["values"]))
             row = row | {"pose_valid": float(now["valid"])}
             for unit in ("mm", "deg"):
-                of_unit = [c for c, u in zip(change, now["units"], strict=True) if u == unit]
+                of_unit = [c for c, u in zip(change, now["units"], strict=True) if u == unit and now["touched"]]
                 row[f"pose_{unit}"] = float(np.mean(of_unit)) if of_unit else np.nan
         table.append(row)
     return table

@@ -21,9 +21,11 @@ class Measure:
     ----------
     name, title, unit : str
     limit : float
-        Of its mean over the contacts; of ``centroid_px`` in pitches.
+        Of its mean over the contacts.
     least : bool
         The limit is a least value, not a largest one.
+    in_pitches : bool
+        The limit is in mean distances of neighbouring pins, not in ``unit``.
     """
 
     name: str
@@ -31,6 +33,7 @@ class Measure:
     unit: str
     limit: float
     least: bool
+    in_pitches: bool = False
 
     def failed(self, value: float, limit: float) -> bool:
         """Whether a value lies beyond a limit."""
@@ -41,7 +44,7 @@ MEASURES = (
     Measure("valid", "frames that can be used", "", 0.95, True),
     Measure("recall", "pins found", "", 0.97, True),
     Measure("precision", "claims that are pins", "", 0.97, True),
-    Measure("centroid_px", "centroid error, rms", "px", 0.06, False),
+    Measure("centroid_px", "centroid error, rms", "px", 0.06, False, in_pitches=True),
     Measure("swaps", "pins with another's name", "", 0.01, False),
     Measure("area_error", "Voronoi area error, median", "", 0.05, False),
     Measure("edges", "edges kept", "", 0.93, True),

@@ -1,45 +1,42 @@
-"""A sweep's page, tables and plots."""
+"""A sweep's page and tables."""
 
 import csv
 import json
 from pathlib import Path
 
-import numpy as np
-from matplotlib.figure import Figure
-
-from twin.robustness.envelope import Curve, Envelope
+from twin.robustness.envelope import SHORT, Curve, Envelope, Share, shares_of
+from twin.robustness.judgement import Judgement
 from twin.robustness.measures import MEASURES, POSE_MEASURES
+from twin.robustness.plots import TITLES, plot_case, plot_shares
 from twin.robustness.sweep import Cell, Plan, cells_of
 from twin.views.page import render_page
 
-DPI = 80
-SHOWN = ("valid", "recall", "precision", "centroid_px", "area_error", "edges")  # measures that are plotted
-TITLES = {m.name: m.title + (f", {m.unit}" if m.unit else "") for m in (*MEASURES, *POSE_MEASURES)}
 TWICE = 2.0
 
 
-def write_report(
-    out: Path, plan: Plan, rows: list[dict], curves: list[Curve], envelopes: list[Envelope], *, source: str, notes: list[str]
-) -> list[Path]:
-    """Write index.html, its plots, and the tables; their paths, the page first."""
+def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str], rendered: Judgement | None = None) -> list[Path]:
+    """Write index.html, its plots, and the tables; their paths, the page first.
+
+    Parameters
+    ----------
+    out : Path
+    judged : Judgement
+    source : str
+        Name of the frames.
+    notes : list of str
+        For the page.
+    rendered : Judgement, optional
+        Of the same cases on rendered frames, to be shown beside real ones.
+    """
     (out / "plots").mkdir(exist_ok=True)
-    cells = cells_of(plan)
-    entries = []
-    for case in plan.cases:
-        own = [e for e in envelopes if e.case == case]
-        plot = out / "plots" / f"{case.name}.png"
-        _plot(plot, case, [c for c in curves if c.case == case.name])
-        entries.append(
-            {
-                "case": case,
-                "envelopes": {e.pipeline: e for e in own},
-                "plot": f"plots/{plot.name}",
-                "picture": _worst(out, cells, case, own[0]) if own else None,
-            }
-        )
-    first = plan.detectors[0].name
+    plan, envelopes = judged.plan, judged.envelopes
+    cells, first = cells_of(plan), plan.detectors[0].name
+    entries = [_entry(out, case, judged, rendered, cells) for case in plan.cases]
     entries.sort(key=lambda entry: entry["envelopes"][first].width)
     comparisons = [compare(envelopes, first, other.name) | {"nameless": other.method == "legacy"} for other in plan.detectors[1:]]
+    shares = shares_of(envelopes, rendered.envelopes, first) if rendered else []
+    if shares:
+        plot_shares(out / "plots" / "real-on-rendered.png", shares)
     page = out / "index.html"
     page.write_text(
         render_page(
@@ -51,6 +48,8 @@ def write_report(
             first=first,
             entries=entries,
             comparisons=comparisons,
+            shares=shares,
+            short_below=SHORT,
             measures=MEASURES,
             pose_measures=POSE_MEASURES if plan.model_names else (),
             detectors=plan.detectors,
@@ -60,16 +59,25 @@ def write_report(
         encoding="utf-8",
     )
     summary = out / "envelope.json"
-    summary.write_text(
-        json.dumps({"comparisons": comparisons, "envelope": [_row(e) for e in envelopes]}, indent=2) + "\n", encoding="utf-8"
-    )
+    content = {"comparisons": comparisons, "envelope": [_row(e) for e in envelopes], "shares": [_share_row(s) for s in shares]}
+    summary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     written = [
         page,
         summary,
         _table(out / "envelope.csv", [_row(e) for e in envelopes]),
-        _table(out / "curves.csv", _curve_rows(plan, curves)),
+        _table(out / "curves.csv", _curve_rows(plan, judged.curves)),
+        _table(out / "frames.csv", [_flat(row) for row in judged.rows]),
     ]
-    return [*written, _table(out / "frames.csv", [_flat(row) for row in rows])]
+    return [*written, _table(out / "real-on-rendered.csv", [_share_row(s) for s in shares])] if shares else written
+
+
+def _entry(out: Path, case, judged: Judgement, rendered: Judgement | None, cells: list[Cell]) -> dict:
+    """What the page says of one case."""
+    own = {e.pipeline: e for e in judged.envelopes if e.case == case}
+    plot = out / "plots" / f"{case.name}.png"
+    plot_case(plot, case, judged.curves, rendered.curves if rendered else [])
+    first = own[judged.plan.detectors[0].name]
+    return {"case": case, "envelopes": own, "plot": f"plots/{plot.name}", "picture": _worst(out, cells, case, first)}
 
 
 def compare(envelopes: list[Envelope], ours: str, theirs: str) -> dict:
@@ -92,25 +100,6 @@ def _worst(out: Path, cells: list[Cell], case, envelope: Envelope) -> dict | Non
     return {"file": file, "label": case.label(cell.severity)} if (out / file).is_file() else None
 
 
-def _plot(path: Path, case, curves: list[Curve]) -> None:
-    names = [name for name in SHOWN if any(c.measure.name == name for c in curves)]
-    names += [m.name for m in POSE_MEASURES if any(c.measure.name == m.name for c in curves)]
-    figure = Figure(figsize=(3.1 * len(names), 2.7), layout="constrained")
-    single = len(case.conditions) == 1
-    for ax, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
-        for curve in (c for c in curves if c.measure.name == name):
-            at = np.array([case.conditions[0].value(s) for s in curve.severity]) if single else curve.severity
-            ax.plot(at, curve.mean, ".-", label=curve.pipeline, lw=1.2)
-            ax.fill_between(at, curve.low, curve.high, alpha=0.2)
-            limit = curve.limit
-        ax.axhline(limit, color="0.4", lw=0.8, ls="--")
-        ax.set_title(TITLES[name], fontsize=9)
-        ax.set_xlabel(f"{case.conditions[0].parameter} {case.conditions[0].unit}".strip() if single else "severity of both", fontsize=8)
-        ax.tick_params(labelsize=7)
-    ax.legend(fontsize=7)
-    figure.savefig(path, dpi=DPI)
-
-
 def _row(e: Envelope) -> dict:
     single = len(e.case.conditions) == 1
     value = e.case.conditions[0].value(e.width) if single else None
@@ -118,6 +107,13 @@ def _row(e: Envelope) -> dict:
     return {
         "condition": e.case.name, "pipeline": e.pipeline, "severity": round(e.width, 4), "reached": bool(e.reached), "measure": e.measure,
         "value": value, "unit": unit,
+    }  # fmt: skip
+
+
+def _share_row(share: Share) -> dict:
+    return {
+        "condition": share.real.case.name, "share": round(share.value, 3), "short": share.short, "real": share.real.label,
+        "rendered": share.rendered.label, "real_measure": share.real.measure, "rendered_measure": share.rendered.measure,
     }  # fmt: skip
 
 

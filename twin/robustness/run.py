@@ -10,15 +10,15 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.detectors import METHODS, DetectorSpec, load_detector, shipped_detector, tune, write_detector
 from twin.errors import TwinError
-from twin.preprocess.reference import nominal_reference
 from twin.recordings import open_recording
 from twin.robustness.condition import Case
 from twin.robustness.contacts import CONTACTS
-from twin.robustness.envelope import Envelope, curves_of, envelopes_of
+from twin.robustness.envelope import Envelope
+from twin.robustness.judgement import judge_sweep
 from twin.robustness.real import consensus
 from twin.robustness.report import write_report
-from twin.robustness.shots import RealSource, RenderedSource
-from twin.robustness.sweep import Plan, run_sweep
+from twin.robustness.shots import RenderedSource
+from twin.robustness.sweep import Models, Plan
 from twin.types import Form, Frame
 
 
@@ -28,7 +28,7 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
     Raises
     ------
     TwinError
-        A name is neither a method nor a file.
+        A file can't be read; `check_pipelines` tells so sooner.
     """
     folder.mkdir(parents=True, exist_ok=True)
     chosen, digest = [], zlib.crc32(b"".join(frame.image.tobytes() for frame in frames))
@@ -41,14 +41,20 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
             if not kept.is_file():
                 write_detector(kept, tune(frames, spec, name).detector, "Tuned on undegraded frames.")
             chosen.append(load_detector(kept).model_copy(update={"name": name}))
-        elif Path(name).suffix == ".toml":
-            chosen.append(load_detector(Path(name)))
         else:
-            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a file written by 'twin tune'")
+            chosen.append(load_detector(Path(name)))
         progress(k + 1, len(names))
-    if len({d.name for d in chosen}) < len(chosen):
-        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(d.name for d in chosen)}; rename the files")
     return tuple(chosen)
+
+
+def check_pipelines(names: list[str]) -> None:
+    """Raise ``TwinError`` where a name is neither a method nor a readable file, or two are alike: before anything is solved or drawn."""
+    for name in names:
+        if name not in METHODS and Path(name).suffix != ".toml":
+            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
+    called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
+    if len(set(called)) < len(called):
+        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
 
 
 def rendered_study(spec: SensorSpec, pipelines: list[str], cases: tuple[Case, ...], severities: tuple, out: Path, bar: Callable, **options):
@@ -64,9 +70,22 @@ def rendered_study(spec: SensorSpec, pipelines: list[str], cases: tuple[Case, ..
 
 
 def real_study(
-    spec: SensorSpec, path: Path, limit: int, pipelines: list[str], cases: tuple[Case, ...], severities: tuple, out: Path, bar, **options
+    spec: SensorSpec,
+    path: Path,
+    limit: int,
+    pipelines: list[str],
+    cases: tuple[Case, ...],
+    severities: tuple,
+    out: Path,
+    bar: Callable,
+    *,
+    beside: bool = True,
+    **options,
 ):
-    """A study on a folder of real frames: image-level conditions only; options and results as `study`."""
+    """A study on a folder of real frames: image-level conditions only; options and results as `study`.
+
+    ``beside``: raw frames are shown on the envelope of rendered ones, which are swept too.
+    """
     recording = open_recording(path, spec)
     frames = [recording.read(int(k)) for k in np.unique(np.linspace(0, len(recording) - 1, min(limit, len(recording))).round())]
     with bar("tuning") as progress:
@@ -78,7 +97,8 @@ def real_study(
         raise TwinError("none of the conditions can be applied to frames that are already there; leave --frames out to render them")
     if left := [c.name for c in cases if c not in usable]:
         notes.append(f"left out, as they can't be applied to frames that are already there: {', '.join(left)}")
-    return study(Plan(source, detectors, usable, severities), path.name, out, bar, notes=notes, **options)
+    rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
+    return study(Plan(source, detectors, usable, severities), path.name, out, bar, notes=notes, rendered=rendered, **options)
 
 
 def _on_frames(case: Case) -> bool:
@@ -87,7 +107,16 @@ def _on_frames(case: Case) -> bool:
 
 
 def study(
-    plan: Plan, source: str, out: Path, bar: Callable, *, jobs: int = 1, models=None, model_names: tuple = (), notes: list | None = None
+    plan: Plan,
+    source: str,
+    out: Path,
+    bar: Callable,
+    *,
+    jobs: int = 1,
+    models: Models | None = None,
+    model_names: tuple[str, ...] = (),
+    notes: list[str] | None = None,
+    rendered: RenderedSource | None = None,
 ) -> tuple[list[Envelope], list[Path]]:
     """Sweep, judge and write; the envelopes and the files written, the page first.
 
@@ -105,14 +134,14 @@ def study(
         As `Plan` takes them.
     notes : list of str, optional
         For the page.
+    rendered : RenderedSource, optional
+        Frames of the same sensor to sweep likewise (in ``out/rendered``) and to show the plan's beside.
     """
     plan = replace(plan, models=models, model_names=model_names)
     with bar("conditions x steps") as progress:
-        rows = run_sweep(plan, out, jobs=jobs, progress=progress)
-    curves = curves_of(rows, plan.cases, _pitch_px(plan.source))
-    envelopes = envelopes_of(curves, plan.cases)
-    return envelopes, write_report(out, plan, rows, curves, envelopes, source=source, notes=notes or [])
-
-
-def _pitch_px(source: RenderedSource | RealSource) -> float:
-    return float(np.mean(nominal_reference(source.spec, source.form).spacing_px))
+        judged = judge_sweep(plan, out, jobs=jobs, progress=progress)
+    beside = None
+    if rendered is not None:
+        with bar("the same, rendered") as progress:
+            beside = judge_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=progress)
+    return judged.envelopes, write_report(out, judged, source=source, notes=notes or [], rendered=beside)

@@ -39,12 +39,15 @@ class Shot:
     caps_px : (N, 2) float
     visible : (N,) bool
         The cap is there, within the frame, and nothing stands before it.
+    touched : bool
+        Something is in contact; taken for granted in real frames.
     """
 
     name: str
     frame: Frame
     caps_px: np.ndarray
     visible: np.ndarray
+    touched: bool = True
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,11 @@ class RenderedSource:
 
     spec: SensorSpec
     contacts: tuple[Contact, ...]
-    form: Form = Form.RAW
+
+    @property
+    def form(self) -> Form:
+        """Of the frames."""
+        return Form.RAW
 
     def names(self) -> list[str]:
         """Of the frames."""
@@ -62,19 +69,15 @@ class RenderedSource:
     def shoot(self, case: Case, severity: float) -> list[Shot]:
         """The frames under a case; contacts that can't be solved are left out."""
         spec = case.on_spec(self.spec, severity)
-        preview = Preview(spec, static=_static(spec))
         view = View.of(spec, np.zeros((spec.pins.count, 2)))
         geometry = _with_light_of(self.spec, spec)
         shots = []
-        for draw, contact in enumerate(self.contacts):
-            try:
-                state, truth = _pressed(geometry, geometry if case.solves else self.spec, contact)
-            except ContactError:
-                continue
-            view = replace(view, caps_px=truth.caps_px)
-            light = case.on_light(preview.render(state), severity, view, draw)
-            image = case.on_frame(expose(light, spec, np.random.default_rng(draw)), severity, view, draw)
-            shots.append(_shot(contact.name, image, Form.RAW, case, severity, view, truth.visible))
+        for film in _films(_with_response_of(self.spec, spec), geometry, geometry if case.solves else self.spec, self.contacts):
+            view = replace(view, caps_px=film.truth.caps_px)
+            light = case.on_light(film.light, severity, view, film.draw)
+            image = case.on_frame(expose(light, spec, np.random.default_rng(film.draw)), severity, view, film.draw)
+            shot = _shot(film.contact.name, image, self.form, case, severity, view, film.truth.visible)
+            shots.append(replace(shot, touched=film.contact.pose.indent_mm > 0))
         return shots
 
 
@@ -131,6 +134,39 @@ def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
     gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
     alike = revised(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
     return alike.model_copy(update={name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
+
+
+def _with_response_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
+    """A specification with all that comes after the light on the film as ``base`` has it."""
+    return spec.model_copy(update={"response": base.response})
+
+
+@dataclass(frozen=True)
+class _Film:
+    """Linear light of one contact, before the camera's response, and where its pins are; ``draw`` seeds what is random in it."""
+
+    draw: int
+    contact: Contact
+    light: np.ndarray
+    truth: CapTruth
+
+
+@lru_cache(maxsize=2)
+def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contacts: tuple[Contact, ...]) -> tuple[_Film, ...]:
+    """Contacts of the sensor ``mechanics``, seen by the camera of ``geometry``, lit as ``spec``: one for all conditions behind the film.
+
+    Contacts that can't be solved are left out.
+    """
+    preview, films = Preview(spec, static=_static(spec)), []
+    for draw, contact in enumerate(contacts):
+        try:
+            state, truth = _pressed(geometry, mechanics, contact)
+        except ContactError:
+            continue
+        light = preview.render(state)
+        light.flags.writeable = False  # it is shared
+        films.append(_Film(draw, contact, light, truth))
+    return tuple(films)
 
 
 @lru_cache(maxsize=32)

@@ -5,6 +5,7 @@ import json
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -13,12 +14,12 @@ import cv2
 import numpy as np
 
 from twin.detectors import DetectorSpec, Found, make_detector
+from twin.errors import TwinError
 from twin.robustness.condition import Case
 from twin.robustness.measures import judge
 from twin.robustness.shots import RealSource, RenderedSource, Shot
-from twin.types import Frame
 
-FORMAT = 1  # raised whenever older cells must not be read
+FORMAT = 2  # raised whenever older cells must not be read: the file's content or the pipeline has changed
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 Models = Callable[[], dict]  # gives {name: estimate}, estimate(frame) -> (values, units, valid)
 
@@ -99,6 +100,8 @@ def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress) -
             for done, future in enumerate(as_completed(running)):
                 future.result()
                 progress(done + 1)
+        except BrokenProcessPool as error:
+            raise TwinError("a process of the sweep ended before its time, for want of memory perhaps; go on with --jobs 1") from error
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -122,7 +125,7 @@ def _run(cell: Cell) -> None:
             rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | judge(detector, found, shot))
             if place == 0 and (worst is None or rows[-1]["recall"] < worst[0]):
                 worst = rows[-1]["recall"], shot, found
-        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot.frame)} for name, model in _WORK["models"].items()]
+        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in _WORK["models"].items()]
     if worst is not None:
         cv2.imwrite(str(folder / "pictures" / f"{cell.file}.jpg"), overlay(worst[1], worst[2]))
     path = folder / "cells" / f"{cell.file}.json"
@@ -131,9 +134,9 @@ def _run(cell: Cell) -> None:
     os.replace(part, path)
 
 
-def _pose(estimate, frame: Frame) -> dict:
-    values, units, valid = estimate(frame)
-    return {"values": [float(v) for v in values], "units": list(units), "valid": bool(valid)}
+def _pose(estimate, shot: Shot) -> dict:
+    values, units, valid = estimate(shot.frame)
+    return {"values": [float(v) for v in values], "units": list(units), "valid": bool(valid), "touched": shot.touched}
 
 
 def overlay(shot: Shot, found: Found) -> np.ndarray:

@@ -3,7 +3,7 @@
 import difflib
 
 from twin.errors import TwinError
-from twin.robustness.condition import Case, Condition
+from twin.robustness.condition import Condition
 from twin.robustness.conditions import electronics, gel, lighting, optics, placement, settings, skin
 
 FAMILIES = (lighting, optics, gel, skin, placement, electronics, settings)
@@ -23,8 +23,3 @@ def condition(name: str) -> Condition:
     near = difflib.get_close_matches(name, CONDITIONS, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(CONDITIONS)}"
     raise TwinError(f"no condition named '{name}': {hint}")
-
-
-def single_cases() -> tuple[Case, ...]:
-    """Every condition alone."""
-    return tuple(Case((c,)) for c in CONDITIONS.values())

@@ -41,7 +41,7 @@ def yellowed(spec, value, rng):
 
 
 def softened(spec, value, rng):
-    return revised(spec, **{part: {"young_modulus_mpa": getattr(spec, part).young_modulus_mpa * (1 - value)} for part in ("gel",)})
+    return revised(spec, gel={"young_modulus_mpa": spec.gel.young_modulus_mpa * (1 - value)})
 
 
 CONDITIONS = (

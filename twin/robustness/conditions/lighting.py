@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twin.robustness.condition import Condition, View, revised
+from twin.robustness.condition import Condition, View, over_channels, revised
 
 GLARE = 3.0  # light of a glare's middle, in saturations: the camera shows it white well beyond its half width
 GLARE_AT = (0.35, -0.25)  # from the disc's centre, in its radius
@@ -33,7 +33,7 @@ def room_light(light, value, view: View, rng):
         return light
     x, y = view.grid(light.shape)
     ramp = np.clip(0.5 + 0.5 * (0.8 * x + 0.6 * y), 0, 1)
-    return light + _channels(value * view.saturation * ramp, light)
+    return light + over_channels(value * view.saturation * ramp, light)
 
 
 def glare(light, value, view: View, rng):
@@ -43,12 +43,7 @@ def glare(light, value, view: View, rng):
     x, y = view.grid(light.shape)
     radius = 0.5 * value * view.px_per_mm / view.radius_px
     away2 = ((x - GLARE_AT[0]) ** 2 + (y - GLARE_AT[1]) ** 2) / radius**2
-    return light + _channels(GLARE * view.saturation * np.exp(-np.log(GLARE) * away2**2), light)
-
-
-def _channels(plane, light):
-    plane = np.asarray(plane, np.float32)
-    return plane[..., None] if light.ndim == 3 else plane
+    return light + over_channels(GLARE * view.saturation * np.exp(-np.log(GLARE) * away2**2), light)
 
 
 CONDITIONS = (

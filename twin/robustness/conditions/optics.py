@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from twin.robustness.condition import Condition, View
+from twin.robustness.condition import Condition, View, over_channels
 
 SUBPIXELS = 8  # per pixel and axis, of a blur's kernel
 MOTION_DEG = 30.0
@@ -60,8 +60,7 @@ def rolled_focus(light, value, view: View, rng):
     sharp_to_soft = [light] + [blurred_by(light, disc_kernel(value * view.px_per_mm * k / FOCUS_STEPS)) for k in range(1, FOCUS_STEPS + 1)]
     mixed = np.zeros_like(light)
     for k, layer in enumerate(sharp_to_soft):
-        weight = np.clip(1 - np.abs(place - k), 0, 1).astype(np.float32)
-        mixed += layer * (weight[..., None] if light.ndim == 3 else weight)
+        mixed += layer * over_channels(np.clip(1 - np.abs(place - k), 0, 1), light)
     return mixed
 
 
@@ -74,8 +73,7 @@ def dirt(light, value, view: View, rng):
     x, y = view.grid(light.shape)
     level = np.quantile(field[x * x + y * y < 1], 1 - value)
     cover = cv2.GaussianBlur((field >= level).astype(np.float32), (0, 0), DIRT_EDGE_MM * view.px_per_mm)
-    through = 1 - np.float32(DIRT_OPACITY) * cover
-    return light * (through[..., None] if light.ndim == 3 else through)
+    return light * over_channels(1 - np.float32(DIRT_OPACITY) * cover, light)
 
 
 def scratched(light, value, view: View, rng):
@@ -92,7 +90,7 @@ def scratched(light, value, view: View, rng):
         distance = np.abs(np.cos(turn[k]) * x + np.sin(turn[k]) * y - away[k])
         added += np.float32(part * bright[k] * SCRATCH_LIGHT * view.saturation) * np.exp(-0.5 * (distance / half) ** 2)
     added *= x * x + y * y < 1
-    return light + (added[..., None] if light.ndim == 3 else added)
+    return light + over_channels(added, light)
 
 
 _IMAGE = {"image_level": True}

@@ -5,7 +5,7 @@ import numpy as np
 
 from twin.geometry.pins import rest_pins
 from twin.optics.surfaces import cap_albedo
-from twin.robustness.condition import Condition, View, chosen, revised
+from twin.robustness.condition import Condition, View, chosen, over_channels, revised
 
 GONE = 1e-6  # reflectance of a cap that has come off, relative to a whole one
 BROKEN = (-0.45, 0.2, 0.1, 0.15, 0.1)  # a broken cap's outline: about a third of its area left, askew
@@ -71,8 +71,7 @@ def translucent(light, value, view: View, rng):
         return light
     x, y = view.grid(light.shape)
     bright = value * view.saturation * np.clip(0.7 + 0.3 * (0.6 * x - 0.8 * y), 0, 1) * (x * x + y * y < 1)
-    bright = bright * (1 - cap_cover(light.shape, view))
-    return light + (bright[..., None] if light.ndim == 3 else bright).astype(np.float32)
+    return light + over_channels(bright * (1 - cap_cover(light.shape, view)), light)
 
 
 def torn(light, value, view: View, rng):
@@ -81,8 +80,7 @@ def torn(light, value, view: View, rng):
         return light
     x, y = view.grid(light.shape)
     away_px = np.hypot(x - TEAR_AT[0], y - TEAR_AT[1]) * view.radius_px
-    cover = np.clip(0.5 * value * view.px_per_mm - away_px + 0.5, 0, 1).astype(np.float32)
-    cover = cover[..., None] if light.ndim == 3 else cover
+    cover = over_channels(np.clip(0.5 * value * view.px_per_mm - away_px + 0.5, 0, 1), light)
     return light * (1 - cover) + np.float32(TEAR_LIGHT * view.saturation) * cover
 
 

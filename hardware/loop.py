@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 
@@ -25,6 +26,15 @@ from twin.types import Frame
 MOST_PIECES, NEAR_MM = 200, 0.5
 MOVE_TIMEOUT_S = 10.0
 BEHIND_MOVES = 2.0  # largest moves that an arm may lag behind before it is told more
+
+
+class Decided(StrEnum):
+    """What each round of the loop ends with."""
+
+    MOVE = "moved"
+    AWAIT_ARM = "let the arm catch up"
+    AWAIT_FRAME = "awaited a newer frame"  # too far from what was seen last
+    HOLD = "held still"
 
 
 @dataclass
@@ -66,6 +76,7 @@ class ServoLoop:
     def __post_init__(self):
         self.records: list[StepRecord] = []
         self.notes: list[str] = []  # what went wrong
+        self.decided: list[tuple[Decided, float]] = []  # every decision, and the age (s) of the frame behind it (NaN without one)
         self._held_since: float | None = None
         self._track = ArmTrack(self.arm)
         self._started_s = self._ended_s = 0.0
@@ -109,9 +120,11 @@ class ServoLoop:
             len(self.records) / spent_s,
             len(fresh) / spent_s,
             Spread.of([record.latency_s for record in fresh]),
-            Spread.of([record.age_s for record in self.records]),
+            Spread.of([age_s for _, age_s in self.decided if np.isfinite(age_s)]),
             Spread.of([record.compute_s for record in fresh]),
             self.source.dropped,
+            len(self.decided) / spent_s,
+            {str(code): count for code in Decided if (count := sum(one is code for one, _ in self.decided))},
         )
 
     def _follow(self) -> None:
@@ -131,6 +144,7 @@ class ServoLoop:
                 self._hold(str(problem), problem)
                 continue
             taken_s = time.monotonic()
+            age_s = taken_s - frame.time_s
             fresh = used is None or frame.sequence != used.sequence
             if fresh:
                 estimate, used = self.estimator(frame), frame
@@ -141,29 +155,32 @@ class ServoLoop:
                     if self.sense is not None:
                         self.sense(reading.depth_mm, frame.time_s)
             if doubt:
-                self._hold(doubt, None)
+                self._hold(doubt, None, age_s)
                 continue
             from_pose = state.pose if sent is None or not state.moving else sent
             if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
-                continue  # the arm is still on its way
+                self.decided.append((Decided.AWAIT_ARM, age_s))
+                continue
             if not fresh and _apart_mm(from_pose, exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
-                continue  # too far from what was seen last
+                self.decided.append((Decided.AWAIT_FRAME, age_s))
+                continue
             step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
             try:
                 sent = self._move(step.pose, wait=False)
             except RefusedMoveError as refused:
                 if refused.decision.code is not Code.STALE_FRAME:
                     raise
-                self._hold(str(refused), refused)
+                self._hold(str(refused), refused, age_s)
                 continue
             memory, self._held_since = step.memory, None
+            self.decided.append((Decided.MOVE, age_s))
             now_s = time.monotonic()
             record = StepRecord(
                 len(self.records),
                 now_s,
                 frame.sequence,
                 frame.time_s,
-                taken_s - frame.time_s,
+                age_s,
                 fresh,
                 now_s - frame.time_s,
                 now_s - taken_s,
@@ -209,8 +226,9 @@ class ServoLoop:
                 return reading, f"the model says {got:.1f} {name}, which can't be ([{low:g}, {high:g}]); give another model or sensor"
         return reading, ""
 
-    def _hold(self, reason: str, problem: Exception | None) -> None:
+    def _hold(self, reason: str, problem: Exception | None, age_s: float = float("nan")) -> None:
         """Stop where the arm is; give up after a while."""
+        self.decided.append((Decided.HOLD, age_s))
         if self._held_since is None:
             self._held_since = time.monotonic()
             self.arm.stop()

@@ -111,7 +111,8 @@ def build_rig(
     plain_light : bool
         Draw the twin's frames with the lamps' direct light alone, without the path-traced frame that sets what comes on top.
     at_once : bool
-        A simulated arm before the twin's camera takes no time: whoever waits for frames at each stop needs none.
+        A simulated arm before the twin's camera takes no time, and frames are drawn when they are waited for: for whoever waits for
+        frames at each stop.
     """
     form = form or (Form.RECORDING if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
@@ -122,7 +123,10 @@ def build_rig(
     if not simulated or limits is not None:
         kind = arm.partition(":")[0]
         device = SafeArm(device, load_limits(limits or kind)) if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file() else device
-    twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=drawn(sensor, form, plain_light)) if camera == TWIN else None
+    twin = None
+    if camera == TWIN:
+        preview = drawn(sensor, form, plain_light)
+        twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=preview, on_demand=at_once)
     return Rig(open_camera(camera, sensor, form, twin=twin), device, placed, camera == TWIN)
 
 

@@ -58,6 +58,10 @@ class ServoLoop:
     retreat : callable, optional
         Withdraws the arm, given the direction (3,) away from the object in the base frame; by default a straight move of the
         servo's ``clear_mm``.
+    way : callable, optional
+        From where the arm stands to the pose clear of the object: the poses to pass, the last of them that one. By default straight.
+    take_rest : callable, optional
+        Given a frame without contact, taken clear of the object, the estimator to go on with.
     on_step : callable, optional
         Called with each record, its frame and its estimate, after the command was given.
     """
@@ -71,6 +75,8 @@ class ServoLoop:
     guards: list[Guard] = field(default_factory=list)
     sense: Callable[[float, float], None] | None = None
     retreat: Callable[[np.ndarray], object] | None = None
+    way: Callable[[np.ndarray, np.ndarray], list[np.ndarray]] | None = None
+    take_rest: Callable[[Frame], Estimator] | None = None
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
 
     def __post_init__(self):
@@ -95,7 +101,11 @@ class ServoLoop:
         try:
             self.arm.enable()
             self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
-            self._move(self._away_from(start_pose), wait=True)
+            clear = self._away_from(start_pose)
+            for pose in self.way(self._state().pose, clear) if self.way else [clear]:
+                self._move(pose, wait=True)
+            if self.take_rest is not None:
+                self.estimator = self.take_rest(self._rest_frame())
             touching = True
             self._move(start_pose, wait=True)
             with nullcontext() if self.settings.blocking else self._track.watched():
@@ -200,6 +210,13 @@ class ServoLoop:
                 self.on_step(record, frame, estimate)
             if self.settings.blocking:
                 self.arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
+
+    def _rest_frame(self) -> Frame:
+        """A frame of the sensor as it stands, clear of the object."""
+        try:
+            return self.source.read_after(self._state().time_s, timeout_s=self.settings.frame_timeout_s)
+        except (TimeoutError, EOFError) as error:
+            raise DeviceError(f"{error}; check the camera") from error
 
     def _frame(self, state: ArmState, arrived_s: float) -> Frame:
         if not self.source.is_live:

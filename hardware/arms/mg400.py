@@ -207,17 +207,13 @@ class MG400(BaseArm):
         self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)}{options})")
         if not wait:
             return
-        try:
+        with self._watched():
             self._await_queue(begun_s + timeout_s, timeout_s)
             left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
             if pose is not None:
                 self.wait_settled(pose, timeout_s=left_s)
             else:
                 self._await_joints(joints, left_s)
-        except BaseException:  # also Ctrl-C: what was begun must not go on unwatched
-            with contextlib.suppress(DeviceError):
-                self.stop()
-            raise
 
     def _send_motion(self, text: str) -> None:
         if self._bare:
@@ -242,10 +238,7 @@ class MG400(BaseArm):
                 return
             if time.monotonic() > deadline:
                 self._forget_sync()
-                raise DeviceError(
-                    f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
-                    "or look for what holds the arm"
-                )
+                raise self._too_long(timeout_s)
             if self._bare:
                 time.sleep(POLL_S)
 

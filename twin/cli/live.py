@@ -6,13 +6,15 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
+from twin.cli.at_rest import FIRST, NONE, AtRest, given_frame
 from twin.cli.servo import SHIPPED_MODEL, Camera, Model
 
 HELP = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
 
 A window opens where there is a display and an OpenCV that can; else a page in the browser (its address is printed).
 With --record DIR every frame is kept, lossless, with its estimate; the folder is readable even if the program is killed.
---replay DIR gives the same frames again, and says whether the estimates are the same.
+--replay DIR gives the same frames again, and says whether the estimates are the same. With --at-rest first the camera must see
+no contact at the start; that frame is kept with the session.
 
 \b
   twin live --camera /dev/video0 --model RUN
@@ -30,13 +32,14 @@ def live(
     headless: Annotated[bool, typer.Option("--headless", help="show nothing, print the figures at the end")] = False,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="stop after this time")] = None,
     count: Annotated[int | None, typer.Option("--count", min=1, help="stop after so many frames")] = None,
+    at_rest: AtRest = NONE,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="of the page; 0: a free one")] = 8080,
 ) -> None:
     from contextlib import ExitStack
 
     from hardware.cameras.choose import open_camera
     from hardware.errors import DeviceError
-    from hardware.live import LiveSession, Shower, same_estimates
+    from hardware.live import FRAME_TIMEOUT_S, LiveSession, Shower, same_estimates
     from hardware.session import SessionSource, SessionWriter
     from hardware.view.draw import draw_view
     from hardware.view.server import BrowserView
@@ -50,10 +53,15 @@ def live(
     estimator = PoseEstimator.load(model)
     source = SessionSource(replay) if replay else open_camera(camera, estimator.sensor, estimator.form)
     estimator.check(estimator.sensor, source.form)
+    rest = source.rest if replay else given_frame(at_rest, estimator)
     found: list = []
     with ExitStack() as stack:
         stack.enter_context(signals_as_ctrl_c())
         stack.enter_context(source)
+        if at_rest == FIRST and not replay:
+            rest = source.read(timeout_s=FRAME_TIMEOUT_S)
+        if rest is not None:
+            estimator = estimator.at_rest(rest)
         view = None
         if not headless:
             title = f"{estimator.sensor.name}, {source.name}"
@@ -62,6 +70,8 @@ def live(
         if record is not None:  # last: a folder is begun only where there is something to keep
             about = {"sensor": estimator.sensor.name, "form": str(source.form), "camera": source.name, "model": str(model)}
             writer = stack.enter_context(SessionWriter(record, about))
+            if rest is not None:
+                writer.keep_rest(rest)
         keep = (lambda frame, estimate: found.append(estimate)) if replay else None
         session = LiveSession(source, estimator, writer, keep)
         shower = None

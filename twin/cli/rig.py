@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hardware.approach import way_around
 from hardware.arms.arm import Arm, ArmState
 from hardware.arms.open_arm import open_arm
 from hardware.arms.simulated import SimulatedArm
@@ -156,6 +157,7 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
 def servo_loop(rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopSettings, on_step=None) -> ServoLoop:
     """The loop on a connected rig; a safe arm is told what the sensor feels, and retreats in its own way."""
     loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[_no_full_turn(rig.arm)], on_step=on_step)
+    loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
         loop.sense = lambda depth_mm, time_s: rig.arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
 

@@ -14,6 +14,7 @@ from hardware.step import LoopSettings
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_of, write_csv
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
+from twin.cli.at_rest import FIRST, given_frame
 from twin.cli.rig import build_rig, servo_loop, steps_round
 from twin.errors import TwinError
 from twin.types import Form
@@ -34,6 +35,8 @@ class ServoRun:
         Decisions a second; None: each waits for the move before.
     known_place : bool
         The object stands where the servo's placement has it, so that there is a truth to measure against (always so in the twin).
+    at_rest : str
+        What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none``, or a file.
     """
 
     sensor: SensorSpec
@@ -49,6 +52,7 @@ class ServoRun:
     seed: int = 0
     plain_light: bool = False
     known_place: bool = False
+    at_rest: str = FIRST
 
 
 @dataclass(frozen=True)
@@ -126,13 +130,23 @@ def follow(
         if progress is not None:
             progress(record.index + 1, steps)
 
+    def at_rest(frame):
+        if session is not None:
+            session.keep_rest(frame)
+        return estimator.at_rest(frame)
+
     failure, followed, session = "", None, None
+    rest = given_frame(run.at_rest, estimator)
     with rig:
         first = rig.await_frame()
         loop = servo_loop(rig, run.servo, estimator, settings, on_step)
         loop.require_labels(estimator(first).names)
         if run.record:
             session = SessionWriter(out / "session", told)
+        if rest is not None:
+            loop.estimator = at_rest(rest)
+        elif run.at_rest == FIRST and estimator.counts_from_rest and rig.source.is_live:
+            loop.take_rest = at_rest
         try:
             loop.run(rig.placed.start_pose(run.servo.indent_mm))
         except TwinError as error:

@@ -77,7 +77,8 @@ class BaseArm(Connection, ABC):
 
     def _too_long(self, timeout_s: float) -> DeviceError:
         return DeviceError(
-            f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, or look for what holds the arm"
+            f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
+            "or look for what holds the arm"
         )
 
     def _require_connected(self) -> None:

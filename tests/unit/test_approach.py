@@ -45,12 +45,12 @@ def test_in_the_open_it_is_straight(placed):
     assert only is clear
 
 
-def test_from_within_the_circle_it_first_goes_outward(placed):
+def test_from_behind_and_near_it_first_goes_outward(placed):
     clear = clear_of(placed)
-    beside = placed.start_pose(-2.0)  # just in front of the surface
-    beside[:3] += 75.0 * placed.mounting.across @ matrix_of(beside)[:3, :3].T
-    first = way_around(placed, beside, clear)[0]
-    middle = placed.T_base_object[:3, 3] + 40.0 * placed.T_base_object[:3, 2]
-    assert np.linalg.norm((first - beside)[:2]) >= 0 and np.linalg.norm((first[:3] - middle)[:2]) > np.linalg.norm(
-        (beside[:3] - middle)[:2]
-    )
+    middle, inward = placed.T_base_object[:3, 3] + 40.0 * placed.T_base_object[:3, 2], placed.T_base_object[:3, 2]
+    start = clear.copy()
+    start[:3] = middle + 65.0 * inward - matrix_of(clear)[:3, :3] @ placed.mounting.centre_mm  # 5 mm behind the square
+    way = [start, *way_around(placed, start, clear)]
+    assert np.allclose((way[1] - start)[:3] / np.linalg.norm((way[1] - start)[:3]), inward)
+    gaps = gaps_mm(placed, way)
+    assert gaps.min() == pytest.approx(5.0, abs=0.1) and gaps[SAMPLES:].min() > 5.0

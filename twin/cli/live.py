@@ -11,7 +11,8 @@ from twin.cli.servo import SHIPPED_MODEL, Camera, Model
 
 HELP = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
 
-A window opens where there is a display and an OpenCV that can; else a page in the browser (its address is printed).
+A window opens where there is a display and an OpenCV that can; else a page in the browser (its address is printed); with
+--rerun (package rerun-sdk) Rerun's viewer, or its file: frame, pins, graph and pose on a time line.
 With --record DIR every frame is kept, lossless, with its estimate; the folder is readable even if the program is killed.
 --replay DIR gives the same frames again, and says whether the estimates are the same. With --at-rest first the camera must see
 no contact at the start; that frame is kept with the session.
@@ -30,6 +31,9 @@ def live(
     record: Annotated[Path | None, typer.Option("--record", metavar="DIR", help="new folder for the session")] = None,
     replay: Annotated[Path | None, typer.Option("--replay", metavar="DIR", help="a recorded session instead of a camera")] = None,
     headless: Annotated[bool, typer.Option("--headless", help="show nothing, print the figures at the end")] = False,
+    rerun: Annotated[
+        str | None, typer.Option("--rerun", metavar="T", help="viewer, a new file *.rrd, or a viewer's address rerun+http://...")
+    ] = None,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="stop after this time")] = None,
     count: Annotated[int | None, typer.Option("--count", min=1, help="stop after so many frames")] = None,
     at_rest: AtRest = NONE,
@@ -42,6 +46,7 @@ def live(
     from hardware.live import FRAME_TIMEOUT_S, LiveSession, Shower, same_estimates
     from hardware.session import SessionSource, SessionWriter
     from hardware.view.draw import draw_view
+    from hardware.view.rerun import RerunView
     from hardware.view.server import BrowserView
     from hardware.view.window import WindowView, has_window
     from training.estimator import PoseEstimator
@@ -62,9 +67,10 @@ def live(
             rest = source.read(timeout_s=FRAME_TIMEOUT_S)
         if rest is not None:
             estimator = estimator.at_rest(rest)
-        view = None
-        if not headless:
-            title = f"{estimator.sensor.name}, {source.name}"
+        view, title = None, f"{estimator.sensor.name}, {source.name}"
+        if rerun is not None:
+            view = RerunView(title, rerun)
+        elif not headless:
             view = WindowView(title) if has_window() else BrowserView(title, port=port)
         writer = None
         if record is not None:  # last: a folder is begun only where there is something to keep
@@ -78,8 +84,15 @@ def live(
         if view is not None:
             pipeline = Pipeline(estimator.sensor, estimator.form, estimator.pipeline.reference)
             rest_px2 = pipeline.reference.area_px2
+
+            def draw(frame, estimate, lines):
+                seen = pipeline(frame)
+                if rerun is not None:
+                    view.log(frame, seen, estimate)
+                return draw_view(frame, seen, rest_px2, lines)
+
             print(f"showing in {view.url}; Ctrl-C ends it", flush=True)
-            shower = stack.enter_context(Shower(session, lambda frame, _, lines: draw_view(frame, pipeline(frame), rest_px2, lines), view))
+            shower = stack.enter_context(Shower(session, draw, view))
         try:
             session.run(most=count, seconds=seconds, going=lambda: shower is None or shower.open)
         except KeyboardInterrupt:

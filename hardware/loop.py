@@ -10,7 +10,7 @@ import numpy as np
 
 from hardware.arm_track import ArmTrack
 from hardware.arms.arm import Arm, ArmState
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError, StaleDataError
 from hardware.let_go import try_each
 from hardware.mounting import Mounting
@@ -105,7 +105,8 @@ class ServoLoop:
             for pose in self.way(self._state().pose, clear) if self.way else [clear]:
                 self._move(pose, wait=True)
             if self.take_rest is not None:
-                self.estimator = self.take_rest(self._rest_frame())
+                rest = await_frame(self.source, timeout_s=self.settings.frame_timeout_s, after_s=self._state().time_s)
+                self.estimator = self.take_rest(rest)
             touching = True
             self._move(start_pose, wait=True)
             with nullcontext() if self.settings.blocking else self._track.watched():
@@ -210,13 +211,6 @@ class ServoLoop:
                 self.on_step(record, frame, estimate)
             if self.settings.blocking:
                 self.arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
-
-    def _rest_frame(self) -> Frame:
-        """A frame of the sensor as it stands, clear of the object."""
-        try:
-            return self.source.read_after(self._state().time_s, timeout_s=self.settings.frame_timeout_s)
-        except (TimeoutError, EOFError) as error:
-            raise DeviceError(f"{error}; check the camera") from error
 
     def _frame(self, state: ArmState, arrived_s: float) -> Frame:
         if not self.source.is_live:

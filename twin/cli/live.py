@@ -42,6 +42,7 @@ def live(
     from contextlib import ExitStack
 
     from hardware.cameras.choose import open_camera
+    from hardware.cameras.source import await_frame
     from hardware.errors import DeviceError
     from hardware.live import FRAME_TIMEOUT_S, LiveSession, Shower, same_estimates
     from hardware.session import SessionSource, SessionWriter
@@ -64,8 +65,8 @@ def live(
         stack.enter_context(signals_as_ctrl_c())
         stack.enter_context(source)
         if at_rest == FIRST and not replay:
-            rest = source.read(timeout_s=FRAME_TIMEOUT_S)
-        if rest is not None:
+            rest = await_frame(source, timeout_s=FRAME_TIMEOUT_S)
+        if rest is not None and (estimator.counts_from_rest or not replay):  # a session may be replayed with another model than its own
             estimator = estimator.at_rest(rest)
         view, title = None, f"{estimator.sensor.name}, {source.name}"
         if rerun is not None:

@@ -9,7 +9,7 @@ from hardware.arms.arm import Arm, ArmState
 from hardware.arms.open_arm import open_arm
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
 from hardware.errors import DeviceError
 from hardware.loop import ServoLoop
@@ -62,10 +62,7 @@ class Rig:
         DeviceError
             It does not.
         """
-        try:
-            return self.source.read(timeout_s=FIRST_FRAME_S)
-        except (TimeoutError, EOFError) as error:
-            raise DeviceError(f"{error}; check the camera") from error
+        return await_frame(self.source, timeout_s=FIRST_FRAME_S)
 
     def __enter__(self) -> "Rig":
         self.arm.connect()

@@ -91,6 +91,9 @@ def follow(
     TwinError
         It could not be begun.
     """
+    rest = given_frame(run.at_rest, estimator)
+    if rest is not None:
+        estimator = estimator.at_rest(rest)
     rig = build_rig(
         run.sensor,
         run.stimulus,
@@ -130,23 +133,22 @@ def follow(
         if progress is not None:
             progress(record.index + 1, steps)
 
-    def at_rest(frame):
+    def take_rest(frame):
         if session is not None:
             session.keep_rest(frame)
         return estimator.at_rest(frame)
 
     failure, followed, session = "", None, None
-    rest = given_frame(run.at_rest, estimator)
     with rig:
         first = rig.await_frame()
         loop = servo_loop(rig, run.servo, estimator, settings, on_step)
         loop.require_labels(estimator(first).names)
         if run.record:
             session = SessionWriter(out / "session", told)
-        if rest is not None:
-            loop.estimator = at_rest(rest)
-        elif run.at_rest == FIRST and estimator.counts_from_rest and rig.source.is_live:
-            loop.take_rest = at_rest
+            if rest is not None:
+                session.keep_rest(rest)
+        if run.at_rest == FIRST and estimator.counts_from_rest and rig.source.is_live:
+            loop.take_rest = take_rest
         try:
             loop.run(rig.placed.start_pose(run.servo.indent_mm))
         except TwinError as error:

@@ -294,6 +294,10 @@ def test_an_hour_of_it_neither_grows_nor_slows(rig):
             assert source.arrived == source.delivered + source.dropped
         assert source.failed == 0
     third = len(memory_kib) // 3
+    print(f"\n{minutes:g} min, {source.arrived} frames arrived, {source.delivered} read, {source.dropped} dropped, {source.failed} failed")
+    print(f"{len(loop.decided)} decisions; memory +{memory_kib[-1] - memory_kib[third]} KiB in the last two thirds")
+    for name, half in zip(("first", "second"), halves, strict=True):
+        print(f"{name} half: exposure to command {1e3 * np.median(half):.1f} ms, 95 % {1e3 * np.percentile(half, 95):.1f} ms")
     assert memory_kib[-1] - memory_kib[third] < 20_000  # what the records take, and no more
     assert np.median(halves[1]) < 1.5 * np.median(halves[0])
     assert np.percentile(halves[1], 95) < 2.0 * np.percentile(halves[0], 95)

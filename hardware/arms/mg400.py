@@ -164,8 +164,7 @@ class MG400(BaseArm):
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         sent, joints = linear_target(self.name, self.kinematics, pose)
-        self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s, options=self._turning_option(sent))
-        self._sent = sent
+        self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def _turning_option(self, pose: np.ndarray) -> str:
@@ -186,15 +185,7 @@ class MG400(BaseArm):
         return sent
 
     def _move(
-        self,
-        command: str,
-        numbers: np.ndarray,
-        joints: np.ndarray,
-        pose: np.ndarray | None,
-        *,
-        wait: bool,
-        timeout_s: float,
-        options: str = "",
+        self, command: str, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float
     ) -> None:
         self._require_connected()
         require_possible(self.name, self.kinematics, numbers, joints)
@@ -203,8 +194,9 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if not packet["enabled"]:
             raise DeviceError(f"{self.name}: not enabled; call enable() first")
-        begun_s = time.monotonic()
+        begun_s, options = time.monotonic(), "" if pose is None else self._turning_option(pose)
         self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)}{options})")
+        self._sent = pose
         if not wait:
             return
         with self._watched():

@@ -29,6 +29,7 @@ from twin.types import Form, Frame
 TWIN = "twin"
 SHADING_QUALITY = "standard"
 FIRST_FRAME_S = 120.0  # kernels may have to be compiled
+FRAME_S, TWIN_FRAME_S = 5.0, 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 
 @dataclass
@@ -53,6 +54,11 @@ class Rig:
     @property
     def mounting(self) -> Mounting:
         return self.placed.mounting
+
+    @property
+    def frame_timeout_s(self) -> float:
+        """For so long a frame of an arm that stands is waited for."""
+        return TWIN_FRAME_S if self.knows_truth else FRAME_S
 
     def await_frame(self) -> Frame:
         """The first frame, for which the camera is given time.

@@ -20,7 +20,6 @@ from twin.errors import TwinError
 from twin.types import Form
 
 GIVE_UP_S = 5.0
-TWIN_FRAME_S = 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ def follow(
         steps,
         blocking=run.stream_hz is None,
         period_s=1.0 / (run.stream_hz or 10.0),
-        frame_timeout_s=TWIN_FRAME_S if rig.knows_truth else GIVE_UP_S,
+        frame_timeout_s=rig.frame_timeout_s,
         give_up_s=GIVE_UP_S,
     )
 

@@ -159,6 +159,7 @@ def collect(
     seed: int,
     speed: tuple[float, float],
     guards: tuple = (),
+    frame_timeout_s: float = FRAME_TIMEOUT_S,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Collect up to ``count`` contacts; those that the collection holds already are not made again.
@@ -171,6 +172,8 @@ def collect(
         Of the draws.
     speed : (float, float)
         In mm/s and deg/s.
+    frame_timeout_s : float
+        For so long a frame of the arm where it stands is waited for.
 
     Returns
     -------
@@ -197,10 +200,16 @@ def collect(
             raise DeviceError(f"{arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg")
         return arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
 
+    def frame_after(state: ArmState) -> Frame:
+        try:
+            return source.read_after(state.time_s, timeout_s=frame_timeout_s)
+        except TimeoutError as error:
+            raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
+
     def stop_at(label: np.ndarray) -> ArmState:
         """Go there and be seen there: what the skin remembers depends on where the arm has been."""
         state = go(label)
-        _frame_after(source, state)
+        frame_after(state)
         return state
 
     here, begun = np.zeros(6), False
@@ -210,7 +219,7 @@ def collect(
         begun = True
         state = go(here, CLEAR_MM)
         if not collection.has_rest:
-            collection.keep_rest(_frame_after(source, state))
+            collection.keep_rest(frame_after(state))
         for index in range(collection.count, count):
             asked = draw_contact(experiment, seed, index)
             before = asked.pose - asked.move + clear
@@ -220,7 +229,7 @@ def collect(
             stop_at(before + tap)
             here = asked.pose + clear + tap
             confirmed = go(here)
-            frame = _frame_after(source, confirmed)
+            frame = frame_after(confirmed)
             after = arm.state()
             log = {
                 "asked": [*asked.pose.tolist(), *asked.move.tolist()],
@@ -231,7 +240,7 @@ def collect(
                 "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
             }
             collection.keep(index, frame, frame_of.label(confirmed.pose), asked.move, log)
-            _frame_after(source, go(here, LIFT_MM))
+            frame_after(go(here, LIFT_MM))
             if progress is not None:
                 progress(index + 1, count)
     finally:
@@ -240,10 +249,3 @@ def collect(
     if failed:
         raise DeviceError("; ".join(failed))
     return collection.count
-
-
-def _frame_after(source: FrameSource, state: ArmState) -> Frame:
-    try:
-        return source.read_after(state.time_s, timeout_s=FRAME_TIMEOUT_S)
-    except TimeoutError as error:
-        raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error

@@ -4,12 +4,13 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 
 from hardware.arm_track import ArmTrack
 from hardware.arms.arm import Arm, ArmState
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError, StaleDataError
 from hardware.let_go import try_each
 from hardware.mounting import Mounting
@@ -25,6 +26,15 @@ from twin.types import Frame
 MOST_PIECES, NEAR_MM = 200, 0.5
 MOVE_TIMEOUT_S = 10.0
 BEHIND_MOVES = 2.0  # largest moves that an arm may lag behind before it is told more
+
+
+class Decided(StrEnum):
+    """What each round of the loop ends with."""
+
+    MOVE = "moved"
+    AWAIT_ARM = "let the arm catch up"
+    AWAIT_FRAME = "awaited a newer frame"  # too far from what was seen last
+    HOLD = "held still"
 
 
 @dataclass
@@ -48,6 +58,10 @@ class ServoLoop:
     retreat : callable, optional
         Withdraws the arm, given the direction (3,) away from the object in the base frame; by default a straight move of the
         servo's ``clear_mm``.
+    way : callable, optional
+        From where the arm stands to the pose clear of the object: the poses to pass, the last of them that one. By default straight.
+    take_rest : callable, optional
+        Given a frame without contact, taken clear of the object, the estimator to go on with.
     on_step : callable, optional
         Called with each record, its frame and its estimate, after the command was given.
     """
@@ -61,11 +75,14 @@ class ServoLoop:
     guards: list[Guard] = field(default_factory=list)
     sense: Callable[[float, float], None] | None = None
     retreat: Callable[[np.ndarray], object] | None = None
+    way: Callable[[np.ndarray, np.ndarray], list[np.ndarray]] | None = None
+    take_rest: Callable[[Frame], Estimator] | None = None
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
 
     def __post_init__(self):
         self.records: list[StepRecord] = []
         self.notes: list[str] = []  # what went wrong
+        self.decided: list[tuple[Decided, float]] = []  # every decision, and the age (s) of the frame behind it (NaN without one)
         self._held_since: float | None = None
         self._track = ArmTrack(self.arm)
         self._started_s = self._ended_s = 0.0
@@ -84,7 +101,12 @@ class ServoLoop:
         try:
             self.arm.enable()
             self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
-            self._move(self._away_from(start_pose), wait=True)
+            clear = self._away_from(start_pose)
+            for pose in self.way(self._state().pose, clear) if self.way else [clear]:
+                self._move(pose, wait=True)
+            if self.take_rest is not None:
+                rest = await_frame(self.source, timeout_s=self.settings.frame_timeout_s, after_s=self._state().time_s)
+                self.estimator = self.take_rest(rest)
             touching = True
             self._move(start_pose, wait=True)
             with nullcontext() if self.settings.blocking else self._track.watched():
@@ -109,9 +131,11 @@ class ServoLoop:
             len(self.records) / spent_s,
             len(fresh) / spent_s,
             Spread.of([record.latency_s for record in fresh]),
-            Spread.of([record.age_s for record in self.records]),
+            Spread.of([age_s for _, age_s in self.decided if np.isfinite(age_s)]),
             Spread.of([record.compute_s for record in fresh]),
             self.source.dropped,
+            len(self.decided) / spent_s,
+            {str(code): count for code in Decided if (count := sum(one is code for one, _ in self.decided))},
         )
 
     def _follow(self) -> None:
@@ -131,6 +155,7 @@ class ServoLoop:
                 self._hold(str(problem), problem)
                 continue
             taken_s = time.monotonic()
+            age_s = taken_s - frame.time_s
             fresh = used is None or frame.sequence != used.sequence
             if fresh:
                 estimate, used = self.estimator(frame), frame
@@ -141,29 +166,32 @@ class ServoLoop:
                     if self.sense is not None:
                         self.sense(reading.depth_mm, frame.time_s)
             if doubt:
-                self._hold(doubt, None)
+                self._hold(doubt, None, age_s)
                 continue
             from_pose = state.pose if sent is None or not state.moving else sent
             if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
-                continue  # the arm is still on its way
+                self.decided.append((Decided.AWAIT_ARM, age_s))
+                continue
             if not fresh and _apart_mm(from_pose, exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
-                continue  # too far from what was seen last
+                self.decided.append((Decided.AWAIT_FRAME, age_s))
+                continue
             step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
             try:
                 sent = self._move(step.pose, wait=False)
             except RefusedMoveError as refused:
                 if refused.decision.code is not Code.STALE_FRAME:
                     raise
-                self._hold(str(refused), refused)
+                self._hold(str(refused), refused, age_s)
                 continue
             memory, self._held_since = step.memory, None
+            self.decided.append((Decided.MOVE, age_s))
             now_s = time.monotonic()
             record = StepRecord(
                 len(self.records),
                 now_s,
                 frame.sequence,
                 frame.time_s,
-                taken_s - frame.time_s,
+                age_s,
                 fresh,
                 now_s - frame.time_s,
                 now_s - taken_s,
@@ -209,8 +237,9 @@ class ServoLoop:
                 return reading, f"the model says {got:.1f} {name}, which can't be ([{low:g}, {high:g}]); give another model or sensor"
         return reading, ""
 
-    def _hold(self, reason: str, problem: Exception | None) -> None:
+    def _hold(self, reason: str, problem: Exception | None, age_s: float = float("nan")) -> None:
         """Stop where the arm is; give up after a while."""
+        self.decided.append((Decided.HOLD, age_s))
         if self._held_since is None:
             self._held_since = time.monotonic()
             self.arm.stop()

@@ -211,7 +211,7 @@ def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decisio
     if limits.annulus_mm is None:
         return None
     inner, outer = limits.annulus_mm
-    nearest = min(_distance_to_axis(start[:2], pose[:2]), float(np.hypot(*pose[:2])))
+    nearest = min(distance_to_axis(start[:2], pose[:2]), float(np.hypot(*pose[:2])))
     if np.hypot(*pose[:2]) > outer or (nearest < inner and nearest < np.hypot(*start[:2])):
         return Decision(
             Action.REFUSE, Code.OUTSIDE_ANNULUS, f"comes within {nearest:.1f} mm of the base's axis or beyond [{inner:g}, {outer:g}] mm"
@@ -219,7 +219,7 @@ def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decisio
     return None
 
 
-def _distance_to_axis(a: np.ndarray, b: np.ndarray) -> float:
+def distance_to_axis(a: np.ndarray, b: np.ndarray) -> float:
     """Smallest distance of the line from a to b (in the plane) from the origin."""
     along = b - a
     length = float(along @ along)

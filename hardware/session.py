@@ -1,7 +1,8 @@
 """A live session on disk: every frame as it was, and a line of JSON for each step; whole up to its last complete line at any time.
 
 ``session.json`` says what it is, ``steps.jsonl`` has a line a step, ``frames/`` the pictures (PNG, lossless). A picture
-is written before its line, so what a line names is there.
+is written before its line, so what a line names is there. ``rest.png`` is the frame without contact that pins were counted
+from, where one was taken.
 """
 
 import json
@@ -17,7 +18,7 @@ from twin.errors import FrameError
 from twin.recordings.images import read_image, write_image
 from twin.types import Form, Frame
 
-ABOUT, STEPS, FRAMES = "session.json", "steps.jsonl", "frames"
+ABOUT, STEPS, FRAMES, REST = "session.json", "steps.jsonl", "frames", "rest.png"
 VERSION = 1
 
 
@@ -59,6 +60,10 @@ class SessionWriter:
         self._lines.flush()
         self.count += 1
 
+    def keep_rest(self, frame: Frame) -> None:
+        """Keep the frame without contact that pins are counted from."""
+        write_image(self.folder / REST, frame.image)
+
     def close(self) -> None:
         """End the session; its lines are on disk already."""
         self._lines.close()
@@ -98,6 +103,13 @@ class SessionSource(SequentialSource):
         if not self.steps:
             raise FrameError(f"{folder}: the session ended before its first step; nothing to replay")
         super().__init__(str(folder), Form(self.steps[0]["frame"]["form"]))
+
+    @property
+    def rest(self) -> Frame | None:
+        """The frame without contact that pins were counted from; None if they were counted from the nominal layout."""
+        if not (self.folder / REST).is_file():
+            return None
+        return Frame(read_image(self.folder / REST)[0], self.form, REST)
 
     def _frames(self) -> Iterator[Frame]:
         for step in self.steps:

@@ -1,6 +1,6 @@
 """How fast and how late a loop is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class Timing:
     ----------
     steps : int
     rate_hz : float
-        Decisions a second, and ``fresh_hz``: those on a frame not used before.
+        Steps a second, and ``fresh_hz``: those on a frame not used before.
     latency_s : Spread
         From a fresh frame's exposure to the command it led to.
     age_s : Spread
@@ -41,6 +41,10 @@ class Timing:
         From having the frame to the command.
     dropped : int
         Frames that nobody read.
+    decided_hz : float
+        Decisions a second: to move (a step), to let the arm or the camera catch up, or to hold. NaN for who decides nothing.
+    decided : dict of str to int
+        How often each of them.
     """
 
     steps: int
@@ -50,10 +54,15 @@ class Timing:
     age_s: Spread
     compute_s: Spread
     dropped: int
+    decided_hz: float = float("nan")
+    decided: dict = field(default_factory=dict)
 
     def lines(self) -> list[str]:
         """For people."""
+        total = sum(self.decided.values())
+        decided = [f"decisions at {self.decided_hz:.1f} Hz: " + ", ".join(f"{n / total:.0%} {what}" for what, n in self.decided.items())]
         return [
+            *(decided if total else []),
             f"{self.steps} steps at {self.rate_hz:.1f} Hz, fresh frames at {self.fresh_hz:.1f} Hz, {self.dropped} frames dropped",
             f"exposure to command: {self.latency_s}",
             f"age of the frame at each decision: {self.age_s}",

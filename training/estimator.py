@@ -107,6 +107,11 @@ class PoseEstimator:
         except (OSError, ValueError, KeyError, RuntimeError, UnpicklingError) as error:
             raise TrainingError(f"{run}: not a run of this version, or a damaged one ({error}); train again") from error
 
+    @property
+    def counts_from_rest(self) -> bool:
+        """Whether a no-contact frame of the sensor in hand serves the model."""
+        return self.model == "vgnn"
+
     def at_rest(self, frame: Frame) -> "PoseEstimator":
         """The same model for the sensor in hand, whose frame without contact is given: pins are counted from where it shows them.
 
@@ -115,7 +120,7 @@ class PoseEstimator:
         FrameError
             The layout can't be found in the frame, or the model knows no pins to count.
         """
-        if self.model != "vgnn":
+        if not self.counts_from_rest:
             raise FrameError(f"a no-contact frame serves vgnn only, this is a {self.model}; leave it out")
         found = copy(self)
         reference = measure_reference(self.sensor, self.form, frame)

@@ -1,19 +1,21 @@
-"""What every arm of ours shares: the context manager, refusals when not connected, waiting until it is at rest."""
+"""What every arm of ours shares: refusals when not connected, waiting until it is at rest."""
 
 import time
 from abc import ABC, abstractmethod
+from contextlib import contextmanager, suppress
 
 import numpy as np
 
 from hardware.arms.arm import ArmState
 from hardware.arms.motion import turn_between_deg
+from hardware.connection import Connection
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
 
 POLL_S = 0.005  # below the 8 ms of the fastest feedback
 BELIEVE_REST_S = 0.15  # at rest elsewhere for this long: the move won't come (a move shows in feedback sooner)
 
 
-class BaseArm(ABC):
+class BaseArm(Connection, ABC):
     """Base of the arms; see ``hardware.arms.arm.Arm`` for what each method promises."""
 
     name: str
@@ -30,14 +32,10 @@ class BaseArm(ABC):
     def disconnect(self) -> None: ...
 
     @abstractmethod
+    def stop(self) -> None: ...
+
+    @abstractmethod
     def state(self, *, max_age_s: float = 1.0) -> ArmState: ...
-
-    def __enter__(self):
-        self.connect()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.disconnect()
 
     def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
         """Wait for feedback of the arm at rest at ``pose``; see ``Arm``."""
@@ -66,6 +64,22 @@ class BaseArm(ABC):
                     "call stop(), then give more time or more speed"
                 )
             time.sleep(POLL_S)
+
+    @contextmanager
+    def _watched(self):
+        """What a move is waited for in: after any error (Ctrl-C too) the arm is stopped, for what was begun must not go on unwatched."""
+        try:
+            yield
+        except BaseException:
+            with suppress(DeviceError):
+                self.stop()
+            raise
+
+    def _too_long(self, timeout_s: float) -> DeviceError:
+        return DeviceError(
+            f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
+            "or look for what holds the arm"
+        )
 
     def _require_connected(self) -> None:
         if not self.is_connected:

@@ -152,13 +152,9 @@ class Magician(BaseArm):
         self._last_index = self._index_of(self._request(Id.PTP, struct.pack("<B4f", mode, *numbers), ctrl=WRITE | QUEUED))
         if not wait:
             return
-        try:
+        with self._watched():
             self._await_queue(timeout_s)
             self.wait_settled(pose, timeout_s=max(begun_s + timeout_s - time.monotonic(), 0.2))
-        except BaseException:  # also Ctrl-C: what was begun must not go on unwatched
-            with contextlib.suppress(DeviceError):
-                self.stop()
-            raise
 
     def _await_queue(self, timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s
@@ -166,10 +162,7 @@ class Magician(BaseArm):
             if state.error:
                 raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
             if time.monotonic() > deadline:
-                raise DeviceError(
-                    f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
-                    "or look for what holds the arm"
-                )
+                raise self._too_long(timeout_s)
             time.sleep(POLL_S)
 
     def _forget_queue(self) -> None:

@@ -76,6 +76,8 @@ class MG400(BaseArm):
         self._in_use = False  # between connect and disconnect, connections lost or not
         self._bare = False  # old firmware: echoes on the dashboard, nothing on the motion port
         self._alarm_text: str | None = None
+        self._speed: tuple[float, float] | None = None  # mm/s and deg/s, unless percents were asked for
+        self._sent: np.ndarray | None = None  # pose where the queue ends, while it may still be going there
 
     @property
     def is_connected(self) -> bool:
@@ -142,15 +144,20 @@ class MG400(BaseArm):
         )
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        """The arm takes whole percents of its fastest, at least 1; lower speeds become that."""
+        """The arm takes whole percents of its fastest, at least 1; lower speeds become that.
+
+        A move in a line may turn as fast as told, too, which the percents of its own length would not let it.
+        """
         self._require_connected()
         if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
             raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
         self.set_speed_percent(linear=100 * linear_mm_s / MAX_LINEAR_MM_S, angular=100 * angular_deg_s / MAX_JOINT_DEG_S)
+        self._speed = linear_mm_s, angular_deg_s
 
     def set_speed_percent(self, *, linear: float | None = None, angular: float | None = None, overall: float | None = None) -> None:
         """``SpeedL``, ``SpeedJ`` and ``SpeedFactor``, which all multiply; rounded down to whole percents."""
         self._require_connected()
+        self._speed = None
         for name, percent in (("SpeedL", linear), ("SpeedJ", angular), ("SpeedFactor", overall)):
             if percent is not None:
                 self._ask(f"{name}({int(np.clip(np.floor(percent + 1e-9), 1, 100))})")
@@ -159,6 +166,18 @@ class MG400(BaseArm):
         sent, joints = linear_target(self.name, self.kinematics, pose)
         self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
+
+    def _turning_option(self, pose: np.ndarray) -> str:
+        """``SpeedL`` of a move that turns more than it goes: it scales line and turn alike, and what takes longer sets the pace."""
+        if self._speed is None:
+            return ""
+        state = self.state()
+        start = self._sent if self._sent is not None and state.moving else state.pose
+        length_mm, turn_deg = float(np.linalg.norm(pose[:3] - start[:3])), abs(pose[5] - start[5])
+        if turn_deg / MAX_JOINT_DEG_S <= length_mm / MAX_LINEAR_MM_S:
+            return ""
+        wanted_s = max(length_mm / self._speed[0], turn_deg / self._speed[1])
+        return f",SpeedL={int(np.clip(np.floor(100 * turn_deg / MAX_JOINT_DEG_S / wanted_s + 1e-9), 1, 100))}"
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         sent = joint_target(self.name, joints_deg)
@@ -175,21 +194,18 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if not packet["enabled"]:
             raise DeviceError(f"{self.name}: not enabled; call enable() first")
-        begun_s = time.monotonic()
-        self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)})")
+        begun_s, options = time.monotonic(), "" if pose is None else self._turning_option(pose)
+        self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)}{options})")
+        self._sent = pose
         if not wait:
             return
-        try:
+        with self._watched():
             self._await_queue(begun_s + timeout_s, timeout_s)
             left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
             if pose is not None:
                 self.wait_settled(pose, timeout_s=left_s)
             else:
                 self._await_joints(joints, left_s)
-        except BaseException:  # also Ctrl-C: what was begun must not go on unwatched
-            with contextlib.suppress(DeviceError):
-                self.stop()
-            raise
 
     def _send_motion(self, text: str) -> None:
         if self._bare:
@@ -214,10 +230,7 @@ class MG400(BaseArm):
                 return
             if time.monotonic() > deadline:
                 self._forget_sync()
-                raise DeviceError(
-                    f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; give more time or more speed, "
-                    "or look for what holds the arm"
-                )
+                raise self._too_long(timeout_s)
             if self._bare:
                 time.sleep(POLL_S)
 

@@ -52,5 +52,5 @@ def open_camera(
     if "://" in text:
         return MjpegCamera(text, spec, live_form)
     if not Path(text).exists():
-        raise DeviceError(f"--camera {text}: no such file or folder; expected a number, /dev/videoN, http://..., twin, a folder or a video")
+        raise DeviceError(f"{text}: no such camera, file or folder; expected a number, /dev/videoN, http://..., twin, a folder or a video")
     return SessionSource(text) if is_session(text) else RecordedSource(text, spec, form)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hardware.connection import Connection
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.types import Form, Frame
 
@@ -40,7 +41,7 @@ class ReadFailed(Exception):  # noqa: N818  (no error until it happens too often
     """One picture could not be had; the reader tries again."""
 
 
-class LiveSource(ABC):
+class LiveSource(Connection, ABC):
     """Base of the live sources; see ``hardware.cameras.source.FrameSource`` for what each method promises.
 
     Parameters
@@ -117,13 +118,6 @@ class LiveSource(ABC):
         self._thread.join(timeout=15.0)
         self._thread = None
         self._close()
-
-    def __enter__(self):
-        self.connect()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.disconnect()
 
     def read(self, *, timeout_s: float = 1.0) -> Frame:
         return self._take(lambda frame: frame.sequence != self._read_last, timeout_s, "no new frame")

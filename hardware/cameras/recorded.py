@@ -4,13 +4,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 
+from hardware.connection import Connection
 from hardware.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from scenes.sensor import SensorSpec
 from twin.recordings import Recording, open_recording
 from twin.types import Form, Frame
 
 
-class SequentialSource(ABC):
+class SequentialSource(Connection, ABC):
     """Frames that wait for their reader, and end: what folders, videos and sessions share.
 
     Parameters
@@ -43,13 +44,6 @@ class SequentialSource(ABC):
 
     def disconnect(self) -> None:
         self._left = None
-
-    def __enter__(self):
-        self.connect()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.disconnect()
 
     def read(self, *, timeout_s: float = 1.0) -> Frame:
         if self._left is None:

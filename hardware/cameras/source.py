@@ -2,6 +2,7 @@
 
 from typing import Protocol
 
+from hardware.errors import DeviceError
 from twin.types import Form, Frame
 
 
@@ -51,3 +52,17 @@ class FrameSource(Protocol):
 
     def read_after(self, time_s: float, *, timeout_s: float = 2.0) -> Frame:
         """The first frame exposed after ``time_s``; ``TimeoutError``."""
+
+
+def await_frame(source: FrameSource, *, timeout_s: float, after_s: float | None = None) -> Frame:
+    """The next frame, or the first one exposed after a time.
+
+    Raises
+    ------
+    DeviceError
+        None comes.
+    """
+    try:
+        return source.read(timeout_s=timeout_s) if after_s is None else source.read_after(after_s, timeout_s=timeout_s)
+    except (TimeoutError, EOFError) as error:
+        raise DeviceError(f"{error}; check the camera") from error

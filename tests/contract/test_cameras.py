@@ -58,13 +58,13 @@ def make_session(path: Path) -> str:
     return str(path)
 
 
-def twin_camera() -> tuple[SimulatedArm, TwinCamera]:
+def twin_camera(**options) -> tuple[SimulatedArm, TwinCamera]:
     sensor = load_sensor("mg400-331")
     placed = PlacedObject(load_object("plane"), PlacementSpec(), Mounting.of(sensor, load_experiment("surface-2d")))
     arm = SimulatedArm(axes=6, pose=placed.start_pose(0.5), time_scale=20.0)
     arm.connect()
     arm.enable()
-    return arm, TwinCamera(sensor, placed, arm.state, Form.RECORDING)
+    return arm, TwinCamera(sensor, placed, arm.state, Form.RECORDING, **options)
 
 
 @pytest.fixture(scope="module")
@@ -323,3 +323,13 @@ class TestUvcSettings:
     def test_a_missing_camera_says_so(self):
         with pytest.raises(DeviceError, match="can't be opened"):
             open_camera("/dev/video97").connect()
+
+
+def test_a_twin_that_draws_on_demand_draws_no_more_frames_than_are_read():
+    arm, camera = twin_camera(on_demand=True)
+    with camera:
+        first = camera.read(timeout_s=60.0)
+        asked_s = time.monotonic()
+        second = camera.read_after(asked_s, timeout_s=60.0)
+        time.sleep(0.5)
+        assert first.time_s < asked_s < second.time_s and camera.arrived <= 3

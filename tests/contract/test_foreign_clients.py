@@ -9,6 +9,7 @@ import sys
 import time
 
 import pytest
+from free_ports import free_offset
 
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
@@ -153,7 +154,7 @@ def test_published_clients_drive_the_emulated_magician(packages, script):
 @pytest.mark.parametrize("device", ["mg400", "magician"])
 def test_twin_emulate_says_when_it_is_ready_and_ends_on_sigterm(device, tmp_path):
     link = tmp_path / "arm"
-    offset = 2000 + os.getpid() % 30000  # tests run beside each other
+    offset = free_offset()
     options = ["--port-offset", str(offset)] if device == "mg400" else ["--link", str(link)]
     command = [sys.executable, "-c", "from twin.cli import main; main()", "emulate", device, *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

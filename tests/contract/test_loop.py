@@ -11,7 +11,7 @@ from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
-from hardware.loop import ServoLoop
+from hardware.loop import Decided, ServoLoop
 from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource, SessionWriter, read_steps
@@ -82,14 +82,33 @@ def test_the_figures_add_up(rig):
     with arm, NoisyCamera(fps=20) as source:
         loop = loop_of(rig, source, 30, blocking=False, period_s=0.02)
         timing = loop.run(start(rig))
-    ages = np.array([record.age_s for record in loop.records])
-    assert timing.age_s.p50 == pytest.approx(np.percentile(ages, 50))
+    moved = [age_s for decided, age_s in loop.decided if decided is Decided.MOVE]
+    assert moved == [record.age_s for record in loop.records]
+    assert timing.age_s.p50 == pytest.approx(np.nanpercentile([age_s for _, age_s in loop.decided], 50))
+    assert sum(timing.decided.values()) == len(loop.decided) >= timing.steps == timing.decided["moved"]
+    assert timing.decided_hz >= timing.rate_hz
     assert timing.latency_s.p50 <= timing.latency_s.p95 <= timing.latency_s.p99
     fresh = [record for record in loop.records if record.fresh]
     assert 1 < len(fresh) < timing.steps  # decisions are faster than frames
     assert len({record.sequence for record in loop.records}) == len(fresh)
     assert timing.rate_hz > timing.fresh_hz > 0
     assert all(record.latency_s >= record.age_s for record in loop.records)
+
+
+def test_it_takes_a_frame_clear_of_the_object_before_it_touches(rig):
+    placed, arm = rig
+    taken = []
+
+    def take(frame):
+        taken.append((frame.time_s, placed.touch(arm.track.pose(frame.time_s)).indent_mm))
+        return loop.estimator
+
+    with arm, NoisyCamera() as source:
+        loop = loop_of(rig, source, 3)
+        loop.take_rest = take
+        loop.run(start(rig))
+    ((time_s, indent_mm),) = taken
+    assert indent_mm < -10 and time_s < loop.records[0].frame_s
 
 
 @pytest.mark.parametrize("fault", ["frozen", "black", "late=0.9", "silent", "unplugged=60"])
@@ -275,6 +294,10 @@ def test_an_hour_of_it_neither_grows_nor_slows(rig):
             assert source.arrived == source.delivered + source.dropped
         assert source.failed == 0
     third = len(memory_kib) // 3
+    print(f"\n{minutes:g} min, {source.arrived} frames arrived, {source.delivered} read, {source.dropped} dropped, {source.failed} failed")
+    print(f"{len(loop.decided)} decisions; memory +{memory_kib[-1] - memory_kib[third]} KiB in the last two thirds")
+    for name, half in zip(("first", "second"), halves, strict=True):
+        print(f"{name} half: exposure to command {1e3 * np.median(half):.1f} ms, 95 % {1e3 * np.percentile(half, 95):.1f} ms")
     assert memory_kib[-1] - memory_kib[third] < 20_000  # what the records take, and no more
     assert np.median(halves[1]) < 1.5 * np.median(halves[0])
     assert np.percentile(halves[1], 95) < 2.0 * np.percentile(halves[0], 95)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arms import mg400_of
+from tried_faults import tried_in
 
 from hardware.arms import kinematics as arms
 from hardware.arms.mg400 import Mg400Ports
@@ -84,9 +85,21 @@ def test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still(faults, re
 
 
 def test_the_list_above_is_complete():
-    mark = test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still.pytestmark[0]
-    tried = {fault.split("=")[0] for faults, _ in mark.args[1] for fault in faults} | {fault.split("=")[0] for fault in HARMLESS}
-    assert tried == set(FAULTS)
+    assert tried_in(test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still, *HARMLESS) == set(FAULTS)
+
+
+def test_a_short_move_with_a_turn_turns_as_fast_as_told():
+    with emulated() as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        arm.set_speed(20.0, 60.0)
+        start = arm.state().pose
+        begun_s = time.monotonic()
+        arm.move_linear(start + [1.0, 0, 0, 0, 0, 12.0])
+        piece = emulator.arm.track.target()
+        assert piece.duration_s == pytest.approx(12.0 / 60.0, rel=0.1)  # at the 2 % of 20 mm/s it would take 2 s
+        assert time.monotonic() - begun_s < 2.0
+        arm.move_linear(start + [6.0, 0, 0, 0, 0, 12.0])  # no turn: as fast as lines are
+        assert emulator.arm.track.target().duration_s == pytest.approx(5.0 / 20.0, rel=0.1)
 
 
 def test_an_unknown_fault_names_the_near_one():

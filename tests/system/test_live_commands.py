@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -43,6 +42,7 @@ from twin.recordings.images import write_image
 from twin.types import Form, Frame
 
 sys.path.append(str(Path(__file__).parents[1] / "contract"))
+from free_ports import free_offset  # noqa: E402
 from noisy_camera import NoisyCamera, number_of  # noqa: E402
 from true_estimator import TrueEstimate, TrueEstimator  # noqa: E402
 
@@ -53,7 +53,7 @@ class StandIn:
     """Looks like a ``PoseEstimator``; in the twin it knows the truth, elsewhere it tells the picture's mean level."""
 
     def __init__(self) -> None:
-        self.sensor, self.form = load_sensor("mg400-331"), Form.RECORDING
+        self.sensor, self.form, self.counts_from_rest = load_sensor("mg400-331"), Form.RECORDING, False
         self.pipeline = Pipeline(self.sensor, self.form)
         self.true: TrueEstimator | None = None
 
@@ -104,6 +104,18 @@ def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path
     seen = stand_in.pipeline(frames[-1])
     assert seen.valid
     assert np.linalg.norm(seen.graph.nodes_px - stand_in.pipeline.reference.pins_px, axis=1).max() > 4.0
+
+
+def test_pins_are_counted_from_a_frame_taken_clear_of_the_object_and_so_they_are_in_a_replay(tmp_path):
+    out = tmp_path / "servo"
+    run("servo", "--object", "can", "--out", out, "--steps", 4, "--plain-light", "--record")
+    rest = SessionSource(out / "session").rest
+    pipeline = Pipeline(load_sensor("mg400-331"), Form.RECORDING)
+    seen = pipeline(rest)
+    assert seen.valid and np.linalg.norm(seen.graph.nodes_px - pipeline.reference.pins_px, axis=1).max() < 1.0  # px: nothing is touched
+    assert "4 of 4 estimates are those that were recorded" in run("live", "--replay", out / "session", "--headless")
+    (out / "session" / "rest.png").unlink()
+    assert "4 of 4" not in run("live", "--replay", out / "session", "--headless")
 
 
 def test_a_model_that_fails_is_a_result_of_the_study(stand_in, tmp_path, monkeypatch):
@@ -246,7 +258,7 @@ def test_an_emulator_that_fails_ends_with_its_error():
 
 @pytest.mark.slow
 def test_sigterm_makes_a_command_let_go_of_its_arm(tmp_path):
-    offset = 3300 + os.getpid() % 30000  # tests run beside each other
+    offset = free_offset()
     port = 29999 + offset
     with Mg400Emulator(port_offset=offset) as arm:
         options = ["--camera", "twin", "--arm", f"mg400:127.0.0.1:{port}", "--sensor", "mg400-331", "--plain-light", "--out", str(tmp_path)]

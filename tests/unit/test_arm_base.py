@@ -25,6 +25,9 @@ class ToldArm(BaseArm):
 
     def disconnect(self): ...
 
+    def stop(self):
+        self.stopped = True
+
     def state(self, *, max_age_s=1.0):
         age_s, pose, moving, error = self.told.pop(0) if len(self.told) > 1 else self.told[0]
         return ArmState(pose, np.zeros(4), time.monotonic() - age_s, True, moving, error)
@@ -55,3 +58,12 @@ def test_turns_are_compared_around_the_circle():
 def test_what_does_not_come_to_rest_there_is_an_error(told, says):
     with pytest.raises(DeviceError, match=says):
         ToldArm(told).wait_settled(TARGET, timeout_s=0.3)
+
+
+def test_a_watched_move_that_fails_stops_the_arm_and_a_good_one_does_not():
+    good, bad = ToldArm((0, TARGET, False, "")), ToldArm((0, TARGET, False, ""))
+    with good._watched():
+        pass
+    with pytest.raises(KeyboardInterrupt), bad._watched():
+        raise KeyboardInterrupt
+    assert bad.stopped and not hasattr(good, "stopped")

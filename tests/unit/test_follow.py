@@ -99,3 +99,25 @@ def test_a_long_way_around_a_can_does_not_wear_it_out(solver):
     late = np.array(forces[-10:])
     assert np.ptp(late[:, 2]) < 0.05 * late[:, 2].mean()
     assert follower.restarts == 0
+
+
+def test_warmed_up_it_is_as_new(solver):
+    plane = load_object("plane")
+    warm, cold = Follower(solver, plane), Follower(solver, plane)
+    warm.warm_up()
+    for k, stop in enumerate([plate(-0.5), plate(1.5)]):
+        one, other = warm.move(stop, float(k)), cold.move(stop, float(k))
+    np.testing.assert_array_equal(one.caps_mm, other.caps_mm)
+
+
+def test_skin_is_not_carried_past_wires():
+    """Load steps stay below a wire's radius: farther, skin ends up beneath a wire and hooks; the mesh drags far less than it is pressed."""
+    can = load_object("mesh-can")
+    follower = Follower(SkinSolver(load_sensor("mg400-331")), can)
+    for k, T in enumerate([plate(-2.0), plate(2.0)]):
+        follower.move(T, float(k))
+    for k in range(6):
+        T = plate(2.0)
+        T[1, 3] = 0.8 * (k + 1)  # along the wires of one family, across the other
+        state = follower.move(T, 2.0 + k)
+    assert np.linalg.norm(state.force_n[:2]) < state.force_n[2]

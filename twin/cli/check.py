@@ -48,7 +48,7 @@ def check(
         raise FrameError(
             f"{pipeline}: tuned for method '{detector.method}', --pipeline takes method 'twin'; run 'twin tune' without --method"
         )
-    frames = live_frames(source, spec, form, limit) if is_live(source) else recorded_frames(Path(source), spec, form, limit)
+    frames = frames_of(source, spec, form, limit)
     with count_bar("frames") as progress:
         findings = examine(frames, spec, detector, progress=progress)
     for found in findings:
@@ -59,16 +59,14 @@ def check(
         raise SystemExit(2)
 
 
-def is_live(source: str) -> bool:
-    """Whether a source is a camera and not a file."""
-    return source.isdecimal() or source.startswith("/dev/") or "://" in source
-
-
-def live_frames(source: str, spec, form, limit: int) -> list:
-    """The next ``limit`` frames of a camera."""
+def frames_of(source: str, spec, form, limit: int) -> list:
+    """The next ``limit`` frames of a camera, or as many, evenly spread, of what was recorded."""
     from hardware.cameras.choose import open_camera
 
-    with open_camera(source, spec, form) as camera:
+    camera = open_camera(source, spec, form)
+    if not camera.is_live:
+        return recorded_frames(Path(source), spec, form, limit)
+    with camera:
         return [camera.read(timeout_s=LIVE_TIMEOUT_S) for _ in range(limit)]
 
 

@@ -83,5 +83,6 @@ def collect_command(
         with signals_as_ctrl_c(), rig, count_bar("contacts") as progress:
             rig.await_frame()
             speed = (servo.linear_mm_s, servo.angular_deg_s)
-            collect(rig.source, rig.arm, asked, rig.placed, collection, count, seed=seed, speed=speed, progress=progress)
+            options = {"seed": seed, "speed": speed, "frame_timeout_s": rig.frame_timeout_s, "progress": progress}
+            collect(rig.source, rig.arm, asked, rig.placed, collection, count, **options)
     print(f"{collection.count} contacts in {out} ({collection.count - begun} new)")

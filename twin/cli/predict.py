@@ -24,7 +24,7 @@ def predict(
 
     estimator = PoseEstimator.load(run)
     recording = open_recording(frame, estimator.sensor, estimator.form)
-    if recording.reference is not None and estimator.model == "vgnn":
+    if recording.reference is not None and estimator.counts_from_rest:
         estimator = estimator.at_rest(recording.reference)
     for picture in recording:
         made = estimator(picture)

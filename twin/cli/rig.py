@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hardware.approach import way_around
 from hardware.arms.arm import Arm, ArmState
 from hardware.arms.open_arm import open_arm
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
 from hardware.errors import DeviceError
 from hardware.loop import ServoLoop
@@ -28,6 +29,7 @@ from twin.types import Form, Frame
 TWIN = "twin"
 SHADING_QUALITY = "standard"
 FIRST_FRAME_S = 120.0  # kernels may have to be compiled
+FRAME_S, TWIN_FRAME_S = 5.0, 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 
 @dataclass
@@ -53,6 +55,11 @@ class Rig:
     def mounting(self) -> Mounting:
         return self.placed.mounting
 
+    @property
+    def frame_timeout_s(self) -> float:
+        """For so long a frame of an arm that stands is waited for."""
+        return TWIN_FRAME_S if self.knows_truth else FRAME_S
+
     def await_frame(self) -> Frame:
         """The first frame, for which the camera is given time.
 
@@ -61,10 +68,7 @@ class Rig:
         DeviceError
             It does not.
         """
-        try:
-            return self.source.read(timeout_s=FIRST_FRAME_S)
-        except (TimeoutError, EOFError) as error:
-            raise DeviceError(f"{error}; check the camera") from error
+        return await_frame(self.source, timeout_s=FIRST_FRAME_S)
 
     def __enter__(self) -> "Rig":
         self.arm.connect()
@@ -111,7 +115,8 @@ def build_rig(
     plain_light : bool
         Draw the twin's frames with the lamps' direct light alone, without the path-traced frame that sets what comes on top.
     at_once : bool
-        A simulated arm before the twin's camera takes no time: whoever waits for frames at each stop needs none.
+        A simulated arm before the twin's camera takes no time, and frames are drawn when they are waited for: for whoever waits for
+        frames at each stop.
     """
     form = form or (Form.RECORDING if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
@@ -122,7 +127,10 @@ def build_rig(
     if not simulated or limits is not None:
         kind = arm.partition(":")[0]
         device = SafeArm(device, load_limits(limits or kind)) if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file() else device
-    twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=drawn(sensor, form, plain_light)) if camera == TWIN else None
+    twin = None
+    if camera == TWIN:
+        preview = drawn(sensor, form, plain_light)
+        twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=preview, on_demand=at_once)
     return Rig(open_camera(camera, sensor, form, twin=twin), device, placed, camera == TWIN)
 
 
@@ -152,6 +160,7 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
 def servo_loop(rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopSettings, on_step=None) -> ServoLoop:
     """The loop on a connected rig; a safe arm is told what the sensor feels, and retreats in its own way."""
     loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[_no_full_turn(rig.arm)], on_step=on_step)
+    loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
         loop.sense = lambda depth_mm, time_s: rig.arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
 

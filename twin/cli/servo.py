@@ -6,13 +6,15 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
+from twin.cli.at_rest import FIRST, AtRest
 from twin.cli.options import Out
 
 HELP = """Follow an object's outline with the sensor, frame by frame: pose-based tactile servoing.
 
 In the twin unless told otherwise: the arm is simulated, the frames are drawn for the contact that its pose makes. With
 --camera and --arm the same loop runs on devices, real or emulated. The arm comes from 50 mm away, and whatever happens
-(Ctrl-C too) it stops, retreats along the surface's normal and is disabled.
+(Ctrl-C too) it stops, retreats along the surface's normal and is disabled. Before it touches anything a frame is taken that the
+model counts pins from (--at-rest none: the specification's layout; models on graphs always do).
 
 \b
   twin servo --object can --model RUN --out out/servo
@@ -48,6 +50,7 @@ def servo(
     seed: Annotated[int, typer.Option("--seed", help="of the twin's noise")] = 0,
     known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo has it: measure against it")] = False,
     plain_light: PlainLight = False,
+    at_rest: AtRest = FIRST,
 ) -> None:
     from scenes import load_object, load_servo
     from training.estimator import PoseEstimator
@@ -71,6 +74,7 @@ def servo(
         seed=seed,
         plain_light=plain_light,
         known_place=known_place,
+        at_rest=at_rest,
     )
     with signals_as_ctrl_c(), count_bar(f"following the {object_name}") as progress:
         followed = follow(run, estimator, writable_folder(out), about={"model": str(model)}, progress=progress)

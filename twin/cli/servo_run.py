@@ -14,12 +14,12 @@ from hardware.step import LoopSettings
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_of, write_csv
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
+from twin.cli.at_rest import FIRST, given_frame
 from twin.cli.rig import build_rig, servo_loop, steps_round
 from twin.errors import TwinError
 from twin.types import Form
 
 GIVE_UP_S = 5.0
-TWIN_FRAME_S = 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ class ServoRun:
         Decisions a second; None: each waits for the move before.
     known_place : bool
         The object stands where the servo's placement has it, so that there is a truth to measure against (always so in the twin).
+    at_rest : str
+        What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none``, or a file.
     """
 
     sensor: SensorSpec
@@ -49,6 +51,7 @@ class ServoRun:
     seed: int = 0
     plain_light: bool = False
     known_place: bool = False
+    at_rest: str = FIRST
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,9 @@ def follow(
     TwinError
         It could not be begun.
     """
+    rest = given_frame(run.at_rest, estimator)
+    if rest is not None:
+        estimator = estimator.at_rest(rest)
     rig = build_rig(
         run.sensor,
         run.stimulus,
@@ -116,7 +122,7 @@ def follow(
         steps,
         blocking=run.stream_hz is None,
         period_s=1.0 / (run.stream_hz or 10.0),
-        frame_timeout_s=TWIN_FRAME_S if rig.knows_truth else GIVE_UP_S,
+        frame_timeout_s=rig.frame_timeout_s,
         give_up_s=GIVE_UP_S,
     )
 
@@ -126,6 +132,11 @@ def follow(
         if progress is not None:
             progress(record.index + 1, steps)
 
+    def take_rest(frame):
+        if session is not None:
+            session.keep_rest(frame)
+        return estimator.at_rest(frame)
+
     failure, followed, session = "", None, None
     with rig:
         first = rig.await_frame()
@@ -133,6 +144,10 @@ def follow(
         loop.require_labels(estimator(first).names)
         if run.record:
             session = SessionWriter(out / "session", told)
+            if rest is not None:
+                session.keep_rest(rest)
+        if run.at_rest == FIRST and estimator.counts_from_rest and rig.source.is_live:
+            loop.take_rest = take_rest
         try:
             loop.run(rig.placed.start_pose(run.servo.indent_mm))
         except TwinError as error:

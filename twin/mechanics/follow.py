@@ -11,7 +11,8 @@ from twin.mechanics.solver import SkinSolver, friction_of
 from twin.stimulus import build_stimulus
 from twin.types import ContactState
 
-STEP_MM = 0.6  # largest motion across the contact in one load step
+STEP_MM = 1.2  # largest motion across the contact in one load step
+FINE_STEP_MM = 0.6  # beside features as fine as wires: a longer one carries skin past a wire's middle, where it then hooks
 LARGEST_MOVE_MM = 30.0  # from one pose to the next in contact: farther, the way between them isn't known
 _DIRECTIONS = 2000  # on the sphere, to see where the object presses
 _KNOWN_RAD = np.radians(7.0)  # a pressed direction is provided for if one this near was
@@ -29,12 +30,12 @@ class Follower:
     ----------
     solver : SkinSolver
     stimulus : ObjectSpec
-    step_mm : float
-        Largest motion across the contact in one load step.
+    step_mm : float, optional
+        Largest motion across the contact in one load step; by default what the object's features allow.
     """
 
-    def __init__(self, solver: SkinSolver, stimulus: ObjectSpec, *, step_mm: float = STEP_MM):
-        self._solver, self._step_mm = solver, step_mm
+    def __init__(self, solver: SkinSolver, stimulus: ObjectSpec, *, step_mm: float | None = None):
+        self._solver, self._step_mm = solver, step_mm or _step_of(stimulus)
         self._field = build_stimulus(stimulus)
         self._law, self._compliance = friction_of(stimulus), stimulus.compliance_mm_per_n
         self._radius_mm = solver.spec.skin.outer_radius_mm
@@ -66,6 +67,14 @@ class Follower:
                 raise
         self._T, self._time_s = T.copy(), time_s
         return self._state
+
+    def warm_up(self) -> None:
+        """Press once, shallowly, and forget it: compiled code is loaded, so that a first contact takes no longer than others."""
+        T = np.eye(4)
+        for depth_mm in (-_BACK_MM, _BACK_MM / 2):
+            T[2, 3] = self._radius_mm - depth_mm
+            self.move(T, self._time_s)
+        self._contact = self._T = None
 
     def gap_mm(self, T: np.ndarray) -> float:
         """Smallest distance of the object at ``T`` to the undeformed dome, negative inside."""
@@ -123,3 +132,9 @@ class Follower:
 
     def _provided(self, pressed_mm: np.ndarray) -> bool:
         return bool((((pressed_mm / self._radius_mm) @ self._reached.T).max(axis=1) > np.cos(_KNOWN_RAD)).all())
+
+
+def _step_of(stimulus: ObjectSpec) -> float:
+    if stimulus.texture is not None:
+        return FINE_STEP_MM * min(1.0, stimulus.texture.wire_diameter_mm)
+    return FINE_STEP_MM if stimulus.shape.kind == "mesh" else STEP_MM

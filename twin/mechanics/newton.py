@@ -19,6 +19,7 @@ GAP_BOUND_MM = 0.01  # no contact point ends deeper inside the object
 RESIDUAL_TOLERANCE = 1e-6  # of the sum of the contact forces
 _PENALTY_GROWTH, _PENALTY_RAISES = 4.0, 5
 _ITERATIONS = 30
+_INNER_ITERATIONS = 400  # in all; a step whose contact flickers for longer is soonest solved in shorter ones
 _WORSE = 2.0  # growth of the residual that is put up with
 _KEEP_TANGENT = 0.3  # contraction of the residual up to which an old tangent is kept
 _SMALLEST_SHIFT_N_MM, _LARGEST_SHIFT_N_MM = 0.01, 50.0  # on the tangent's diagonal, where it leads astray
@@ -139,11 +140,14 @@ class LoadStepper:
         balance = problem.balance(control, border)
         astray = False
         tangent, fresh, shift, last, accepted = self._tangent, False, 0.0, np.inf, 0
+        most_inner = self.inner_iterations + _INNER_ITERATIONS
         for _ in range(_ITERATIONS):
             if balance is None:
                 raise NoConvergence(np.inf)
             if balance.relative <= RESIDUAL_TOLERANCE:
                 return control, border, balance
+            if self.inner_iterations > most_inner:
+                break
             self.iterations += 1
             if tangent is None or (not fresh and balance.absolute > _KEEP_TANGENT * last) or shift != self._shift:
                 self._tangent = tangent = self._linearise(problem, control, border, shift)

@@ -1,0 +1,54 @@
+"""The way to an object: from wherever the arm stands to the pose clear of it, around the object and not through it."""
+
+import numpy as np
+
+from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
+from hardware.safety import distance_to_axis
+
+MARGIN_MM = 10.0  # between the dome and the circle about the object
+STEP_DEG = 30.0  # along that circle
+
+
+def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> list[np.ndarray]:
+    """Poses (6,) to pass from ``start`` on, the last of them ``clear``.
+
+    Straight, where the dome keeps out of a circle about the object's section. Else out of the circle if need be, and along
+    it the shorter way, the sensor turned towards the object. An object without an end (a plane) is not gone around.
+    """
+    outline = placed.outline()
+    if not np.allclose(outline[0], outline[-1]):
+        return [clear]
+    surface = outline @ placed.T_base_object[:2, [0, 2]].T + placed.T_base_object[:2, 3]
+    middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
+    radius_mm = np.linalg.norm(surface - middle, axis=1).max() + placed.mounting.radius_mm + MARGIN_MM
+    T = matrix_of(clear)
+    domes = [matrix_of(pose)[:2, :3] @ placed.mounting.centre_mm + pose[:2] - middle for pose in (start, clear)]
+    if distance_to_axis(*domes) >= min(radius_mm, np.linalg.norm(domes[1])):
+        return [clear]
+    angle, end = (np.arctan2(dome[1], dome[0]) for dome in domes)
+    turn = (angle - end + np.pi) % (2 * np.pi) - np.pi  # from the clear pose back to the start's side
+    outward_mm = max(0.0, radius_mm / np.cos(np.radians(STEP_DEG / 2)) - np.linalg.norm(domes[1]))
+    way, last = [], start
+    inside_mm = np.linalg.norm(domes[1]) + outward_mm - np.linalg.norm(domes[0])
+    if inside_mm > 0:
+        last = start.copy()
+        last[:2] += inside_mm * np.array([np.cos(angle), np.sin(angle)])
+        way.append(last)
+    for at in np.linspace(turn, 0.0, int(np.ceil(abs(np.degrees(turn)) / STEP_DEG)) + 1):
+        spun = _spun(T, at, middle)
+        spun[:2, 3] += outward_mm * np.array([np.cos(end + at), np.sin(end + at)])
+        last = pose_of(spun, last)
+        way.append(last)
+    if outward_mm > 0:
+        way.append(clear)
+    return way
+
+
+def _spun(T: np.ndarray, angle: float, middle: np.ndarray) -> np.ndarray:
+    """A pose (4, 4) turned about the vertical through ``middle`` (2,)."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    out = T.copy()
+    out[:2, :3] = turn @ T[:2, :3]
+    out[:2, 3] = middle + turn @ (T[:2, 3] - middle)
+    return out

@@ -1,0 +1,72 @@
+"""A view in Rerun (``rerun-sdk``, an optional package): frame, pins, graph and estimates over time, in its viewer or in a file."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hardware.errors import DeviceError
+from hardware.step import Estimate
+from twin.types import Frame, Observation
+
+VIEWER, SUFFIX = "viewer", ".rrd"
+
+
+class RerunView:
+    """Logs what it is shown. A context manager.
+
+    Parameters
+    ----------
+    title : str
+    target : str
+        ``viewer`` (opened on this machine), a new file ``*.rrd``, or the address of a viewer that runs (``rerun+http://...``).
+
+    Raises
+    ------
+    DeviceError
+        The package is missing, or the target is none of these.
+    """
+
+    def __init__(self, title: str, target: str) -> None:
+        if target != VIEWER and "://" not in target and not target.endswith(SUFFIX):
+            raise DeviceError(f"--rerun {target}: expected '{VIEWER}', a file *{SUFFIX} or an address rerun+http://...")
+        try:
+            import rerun
+        except ImportError as error:
+            raise DeviceError("--rerun needs the package rerun-sdk; install it: pip install 'tactip-twin[rerun]'") from error
+        self._rerun, self._title, self._target = rerun, title, target
+        self._stream = None
+        self.url = "Rerun's viewer" if target == VIEWER else target
+
+    def __enter__(self) -> "RerunView":
+        self._stream = self._rerun.RecordingStream(self._title)
+        if self._target == VIEWER:
+            self._stream.spawn()
+        elif "://" in self._target:
+            self._stream.connect_grpc(self._target)
+        else:
+            Path(self._target).parent.mkdir(parents=True, exist_ok=True)
+            self._stream.save(self._target)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def log(self, frame: Frame, seen: Observation, estimate: Estimate) -> None:
+        """A frame with its pins and graph, and the estimate's values with their intervals, on the timelines ``frame`` and ``time``."""
+        rerun, stream = self._rerun, self._stream
+        stream.set_time("frame", sequence=frame.sequence)
+        stream.set_time("time", duration=frame.time_s)
+        stream.log("camera", rerun.Image(frame.image))
+        if seen.valid:
+            nodes = seen.graph.nodes_px
+            stream.log("camera/edges", rerun.LineStrips2D(nodes[np.asarray(seen.graph.edges)]))
+            stream.log("camera/pins", rerun.Points2D(nodes))
+        for name, value, low, high in zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True):
+            stream.log(f"pose/{name}", rerun.Scalars([value, low, high]))
+
+    def show(self, picture: np.ndarray, stats: dict) -> bool:
+        """Show a picture (H, W, 3) RGB and figures by name; False once the user closed the view (never, in Rerun)."""
+        self._stream.log("view", self._rerun.Image(picture))
+        self._stream.log("figures", self._rerun.TextDocument("\n".join(stats.values())))
+        return True

@@ -1,0 +1,56 @@
+"""The way to an object leads around it."""
+
+import numpy as np
+import pytest
+
+from hardware.approach import way_around
+from hardware.mounting import Mounting
+from hardware.rig_geometry import PlacedObject, matrix_of, moved
+from scenes import load_experiment, load_object, load_sensor, load_servo
+
+SAMPLES = 200  # along each straight piece
+
+
+@pytest.fixture
+def placed():
+    sensor, servo = load_sensor("mg400-331"), load_servo("surface")
+    return PlacedObject(load_object("square"), servo.placement, Mounting.of(sensor, load_experiment("surface-2d")))
+
+
+def clear_of(placed):
+    return moved(placed.start_pose(3.0), -50.0 * placed.mounting.axis)
+
+
+def gaps_mm(placed, way):
+    """Of the dome from the object, along straight pieces with the turn in proportion."""
+    poses = [a + t * (b - a) for a, b in zip(way[:-1], way[1:], strict=True) for t in np.linspace(0, 1, SAMPLES)]
+    return np.array([-placed.touch(pose).indent_mm for pose in poses])
+
+
+@pytest.mark.parametrize("side_deg", range(0, 360, 45))
+def test_from_any_side_the_dome_stays_clear_of_the_object(placed, side_deg):
+    clear = clear_of(placed)
+    middle = placed.T_base_object[:3, 3] + 40.0 * placed.T_base_object[:3, 2]  # of the square
+    away = np.array([np.cos(np.radians(side_deg)), np.sin(np.radians(side_deg)), 0.0])
+    start = clear.copy()
+    start[:3] = middle + 150.0 * away - matrix_of(clear)[:3, :3] @ placed.mounting.centre_mm
+    way = [start, *way_around(placed, start, clear)]
+    assert np.allclose(way[-1], clear)
+    assert gaps_mm(placed, way).min() > 5.0
+
+
+def test_in_the_open_it_is_straight(placed):
+    clear = clear_of(placed)
+    (only,) = way_around(placed, moved(clear, -100.0 * placed.mounting.axis), clear)
+    assert only is clear
+
+
+def test_from_behind_and_near_it_first_goes_outward(placed):
+    clear = clear_of(placed)
+    middle, inward = placed.T_base_object[:3, 3] + 40.0 * placed.T_base_object[:3, 2], placed.T_base_object[:3, 2]
+    start = clear.copy()
+    start[:3] = middle + 65.0 * inward - matrix_of(clear)[:3, :3] @ placed.mounting.centre_mm  # 5 mm behind the square
+    way = [start, *way_around(placed, start, clear)]
+    assert np.allclose((way[1] - start)[:3] / np.linalg.norm((way[1] - start)[:3]), inward)
+    gaps = gaps_mm(placed, way)
+    assert gaps.min() == pytest.approx(5.0, abs=0.1) and gaps[SAMPLES:].min() > 5.0

@@ -22,6 +22,7 @@ from twin.recordings import Recording, open_recording
 from twin.types import Form
 
 HELD_OUT = 5  # one row in five is the validation part
+PIN_COLUMNS = ("image_name", "nodes_px", "area_px2", "lost", "valid")  # what a PinTable holds of each frame
 GROUP_COLUMN = "path_id"  # of a simulated data set's table
 
 
@@ -62,7 +63,7 @@ class PinTable:
 
     def rows(self, index: np.ndarray) -> "PinTable":
         """The same table with only some rows, or rows in another order."""
-        parts = {key: getattr(self, key)[index] for key in ("image_name", "nodes_px", "area_px2", "lost", "valid")}
+        parts = {key: getattr(self, key)[index] for key in PIN_COLUMNS}
         return PinTable(self.sensor, self.form, self.reference, **parts, measured=self.measured)
 
     def seen_from(self, reference: Reference) -> "PinTable":
@@ -102,6 +103,13 @@ class Dataset:
         """The same data set with only some rows."""
         group = None if self.group is None else self.group[index]
         return replace(self, pins=self.pins.rows(index), targets=self.targets.rows(index), group=group)
+
+    def beside(self, pins: "list[PinTable]") -> "Dataset":
+        """This data set once with its own pins and once more with each of ``pins``; all copies of a row belong together."""
+        copies = np.tile(np.arange(len(self)), 1 + len(pins))
+        every = self.rows(copies)
+        parts = {key: np.concatenate([getattr(table, key) for table in (self.pins, *pins)]) for key in PIN_COLUMNS}
+        return replace(every, pins=replace(every.pins, **parts), group=copies if self.group is None else every.group)
 
 
 def load_dataset(

@@ -12,10 +12,12 @@ from twin.types import FINE
 HELP = """Train in the twin, test on real frames, against training on real frames.
 
 \b
-  twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 --seed 0 --out out/sim-to-real
+  twin study sim-to-real --sensor mg400-331 --frames DIR --contacts surface-2d-wide --labels 40 --seed 0 --out out/sim-to-real
+
+The recording's --experiment says how the arm went and what is learnt; --contacts is the experiment that is simulated.
 
 --labels real frames are drawn by --seed from four fifths of the recording. What the twin's pins miss on them is learnt as a
-Gaussian process of the label, and drawn anew for every simulated contact; with --calibrate the specification is fitted to
+Gaussian process of the label, and drawn --draws times for every simulated contact; with --calibrate the specification is fitted to
 them first ('twin calibrate contact'; about an hour). Judged on the random fifth that is left:
 
 \b
@@ -32,6 +34,8 @@ goes on where it was ended.
 Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv, index.html.
 """
 
+SEEDS_APART = 1000  # of the draws of one study, so that those of --seed 0, 1, 2... differ
+
 
 @study.command("sim-to-real", help=HELP)
 def study_sim_to_real(
@@ -40,6 +44,11 @@ def study_sim_to_real(
     out: Out,
     labels: Annotated[int, typer.Option("--labels", min=8, metavar="N", help="labelled frames beside the simulated ones")] = 40,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the frames drawn, the contacts and the weights")] = 0,
+    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how the frames were recorded")] = "surface-2d",
+    contacts: Annotated[
+        str | None, typer.Option("--contacts", metavar="E", help="experiment to simulate; that of the frames if not given")
+    ] = None,
+    draws: Annotated[int, typer.Option("--draws", min=1, help="of what the twin misses, for each contact")] = 4,
     count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts to simulate")] = 500,
     sim: Annotated[Path | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead")] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
@@ -64,10 +73,10 @@ def study_sim_to_real(
     from twin.kinematics import rig_of
     from twin.views.page import render_page
 
-    spec, plan = load_sensor(sensor), load_experiment("surface-2d")
-    touched = load_object(plan.object)
+    spec, plan = load_sensor(sensor), load_experiment(experiment)
+    simulated_plan, touched = load_experiment(contacts or experiment), load_object(plan.object)
     with count_bar("frames") as progress:
-        real = load_dataset(frames, spec, progress=progress)
+        real = load_dataset(frames, spec, plan.targets, progress=progress)
     chosen = choose_frames(len(real), labels, seed)
     writable_folder(out)
     measured = measured_of(real, chosen.few)
@@ -84,7 +93,7 @@ def study_sim_to_real(
         config = GenerationConfig(
             sensor=spec,
             object=touched,
-            experiment=plan,
+            experiment=simulated_plan,
             randomisation=load_randomisation("moves"),
             friction=rig_of(spec).friction,
             seed=seed,
@@ -92,15 +101,21 @@ def study_sim_to_real(
             states="all",
             across=across,
         )
-        with rate_bar(f"{plan.name}, {spec.name}") as progress:
+        with rate_bar(f"{simulated_plan.name}, {spec.name}") as progress:
             generate(sim, config, count, workers=workers, progress=progress)
-    rows = []
-    for name, missing in [("sim_only", partial(discrepancy.draw_px, seed=seed))] + [("sim_bare", None)] * ablate:
+
+    def simulated_as(missing):
         with count_bar("simulated states") as progress:
-            simulated = load_dataset(sim, spec, form=real.pins.form, missing=missing, progress=progress)
-        with epoch_bar(name) as progress:
-            train_in_twin(simulated, out / name, seed=seed, epochs=epochs, progress=progress)
-        rows.append(judged({"sim_only": "simulated", "sim_bare": "simulated, bare"}[name], 0, out / name, real, chosen.test))
+            return load_dataset(sim, spec, plan.targets, form=real.pins.form, missing=missing, progress=progress)
+
+    drawn = [simulated_as(partial(discrepancy.draw_px, seed=seed + SEEDS_APART * k)) for k in range(draws)]
+    simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": simulated_as(None)} if ablate else {})
+    rows = []
+    for name, trained_on in (("sim_only", "simulated"), ("sim_bare", "simulated, bare")):
+        if name in simulated:
+            with epoch_bar(name) as progress:
+                train_in_twin(simulated[name], out / name, seed=seed, epochs=epochs, progress=progress)
+            rows.append(judged(trained_on, 0, out / name, real, chosen.test))
     corrections = correct(out / "sim_only", out / "sim_plus_real", real, chosen.few)
     rows.insert(1, judged("simulated and real", labels, out / "sim_plus_real", real, chosen.test))
     for name, index in chosen.trained.items():
@@ -119,8 +134,8 @@ def study_sim_to_real(
         calibrated=calibrate,
         error_px=residuals.error_px,
         modes=discrepancy.summary()[:4],
-        simulated=len(simulated),
-        contacts=len(np.unique(simulated.group)) if simulated.group is not None else len(simulated),
+        simulated=len(drawn[0]),
+        contacts=len(np.unique(drawn[0].group)),
         names=real.targets.names,
         chosen=corrections,
         columns=columns,

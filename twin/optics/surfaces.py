@@ -96,12 +96,14 @@ def cap_albedo(spec: SensorSpec) -> np.ndarray:
 
 def cap_outlines(spec: SensorSpec, sides: int) -> np.ndarray | None:
     """Radius (N, sides) of each cap's outline relative to its circle's, or None where all are round."""
-    if not spec.appearance.cap_shapes:
+    look = spec.appearance
+    if not look.cap_shapes and not look.cap_offsets:
         return None
-    shapes = np.array(spec.appearance.cap_shapes)
+    shapes, offsets = np.array(look.cap_shapes or [[0.0]]), np.array(look.cap_offsets or [[0.0, 0.0]])
     turn = np.arange(sides) * 2 * np.pi / sides
     orders = 2 + np.arange(shapes.shape[1] // 2)[:, None]
-    return 1 + shapes[:, :1] + shapes[:, 1::2] @ np.cos(orders * turn) + shapes[:, 2::2] @ np.sin(orders * turn)
+    beside = offsets @ np.stack([np.cos(turn), np.sin(turn)])
+    return 1 + shapes[:, :1] + shapes[:, 1::2] @ np.cos(orders * turn) + shapes[:, 2::2] @ np.sin(orders * turn) + beside
 
 
 def _chart(points_mm: np.ndarray) -> np.ndarray:

@@ -77,11 +77,11 @@ def stems(spec: SensorSpec, base_mm: np.ndarray, axis: np.ndarray) -> Surface:
 
 
 def caps(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> Surface:
-    """All caps, one surface: bevelled discs, or of their own outlines, about their centres."""
+    """All caps, one surface: bevelled discs, or of their own outlines, about their centres; open below, where nothing is seen of them."""
     radius, half = 0.5 * spec.pins.cap_diameter_mm, 0.5 * spec.pins.cap_height_mm
     bevel = min(CAP_BEVEL * spec.pins.cap_height_mm, 0.5 * radius)
     radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
-    profile = np.array([[0, -half], [radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
+    profile = np.array([[radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
     body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(spec, CAP_SIDES))
     return Surface(body.vertices_mm, body.faces, np.repeat(cap_albedo(spec), len(body.vertices_mm) // len(caps_mm), axis=0))
 

@@ -11,8 +11,10 @@ from twin.camera import expose, hazed
 from twin.preprocess.forms import gray_levels
 from twin.projection import project
 from twin.realism.caps import measure_caps
+from twin.realism.disc import lens_disc
 from twin.realism.radial import bin_of, equal_count_edges
 from twin.realism.spectra import noise_sd
+from twin.realism.statistics import bare_skin
 from twin.video import luma_weights, stream_of
 
 BOUNDS = {  # name: least, largest, unit of a step
@@ -175,14 +177,17 @@ def apparent_mm(spec: SensorSpec, z_mm: np.ndarray) -> np.ndarray:
     )
 
 
-def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], inside: np.ndarray, rounds: int = 3) -> SensorSpec:
-    """Scale the noise until even places of renders are as rough as the real frames'."""
-    real = np.median([noise_sd(gray_levels(f.image), inside) for f in frames])
-    scale = 1.0
+def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], rounds: int = 3) -> SensorSpec:
+    """Scale the noise until bare skin of renders is as rough as the real frames'."""
+    disc, scale = lens_disc(spec), 1.0
+    bare = [bare_skin(f.image.shape, f.pins_px, disc) for f in frames]
+
+    def roughness(images) -> float:
+        return float(np.median([noise_sd(gray_levels(image), skin) for image, skin in zip(images, bare, strict=True)]))
+
+    real, still = roughness(f.image for f in frames), roughness(expose(x, spec) for x in light)
     for _ in range(rounds):
-        trial = _noisier(spec, scale)
-        ours = np.median([noise_sd(gray_levels(expose(x, trial, np.random.default_rng(k))), inside) for k, x in enumerate(light)])
-        still = np.median([noise_sd(gray_levels(expose(x, trial)), inside) for x in light])
+        ours = roughness(expose(x, _noisier(spec, scale), np.random.default_rng(k)) for k, x in enumerate(light))
         grown = max(ours**2 - still**2, 1e-4)
         scale *= float(np.sqrt(max(real**2 - still**2, 0.01 * grown) / grown))
     return _noisier(spec, scale)

@@ -147,7 +147,7 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
         return fit_rim(spec, frames, studio.light(spec, frames, "render for the rim"))
 
     def noise(spec):
-        return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"), inside)
+        return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"))
 
     stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim, noise]
     for number, stage in enumerate(stages):

@@ -256,7 +256,8 @@ class AppearanceSpec(Section):
     ``cap_levels`` is each cap's reflectance relative to ``cap_albedo``, in pin order, where it has been measured; without
     them ``cap_variation`` is the relative sd of a random pattern of number ``cap_pattern`` (another number: another print
     of the sensor). ``cap_shapes``: each cap's outline, relative to a circle, as measured: coefficients a_0, a_2, b_2, a_3,
-    b_3, ... of ``1 + a_0 + sum a_m cos(m t) + b_m sin(m t)``, t turning from the sensor's x towards y.
+    b_3, ... of ``1 + a_0 + sum a_m cos(m t) + b_m sin(m t)``, t turning from the sensor's x towards y; ``cap_offsets``: a_1, b_1,
+    by which its middle lies beside the pin's, in cap radii.
     """
 
     skin_albedo: Rgb
@@ -271,6 +272,7 @@ class AppearanceSpec(Section):
     cap_pattern: Annotated[int, Field(ge=0)] = 0
     cap_levels: tuple[Positive, ...] = ()
     cap_shapes: tuple[tuple[float, ...], ...] = ()
+    cap_offsets: tuple[tuple[float, float], ...] = ()
     specks: tuple[SpeckSpec, ...] = ()
 
 
@@ -279,9 +281,12 @@ class ResponseSpec(Section):
 
     ``blur_sigma_px`` of the optics; ``exposure`` and ``white_balance``; ``brightness_drift``: relative sd of a gain
     drawn for each frame; noise with variance ``read_noise^2 + shot_noise * light``, light 1 being saturation;
-    the curve ``black + (255 - black) light^(1 / gamma)``; ``sharpening``: weight of the unsharp mask of
-    ``sharpening_sigma_px`` that cameras apply to the luma; ``chroma_sigma_px``: blur of the colour differences,
-    ``chroma_columns`` neighbours of which share one (2: a 4:2:2 stream); ``jpeg_quality`` of the stream (0: not compressed).
+    ``sharpening``: weight of the unsharp mask of ``sharpening_sigma_px`` that cameras apply to the luma, not to its noise, which
+    they smooth by ``noise_sigma_px``; the curve ``black + (255 - black) light^(1 / gamma)``;
+    ``chroma_sigma_px``: further blur of the light that the colour differences are made of, of which ``chroma_columns``
+    neighbours have the first one's (2: a 4:2:2 stream); ``stream``: whole numbers of luma and colour differences (ITU-R BT.601
+    or BT.709, studio range)
+    that the frame comes as, or "rgb"; ``jpeg_quality`` of the stream (0: not compressed).
     """
 
     exposure: Positive
@@ -296,6 +301,8 @@ class ResponseSpec(Section):
     sharpening_sigma_px: Positive = 1.5
     chroma_sigma_px: NonNegative = 0.0
     chroma_columns: Literal[1, 2] = 1
+    noise_sigma_px: NonNegative = 0.0
+    stream: Literal["rgb", "bt601", "bt709"] = "rgb"
     jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 0
 
 

@@ -5,9 +5,9 @@ import numpy as np
 
 from scenes.sensor import CameraSpec, GelSpec, RecordingSpec, ResponseSpec, SensorSpec
 from twin.errors import FrameError
+from twin.video import luma_weights, through_stream
 
 JPEG_BLOCK_PX = 16  # the unit of a JPEG with halved chroma
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 MEDIAN_PX = 5  # the recorder's own despeckling before its threshold
 
 
@@ -16,9 +16,9 @@ def expose(
 ) -> np.ndarray:
     """What gel, lens and camera make of the light: a raw frame.
 
-    Gel haze, lateral chromatic aberration, blur and vignetting act on light; then come gain, noise, the response curve,
-    sharpening of the luma, loss of chroma and the stream's compression (`GelSpec`, `CameraSpec`, `ResponseSpec`). A step whose
-    parameter is neutral does nothing at all.
+    Gel haze, lateral chromatic aberration, blur and vignetting act on light; then come gain, noise, sharpening of the luma,
+    the response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`).
+    A step whose parameter is neutral does nothing at all.
 
     Parameters
     ----------
@@ -40,9 +40,9 @@ def expose(
     light = blurred(light, response.blur_sigma_px)
     light = vignetted(light, spec.camera, origin_px)
     light = amplified(light, response, rng)
-    light = noisy(light, response, rng)
-    gray = developed(curve(light, response), response, origin_px)
-    return compressed(np.clip(np.rint(gray), 0, 255).astype(np.uint8), response.jpeg_quality, origin_px)
+    gray = developed(light, noisy(light, response, rng), response, origin_px)
+    frame = through_stream(gray, response.stream) if gray.ndim == 3 else np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    return compressed(frame, response.jpeg_quality, origin_px)
 
 
 def hazed(light: np.ndarray, gel: GelSpec) -> np.ndarray:
@@ -104,30 +104,43 @@ def curve(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
     return np.float32(response.black_level) + np.float32(255 - response.black_level) * shown
 
 
-def developed(gray: np.ndarray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """Luma sharpened by an unsharp mask, colour differences blurred and shared by neighbouring columns of the full frame."""
-    colour = gray.ndim == 3 and (response.chroma_sigma_px > 0 or response.chroma_columns > 1)
-    if response.sharpening == 0 and not colour:
-        return gray
-    luma = gray @ LUMA if gray.ndim == 3 else gray
+def sharpened(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
+    """Light with an unsharp mask of its luma added to every channel; the curve then makes more of the dark side of an edge."""
+    if response.sharpening == 0:
+        return light
+    luma = light @ luma_weights(response.stream) if light.ndim == 3 else light
     mask = np.float32(response.sharpening) * (luma - blurred(luma, response.sharpening_sigma_px))
-    if gray.ndim == 2:
-        return gray + mask
-    chroma = gray - luma[..., None]
-    if colour:
-        chroma = shared(blurred(chroma, response.chroma_sigma_px), response.chroma_columns, origin_px[0])
-    return chroma + (luma + mask)[..., None]
+    return light + (mask[..., None] if light.ndim == 3 else mask)
+
+
+def developed(light: np.ndarray, grainy: np.ndarray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Gray levels of light, and of the same with its noise: the luma sharpened, colour taken from softer light.
+
+    A camera has one colour at each pixel of its sensor and guesses the other two from its neighbours, in linear light: colour is
+    softer than luma, and the curve moves its edges outwards. Its sharpening spares the noise. Colour differences are shared by
+    neighbouring columns of the full frame.
+    """
+    gray = curve(sharpened(light, response), response)
+    if grainy is not light:
+        gray = gray + blurred(curve(grainy, response) - curve(light, response), response.noise_sigma_px)
+    if gray.ndim == 2 or (response.sharpening == 0 and response.chroma_sigma_px == 0 and response.chroma_columns == 1):
+        return gray
+    weights = luma_weights(response.stream)
+    soft = curve(blurred(grainy, response.chroma_sigma_px), response)
+    chroma = shared(soft - (soft @ weights)[..., None], response.chroma_columns, origin_px[0])
+    return chroma + (gray @ weights)[..., None]
 
 
 def shared(chroma: np.ndarray, columns: int, left_px: int = 0) -> np.ndarray:
-    """Chroma (H, W, 3) with the mean of every ``columns`` neighbouring columns in all of them; groups begin at the full frame's first."""
+    """Chroma (H, W, 3) with that of the first of every ``columns`` neighbouring columns in all of them, as 4:2:2 streams sample it.
+
+    Groups begin at the full frame's first column; ``left_px`` is this part's place in it.
+    """
     if columns == 1:
         return chroma
     group = (left_px + np.arange(chroma.shape[1])) // columns
-    starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
-    widths = np.diff(starts, append=chroma.shape[1])
-    mean = np.add.reduceat(chroma, starts, axis=1) / widths[:, None].astype(np.float32)
-    return np.repeat(mean, widths, axis=1)
+    first = np.searchsorted(group, group)
+    return chroma[:, first]
 
 
 def compressed(frame: np.ndarray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:

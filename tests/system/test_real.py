@@ -13,8 +13,8 @@ from twin.preprocess.batch import recording_reference
 from twin.preprocess.forms import recording_to_raw
 from twin.preprocess.legacy import LegacyPipeline
 from twin.projection import project
+from twin.realism.images import compare_images
 from twin.recordings import open_recording
-from twin.similarity import frame_similarity
 from twin.simulator import Simulator
 from twin.types import Form
 
@@ -99,7 +99,7 @@ def test_the_rendered_frame_without_contact_is_like_the_recorded_one(real_dir, f
     recorded = open_recording(real_dir / folder, spec).reference.image
     simulator = Simulator(spec)
     rendered = simulator.shoot(simulator.rest, form=Form.RECORDING).frame.image
-    likeness = frame_similarity(rendered, recorded)
-    turned = frame_similarity(np.ascontiguousarray(rendered[::-1]), recorded)
+    likeness = compare_images(recorded, rendered, np.ones(recorded.shape[:2], bool))
+    turned = compare_images(recorded, np.ascontiguousarray(rendered[::-1]), np.ones(recorded.shape[:2], bool))
     print(f"\n{folder}: SSIM {likeness.ssim:.3f}, PSNR {likeness.psnr_db:.1f} dB; mirrored {turned.ssim:.3f}, {turned.psnr_db:.1f} dB")
     assert likeness.ssim > LEAST_SSIM and likeness.ssim > turned.ssim + 0.05

@@ -17,11 +17,12 @@ SECTIONS = {
     "appearance": {
         "skin_albedo": (0.0048, 0.0066, 0.023), "pin_albedo": (0.006, 0.009, 0.03), "cap_albedo": (0.2, 0.41, 0.8),
         "skin_gloss": 0.0, "cap_gloss": 0.0,
-        "cap_bump": 0.0, "cap_variation": 0.0, "cap_levels": (), "cap_shapes": (), "specks": (),
+        "cap_bump": 0.0, "cap_variation": 0.0, "cap_levels": (), "cap_shapes": (), "cap_offsets": (), "specks": (),
     },
     "response": {
         "exposure": 1.0, "gamma": 2.2, "black_level": 4.0, "blur_sigma_px": 0.6, "read_noise": 2e-4, "shot_noise": 6e-5, "sharpening": 0.0,
-        "sharpening_sigma_px": 1.5, "chroma_sigma_px": 0.0, "chroma_columns": 1, "jpeg_quality": 0,
+        "sharpening_sigma_px": 1.5, "chroma_sigma_px": 0.0, "chroma_columns": 1, "noise_sigma_px": 0.0, "stream": "rgb",
+        "jpeg_quality": 0,
     },
 }  # fmt: skip
 

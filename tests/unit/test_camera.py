@@ -6,7 +6,21 @@ import pytest
 from plain_sensor import changed, plain
 
 from scenes.sensor import RecordingSpec
-from twin.camera import amplified, blurred, compressed, curve, developed, dispersed, expose, hazed, noisy, record, shared, vignetted
+from twin.camera import (
+    amplified,
+    blurred,
+    compressed,
+    curve,
+    developed,
+    dispersed,
+    expose,
+    hazed,
+    noisy,
+    record,
+    shared,
+    sharpened,
+    vignetted,
+)
 from twin.errors import FrameError
 
 RECORDING = RecordingSpec(crop_px=(20, 10, 140, 110), width_px=120, height_px=100, threshold_block_px=61, threshold_offset=-5.0)
@@ -19,7 +33,7 @@ NEUTRAL = {
     "response": {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "gamma": 1.0, "black_level": 0.0, "blur_sigma_px": 0.0,
         "brightness_drift": 0.0, "read_noise": 0.0, "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0,
-        "chroma_columns": 1, "jpeg_quality": 0,
+        "chroma_columns": 1, "noise_sigma_px": 0.0, "stream": "rgb", "jpeg_quality": 0,
     },
 }  # fmt: skip
 FULL = {
@@ -33,6 +47,7 @@ FULL = {
         "sharpening": 0.5,
         "chroma_sigma_px": 1.0,
         "chroma_columns": 2,
+        "stream": "bt709",
     },
 }
 SECTIONS = [(section, key, value) for section, values in FULL.items() for key, value in values.items() if key != "haze_sigma_px"]
@@ -85,7 +100,7 @@ def test_each_step_acts_in_the_chain(section, key, value):
 def test_a_neutral_step_hands_the_very_same_light_on():
     light, frame, rng = picture(), expose(picture(), PLAIN), np.random.default_rng(0)
     optics = hazed(light, PLAIN.gel), dispersed(light, PLAIN.camera), blurred(light, 0.0), vignetted(light, PLAIN.camera)
-    film = amplified(light, PLAIN.response, rng), noisy(light, PLAIN.response, rng), developed(light, PLAIN.response)
+    film = amplified(light, PLAIN.response, rng), noisy(light, PLAIN.response, rng), sharpened(light, PLAIN.response)
     assert all(handed is light for handed in (*optics, *film)) and compressed(frame, 0) is frame
     assert rng.standard_normal() == np.random.default_rng(0).standard_normal(), "a neutral step drew a number"
 
@@ -204,25 +219,44 @@ def luma(frame: np.ndarray) -> np.ndarray:
 
 
 def test_lost_chroma_leaves_the_luma_as_it_is():
-    gray = 255 * picture()
-    lost = developed(gray, changed(PLAIN, response={"chroma_sigma_px": 2.0, "chroma_columns": 2}).response)
-    assert np.abs(luma(lost) - luma(gray)).max() < 1e-3 and np.abs(lost - gray).max() > 10
+    light, soft = picture(), changed(PLAIN, response={"chroma_sigma_px": 2.0, "chroma_columns": 2}).response
+    lost = developed(light, light, soft)
+    assert np.abs(luma(lost) - luma(255 * light)).max() < 1e-3 and np.abs(lost - 255 * light).max() > 10
 
 
-def test_neighbouring_columns_share_their_mean_chroma():
+def test_soft_colour_of_a_bright_spot_reaches_further_out():
+    """Blurred before the curve, light spreads into the dark, where the curve shows it: half of the colour lies outside half of the luma."""
+    light = np.full((40, 80, 3), 0.01, np.float32)
+    light[:, 40:] = (0.2, 0.3, 0.6)
+    soft = changed(CURVED, response={"chroma_sigma_px": 2.0}).response
+    gray = developed(light, light, soft)
+    row = (gray[20, :, 2] - luma(gray[20]))[30:50]
+    half = np.interp((row[0] + row[-1]) / 2, row, np.arange(30.0, 50.0))
+    edge = 39.5
+    assert half < edge - 0.5
+
+
+def test_neighbouring_columns_share_the_first_ones_chroma():
     gray = 255 * picture()
     chroma = gray - luma(gray)[..., None]
     pairs = shared(chroma, 2)
-    assert (pairs[:, 0::2] == pairs[:, 1::2]).all()
-    assert np.abs(pairs[:, 0::2] - (chroma[:, 0::2] + chroma[:, 1::2]) / 2).max() < 1e-3
-    assert np.abs(shared(chroma[:, 3:], 2, 3)[:, 1:] - pairs[:, 4:]).max() < 1e-3, "a window's pairs are the full frame's"
+    assert (pairs[:, 0::2] == chroma[:, 0::2]).all() and (pairs[:, 1::2] == chroma[:, 0::2]).all()
+    assert (shared(chroma[:, 3:], 2, 3)[:, 1:] == pairs[:, 4:]).all(), "a window's pairs are the full frame's"
 
 
-def test_sharpening_leaves_the_colour_differences():
-    gray = 255 * picture()
-    sharp = developed(gray, changed(PLAIN, response={"sharpening": 1.0}).response)
-    change = sharp - gray
-    assert np.abs(change - change[..., :1]).max() < 1e-3 and np.abs(change).max() > 1
+def test_sharpening_changes_all_channels_alike():
+    light = picture()
+    change = sharpened(light, changed(PLAIN, response={"sharpening": 1.0}).response) - light
+    assert np.abs(change - change[..., :1]).max() < 1e-5 and np.abs(change).max() > 0.01
+
+
+def test_noise_is_smoothed_but_not_sharpened():
+    light = np.full((200, 200), 0.2, np.float32)
+    noise = {"read_noise": 0.01, "noise_sigma_px": 0.0}
+    sd = {}
+    for name, more in (("plain", {}), ("sharp", {"sharpening": 2.0}), ("smooth", {"noise_sigma_px": 0.6})):
+        sd[name] = expose(light, changed(PLAIN, response=noise | more), np.random.default_rng(0)).std()
+    assert sd["sharp"] == sd["plain"] > 1.2 * sd["smooth"]
 
 
 def test_a_window_of_a_frame_is_exposed_as_the_frame_is():

@@ -1,26 +1,28 @@
 """What each cap of a printed sensor has of its own: its reflectance and its outline.
 
-Both are ratios of real to rendered frames, so that light, window and blur drop out; the median over the frames keeps
-bubbles and glints from counting.
+Reflectance is the ratio of real to rendered light at a cap's middle, so that light, window and blur drop out; the median over
+the frames keeps bubbles and glints from counting. The outline is a step of Gauss-Newton on gray levels: where an outline
+of radius r(t) grows by dr(t), the image changes by ``-grad I . dr(t) e(t)``, e(t) being the outward way t as the camera sees it.
 """
 
 from collections.abc import Callable
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scenes.sensor import SensorSpec
 from twin.calibration.aligned import SATURATED, Aligned, revised, to_light
-from twin.optics.surfaces import cap_outlines
 from twin.preprocess.forms import gray_levels
 from twin.projection import project
 
-DIRECTIONS = 24  # in which an outline is measured
-REACH = np.linspace(0.35, 1.75, 29)  # of the cap's radius: where its edge may be
-ORDERS = 4  # highest of an outline's harmonics
+ORDERS = 6  # highest of an outline's harmonics
+SHAPE_SD, MISFIT_LEVELS = 0.03, 10.0  # of a harmonic, in cap radii, before frames are seen; of a gray level that outlines don't explain
+REACH = 1.7  # cap radii about a cap's middle that tell of its outline
 LEVEL_BOUNDS, SHAPE_BOUND = (0.3, 3.0), 0.35
+LARGEST_STEP = 0.1  # of a harmonic: the slope of the gray levels reaches no further
 SKIN_PERCENTILE = 10.0  # of what surrounds a cap
-DAMPING = 0.8  # of a correction: the blur makes outlines rounder than they are, noise makes them rougher
+DAMPING = 0.8  # of a correction of the reflectance
 
 Shoot = Callable  # shoot(spec, frames) gives the captured renders (M, H, W[, 3]) uint8 without noise
 
@@ -38,76 +40,71 @@ def fit_caps(spec: SensorSpec, frames: list[Aligned], shoot: Shoot) -> SensorSpe
     Returns
     -------
     SensorSpec
-        With ``appearance.cap_levels`` and ``cap_shapes``.
+        With ``appearance.cap_levels``, ``cap_shapes`` and ``cap_offsets``.
     """
-    rendered = shoot(spec, frames)
+    rendered, look, count = shoot(spec, frames), spec.appearance, spec.pins.count
     level = np.array([_levels(spec, f, f.image) / _levels(spec, f, r) for f, r in zip(frames, rendered, strict=True)])
-    edge = np.array([cap_edges(spec, f, f.image) / cap_edges(spec, f, r) for f, r in zip(frames, rendered, strict=True)])
-    level, edge = np.nan_to_num(_median(level), nan=1.0), _reliable(edge)
-    before = np.array(spec.appearance.cap_levels or np.ones(spec.pins.count))
-    levels = np.clip(before * level**DAMPING, *LEVEL_BOUNDS)
-    outline = cap_outlines(spec, DIRECTIONS)
-    outline = np.ones((spec.pins.count, DIRECTIONS)) if outline is None else outline
+    level = np.nan_to_num(_median(level), nan=1.0)
+    levels = np.clip(np.array(look.cap_levels or np.ones(count)) * level**DAMPING, *LEVEL_BOUNDS)
+    before = np.zeros((count, 2 * ORDERS + 1))
+    if look.cap_offsets:
+        before[:, 1:3] = look.cap_offsets
+    if look.cap_shapes:
+        known = np.array(look.cap_shapes)[:, : 2 * ORDERS - 1]
+        before[:, 0], before[:, 3 : 2 + known.shape[1]] = known[:, 0], known[:, 1:]
+    shapes = np.clip(before + outline_steps(spec, frames, rendered), -SHAPE_BOUND, SHAPE_BOUND).round(3)
     return revised(
         spec,
         appearance={
             "cap_levels": tuple(levels.round(3).tolist()),
-            "cap_shapes": tuple(map(tuple, harmonics(outline * edge**DAMPING).round(3).tolist())),
+            "cap_shapes": tuple(map(tuple, np.delete(shapes, [1, 2], axis=1).tolist())),
+            "cap_offsets": tuple(map(tuple, shapes[:, 1:3].tolist())),
         },
     )
 
 
-def _reliable(edge: np.ndarray) -> np.ndarray:
-    """Outline ratios (N, DIRECTIONS) of frames (M, N, DIRECTIONS), each harmonic shrunk by what of it differs from frame to frame.
-
-    A cap's print is the same in all frames; noise, and an edge seen too flat, is not: a coefficient counts
-    ``signal / (signal + noise / M)``, its variance over the caps of like harmonics against that over the frames.
-    """
-    middle = _median(edge)
-    each = np.array([harmonics(np.where(np.isfinite(one), one, np.nan_to_num(middle, nan=1.0))) for one in edge])
-    mean = np.median(each, axis=0)
-    if len(edge) > 1:
-        noise = 1.57 * np.var(each, axis=0, ddof=1) / len(edge)  # of a median
-        signal = np.maximum(np.mean(mean**2, axis=0) - noise.mean(axis=0), 0)
-        mean = mean * signal / (signal + noise + 1e-12)
-    turn = np.arange(edge.shape[2]) * 2 * np.pi / edge.shape[2]
-    orders = np.arange(2, ORDERS + 1)[:, None]
-    return 1 + mean[:, :1] + mean[:, 1::2] @ np.cos(orders * turn) + mean[:, 2::2] @ np.sin(orders * turn)
+def outline_steps(spec: SensorSpec, frames: list[Aligned], rendered: list[np.ndarray]) -> np.ndarray:
+    """Changes (N, 2 ORDERS + 1) of each outline's ``a_0, a_1, b_1, a_2, ...`` that bring renders nearer to the frames, in cap radii."""
+    unknowns = 2 * ORDERS + 3  # the last two: the cap's contrast and the skin's level
+    normal, right = np.zeros((spec.pins.count, unknowns, unknowns)), np.zeros((spec.pins.count, unknowns))
+    for frame, image in zip(frames, rendered, strict=True):
+        for cap, slopes, missing in _changes(spec, frame, image):
+            normal[cap] += slopes.T @ slopes
+            right[cap] += slopes.T @ missing
+    prior = np.full(unknowns, (MISFIT_LEVELS / SHAPE_SD) ** 2)
+    prior[-2:] = 1e-6
+    steps = np.linalg.solve(normal + np.diag(prior), right[..., None])[:, : 2 * ORDERS + 1, 0]
+    return np.clip(steps, -LARGEST_STEP, LARGEST_STEP)
 
 
-def harmonics(outline: np.ndarray) -> np.ndarray:
-    """Coefficients (N, 2 ORDERS - 1) as in ``AppearanceSpec.cap_shapes`` of outlines (N, DIRECTIONS) relative to a circle."""
-    turn = np.arange(outline.shape[1]) * 2 * np.pi / outline.shape[1]
-    columns = [np.mean(outline - 1, axis=1)]
-    for order in range(2, ORDERS + 1):
-        columns += [2 * np.mean(outline * wave(order * turn), axis=1) for wave in (np.cos, np.sin)]
-    return np.clip(np.stack(columns, axis=1), -SHAPE_BOUND, SHAPE_BOUND)
-
-
-def cap_edges(spec: SensorSpec, frame: Aligned, image: np.ndarray) -> np.ndarray:
-    """Distance (N, DIRECTIONS) from each cap's centre to where it falls to half, in cap radii in the cap's plane; NaN where not found."""
-    u = np.array([1.0, 0.0, 0.0]) - frame.state.axis[:, :1] * frame.state.axis
+def _changes(spec: SensorSpec, frame: Aligned, image: np.ndarray):
+    """Of each seen cap: its index, how its pixels' gray levels change with the unknowns (n, 2 ORDERS + 3), what they lack (n,)."""
+    state, real, ours = frame.state, *(gray_levels(x).astype(np.float32) for x in (frame.image, image))
+    slope = np.stack([cv2.Sobel(ours, cv2.CV_32F, *way, ksize=3) / 8 for way in ((1, 0), (0, 1))], axis=-1)
+    u = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(u, frame.state.axis)
-    turn = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
-    way = np.cos(turn)[:, None, None] * u + np.sin(turn)[:, None, None] * v
-    face = frame.state.caps_mm + 0.5 * spec.pins.cap_height_mm * frame.state.axis
-    radius = 0.5 * spec.pins.cap_diameter_mm
-    at = project(spec, face + radius * REACH[:, None, None, None] * way).astype(np.float32)  # (reach, directions, N, 2)
-    gray = gray_levels(image).astype(np.float32)
-    profile = cv2.remap(gray, at[..., 0].reshape(len(REACH), -1), at[..., 1].reshape(len(REACH), -1), cv2.INTER_LINEAR).reshape(
-        at.shape[:3]
-    )
-    top = profile[0].mean(axis=0)
-    bottom = np.percentile(profile, SKIN_PERCENTILE, axis=(0, 1))
-    share = (profile - bottom) / np.maximum(top - bottom, 1.0)
-    below = share < 0.5
-    first = np.argmax(below, axis=0)
-    found = below.any(axis=0) & (first > 0)
-    after = np.maximum(first, 1)
-    high, low = (np.take_along_axis(share, k[None], axis=0)[0] for k in (after - 1, after))
-    place = REACH[after - 1] + (REACH[1] - REACH[0]) * (high - 0.5) / np.maximum(high - low, 1e-6)
-    return np.where(found, place, np.nan).T
+    face, radius = state.caps_mm + 0.5 * spec.pins.cap_height_mm * state.axis, 0.5 * spec.pins.cap_diameter_mm
+    middle = project(spec, face)
+    plane = np.stack([project(spec, face + radius * way) - middle for way in (u, np.cross(u, state.axis))], axis=-1)  # px of a cap radius
+    others = cKDTree(middle)
+    height, width = real.shape
+    for cap in np.flatnonzero(np.isfinite(frame.pins_px).all(axis=1)):
+        half = np.abs(plane[cap]).max() * REACH
+        (x0, y0), (x1, y1) = np.floor(middle[cap] - half).astype(int), np.ceil(middle[cap] + half).astype(int) + 1
+        if min(x0, y0) < 0 or x1 > width or y1 > height:
+            continue
+        pixels = np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1).reshape(-1, 2)
+        place = (pixels - middle[cap]) @ np.linalg.inv(plane[cap]).T
+        near = (np.linalg.norm(place, axis=1) < REACH) & (others.query(pixels)[1] == cap)
+        near &= (real[pixels[:, 1], pixels[:, 0]] < SATURATED) & (ours[pixels[:, 1], pixels[:, 0]] < SATURATED)
+        at = pixels[near, 1], pixels[near, 0]
+        turn = np.arctan2(place[near, 1], place[near, 0])
+        way = np.stack([np.cos(turn), np.sin(turn)], axis=1) @ plane[cap].T
+        edge = -np.sum(slope[at] * way, axis=1)
+        waves = [np.ones_like(turn), *(wave(order * turn) for order in range(1, ORDERS + 1) for wave in (np.cos, np.sin))]
+        level = ours[at]
+        contrast = level - np.percentile(level, SKIN_PERCENTILE) if len(level) else level
+        yield cap, np.stack([*(edge * wave for wave in waves), contrast, np.ones_like(level)], axis=1), real[at] - level
 
 
 def _levels(spec: SensorSpec, frame: Aligned, image: np.ndarray) -> np.ndarray:

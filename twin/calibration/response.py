@@ -2,36 +2,38 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
 from scenes.sensor import SensorSpec
 from twin.calibration.aligned import SATURATED, Aligned, revised
-from twin.camera import LUMA, expose, hazed
+from twin.camera import expose, hazed
 from twin.preprocess.forms import gray_levels
 from twin.projection import project
 from twin.realism.caps import measure_caps
+from twin.realism.disc import lens_disc
 from twin.realism.radial import bin_of, equal_count_edges
-from twin.realism.spectra import NOISE_KERNEL
+from twin.realism.spectra import noise_sd
+from twin.realism.statistics import bare_skin
+from twin.video import luma_weights, stream_of
 
 BOUNDS = {  # name: least, largest, unit of a step
-    "blur_sigma_px": (0.05, 4.0, 0.1),
-    "sharpening": (0.0, 4.0, 0.2),
-    "sharpening_sigma_px": (0.5, 4.0, 0.2),
+    "blur_sigma_px": (0.05, 4.0, 0.03),
+    "sharpening": (0.0, 4.0, 0.05),
+    "sharpening_sigma_px": (0.5, 4.0, 0.05),
 }
-CHROMA = {"chroma_sigma_px": (0.05, 4.0, 0.2)}
-FRINGES = {"red_scale": (0.985, 1.015, 0.001), "blue_scale": (0.985, 1.015, 0.001)}
-SHIFTS = {f"{colour}_shift_px.{axis}": (-3.0, 3.0, 0.1) for colour in ("red", "blue") for axis in (0, 1)}
+CHROMA = {"chroma_sigma_px": (0.05, 4.0, 0.05)}
+FRINGES = {"red_scale": (0.985, 1.015, 0.0003), "blue_scale": (0.985, 1.015, 0.0003)}
+SHIFTS = {f"{colour}_shift_px.{axis}": (-3.0, 3.0, 0.03) for colour in ("red", "blue") for axis in (0, 1)}
 LEAST_SHARPENING = 0.2  # to start from: a mask of no weight has no width
 SAME_CHROMA = 0.5  # colour step between columns that share it, relative to the step to the next pair
 QUALITIES = (0, 95, 90, 80, 70)
 MOST_TRIES = 10  # of the least squares
 MOST_FRAMES = 3  # that the sharpness is fitted to
 EVERY = 3  # pixels that the fit looks at: one in this many, in both directions
-MOST_APERTURE_MM = 1.2  # more needs more samples a pixel than frames for learning have
+MOST_APERTURE_MM = 3.0  # more needs more samples a pixel than frames for learning have
+GAUSSIAN_WIDTH = 2.563  # 10-90 % edge width of a Gaussian blur relative to its sd
 DISC_WIDTH = 0.69  # 10-90 % edge width of a uniform disc relative to its diameter
-FLAT_LEVELS = 6.0  # spread in 5 x 5 px below which a place is flat
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,9 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     frames, light = frames[:MOST_FRAMES], [hazed(np.asarray(x, np.float32), spec.gel) for x in light[:MOST_FRAMES]]
     useful = [inside & pick & (gray_levels(f.image) < SATURATED) for f in frames]
     real = np.concatenate([f.image[u].astype(float).ravel() for f, u in zip(frames, useful, strict=True)])
-    columns = chroma_columns([f.image for f in frames])
-    flat = revised(spec, response={"jpeg_quality": 0, "chroma_columns": columns}, gel={"haze": 0.0})  # the light is hazed already
+    images = [f.image for f in frames]
+    stream = {"stream": stream_of(images), "chroma_columns": chroma_columns(images)}
+    flat = revised(spec, response={"jpeg_quality": 0} | stream, gel={"haze": 0.0})  # the light is hazed already
 
     def with_values(values) -> SensorSpec:
         return _changed(flat, dict(zip(names, map(float, values), strict=True)))
@@ -91,11 +94,11 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
 
 def chroma_columns(images: list[np.ndarray]) -> int:
     """2 if frames (H, W, 3) come from a 4:2:2 stream, in which columns 2k and 2k + 1 share their colour differences; else 1."""
-    steps = np.zeros(2)
+    steps, weights = np.zeros(2), luma_weights(stream_of(images))
     for image in images:
         if image.ndim == 3:
             levels = image.astype(np.float32)
-            chroma = levels - (levels @ LUMA)[..., None]
+            chroma = levels - (levels @ weights)[..., None]
             step = np.abs(np.diff(chroma, axis=1)).mean(axis=(0, 2))
             steps += step[0::2].mean(), step[1::2].mean()
     return 2 if steps[0] < SAME_CHROMA * steps[1] else 1
@@ -130,6 +133,19 @@ def sharpness(spec: SensorSpec, frames: list[Aligned], rendered: list[np.ndarray
     return Sharpness(*(np.array([np.median(values[p]) for p in parts]) for values in (distance, real, ours)))
 
 
+def fit_blur(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], rounds: int = 3) -> SensorSpec:
+    """The blur under which rendered edges are as wide as real ones, of all caps together.
+
+    Least squares on gray levels, where edges don't lie exactly on each other, prefer them too soft.
+    """
+    for _ in range(rounds):
+        seen = sharpness(spec, frames, [expose(x, spec) for x in light], bins=1)
+        lacking = float((seen.real_px**2 - seen.rendered_px**2)[0]) / GAUSSIAN_WIDTH**2
+        blur = np.sqrt(max(spec.response.blur_sigma_px**2 + lacking, BOUNDS["blur_sigma_px"][0] ** 2))
+        spec = revised(spec, response={"blur_sigma_px": round(float(blur), 4)})
+    return spec
+
+
 def fit_aperture(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
     """Aperture and focus whose defocus explains how the edges' width changes with distance.
 
@@ -140,7 +156,7 @@ def fit_aperture(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
     wanted = seen.real_px**2 - seen.rendered_px**2 + (DISC_WIDTH * before) ** 2
     best = (np.inf, 0.0, spec.camera.focus_mm)
     for focus in np.linspace(0.85 * seen.distance_mm.min(), 1.15 * seen.distance_mm.max(), 31):
-        for aperture in np.linspace(0, MOST_APERTURE_MM, 25):
+        for aperture in np.linspace(0, MOST_APERTURE_MM, 31):
             grown = (DISC_WIDTH * defocus_px(spec.camera.fx_px, aperture, focus, seen.distance_mm)) ** 2
             miss = float(np.var(wanted - grown))
             if miss < best[0]:
@@ -161,24 +177,17 @@ def apparent_mm(spec: SensorSpec, z_mm: np.ndarray) -> np.ndarray:
     )
 
 
-def noise_level(gray: np.ndarray, inside: np.ndarray) -> float:
-    """Sd of the noise in flat places of a frame (H, W) uint8 (Immerkaer 1996), gray levels."""
-    levels = gray.astype(np.float32)
-    spread = np.sqrt(np.maximum(cv2.blur(levels**2, (5, 5)) - cv2.blur(levels, (5, 5)) ** 2, 0))
-    flat = inside & (spread < FLAT_LEVELS)
-    if not flat.any():
-        return float("nan")
-    return float(np.sqrt(np.pi / 2) * np.mean(np.abs(cv2.filter2D(levels, -1, NOISE_KERNEL))[flat]))
+def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], rounds: int = 3) -> SensorSpec:
+    """Scale the noise until bare skin of renders is as rough as the real frames'."""
+    disc, scale = lens_disc(spec), 1.0
+    bare = [bare_skin(f.image.shape, f.pins_px, disc) for f in frames]
 
+    def roughness(images) -> float:
+        return float(np.median([noise_sd(gray_levels(image), skin) for image, skin in zip(images, bare, strict=True)]))
 
-def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], inside: np.ndarray, rounds: int = 3) -> SensorSpec:
-    """Scale the noise until flat places of renders are as rough as the real frames'."""
-    real = np.median([noise_level(gray_levels(f.image), inside) for f in frames])
-    scale = 1.0
+    real, still = roughness(f.image for f in frames), roughness(expose(x, spec) for x in light)
     for _ in range(rounds):
-        trial = _noisier(spec, scale)
-        ours = np.median([noise_level(gray_levels(expose(x, trial, np.random.default_rng(k))), inside) for k, x in enumerate(light)])
-        still = np.median([noise_level(gray_levels(expose(x, trial)), inside) for x in light])
+        ours = roughness(expose(x, _noisier(spec, scale), np.random.default_rng(k)) for k, x in enumerate(light))
         grown = max(ours**2 - still**2, 1e-4)
         scale *= float(np.sqrt(max(real**2 - still**2, 0.01 * grown) / grown))
     return _noisier(spec, scale)

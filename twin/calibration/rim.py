@@ -6,11 +6,11 @@ from scenes.sensor import RimSpec, SensorSpec
 from twin.calibration.aligned import SATURATED, Aligned, revised, to_light
 from twin.camera import expose
 from twin.optics.lens import ray_table
-from twin.optics.static_layer import RIM_UNIT, static_layer
+from twin.optics.static_layer import RIM_UNIT, rim_places, static_layer
 from twin.projection import sensor_to_camera
 
 INSIDE_MM, OUTSIDE_MM = 1.75, 0.4  # of the housing's opening: how far the table reaches; no pin comes so near
-AZIMUTHS, RADII = 360, 20
+AZIMUTHS, RADII = 240, 32  # the edge is steep along the radius
 ROUNDS = 3  # blur and sharpening lie between the table and the pixels
 GAIN = 0.9  # of a correction
 
@@ -65,13 +65,10 @@ def _cells(spec: SensorSpec, inner_mm: float, outer_mm: float) -> tuple[np.ndarr
     """The four table entries (n, 4) around each pixel of the band, their bilinear weights (n, 4), and the pixels' flat indices (n,)."""
     camera, ring = spec.camera, spec.housing
     corners = ray_table(camera, (0, 0, camera.width_px, camera.height_px)) @ sensor_to_camera(camera)[:3, :3]
-    rays = (corners[:-1, :-1] + corners[1:, 1:]) / 2
-    at = rays[..., :2] / rays[..., 2:] * (ring.z_mm + camera.distance_mm) - ring.center_mm
-    radius = np.linalg.norm(at, axis=-1).ravel()
-    pixels = np.flatnonzero((radius > inner_mm) & (radius < outer_mm))
-    x, y = at.reshape(-1, 2)[pixels].T
-    turn = np.arctan2(y, x) % (2 * np.pi) / (2 * np.pi) * AZIMUTHS
-    along = (radius[pixels] - inner_mm) / (outer_mm - inner_mm) * (RADII - 1)
+    rays = ((corners[:-1, :-1] + corners[1:, 1:]) / 2).reshape(-1, 3)
+    turn, along = rim_places(ring, inner_mm, outer_mm, (AZIMUTHS, RADII), rays[:, :2] / rays[:, 2:] * (ring.z_mm + camera.distance_mm))
+    pixels = np.flatnonzero((along > 0) & (along < RADII - 1))
+    turn, along = turn[pixels], along[pixels]
     row, column = np.floor(turn).astype(int), np.minimum(np.floor(along).astype(int), RADII - 2)
     a, b = turn - row, along - column
     cell = np.stack([(row + j) % AZIMUTHS * RADII + column + k for j in (0, 1) for k in (0, 1)], axis=1)

@@ -14,7 +14,7 @@ from twin.calibration.aligned import Aligned, read_frames, revised
 from twin.calibration.camera_pose import fit_camera
 from twin.calibration.caps import fit_caps
 from twin.calibration.photometry import fit_photometry
-from twin.calibration.response import fit_aperture, fit_noise, fit_response, sharpness
+from twin.calibration.response import fit_aperture, fit_blur, fit_noise, fit_response, sharpness
 from twin.calibration.rim import fit_rim
 from twin.calibration.surroundings import fit_surroundings
 from twin.camera import expose
@@ -137,7 +137,8 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
         return fit_aperture(spec, sharpness(spec, frames, shots))
 
     def response(spec):
-        return fit_response(spec, frames, studio.light(spec, frames, "render for the response"), inside)
+        light = studio.light(spec, frames, "render for the response")
+        return fit_blur(fit_response(spec, frames, light, inside), frames, light)
 
     def caps(spec):
         return fit_caps(spec, frames, lambda s, f: studio.shots(s, f, "render for the caps"))
@@ -146,7 +147,7 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
         return fit_rim(spec, frames, studio.light(spec, frames, "render for the rim"))
 
     def noise(spec):
-        return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"), inside)
+        return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"))
 
     stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim, noise]
     for number, stage in enumerate(stages):

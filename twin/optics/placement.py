@@ -21,10 +21,11 @@ def near_pins(spec: SensorSpec, state, window_px: tuple[int, int, int, int]) -> 
     sides = [project(spec, state.caps_mm + reach_mm * way) for way in (across, np.cross(state.axis, across))]
     radius = np.max([np.linalg.norm(side - middle, axis=1) for side in sides], axis=0) + MARGIN_PX
     feet = project(spec, state.base_mm)
-    mask, fine = np.zeros((y1 - y0, x1 - x0), np.uint8), 1 << SUBPIXEL_BITS
-    for foot, cap, wide in zip(feet - [x0, y0], middle - [x0, y0], radius, strict=True):
-        ends = [tuple(int(v) for v in np.rint(fine * end)) for end in (foot, cap)]
-        cv2.line(mask, *ends, 1, int(np.ceil(2 * wide)), cv2.LINE_8, SUBPIXEL_BITS)  # its ends are round
+    mask, ends = np.zeros((y1 - y0, x1 - x0), np.uint8), np.stack([feet, middle], axis=1) - [x0, y0]
+    fine = np.rint(ends * (1 << SUBPIXEL_BITS)).astype(np.int32)
+    width = np.ceil(2 * radius).astype(int)
+    for wide in np.unique(width):
+        cv2.polylines(mask, list(fine[width == wide]), False, 1, int(wide), cv2.LINE_8, SUBPIXEL_BITS)  # their ends are round
     return mask.astype(bool)
 
 

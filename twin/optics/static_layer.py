@@ -58,17 +58,24 @@ def rim_light(ring: HousingSpec, at_mm: np.ndarray) -> np.ndarray:
     if ring.rim is None:
         return np.zeros((*at_mm.shape[:-1], 3))
     table = np.array(ring.rim.light, np.float32) / RIM_UNIT
-    place = at_mm - ring.center_mm
-    radius = np.linalg.norm(place, axis=-1)
-    turn = np.arctan2(place[..., 1], place[..., 0]) % (2 * np.pi) / (2 * np.pi) * len(table)
-    along = (radius - ring.rim.inner_mm) / (ring.rim.outer_mm - ring.rim.inner_mm) * (table.shape[1] - 1)
+    turn, along = rim_places(ring, ring.rim.inner_mm, ring.rim.outer_mm, table.shape[:2], at_mm)
     inside = (along >= 0) & (along <= table.shape[1] - 1)
-    light = np.zeros((*radius.shape, 3))
+    light = np.zeros((*turn.shape, 3))
     round_table = np.concatenate([table, table[:1]])
     light[inside] = np.stack(
         [map_coordinates(round_table[..., k], [turn[inside], along[inside]], order=1, mode="nearest") for k in range(3)], axis=-1
     )
     return light
+
+
+def rim_places(
+    ring: HousingSpec, inner_mm: float, outer_mm: float, shape: tuple[int, int], at_mm: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column (...) in a rim's table, of ``shape`` azimuths and radii, of places (..., 2) of the housing's plane."""
+    place = at_mm - ring.center_mm
+    turn = np.arctan2(place[..., 1], place[..., 0]) % (2 * np.pi) / (2 * np.pi) * shape[0]
+    along = (np.linalg.norm(place, axis=-1) - inner_mm) / (outer_mm - inner_mm) * (shape[1] - 1)
+    return turn, along
 
 
 def housing_light(spec: SensorSpec, at_mm: np.ndarray) -> np.ndarray:

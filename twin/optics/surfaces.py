@@ -77,11 +77,11 @@ def stems(spec: SensorSpec, base_mm: np.ndarray, axis: np.ndarray) -> Surface:
 
 
 def caps(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> Surface:
-    """All caps, one surface: bevelled discs, or of their own outlines, about their centres."""
+    """All caps, one surface: bevelled discs, or of their own outlines, about their centres; open below, where nothing is seen of them."""
     radius, half = 0.5 * spec.pins.cap_diameter_mm, 0.5 * spec.pins.cap_height_mm
     bevel = min(CAP_BEVEL * spec.pins.cap_height_mm, 0.5 * radius)
     radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
-    profile = np.array([[0, -half], [radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
+    profile = np.array([[radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
     body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(spec, CAP_SIDES))
     return Surface(body.vertices_mm, body.faces, np.repeat(cap_albedo(spec), len(body.vertices_mm) // len(caps_mm), axis=0))
 
@@ -96,12 +96,14 @@ def cap_albedo(spec: SensorSpec) -> np.ndarray:
 
 def cap_outlines(spec: SensorSpec, sides: int) -> np.ndarray | None:
     """Radius (N, sides) of each cap's outline relative to its circle's, or None where all are round."""
-    if not spec.appearance.cap_shapes:
+    look = spec.appearance
+    if not look.cap_shapes and not look.cap_offsets:
         return None
-    shapes = np.array(spec.appearance.cap_shapes)
+    shapes, offsets = np.array(look.cap_shapes or [[0.0]]), np.array(look.cap_offsets or [[0.0, 0.0]])
     turn = np.arange(sides) * 2 * np.pi / sides
     orders = 2 + np.arange(shapes.shape[1] // 2)[:, None]
-    return 1 + shapes[:, :1] + shapes[:, 1::2] @ np.cos(orders * turn) + shapes[:, 2::2] @ np.sin(orders * turn)
+    beside = offsets @ np.stack([np.cos(turn), np.sin(turn)])
+    return 1 + shapes[:, :1] + shapes[:, 1::2] @ np.cos(orders * turn) + shapes[:, 2::2] @ np.sin(orders * turn) + beside
 
 
 def _chart(points_mm: np.ndarray) -> np.ndarray:

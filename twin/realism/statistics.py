@@ -78,20 +78,24 @@ class Statistics:
 
 def measure_frame(gray: np.ndarray, pins_px: np.ndarray, disc: Disc) -> FrameStatistics:
     """Measure a gray frame (H, W) uint8 with pins at (N, 2) px."""
-    distance = disc.distance_px(pins_px)
-    spacing = pin_spacing_px(pins_px)
-    among = disc.distance_px(np.stack(np.meshgrid(np.arange(gray.shape[1]), np.arange(gray.shape[0])), axis=2)) < np.nanmax(distance)
-    bare = clear_of_pins(gray.shape, pins_px, CLEAR_SHARE * spacing) & disc.inside & among
+    bare = bare_skin(gray.shape, pins_px, disc)
     frequency, power = radial_spectrum(gray, disc.center_px, disc.radius_px)
     return FrameStatistics(
         caps=measure_caps(gray, pins_px),
-        distance_px=distance,
+        distance_px=disc.distance_px(pins_px),
         skin_level=float(np.median(gray[bare])) if bare.any() else np.nan,
         noise_sd=noise_sd(gray, bare) if bare.any() else np.nan,
         frequency=frequency,
         power=power,
-        spots=find_spots(gray, disc, pins_px, spacing),
+        spots=find_spots(gray, disc, pins_px, pin_spacing_px(pins_px)),
     )
+
+
+def bare_skin(shape: tuple, pins_px: np.ndarray, disc: Disc) -> np.ndarray:
+    """(H, W) bool: pixels among the pins at (N, 2) px that show none of them."""
+    places = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=2)
+    among = disc.distance_px(places) < np.nanmax(disc.distance_px(pins_px))
+    return clear_of_pins(shape, pins_px, CLEAR_SHARE * pin_spacing_px(pins_px)) & disc.inside & among
 
 
 def compare_statistics(real: list[FrameStatistics], rendered: list[FrameStatistics]) -> Statistics:

@@ -24,7 +24,6 @@ from brute_force import BLOCK_PX, blocks, changed, laboratory, reference, z_scor
 
 BOUNCES = 6  # of the bright laboratory: what a seventh brings is below the noise
 CHANCE = 1e-3  # of refusing a right renderer, by blocks or in total
-WIDE = 1e-9  # a wrong one must be this improbable
 OURS = {"batches": 8, "spp": 64}
 SMALL = {"size_px": 24, "batches": 12, "spp": 144}  # 7 s; total known to 0.4 %
 LARGE = {"size_px": 48, "batches": 12, "spp": 400}  # two minutes; total known to 0.15 %
@@ -101,7 +100,7 @@ def test_the_comparison_sees_what_is_wrong(compared, wrong, monkeypatch):
     spec, theirs = compared
     ours = our_batches(wrong(spec, monkeypatch))
     print(f"{wrong.__name__}: total {ours.mean() / theirs.mean() - 1:+.3%}, chances {chances(ours, theirs)}")
-    assert min(chances(ours, theirs)) < WIDE
+    assert min(chances(ours, theirs)) < CHANCE
 
 
 def test_the_mirror_images_alone_are_those_of_plain_path_tracing():

@@ -19,12 +19,15 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from training.contact_calibration.fit import expect, mean_squared
+from training.contact_calibration.fit import expect, mean_squared, simulate
+from training.contact_calibration.parameters import PARAMETERS
 from training.contact_calibration.simulate import Setup
 from training.recipes import TrainingError
 from training.validation.model import MeasuredFrames
 from twin.kinematics import ArmLabel, rig_of
 
+FRICTION = next(parameter for parameter in PARAMETERS if parameter.name == "rig.friction")
+FRICTIONS = (0.05, 0.15, 0.35, 0.7, 3.0)  # of a frame, tried one after another; the last is stick
 FEWEST = 8  # frames that both stories could be simulated of
 LEAST_PX = 0.5  # of the rms displacement that residuals are divided by
 VARIES = 1e-6  # mm or deg: sd of a label's axis from which on it counts
@@ -65,7 +68,9 @@ def label_axes(labels: list[ArmLabel]) -> np.ndarray:
 
 
 def measure_residuals(setup: Setup, measured: MeasuredFrames, progress: Callable | None = None) -> Residuals:
-    """Simulate labelled frames after the tap and after the move; the likelier story of each is compared.
+    """Simulate labelled frames after the tap and after the move, with several frictions; the likeliest story of each is compared.
+
+    Friction differs from frame to frame, and simulated data sets draw it: what is left must not hold it once more.
 
     Raises
     ------
@@ -73,9 +78,13 @@ def measure_residuals(setup: Setup, measured: MeasuredFrames, progress: Callable
         Too few frames that the twin can simulate and half explain.
     """
     labels, real_px = measured.labels, measured.pins_px - measured.no_contact_px
-    jobs = [(np.zeros(0), rig_of(setup.sensor).turn_sign, row) for row in range(len(labels))]
-    moved = setup.displacements(jobs, labels, progress)
-    weights = expect(mean_squared(moved, real_px))
+    setup = replace(setup, parameters=(FRICTION,))
+    moved = simulate(setup, measured, [[np.log(friction)] for friction in FRICTIONS], rig_of(setup.sensor).turn_sign, progress)
+    squared = np.stack([mean_squared(each, real_px) for each in moved])
+    best = np.where(np.isfinite(squared).all(axis=2), squared.min(axis=2), np.inf).argmin(axis=0)
+    rows = np.arange(len(labels))
+    moved = moved[best, rows]
+    weights = expect(squared[best, rows])
     good = np.flatnonzero(np.isfinite(moved).all(axis=(1, 2, 3)) & (weights.trust > TRUSTED))
     if len(good) < FEWEST:
         raise TrainingError(f"{len(good)} of {len(labels)} labelled frames fit the twin, {FEWEST} must; give more --labels, or --calibrate")

@@ -43,6 +43,8 @@ class RunConfig:
         Further label columns that are learnt beside the data set's own, with less weight.
     size : dict
         Fields of ``VgnnSize``.
+    labelled : tuple of str
+        Names of the real frames that what simulated pins miss was learnt from.
     """
 
     model: str
@@ -52,6 +54,7 @@ class RunConfig:
     split: int | None = 0
     helpers: tuple = ()
     size: dict = field(default_factory=dict)
+    labelled: tuple = ()
 
 
 def train_run(
@@ -155,7 +158,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
         "pipeline": {"form": str(pins.form), "graph": "voronoi", "detection": blob_spec(pins.sensor, pins.form).model_dump(mode="json")},
         "data": str(data.folder),
         "problems": data.problems,
-    }
+    } | ({"labelled": list(config.labelled)} if config.labelled else {})
 
 
 def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:

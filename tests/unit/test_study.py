@@ -1,5 +1,7 @@
 """The parts of the paper's comparison say what they measured, and nothing that they did not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -44,6 +46,19 @@ def test_a_study_is_resumed_and_never_speaks_of_what_was_not_run(data, tmp_path)
     )
     text = write_table(tmp_path / "models.csv", [*rows, untouched]).read_text()
     assert text.count("\n") == 4 and "not begun,,," in text
+
+
+def test_a_run_taught_by_other_labelled_frames_is_not_gone_on_with(data, tmp_path):  # noqa: F811
+    """The simulated contacts' pins differ, and nothing else that a run tells."""
+    plan = plan_run("vgnn-without-kernel", labels="raw", seed=0, split=0, epochs=2).config
+    taught, otherwise = (replace(plan, labelled=names) for names in (("frame_1.png",), ("frame_2.png",)))
+    train_run(taught, data, tmp_path, max_minutes=0.0)
+    with pytest.raises(TrainingError, match="other settings or data"):
+        train_run(otherwise, data, tmp_path)
+    train_run(taught, data, tmp_path)
+    assert is_finished(taught, data, tmp_path)
+    with pytest.raises(TrainingError, match="other settings or data"):
+        is_finished(otherwise, data, tmp_path)
 
 
 def test_unknown_parts_are_named():

@@ -67,9 +67,11 @@ def measured_of(real: Dataset, rows: np.ndarray) -> MeasuredFrames:
     return MeasuredFrames(real.pins.form, names, [labels[name] for name in names], pins_px, real.pins.reference.pins_px, [])
 
 
-def train_in_twin(sim: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Callable | None = None) -> None:
-    """The run ``sim_only``, or what is left of it to do."""
-    config = RunConfig("vgnn", recipe_of("vgnn", members=1, epochs=epochs, kernel=False), seed=seed, split=seed)
+def train_in_twin(
+    sim: Dataset, out: Path, *, seed: int, epochs: int | None, labelled: tuple = (), progress: Callable | None = None
+) -> None:
+    """A run on simulated contacts, or what is left of it to do; ``labelled`` names the real frames that told what they miss."""
+    config = RunConfig("vgnn", recipe_of("vgnn", members=1, epochs=epochs, kernel=False), seed=seed, split=seed, labelled=labelled)
     if not is_finished(config, sim, out):
         train_run(config, sim, out, progress=progress)
 

@@ -84,6 +84,7 @@ class ServoLoop:
         self.notes: list[str] = []  # what went wrong
         self.decided: list[tuple[Decided, float]] = []  # every decision, and the age (s) of the frame behind it (NaN without one)
         self._held_since: float | None = None
+        self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has one
         self._track = ArmTrack(self.arm)
         self._started_s = self._ended_s = 0.0
 
@@ -140,7 +141,7 @@ class ServoLoop:
 
     def _follow(self) -> None:
         memory, used, tangent, estimate, reading, doubt = Memory(), None, None, None, Reading(np.nan, np.nan), ""
-        exposed_pose, sent = np.full(6, np.nan), None
+        exposed_pose, self._sent = np.full(6, np.nan), None
         self._started_s = due_s = arrived_s = time.monotonic()
         while len(self.records) < self.settings.steps:
             if not self.settings.blocking:
@@ -168,7 +169,7 @@ class ServoLoop:
             if doubt:
                 self._hold(doubt, None, age_s)
                 continue
-            from_pose = state.pose if sent is None or not state.moving else sent
+            from_pose = state.pose if self._sent is None or not state.moving else self._sent
             if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
                 self.decided.append((Decided.AWAIT_ARM, age_s))
                 continue
@@ -177,7 +178,7 @@ class ServoLoop:
                 continue
             step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
             try:
-                sent = self._move(step.pose, wait=False)
+                self._sent = self._move(step.pose, wait=False)
             except RefusedMoveError as refused:
                 if refused.decision.code is not Code.STALE_FRAME:
                     raise
@@ -204,13 +205,13 @@ class ServoLoop:
                 from_pose,
                 exposed_pose,
                 state.joints_deg,
-                sent,
+                self._sent,
             )
             self.records.append(record)
             if self.on_step is not None:
                 self.on_step(record, frame, estimate)
             if self.settings.blocking:
-                self.arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
+                self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
 
     def _frame(self, state: ArmState, arrived_s: float) -> Frame:
         if not self.source.is_live:
@@ -242,6 +243,7 @@ class ServoLoop:
         self.decided.append((Decided.HOLD, age_s))
         if self._held_since is None:
             self._held_since = time.monotonic()
+            self._sent = None  # stopping empties the queue, however long feedback goes on saying that it moves
             self.arm.stop()
             self.notes.append(f"held still before step {len(self.records)}: {reason}")
         held_s = time.monotonic() - self._held_since

@@ -118,6 +118,7 @@ class MG400(BaseArm):
     def clear_error(self) -> None:
         """Clear the alarms and forget the queue; after an emergency stop ``enable`` brings the arm back."""
         self._require_connected()
+        self._sent = None
         with contextlib.suppress(DeviceError):
             self._ask("ResetRobot()")
         self._ask("ClearError()")
@@ -125,6 +126,7 @@ class MG400(BaseArm):
         self._alarm_text = None
 
     def stop(self) -> None:
+        self._sent = None  # the queue is dropped
         self._tell_in_any_case("ResetRobot()", "stopped")
 
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:

@@ -1,6 +1,7 @@
 """The loop over a simulated arm and a live source: it follows, it measures, and whatever goes wrong it stops and lets go."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -153,6 +154,44 @@ def test_the_arm_stands_still_while_it_holds(rig):
             loop.run(start(rig))
     assert len(held) > 3
     np.testing.assert_array_equal(held[0], held[-1])
+
+
+class LateArm(SimulatedArm):
+    """Its feedback says for a while after a stop that it still moves."""
+
+    stopped_s = -np.inf
+
+    def stop(self):
+        super().stop()
+        self.stopped_s = time.monotonic()
+
+    def state(self, *, max_age_s=1.0):
+        told = super().state(max_age_s=max_age_s)
+        return replace(told, moving=told.moving or told.time_s < self.stopped_s + 0.3)
+
+
+def test_after_a_hold_it_goes_on_from_where_the_arm_stands(rig):
+    """And not from where the move that was dropped would have ended, though feedback is late."""
+    placed, _ = rig
+    arm = LateArm(axes=6, pose=placed.start_pose(-60.0), time_scale=1.0)
+    estimator = TrueEstimator(arm, placed)
+    stands: list[np.ndarray] = []
+    with arm, NoisyCamera() as source:
+        loop = loop_of((placed, arm), source, 6, estimator=estimator, blocking=False, period_s=0.02)
+        hold = loop._hold
+
+        def held(*arguments):
+            hold(*arguments)
+            stands.append(arm.state().pose)
+            estimator.fail = ""
+
+        loop._hold = held
+        loop.on_step = lambda record, frame, estimate: setattr(estimator, "fail", "no pins" if record.index == 2 else "")
+        loop.run(start((placed, arm)))
+    assert len(stands) >= 1
+    dropped, after = loop.records[2], loop.records[3]
+    assert np.linalg.norm(dropped.sent[:3] - stands[-1][:3]) > 0.3  # mm: it had been on its way
+    np.testing.assert_allclose(after.pose, stands[-1], atol=1e-6)
 
 
 def test_an_estimate_that_is_not_valid_moves_nothing(rig):

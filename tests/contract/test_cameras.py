@@ -12,7 +12,7 @@ from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.choose import open_camera
 from hardware.cameras.lerobot import LeRobotCamera
 from hardware.cameras.mjpeg import MjpegCamera
-from hardware.cameras.reader import MOST_FAILED_READS
+from hardware.cameras.reader import MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
 from hardware.cameras.uvc import UvcSettings, apply_settings, exposed_s
@@ -23,6 +23,7 @@ from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionWriter
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
+from twin.cli import check
 from twin.recordings.images import write_image
 from twin.types import Form, Frame
 
@@ -333,3 +334,15 @@ def test_a_twin_that_draws_on_demand_draws_no_more_frames_than_are_read():
         second = camera.read_after(asked_s, timeout_s=60.0)
         time.sleep(0.5)
         assert first.time_s < asked_s < second.time_s and camera.arrived <= 3
+
+
+def test_check_says_what_to_do_about_a_camera_that_gives_nothing(monkeypatch):
+    class Silent(NoisyCamera):
+        def _grab(self):
+            self._end.wait()
+            raise ReadFailed("ended")
+
+    monkeypatch.setattr("hardware.cameras.choose.open_camera", lambda *_: Silent())
+    monkeypatch.setattr(check, "LIVE_TIMEOUT_S", 0.1)
+    with pytest.raises(DeviceError, match="check the camera"):
+        check.frames_of("0", None, None, 2)

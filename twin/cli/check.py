@@ -62,12 +62,13 @@ def check(
 def frames_of(source: str, spec, form, limit: int) -> list:
     """The next ``limit`` frames of a camera, or as many, evenly spread, of what was recorded."""
     from hardware.cameras.choose import open_camera
+    from hardware.cameras.source import await_frame
 
     camera = open_camera(source, spec, form)
     if not camera.is_live:
         return recorded_frames(Path(source), spec, form, limit)
     with camera:
-        return [camera.read(timeout_s=LIVE_TIMEOUT_S) for _ in range(limit)]
+        return [await_frame(camera, timeout_s=LIVE_TIMEOUT_S) for _ in range(limit)]
 
 
 def recorded_frames(path: Path, spec, form, limit: int) -> list:

@@ -149,7 +149,7 @@ class Shower:
         self._end.set()
         self._thread.join(timeout=5.0)
         if self._error is not None and kind is None:
-            raise DeviceError(f"the view broke ({self._error}); --headless goes without") from self._error
+            raise DeviceError(f"the view broke ({self._error}); without --rerun, --headless shows nothing") from self._error
 
     def _run(self) -> None:
         try:

@@ -23,12 +23,14 @@ class RerunView:
     Raises
     ------
     DeviceError
-        The package is missing, or the target is none of these.
+        The package is missing, the target is none of these, or the file is there already.
     """
 
     def __init__(self, title: str, target: str) -> None:
         if target != VIEWER and "://" not in target and not target.endswith(SUFFIX):
             raise DeviceError(f"--rerun {target}: expected '{VIEWER}', a file *{SUFFIX} or an address rerun+http://...")
+        if target.endswith(SUFFIX) and "://" not in target and Path(target).exists():
+            raise DeviceError(f"--rerun {target}: is there already; give a new file, or remove it")
         try:
             import rerun
         except ImportError as error:

@@ -166,6 +166,11 @@ def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
         assert np.linalg.norm(pipeline(frame).graph.nodes_px - without, axis=1).max() > 2.0
 
 
+def test_a_replay_takes_no_other_frame_at_rest(tmp_path):
+    with pytest.raises(DeviceError, match="leave it out"):
+        run("live", "--replay", tmp_path, "--at-rest", "first", "--headless")
+
+
 def test_live_records_and_replays_the_same(stand_in, tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()

@@ -56,6 +56,8 @@ def live(
 
     if bool(camera) == (replay is not None):
         raise DeviceError("give either --camera or --replay")
+    if replay is not None and at_rest != NONE:
+        raise DeviceError("--at-rest goes with --camera: a replay counts pins from the frame that was kept with its session; leave it out")
     estimator = PoseEstimator.load(model)
     source = SessionSource(replay) if replay else open_camera(camera, estimator.sensor, estimator.form)
     estimator.check(estimator.sensor, source.form)
@@ -64,7 +66,7 @@ def live(
     with ExitStack() as stack:
         stack.enter_context(signals_as_ctrl_c())
         stack.enter_context(source)
-        if at_rest == FIRST and not replay:
+        if at_rest == FIRST:
             rest = await_frame(source, timeout_s=FRAME_TIMEOUT_S)
         if rest is not None and (estimator.counts_from_rest or not replay):  # a session may be replayed with another model than its own
             estimator = estimator.at_rest(rest)

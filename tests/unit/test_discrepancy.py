@@ -31,7 +31,7 @@ def missed_by(labels, moved, scatter=0.0, seed=9):
     return 0.02 * moved + rms * (0.03 * bend + scatter * rng.normal(size=(len(labels), 1, 1)))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def rng():
     return np.random.default_rng(1)
 

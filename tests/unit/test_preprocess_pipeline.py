@@ -109,7 +109,9 @@ def test_a_threshold_that_does_not_suit_the_frame_is_replaced(levels, offset):
     image = draw_discs((spec.camera.width_px, spec.camera.height_px), rest, radius, level=levels, blur_px=0.8)
     seen = Pipeline(spec, Form.RAW)(Frame(image, Form.RAW))
     assert seen.found == len(rest) and rms(errors_px(seen, rest)) < 0.6
+    assert sum(ms for stage, ms in seen.ms.items() if stage != "total") == pytest.approx(seen.ms["total"], rel=0.1)
     if offset == -60.0 and levels[1] < 200:
+        assert seen.ms["look again"] > seen.ms["complete"]  # by far: it is a whole look
         assert Pipeline(spec, Form.RAW, second_look=False)(Frame(image, Form.RAW)).found == 0
 
 

@@ -80,6 +80,7 @@ class Pipeline:
         now = perf_counter()
         if self.second_look and self.blob_spec.threshold_block_px and not self._clear(blobs, found):
             blobs, found = self._with_own_threshold(frame, blobs, found)
+        ms["look again"], now = _since(now)
         paired = found.blob >= 0
         pins_px = np.full_like(self.reference.pins_px, np.nan)
         pins_px[paired] = blobs.px[found.blob[paired]]
@@ -115,11 +116,11 @@ class Pipeline:
         blobs = self._detect(frame, self._mask, blob)
         ms["detect"], now = _since(started)
         found = match(self.reference, blobs.px, blobs.area_px2)
-        ms["match"], _ = _since(now)
         if self._plausible(found):
             blobs, found = self._with_displaced_mask(frame, blob, blobs, found)
         if (found.blob < 0).any() and self._plausible(found):
             blobs, found = self._with_split_caps(blobs, found)
+        ms["match"], _ = _since(now)
         return blobs, found
 
     def _with_own_threshold(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:

@@ -17,7 +17,7 @@ from twin.robustness.envelope import Envelope, crossing, curves_of, envelopes_of
 from twin.robustness.measures import MEASURES, judge
 from twin.robustness.plan import SweepPlan, load_plan
 from twin.robustness.real import consensus
-from twin.robustness.report import compare
+from twin.robustness.report import _share_row, compare
 from twin.robustness.run import check_pipelines, study
 from twin.robustness.shots import RealSource, Shot
 from twin.robustness.sweep import Plan, cells_of, run_sweep
@@ -248,6 +248,7 @@ def test_shares_tell_the_bad_side():
     assert not shares_of([whole], [half], "a")[0].short
     nothing = Envelope(case, "a", 0.0, "recall")
     assert shares_of([nothing], [nothing], "a")[0].value == 1.0 and shares_of([whole], [nothing], "a")[0].value == np.inf
+    json.dumps(_share_row(shares_of([whole], [nothing], "a")[0]), allow_nan=False)  # JSON knows no infinity
 
 
 def test_pipelines_are_checked_before_the_work(tmp_path):
@@ -258,3 +259,7 @@ def test_pipelines_are_checked_before_the_work(tmp_path):
     ):
         with pytest.raises(TwinError, match=says):
             check_pipelines(names)
+    for models in (("run", "run"), ("twin",)):
+        with pytest.raises(TwinError, match="--model: each needs a name of its own"):
+            check_pipelines(["twin"], models)
+    check_pipelines(["twin"], ("run", "other"))

@@ -77,9 +77,9 @@ def robustness(
 
     spec, plan = load_sensor(sensor), load_plan(conditions) if conditions else SweepPlan()
     cases, names = plan.cases(), pipeline or ["twin", "legacy"]
-    check_pipelines(names)
-    writable_folder(out)
     runs = tuple(model or ())
+    check_pipelines(names, tuple(run.name for run in runs))
+    writable_folder(out)
     options = {"jobs": jobs, "models": partial(load_models, runs, spec) if runs else None, "model_names": tuple(run.name for run in runs)}
     if runs:
         load_models(runs, spec)  # each process loads its own: what can't be is told here, and once

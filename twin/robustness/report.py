@@ -4,6 +4,8 @@ import csv
 import json
 from pathlib import Path
 
+import numpy as np
+
 from twin.robustness.envelope import SHORT, Curve, Envelope, Share, shares_of
 from twin.robustness.judgement import Judgement
 from twin.robustness.measures import MEASURES, POSE_MEASURES
@@ -111,8 +113,9 @@ def _row(e: Envelope) -> dict:
 
 
 def _share_row(share: Share) -> dict:
+    value = round(share.value, 3) if np.isfinite(share.value) else None
     return {
-        "condition": share.real.case.name, "share": round(share.value, 3), "short": share.short, "real": share.real.label,
+        "condition": share.real.case.name, "share": value, "short": share.short, "real": share.real.label,
         "rendered": share.rendered.label, "real_measure": share.real.measure, "rendered_measure": share.rendered.measure,
     }  # fmt: skip
 

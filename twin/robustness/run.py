@@ -47,14 +47,19 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
     return tuple(chosen)
 
 
-def check_pipelines(names: list[str]) -> None:
-    """Raise ``TwinError`` where a name is neither a method nor a readable file, or two are alike: before anything is solved or drawn."""
+def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
+    """Raise ``TwinError`` where a name is neither a method nor a readable file, or two are alike: before anything is solved or drawn.
+
+    ``models``: names of the models whose rows stand beside those of the pipelines.
+    """
     for name in names:
         if name not in METHODS and Path(name).suffix != ".toml":
             raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
     called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
     if len(set(called)) < len(called):
         raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
+    if len({*called, *models}) < len(called) + len(models):
+        raise TwinError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
 
 
 def rendered_study(spec: SensorSpec, pipelines: list[str], cases: tuple[Case, ...], severities: tuple, out: Path, bar: Callable, **options):

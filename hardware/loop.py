@@ -143,6 +143,7 @@ class ServoLoop:
         memory, used, tangent, estimate, reading, doubt = Memory(), None, None, None, Reading(np.nan, np.nan), ""
         exposed_pose, self._sent = np.full(6, np.nan), None
         self._started_s = due_s = arrived_s = time.monotonic()
+        behind_s: float | None = None  # since when the arm lags too far behind
         while len(self.records) < self.settings.steps:
             if not self.settings.blocking:
                 time.sleep(max(0.0, due_s - time.monotonic()))
@@ -172,7 +173,14 @@ class ServoLoop:
             from_pose = state.pose if self._sent is None or not state.moving else self._sent
             if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
                 self.decided.append((Decided.AWAIT_ARM, age_s))
+                behind_s = taken_s if behind_s is None else behind_s
+                if taken_s - behind_s > MOVE_TIMEOUT_S:
+                    raise DeviceError(
+                        f"{self.arm.name}: says that it moves, and has not come near to where it was sent for {taken_s - behind_s:.1f} s; "
+                        "look for what holds it, call clear_error(), then begin again"
+                    )
                 continue
+            behind_s = None
             if not fresh and _apart_mm(from_pose, exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
                 self.decided.append((Decided.AWAIT_FRAME, age_s))
                 continue

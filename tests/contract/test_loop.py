@@ -194,6 +194,37 @@ def test_after_a_hold_it_goes_on_from_where_the_arm_stands(rig):
     np.testing.assert_allclose(after.pose, stands[-1], atol=1e-6)
 
 
+class HeldArm(SimulatedArm):
+    """Once held, its feedback says that it moves, and it does not."""
+
+    held: np.ndarray | None = None
+
+    def state(self, *, max_age_s=1.0):
+        told = super().state(max_age_s=max_age_s)
+        return told if self.held is None else replace(told, pose=self.held, moving=True)
+
+    def stop(self):
+        super().stop()
+        self.held = None
+
+
+def test_an_arm_that_is_held_is_not_awaited_for_ever(rig, monkeypatch):
+    placed, _ = rig
+    arm = HeldArm(axes=6, pose=placed.start_pose(-60.0), time_scale=SPEED)
+    with arm, NoisyCamera() as source:
+        loop = loop_of((placed, arm), source, 10_000, blocking=False, period_s=0.02)
+
+        def hold(record, frame, estimate):
+            if record.index == 5:
+                arm.held = record.pose
+                monkeypatch.setattr("hardware.loop.MOVE_TIMEOUT_S", 1.0)
+
+        loop.on_step = hold
+        with pytest.raises(DeviceError, match="look for what holds it"):
+            loop.run(start((placed, arm)))
+        assert_let_go((placed, arm))
+
+
 def test_an_estimate_that_is_not_valid_moves_nothing(rig):
     placed, arm = rig
     estimator = TrueEstimator(arm, placed)

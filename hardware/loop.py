@@ -24,7 +24,8 @@ from scenes.servo import ServoSpec
 from twin.types import Frame
 
 MOST_PIECES, NEAR_MM = 200, 0.5
-MOVE_TIMEOUT_S = 10.0
+MOVE_TIMEOUT_S = 10.0  # beside what the way takes
+SPARE = 2.0  # of that: arms take whole percents of their speed
 BEHIND_MOVES = 2.0  # largest moves that an arm may lag behind before it is told more
 
 
@@ -272,7 +273,8 @@ class ServoLoop:
             state, allowed = self._state(), target
             for guard in self.guards:
                 allowed = guard(state, allowed)
-            sent = self.arm.move_linear(allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S)
+            way_s = SPARE * _apart_mm(allowed, state.pose) / self.servo.linear_mm_s
+            sent = self.arm.move_linear(allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S + way_s)
             if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM:
                 break
         return sent

@@ -194,6 +194,14 @@ def test_after_a_hold_it_goes_on_from_where_the_arm_stands(rig):
     np.testing.assert_allclose(after.pose, stands[-1], atol=1e-6)
 
 
+def test_a_long_way_to_the_object_is_given_its_time(rig, monkeypatch):
+    placed, _ = rig
+    arm = SimulatedArm(axes=6, pose=placed.start_pose(-60.0), time_scale=1.0)
+    monkeypatch.setattr("hardware.loop.MOVE_TIMEOUT_S", 1.0)  # the 50 mm from clear of it take 2.5 s
+    with arm, NoisyCamera() as source:
+        assert loop_of((placed, arm), source, 1).run(start((placed, arm))).steps == 1
+
+
 class HeldArm(SimulatedArm):
     """Once held, its feedback says that it moves, and it does not."""
 

@@ -30,6 +30,8 @@ from hardware.errors import DeviceError, DeviceNotConnectedError
 
 ENABLE_TIMEOUT_S = 5.0
 SETTLE_S = 0.5  # at least, for feedback to confirm a move: two periods of the slow port
+PAUSED = "paused by another client; stop() drops what is queued, its Continue() would go on"
+SHORT_MM = 5.0  # a move whose turn may set its speed
 RESTED_S = 0.05  # without replies (old firmware), at rest for this long counts as done
 
 
@@ -142,7 +144,7 @@ class MG400(BaseArm):
             time_s,
             bool(packet["enabled"]),
             mode in (Mode.RUNNING, Mode.JOG),
-            self._alarm() if mode == Mode.ERROR else "",
+            self._alarm() if mode == Mode.ERROR else PAUSED if mode == Mode.PAUSE else "",
         )
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
@@ -170,13 +172,16 @@ class MG400(BaseArm):
         return sent
 
     def _turning_option(self, pose: np.ndarray) -> str:
-        """``SpeedL`` of a move that turns more than it goes: it scales line and turn alike, and what takes longer sets the pace."""
+        """``SpeedL`` of a short move that turns more than it goes, taken to scale line and turn alike: what takes longer sets the pace.
+
+        The manual gives no more than its syntax. Should an arm go the line that fast, it is over within ``SHORT_MM``.
+        """
         if self._speed is None:
             return ""
         state = self.state()
         start = self._sent if self._sent is not None and state.moving else state.pose
         length_mm, turn_deg = float(np.linalg.norm(pose[:3] - start[:3])), abs(pose[5] - start[5])
-        if turn_deg / MAX_JOINT_DEG_S <= length_mm / MAX_LINEAR_MM_S:
+        if length_mm > SHORT_MM or turn_deg / MAX_JOINT_DEG_S <= length_mm / MAX_LINEAR_MM_S:
             return ""
         wanted_s = max(length_mm / self._speed[0], turn_deg / self._speed[1])
         return f",SpeedL={int(np.clip(np.floor(100 * turn_deg / MAX_JOINT_DEG_S / wanted_s + 1e-9), 1, 100))}"

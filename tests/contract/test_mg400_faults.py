@@ -184,6 +184,18 @@ def test_unknown_targets_alarm_in_the_arm_if_the_driver_lets_them_through():
             arm.move_linear([160.0, 0, -100, 0, 0, 0])
 
 
+def test_an_arm_that_another_client_paused_is_no_arm_at_rest():
+    with emulated(time_scale=4.0) as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        arm.move_linear(AWAY, wait=False)
+        emulator.arm.pause()
+        time.sleep(0.3)  # until the feedback tells
+        assert "paused" in arm.state().error
+        arm.stop()
+        time.sleep(0.3)
+        assert not arm.state().error
+
+
 def test_several_clients_in_turn_and_at_once():
     with emulated(time_scale=4.0) as emulator:
         for _ in range(3):

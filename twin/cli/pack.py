@@ -13,9 +13,8 @@ HELP = """Write a small copy of a finished training run, half as precise and les
 It serves wherever a RUN does. Those that go with the package, below training/weights, were made so:
 
 \b
-  twin dataset --experiment surface-2d --sensor mg400-331 --count 295 --images none --states all --randomise contact --out sim
-  twin train --model vgnn --sensor mg400-331 --data sim --split -1 --members 1 --no-kernel --out run
-  twin pack run --out training/weights/mg400-331
+  twin study sim-to-real --sensor mg400-331 --frames DIR --contacts surface-2d-wide --draws 2 --epochs 60 --out study
+  twin pack study/sim_only --out training/weights/mg400-331
 """
 
 

@@ -151,6 +151,18 @@ def test_published_clients_drive_the_emulated_magician(packages, script):
     assert done.stdout.strip().endswith("done"), done.stderr
 
 
+def test_an_emulator_ends_on_a_signal_that_another_thread_gets():
+    """Threads of numerical libraries don't block what the main thread waits for."""
+    source = (
+        "import threading, time, signal, contextlib; idle = threading.Thread(target=time.sleep, args=(3,), daemon=True); idle.start();"
+        "from twin.cli.emulate import run_until_told;"
+        "threading.Timer(0.2, lambda: signal.pthread_kill(idle.ident, signal.SIGTERM)).start();"
+        "run_until_told(contextlib.nullcontext(), lambda: 'now')"
+    )
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 0 and done.stdout == "ready now\n", done.stderr
+
+
 @pytest.mark.parametrize("device", ["mg400", "magician"])
 def test_twin_emulate_says_when_it_is_ready_and_ends_on_sigterm(device, tmp_path):
     link = tmp_path / "arm"

@@ -24,15 +24,19 @@ TimeScale = Annotated[float, typer.Option("--time-scale", help="how much faster 
 def run_until_told(device, ready, failure=lambda: None) -> None:
     """Run a device (a context manager) and print ``ready()`` once it listens; end on SIGTERM or Ctrl-C, or with its ``failure()``."""
     ends = {signal.SIGTERM, signal.SIGINT}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # waited for, not handled: nothing is ever interrupted halfway
+    told = []
+    handlers = {end: signal.signal(end, lambda *_: told.append(True)) for end in ends}  # libraries' threads get signals, too
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # waited for: nothing is ever interrupted halfway
     try:
         with device:
             print(f"ready {ready()}", flush=True)
-            while signal.sigtimedwait(ends, CHECK_S) is None:
+            while not told and signal.sigtimedwait(ends, CHECK_S) is None:
                 if (error := failure()) is not None:
                     raise error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for end, handler in handlers.items():
+            signal.signal(end, handler)
 
 
 def list_faults(faults: list[str], known: dict) -> None:

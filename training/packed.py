@@ -19,7 +19,7 @@ from twin.preprocess import make_reference
 
 WEIGHTS = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "weights"
-DERIVED = ("adjacency", "smoothing", "waves")
+DERIVED = ("adjacency", "smoothing")  # not the waves: those of equal frequency are any basis, another on another machine
 LARGE = 1000  # numbers, from which an array is kept in half precision
 TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "I64": np.int64}
 PLAIN_KEYS = ("kernels", "kernel_labels", "parameters")  # no arrays, or none that are packed

@@ -9,6 +9,7 @@ from test_training import config_of, data  # noqa: F401  (a fixture)
 
 from training.correction import KINDS, fit_terms, terms
 from training.estimator import PoseEstimator
+from training.models import vgnn
 from training.packed import pack, read_arrays, shipped_names, write_arrays
 from training.recipes import TrainingError
 from training.run import train_run
@@ -65,10 +66,14 @@ def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, 
     assert json.loads((tmp_path / "plus" / "config.json").read_text())["correction"]["frames"] == data.pins.image_name[:40].tolist()
 
 
-def test_a_small_copy_says_the_same(data, run, tmp_path):  # noqa: F811
+def test_a_small_copy_says_the_same_on_any_machine(data, run, tmp_path, monkeypatch):  # noqa: F811
+    """Waves of equal frequency may be any basis: another linear algebra finds another one."""
     size = pack(run, tmp_path)
     assert size < 0.5 * (run / "weights.pt").stat().st_size
-    whole, small = (PoseEstimator.load(path).predict_table(data.pins) for path in (run, tmp_path))
+    whole = PoseEstimator.load(run).predict_table(data.pins)
+    found_here = vgnn.laplacian_waves
+    monkeypatch.setattr(vgnn, "laplacian_waves", lambda adjacency, count: -found_here(adjacency, count))
+    small = PoseEstimator.load(tmp_path).predict_table(data.pins)
     assert (np.abs(whole.mean - small.mean).max(axis=0) < HALF * data.targets.corrected.std(axis=0)).all()
     assert "data" not in json.loads((tmp_path / "config.json").read_text())
     cut = (tmp_path / "weights.safetensors").read_bytes()[:-100]

@@ -1,6 +1,5 @@
 """What the comparison leaves behind: metrics.json, tables, pictures and the page."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from twin.realism.images import difference_picture
 from twin.realism.statistics import RADIAL_MEASURES, TARGET, TARGET_MEASURES, Statistics
 from twin.recordings.images import write_image
 from twin.views.page import render_page
+from twin.views.table import write_rows
 
 DPI = 110
 NAMES = {
@@ -99,20 +99,12 @@ def write_tables(out: Path, pairs: list[Pair], found: Statistics, poses: PoseAli
         for (x, y), peak in zip(s.px, s.peak, strict=True)
     ]
     tables = {"frames": frames, "radial": radial, "spectrum": spectrum, "spots": spots}
-    return [_write_csv(out / f"{name}.csv", rows) for name, rows in tables.items() if rows]
+    return [write_rows(out / f"{name}.csv", rows) for name, rows in tables.items() if rows]
 
 
 def _frame_row(pair: Pair, alignment: str) -> dict:
     pins = {"pin_px": pair.remainder_px, "exact": pair.exact}
     return {"image_name": pair.real.frame.name, "alignment": alignment, **pair.figures.as_dict(), **pins}
-
-
-def _write_csv(path: Path, rows: list[dict]) -> Path:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
 
 
 def write_plots(folder: Path, found: Statistics) -> dict[str, str]:

@@ -1,6 +1,5 @@
 """A sweep's page and tables."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from twin.robustness.measures import MEASURES, POSE_MEASURES
 from twin.robustness.plots import TITLES, plot_case, plot_shares
 from twin.robustness.sweep import Cell, Plan, cells_of
 from twin.views.page import render_page
+from twin.views.table import write_rows
 
 TWICE = 2.0
 
@@ -66,11 +66,11 @@ def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str],
     written = [
         page,
         summary,
-        _table(out / "envelope.csv", [_row(e) for e in envelopes]),
-        _table(out / "curves.csv", _curve_rows(plan, judged.curves)),
-        _table(out / "frames.csv", [_flat(row) for row in judged.rows]),
+        write_rows(out / "envelope.csv", [_row(e) for e in envelopes]),
+        write_rows(out / "curves.csv", _curve_rows(plan, judged.curves)),
+        write_rows(out / "frames.csv", [_flat(row) for row in judged.rows]),
     ]
-    return [*written, _table(out / "real-on-rendered.csv", [_share_row(s) for s in shares])] if shares else written
+    return [*written, write_rows(out / "real-on-rendered.csv", [_share_row(s) for s in shares])] if shares else written
 
 
 def _entry(out: Path, case, judged: Judgement, rendered: Judgement | None, cells: list[Cell]) -> dict:
@@ -133,11 +133,3 @@ def _curve_rows(plan: Plan, curves: list[Curve]) -> list[dict]:
 def _flat(row: dict) -> dict:
     keys = ("case", "severity", "frame", "pipeline", *(m.name for m in MEASURES), "reason", "pose")
     return {key: row.get(key, "") for key in keys}
-
-
-def _table(path: Path, rows: list[dict]) -> Path:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
-    return path

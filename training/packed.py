@@ -55,7 +55,7 @@ def pack(run: Path, out: Path) -> int:
     out.mkdir(parents=True, exist_ok=True)
     write_arrays(out / WEIGHTS, small)
     kept = {key: value for key, value in config.items() if key not in ("data", "problems")}
-    (out / "config.json").write_text(json.dumps(kept, indent=1) + "\n")
+    (out / "config.json").write_text(json.dumps(kept) + "\n")
     return (out / WEIGHTS).stat().st_size
 
 

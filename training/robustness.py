@@ -3,9 +3,7 @@
 Each change is made to the image itself, frame by frame and in a random direction, before the pipeline sees it.
 """
 
-import csv
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -98,12 +96,3 @@ def judge_changes(
         labels |= {f"{label}_more": float(error[k] / usual[k] - 1) for k, label in enumerate(estimator.names)}
         found.append({"change": name, "frames": len(rows), "not_valid": int((~valid).sum())} | labels)
     return found
-
-
-def write_changes(path: Path, found: list[dict]) -> Path:
-    """The table as CSV."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(found[0]))
-        writer.writeheader()
-        writer.writerows({key: f"{v:.6g}" if isinstance(v, float) else v for key, v in row.items()} for row in found)
-    return path

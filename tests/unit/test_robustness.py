@@ -9,8 +9,9 @@ from drawn_frames import drawn_frame
 from test_training import data, trained  # noqa: F401  (fixtures)
 
 from training.estimator import PoseEstimator
-from training.robustness import CHANGES, judge_changes, write_changes
+from training.robustness import CHANGES, judge_changes
 from twin.types import Form, Frame
+from twin.views.table import write_table
 
 
 @pytest.fixture(scope="module")
@@ -48,4 +49,4 @@ def test_the_table_has_every_change_and_every_frame(data, estimator, tmp_path): 
     found = judge_changes(estimator, replace(data, folder=folder), rows)
     assert [row["change"] for row in found] == ["none", *CHANGES]
     assert all(row["frames"] == 6 and row["not_valid"] == 1 for row in found) and found[0]["pose_2_more"] == 0
-    assert write_changes(tmp_path / "robustness.csv", found).read_text().count("\n") == 1 + len(found)
+    assert write_table(tmp_path / "robustness.csv", found).read_text().count("\n") == 1 + len(found)

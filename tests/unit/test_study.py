@@ -14,9 +14,9 @@ from training.study.contacts import AreaChange, recorded_contacts
 from training.study.efficiency import PeakMemory, measure_training
 from training.study.graphs import compare_graphs
 from training.study.models import ordering, plan_run, table_row, train_all
-from training.study.report import write_table
 from twin.cli.progress import epoch_bar
 from twin.preprocess import make_graph
+from twin.views.table import write_table
 
 WATCHED_S = 0.1  # ten looks at the memory
 

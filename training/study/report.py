@@ -1,6 +1,5 @@
 """The study's tables, plots and page."""
 
-import csv
 from pathlib import Path
 
 from training.study.contacts import AreaChange, contacts_figure
@@ -9,20 +8,6 @@ from twin.views.page import render_page
 from twin.views.plots import new_figure
 
 DPI = 110
-
-
-def write_table(path: Path, rows: list[dict]) -> Path:
-    """Rows as CSV; a column of any row is a column of the table."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=columns, restval="")
-        writer.writeheader()
-        writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
-    return path
-
-
-def _cell(value) -> str:
-    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def draw_efficiency(path: Path, rows: list[dict]) -> Path:

@@ -37,8 +37,9 @@ def evaluate(
     from training.estimator import PoseEstimator
     from training.evaluate import judge, predict_rows_of, rows_to_judge, time_frames, write_evaluation
     from training.recipes import TrainingError
-    from training.robustness import judge_changes, write_changes
+    from training.robustness import judge_changes
     from twin.cli.progress import count_bar
+    from twin.views.table import write_table
 
     for value, allowed, option in ((rows, ("validation", "all"), "--rows"), (labels, ("corrected", "raw"), "--labels")):
         if value not in allowed:
@@ -69,6 +70,6 @@ def evaluate(
         for row in changes:
             said = (f"{name} {row[f'{name}_mae']:.4g} ({100 * row[f'{name}_more']:+.1f} %)" for name in estimator.names)
             print(f"{row['change']}: {', '.join(said)}; {row['not_valid']} frames not valid")
-        written.append(write_changes(out / "robustness.csv", changes))
+        written.append(write_table(out / "robustness.csv", changes))
     for path in written:
         print(f"wrote {path}")

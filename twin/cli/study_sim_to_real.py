@@ -68,10 +68,10 @@ def study_sim_to_real(
     from training.generation import GenerationConfig, generate
     from training.sim_to_real.discrepancy import Discrepancy, measure_residuals
     from training.sim_to_real.study import choose_frames, correct, judged, measured_of, quadratic_row, train_in_twin, train_on_real
-    from training.study.report import write_table
     from twin.cli.progress import count_bar, epoch_bar, rate_bar
     from twin.kinematics import rig_of
     from twin.views.page import render_page
+    from twin.views.table import write_table
 
     spec, plan = load_sensor(sensor), load_experiment(experiment)
     simulated_plan, touched = load_experiment(contacts or experiment), load_object(plan.object)

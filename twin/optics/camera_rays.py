@@ -3,6 +3,7 @@
 import numpy as np
 
 from scenes.sensor import CameraSpec
+from twin.optics.arrays import with_room
 from twin.optics.lens import ray_table
 from twin.optics.window import Window
 from twin.projection import sensor_to_camera
@@ -24,7 +25,7 @@ class CameraRays:
     def __init__(self, mi, dr, camera: CameraSpec, window: Window, window_px: tuple[int, int, int, int]):
         table = ray_table(camera, window_px)
         self._columns, self._rows = table.shape[1] - 1, table.shape[0] - 1
-        texels = mi.TensorXf(table.astype(np.float32))
+        texels = mi.TensorXf(with_room(table, np.float32))
         self._directions = mi.Texture2f(texels, filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp)
         self._to_sensor = mi.Matrix3f(sensor_to_camera(camera)[:3, :3].T)
         self._camera, self._window = camera, window

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import RenderError
+from twin.optics.arrays import with_room
 from twin.optics.render import BOUNCES, GelView, Renderer
 from twin.optics.tracer import spectrum
 from twin.optics.variant import use_variant
@@ -66,7 +67,7 @@ class LightModel:
         self._mi, self._dr, self._seed = use_variant(renderer.choice), dr, seed
         mi = self._mi
         self._view = GelView(mi, renderer.spec, renderer.window_px, renderer.surfaces(state), BOUNCES)
-        self._pixels = mi.UInt32(np.asarray(pixels, np.uint32))
+        self._pixels = mi.UInt32(with_room(pixels, np.uint32))
         emitters = self._view.tracer.emitters
         self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
         self._radiance = [mi.Spectrum(r) for r in emitters.radiance]

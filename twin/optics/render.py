@@ -8,6 +8,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
+from twin.optics.arrays import with_room
 from twin.optics.camera_rays import CameraRays
 from twin.optics.placement import SKIN_SAVING, near_pins
 from twin.optics.sampling import PixelSamples
@@ -165,8 +166,8 @@ class GelView:
         counts = np.where(pins, each, few)
         rows = np.repeat(np.arange(len(pixels), dtype=np.uint32), counts)
         index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        row, total = mi.UInt32(rows), 0.0
-        pixel, number = mi.UInt32(pixels.astype(np.uint32)[rows]), mi.UInt32(index.astype(np.uint32))
+        row, total = mi.UInt32(with_room(rows, np.uint32)), 0.0
+        pixel, number = mi.UInt32(with_room(pixels[rows], np.uint32)), mi.UInt32(with_room(index, np.uint32))
         for k in range(passes):
             light = self._light(pixel, number, each, (seed * 1009 + k) % 2**32)
             found = dr.zeros(mi.Spectrum, len(pixels))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from scenes.sensor import SensorSpec
+from twin.optics.arrays import with_room
 from twin.optics.surfaces import Surface
 from twin.optics.tracer import luminance
 
@@ -68,10 +69,10 @@ def mesh(mi, name: str, surface: Surface, bsdf, *, smooth: bool, emitter=None):
     made = mi.Mesh(name, len(surface.vertices_mm), len(surface.faces), props=props, has_vertex_normals=smooth)
     if surface.paint is not None:
         paint = luminance(surface.paint)[:, None] if mi.variant().endswith("mono") else surface.paint
-        made.add_attribute(PAINT["name"], paint.shape[1], np.ascontiguousarray(paint, np.float32).ravel())
+        made.add_attribute(PAINT["name"], paint.shape[1], with_room(paint.ravel(), np.float32))
     params = mi.traverse(made)
-    params["faces"] = np.ascontiguousarray(surface.faces, np.uint32).ravel()
-    params["vertex_positions"] = np.ascontiguousarray(surface.vertices_mm, np.float32).ravel()
+    params["faces"] = with_room(surface.faces.ravel(), np.uint32)
+    params["vertex_positions"] = with_room(surface.vertices_mm.ravel(), np.float32)
     params.update()
     made.set_id(name)
     return made
@@ -80,7 +81,7 @@ def mesh(mi, name: str, surface: Surface, bsdf, *, smooth: bool, emitter=None):
 def move_meshes(params, surfaces: dict[str, Surface]) -> None:
     """Move the vertices of a scene's meshes, given its traversed parameters and surfaces by the meshes' ids."""
     for name, surface in surfaces.items():
-        params[f"{name}.vertex_positions"] = np.ascontiguousarray(surface.vertices_mm, np.float32).ravel()
+        params[f"{name}.vertex_positions"] = with_room(surface.vertices_mm.ravel(), np.float32)
     params.update()
 
 

@@ -57,6 +57,8 @@ class ExperimentSpec(Section):
         The labels a model is to learn.
     seed : int
         Of the draws.
+    wider : str
+        Name of an experiment that goes a little beyond this one's ranges: what models for this one are trained on in the twin.
     """
 
     name: str
@@ -69,6 +71,7 @@ class ExperimentSpec(Section):
     tap: Six
     targets: Annotated[tuple[str, ...], Field(min_length=1)]
     seed: Annotated[int, Field(ge=0)] = 0
+    wider: str = ""
     pose: PoseRanges
     move: MoveRanges = MoveRanges()
 

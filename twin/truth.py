@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from scenes.sensor import SensorSpec
@@ -44,23 +45,37 @@ def occluded(spec: SensorSpec, state: ContactState) -> np.ndarray:
     Pins count as capsules of the cap's radius around the axis from foot to cap.
     """
     window_mm, _ = pixel_rays(spec, project(spec, state.caps_mm))
-    radius = spec.pins.cap_diameter_mm / 2
-    count = len(state.caps_mm)
-    hidden = np.zeros(count, bool)
-    for i in range(count):
-        gap = _segment_distance(window_mm[i], state.caps_mm[i], state.base_mm, state.caps_mm)
-        gap[i] = np.inf
-        hidden[i] = gap.min(initial=np.inf) < radius
+    return _meets_another(window_mm, state.base_mm, state.caps_mm, spec.pins.cap_diameter_mm / 2)
+
+
+@numba.njit(cache=True)
+def _meets_another(eyes: np.ndarray, base: np.ndarray, caps: np.ndarray, radius: float) -> np.ndarray:
+    """(N,) bool: the segment from ``eyes`` to ``caps``, (N, 3) each, comes nearer than ``radius`` to another pin's axis."""
+    hidden = np.zeros(len(caps), np.bool_)
+    for i in range(len(caps)):
+        for j in range(len(caps)):
+            if j != i and segment_distance(eyes[i], caps[i], base[j], caps[j]) < radius:
+                hidden[i] = True
+                break
     return hidden
 
 
-def _segment_distance(p0: np.ndarray, p1: np.ndarray, q0: np.ndarray, q1: np.ndarray) -> np.ndarray:
-    """Distance of the segment p0-p1 (3,) to each of the segments q0-q1 (n, 3) (Ericson 2004, 5.1.9)."""
-    d1, d2, r = p1 - p0, q1 - q0, p0 - q0
-    a, e, f = d1 @ d1, np.einsum("ij,ij->i", d2, d2), np.einsum("ij,ij->i", d2, r)
-    b, c = d2 @ d1, r @ d1
+@numba.njit(cache=True)
+def segment_distance(p0: np.ndarray, p1: np.ndarray, q0: np.ndarray, q1: np.ndarray) -> float:
+    """Distance of the segment p0-p1 to the segment q0-q1, (3,) each (Ericson 2004, 5.1.9)."""
+    a = b = c = e = f = 0.0
+    for k in range(3):
+        d1, d2, r = p1[k] - p0[k], q1[k] - q0[k], p0[k] - q0[k]
+        a += d1 * d1
+        b += d1 * d2
+        c += d1 * r
+        e += d2 * d2
+        f += d2 * r
     denominator = a * e - b * b
-    s = np.clip(np.divide(b * f - c * e, denominator, out=np.zeros_like(f), where=denominator > 1e-12), 0, 1)
-    t = np.clip((b * s + f) / e, 0, 1)
-    s = np.clip((t * b - c) / a, 0, 1)
-    return np.linalg.norm(p0 + s[:, None] * d1 - (q0 + t[:, None] * d2), axis=1)
+    s = (b * f - c * e) / denominator if denominator > 1e-12 else 0.0
+    t = min(max((b * min(max(s, 0.0), 1.0) + f) / e, 0.0), 1.0)
+    s = min(max((t * b - c) / a, 0.0), 1.0)
+    square = 0.0
+    for k in range(3):
+        square += (p0[k] - q0[k] + s * (p1[k] - p0[k]) - t * (q1[k] - q0[k])) ** 2
+    return np.sqrt(square)

@@ -4,7 +4,7 @@ import numpy as np
 
 from scenes import load_sensor
 from twin.geometry.pins import rest_pins
-from twin.truth import _segment_distance, cap_truth, occluded
+from twin.truth import cap_truth, occluded, segment_distance
 from twin.types import ContactState, Form
 
 
@@ -25,7 +25,7 @@ def test_segment_distance_matches_a_fine_sampling():
         first = p0 + share[:, None] * (p1 - p0)
         second = q0 + share[:, None] * (q1 - q0)
         sampled = np.linalg.norm(first[:, None] - second[None], axis=2).min()
-        assert abs(_segment_distance(p0, p1, q0[None], q1[None])[0] - sampled) < 2e-2
+        assert abs(segment_distance(p0, p1, q0, q1) - sampled) < 2e-2
 
 
 def test_every_cap_is_in_sight_at_rest(sensor):

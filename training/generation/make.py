@@ -11,6 +11,7 @@ from twin.errors import ContactError, MeshError
 from twin.geometry.solid import Resolution
 from twin.kinematics import ArmLabel, arm_path, rig_of
 from twin.mechanics.solver import SkinSolver
+from twin.optics.variant import one_thread
 from twin.preprocess.forms import gray_levels
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
@@ -47,7 +48,7 @@ class Outcome:
 
 
 def make_contact(text: str, index: int) -> Outcome:
-    """Simulate contact ``index`` of the configuration given as JSON.
+    """Simulate contact ``index`` of the configuration given as JSON, on one thread.
 
     Raises
     ------
@@ -112,7 +113,8 @@ def _row(config: GenerationConfig, draw: Draw, simulator: Simulator, state: Cont
 
 
 def _png(config: GenerationConfig, simulator: Simulator, state: ContactState, seed: int) -> bytes:
-    shot = simulator.shoot(state, form=config.form, seed=seed)
+    with one_thread(simulator.renderer.choice):
+        shot = simulator.shoot(state, form=config.form, seed=seed)
     image = shot.frame.image if config.images != "gray" else gray_levels(shot.frame.image)
     return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
 

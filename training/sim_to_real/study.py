@@ -19,6 +19,7 @@ from training.run_files import write_tensors, write_text
 from training.validation.model import MeasuredFrames
 from twin.recordings import open_recording
 
+TWIN_EPOCHS = 60  # on thousands of simulated states: more change nothing
 MANY = 500  # labelled frames: a morning's work with the rig
 MODES, RIDGES = 20, 10.0 ** np.arange(-4, 3.1, 0.5)  # of the quadratic regression
 
@@ -71,7 +72,9 @@ def train_in_twin(
     sim: Dataset, out: Path, *, seed: int, epochs: int | None, labelled: tuple = (), progress: Callable | None = None
 ) -> None:
     """A run on simulated contacts, or what is left of it to do; ``labelled`` names the real frames that told what they miss."""
-    config = RunConfig("vgnn", recipe_of("vgnn", members=1, epochs=epochs, kernel=False), seed=seed, split=seed, labelled=labelled)
+    config = RunConfig(
+        "vgnn", recipe_of("vgnn", members=1, epochs=epochs or TWIN_EPOCHS, kernel=False), seed=seed, split=seed, labelled=labelled
+    )
     if not is_finished(config, sim, out):
         train_run(config, sim, out, progress=progress)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Across, FormOrAuto, Sensor
+from twin.cli.options import CORES, Across, FormOrAuto, Sensor, Workers
 from twin.types import FINE
 
 calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
@@ -102,7 +102,7 @@ def contact(
         str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
     ] = None,
     hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="leave this parameter as it is; may be repeated")] = None,
-    workers: Annotated[int, typer.Option("--workers", min=1, metavar="N", help="processes on this machine")] = 1,
+    workers: Workers = CORES,
     across: Across = FINE,
     form: FormOrAuto = None,
 ) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Across, Out, Sensor
+from twin.cli.options import CORES, Across, Out, Sensor, Workers
 from twin.cli.render import Quality
 from twin.types import FINE
 
@@ -80,9 +80,11 @@ def dataset(
         str | None, typer.Option("--randomise", metavar="R", help="randomisation name or file; nothing if not given")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="of all that is drawn; the experiment's own if not given")] = None,
-    workers: Annotated[int, typer.Option("--workers", min=1, metavar="N", help="processes on this machine")] = 1,
+    workers: Workers = CORES,
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="of a running Dask scheduler, whose workers do it")] = "",
-    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = Quality.STANDARD,
+    quality: Annotated[
+        Quality | None, typer.Option(help="samples per pixel", show_default="preview for --images recording, else standard")
+    ] = None,
     across: Across = FINE,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
@@ -102,7 +104,7 @@ def dataset(
         seed=plan.seed if seed is None else seed,
         images=images.value,
         states=states.value,
-        quality=quality.value,
+        quality=(quality or (Quality.PREVIEW if images is Images.RECORDING else Quality.STANDARD)).value,
         across=across,
     )
     frame_size(spec, config.form)  # before anything is made: has the sensor this form?

@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -8,12 +9,21 @@ import typer
 from twin.errors import TwinError
 from twin.types import Form
 
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+CORES = usable_cores()
+
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
 Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
 FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; told by size and content if not given")]
 Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
 Target = Annotated[str, typer.Option("--target", help="preset, or label columns with commas between")]
+Workers = Annotated[int, typer.Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
 
 

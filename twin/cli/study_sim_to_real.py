@@ -5,14 +5,14 @@ from typing import Annotated
 
 import typer
 
-from twin.cli.options import Across, Out, Sensor, writable_folder
+from twin.cli.options import CORES, Across, Out, Sensor, Workers, writable_folder
 from twin.cli.study import study
 from twin.types import FINE
 
 HELP = """Train in the twin, test on real frames, against training on real frames.
 
 \b
-  twin study sim-to-real --sensor mg400-331 --frames DIR --contacts surface-2d-wide --labels 40 --seed 0 --out out/sim-to-real
+  twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 --seed 0 --out out/sim-to-real
 
 The recording's --experiment says how the arm went and what is learnt; --contacts is the experiment that is simulated.
 
@@ -46,15 +46,16 @@ def study_sim_to_real(
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the frames drawn, the contacts and the weights")] = 0,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how the frames were recorded")] = "surface-2d",
     contacts: Annotated[
-        str | None, typer.Option("--contacts", metavar="E", help="experiment to simulate; that of the frames if not given")
+        str | None,
+        typer.Option("--contacts", metavar="E", help="experiment to simulate; if not given, one wider than the frames' own"),
     ] = None,
-    draws: Annotated[int, typer.Option("--draws", min=1, help="of what the twin misses, for each contact")] = 4,
+    draws: Annotated[int, typer.Option("--draws", min=1, help="of what the twin misses, for each contact")] = 2,
     count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts to simulate")] = 500,
     sim: Annotated[Path | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead")] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
     ablate: Annotated[bool, typer.Option("--ablate", help="also train without what was learnt of the twin's errors")] = False,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="of every training, instead of the model's own number")] = None,
-    workers: Annotated[int, typer.Option("--workers", min=1, metavar="N", help="processes that simulate")] = 1,
+    workers: Workers = CORES,
     across: Across = FINE,
 ) -> None:
     from functools import partial
@@ -74,7 +75,7 @@ def study_sim_to_real(
     from twin.views.table import write_table
 
     spec, plan = load_sensor(sensor), load_experiment(experiment)
-    simulated_plan, touched = load_experiment(contacts or experiment), load_object(plan.object)
+    simulated_plan, touched = load_experiment(contacts or plan.wider or experiment), load_object(plan.object)
     with count_bar("frames") as progress:
         real = load_dataset(frames, spec, plan.targets, progress=progress)
     chosen = choose_frames(len(real), labels, seed)

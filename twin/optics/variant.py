@@ -11,7 +11,8 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -138,6 +139,20 @@ def use_variant(choice: VariantChoice):
     if mi.variant() != choice.variant:
         mi.set_variant(choice.variant)
     return mi
+
+
+@contextmanager
+def one_thread(choice: VariantChoice) -> Iterator[None]:
+    """``choice`` renders on one thread: for processes that share a machine, where more threads only wait for each other."""
+    use_variant(choice)
+    import drjit as dr
+
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
 
 
 def available_variants() -> tuple[str, ...]:

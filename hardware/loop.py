@@ -13,7 +13,6 @@ from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError, StaleDataError
 from hardware.let_go import try_each
-from hardware.mounting import Mounting
 from hardware.rig_geometry import matrix_of, moved
 from hardware.safe_arm import RefusedMoveError
 from hardware.safety import Code
@@ -21,6 +20,7 @@ from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
 from hardware.timing import Spread, Timing
 from scenes.servo import ServoSpec
+from twin.mounting import Mounting
 from twin.types import Frame
 
 MOST_PIECES, NEAR_MM = 200, 0.5

@@ -1,14 +1,14 @@
 """Where tool, sensor and object are: poses of the arm as matrices, and what a sensor at a pose truly touches."""
 
-from dataclasses import dataclass
+from dataclasses import fields
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hardware.mounting import Mounting
 from scenes.object import ObjectSpec
 from scenes.servo import PlacementSpec
-from twin.stimulus import build_stimulus
+from twin.mounting import Mounting
+from twin.touch import Surface, Touch
 
 OUTLINE_STEP_MM = 0.5
 LONGEST_OUTLINE_MM = 2000.0
@@ -58,28 +58,6 @@ def object_in_base(placement: PlacementSpec) -> np.ndarray:
     return T
 
 
-@dataclass(frozen=True)
-class Touch:
-    """What a sensor at a pose truly touches, rigid bodies assumed.
-
-    Attributes
-    ----------
-    depth_mm : float
-        Of the tool, along the surface's normal, from where an unturned sensor first touches (what the depth's label less its zero means).
-    angle_deg : float
-        Of the tool from the surface's normal.
-    indent_mm : float
-        Of the dome.
-    point_mm : (3,) float
-        Place of the surface nearest to the dome's centre, in the base frame.
-    """
-
-    depth_mm: float
-    angle_deg: float
-    indent_mm: float
-    point_mm: np.ndarray
-
-
 class PlacedObject:
     """An object in front of a mounted sensor.
 
@@ -94,9 +72,7 @@ class PlacedObject:
         self.spec, self.mounting = spec, mounting
         self.T_base_object = object_in_base(placement)
         self._T_tool_sensor = sensor_in_tool(mounting)
-        # the outline without its texture, as far out as that lies
-        self._field = build_stimulus(spec.model_copy(update={"texture": None}))
-        self._raised_mm = spec.texture.wire_diameter_mm if spec.texture else 0.0
+        self._surface = Surface(spec)
 
     def seen_from(self, pose: np.ndarray) -> np.ndarray:
         """``T_sensor_object`` (4, 4) with the arm at a pose (6,)."""
@@ -107,40 +83,31 @@ class PlacedObject:
         x, y, z = self.mounting.across, self.mounting.axis, self.mounting.out_of_plane
         T = np.eye(4)  # the tool's across, axis and plane's normal lie along the object's x, z and -y
         T[:3, :3] = self.T_base_object[:3, [0, 2, 1]] * [1, 1, -1] @ np.stack([x, y, z])
-        out_mm = self.mounting.radius_mm + self._raised_mm - indent_mm
+        out_mm = self.mounting.radius_mm + self._surface.raised_mm - indent_mm
         centre = self.T_base_object[:3, 3] - out_mm * self.T_base_object[:3, 2]
         T[:3, 3] = centre - T[:3, :3] @ self.mounting.centre_mm
         return pose_of(T, np.zeros(6))
 
     def touch(self, pose: np.ndarray) -> Touch:
-        """What the sensor truly touches with the arm at a pose (6,)."""
-        T = matrix_of(pose)
-        centre = T[:3, :3] @ self.mounting.centre_mm + T[:3, 3]
-        turn = self.T_base_object[:3, :3]
-        distance, gradient, _ = self._field.probe(((centre - self.T_base_object[:3, 3]) @ turn)[None])
-        gap, outward = float(distance[0]) - self._raised_mm, turn @ gradient[0]
-        axis, across = T[:3, :3] @ self.mounting.axis, T[:3, :3] @ self.mounting.across
-        inward = -outward
-        angle = np.degrees(np.arctan2(inward @ across, inward @ axis))
-        tool_gap = gap + float(outward @ (T[:3, 3] - centre))
-        depth = self.mounting.apex_mm @ self.mounting.axis - tool_gap
-        return Touch(depth, float(angle), self.mounting.radius_mm - gap, centre - gap * outward)
+        """What the sensor truly touches with the arm at a pose (6,): a ``Touch`` of one row, without that axis."""
+        found = self._surface.touched(self.mounting, self.seen_from(pose)[None])
+        return Touch(*(getattr(found, field.name)[0] for field in fields(Touch)))
 
     def distance_mm(self, place_mm: np.ndarray) -> float:
         """Of a place (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""
         local = (place_mm - self.T_base_object[:3, 3]) @ self.T_base_object[:3, :3] * [1, 0, 1]
-        return float(self._field.distance(local[None])[0]) - self._raised_mm
+        return float(self._surface.field.distance(local[None])[0]) - self._surface.raised_mm
 
     def outline(self) -> np.ndarray:
         """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x."""
         at, points = np.zeros(3), [np.zeros(2)]
         while len(points) * OUTLINE_STEP_MM < LONGEST_OUTLINE_MM:
-            _, gradient, _ = self._field.probe(at[None])
+            _, gradient, _ = self._surface.field.probe(at[None])
             outward = gradient[0] * [1, 0, 1]
             outward /= np.linalg.norm(outward)
             at = at + OUTLINE_STEP_MM * np.array([-outward[2], 0.0, outward[0]])
             for _ in range(4):
-                distance, gradient, _ = self._field.probe(at[None])
+                distance, gradient, _ = self._surface.field.probe(at[None])
                 at = at - distance[0] * gradient[0] * [1, 0, 1]
             points.append(at[[0, 2]])
             if len(points) > 10 and np.linalg.norm(points[-1]) < 0.75 * OUTLINE_STEP_MM:

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hardware.mounting import Mounting
 from hardware.rig_geometry import matrix_of, pose_of
 from scenes.servo import ServoSpec
+from twin.mounting import Mounting
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject, matrix_of
 from hardware.servo import Reading, tangent_of
 from hardware.step import StepRecord
+from twin.mounting import Mounting
 
 LOCAL_N = 9  # points in a window of the local smoothness
 SETTLING_N = 5  # steps after the start that the errors leave out
@@ -102,7 +102,7 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
         return Trajectory(poses[:, :2], felt[:, :2], depth, angle, none, none, none, none, none)
     touches = [placed.touch(pose) for pose in poses]
     outline = placed.outline()
-    local = (np.array([touch.point_mm for touch in touches]).reshape(-1, 3) - placed.T_base_object[:3, 3]) @ placed.T_base_object[:3, :3]
+    places = np.array([touch.place_mm for touch in touches]).reshape(-1, 3)
     return Trajectory(
         poses[:, :2],
         felt[:, :2],
@@ -112,7 +112,7 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
         np.array([touch.angle_deg for touch in touches]),
         np.array([touch.indent_mm for touch in touches]),
         np.array([abs(placed.distance_mm(place)) for place in felt]),
-        way_along(outline, local[:, [0, 2]]),
+        way_along(outline, places[:, [0, 2]]),
     )
 
 

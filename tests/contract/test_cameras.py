@@ -19,11 +19,11 @@ from hardware.cameras.uvc import UvcSettings, apply_settings, exposed_s
 from hardware.devices import cameras
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
-from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionWriter
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from twin.cli import check
+from twin.mounting import Mounting
 from twin.recordings.images import write_image
 from twin.types import Form, Frame
 

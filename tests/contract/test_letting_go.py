@@ -17,7 +17,6 @@ from hardware.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.loop import ServoLoop
-from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SafetyLimits
@@ -25,6 +24,7 @@ from hardware.step import LoopSettings
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.cli.endings import signals_as_ctrl_c
 from twin.cli.rig import Rig, servo_loop
+from twin.mounting import Mounting
 from twin.types import Form
 
 AWAY = np.array([300.0, 60, -10, 0, 0, 30])

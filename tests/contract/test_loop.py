@@ -13,12 +13,12 @@ from hardware.cameras.mjpeg import MjpegCamera
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.loop import Decided, ServoLoop
-from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource, SessionWriter, read_steps
 from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of, write_csv
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
+from twin.mounting import Mounting
 
 SPEED = 20.0  # of the simulated arm, times real
 CLEAR_INDENT_MM = -10.0  # a sensor that has let go is farther than this from the surface

@@ -24,7 +24,6 @@ from hardware.cameras.twin import preview_of
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.live import LiveSession, Shower
-from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource
 from hardware.view.draw import draw_view, voronoi_map
@@ -36,6 +35,7 @@ from twin.cli import app, servo_run
 from twin.cli.emulate import run_until_told
 from twin.cli.rig import build_rig, steps_round
 from twin.errors import TwinError
+from twin.mounting import Mounting
 from twin.preprocess import Pipeline
 from twin.recordings import open_recording
 from twin.recordings.images import write_image

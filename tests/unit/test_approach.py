@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from hardware.approach import way_around
-from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject, matrix_of, moved
 from scenes import load_experiment, load_object, load_sensor, load_servo
+from twin.mounting import Mounting
 
 SAMPLES = 200  # along each straight piece
 

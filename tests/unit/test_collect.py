@@ -11,9 +11,9 @@ from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.cameras.reader import LiveSource, Picture
 from hardware.collect import COLUMNS, Collection, WorkFrame, collect, draw_contact
 from hardware.errors import DeviceError
-from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject, matrix_of
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
+from twin.mounting import Mounting
 from twin.recordings import open_recording, read_image
 from twin.types import Form
 

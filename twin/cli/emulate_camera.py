@@ -32,10 +32,10 @@ def camera(
 ) -> None:
     from hardware.emulators.arm_pose import FeedbackPose
     from hardware.emulators.camera import FAULTS, CameraEmulator
-    from hardware.mounting import Mounting
     from hardware.rig_geometry import PlacedObject
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from twin.cli.rig import twin_camera
+    from twin.mounting import Mounting
     from twin.types import Form
 
     list_faults(fault, FAULTS)

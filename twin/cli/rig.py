@@ -13,7 +13,6 @@ from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
 from hardware.errors import DeviceError
 from hardware.loop import ServoLoop
-from hardware.mounting import Mounting
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SHIPPED_LIMITS, load_limits
@@ -22,6 +21,7 @@ from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
 from twin.cache import cached_arrays
 from twin.errors import RenderError
+from twin.mounting import Mounting
 from twin.optics.preview import Preview, Shading
 from twin.optics.render import Renderer
 from twin.types import Form, Frame

@@ -1,0 +1,93 @@
+"""What a rigid sensor would touch: depth and angle against the surface, the same for objects of any shape.
+
+The place of the surface that is nearest to the dome's centre, and its normal there, stand for a flat plate that would be
+touched alike. With g the distance of the dome's centre from the surface, w the angle of the tool's axis from the normal, and
+``tcp``, ``lateral`` the dome's centre from the tool point along the axis and across it,
+
+    indentation = radius - g,   depth of the tool = radius + tcp - (g + tcp cos w + lateral sin w)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
+from twin.mounting import Mounting
+from twin.stimulus import build_stimulus
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What a sensor truly touches in M poses of the object, rigid bodies assumed.
+
+    Attributes
+    ----------
+    depth_mm : (M,) float
+        Of the tool, along the surface's normal, from where an unturned sensor first touches (what the depth's label less its zero means).
+    angle_deg : (M,) float
+        Of the tool from the surface's normal, in the plane of the mounting's ``axis`` and ``across``.
+    indent_mm : (M,) float
+        Of the dome.
+    place_mm : (M, 3) float
+        Place of the surface nearest to the dome's centre, in the object frame.
+    """
+
+    depth_mm: np.ndarray
+    angle_deg: np.ndarray
+    indent_mm: np.ndarray
+    place_mm: np.ndarray
+
+
+class Surface:
+    """An object's surface without its texture, as far out as that lies.
+
+    Parameters
+    ----------
+    spec : ObjectSpec
+
+    Attributes
+    ----------
+    field : Stimulus
+        The object without its texture.
+    raised_mm : float
+        How far out the texture lies.
+    """
+
+    def __init__(self, spec: ObjectSpec) -> None:
+        self.field = build_stimulus(spec.model_copy(update={"texture": None}))
+        self.raised_mm = spec.texture.wire_diameter_mm if spec.texture else 0.0
+
+    def touched(self, mounting: Mounting, T_sensor_object: np.ndarray) -> Touch:
+        """What a mounted sensor touches with the object in poses (M, 4, 4)."""
+        turn, shift = T_sensor_object[:, :3, :3], T_sensor_object[:, :3, 3]
+        centre_mm = -np.einsum("mji,mj->mi", turn, shift)
+        distance_mm, outward, _ = self.field.probe(centre_mm)
+        gap_mm = distance_mm - self.raised_mm
+        inward = -np.einsum("mij,mj->mi", turn, outward)  # in the sensor frame
+        azimuth = np.radians(mounting.image_turn_deg)
+        across, axial = inward[:, :2] @ [np.cos(azimuth), np.sin(azimuth)], inward[:, 2]
+        along_mm, lateral_mm = mounting.centre_mm @ mounting.axis, mounting.centre_mm @ mounting.across
+        return Touch(
+            mounting.radius_mm + along_mm - (gap_mm + along_mm * axial + lateral_mm * across),
+            np.degrees(np.arctan2(across, axial)),
+            mounting.radius_mm - gap_mm,
+            centre_mm - gap_mm[:, None] * outward,
+        )
+
+
+def surface_labels(experiment: ExperimentSpec, mounting: Mounting, surface: Surface, T_sensor_object: np.ndarray) -> dict[str, np.ndarray]:
+    """The labels that tell depth and angle, as an arm would have them that touches a flat plate alike.
+
+    Returns
+    -------
+    dict of str to (M,) float
+        By the table's columns; mm and deg. Empty if the experiment turns the tool about other axes too, where one angle doesn't tell.
+    """
+    ranges = experiment.ranges()
+    turned = {name for name in ("pose_4", "pose_5", "pose_6", "move_4", "move_5", "move_6") if ranges[name] != (0.0, 0.0)}
+    if not turned <= {mounting.angle_label, mounting.angle_label.replace("pose", "move")}:
+        return {}
+    touch = surface.touched(mounting, T_sensor_object)
+    depth, angle = mounting.labels(touch.depth_mm, touch.angle_deg)
+    return {mounting.depth_label: depth, mounting.angle_label: angle}

@@ -9,8 +9,9 @@ import numpy as np
 
 import twin.preprocess
 from scenes.sensor import SensorSpec
+from training.generation.truth_file import TRUTH
 from training.recorded_contact import read_arm_labels
-from training.simulated import is_pins_only, open_simulated
+from training.simulated import is_pins_only, open_simulated, touched_labels
 from training.targets import DEPTH_PER_MOVE, Targets, choose_targets
 from twin.cache import cached_arrays
 from twin.errors import FrameError
@@ -83,7 +84,8 @@ class Dataset:
         M valid frames with complete labels.
     targets : Targets
         M rows of labels, raw and corrected.
-    folder : Path
+    folders : tuple of Path
+        Where it was read from.
     group : (M,) array or None
         Rows of one value belong together (the states of one simulated contact): they are never split.
     problems : list of str
@@ -92,12 +94,25 @@ class Dataset:
 
     pins: PinTable
     targets: Targets
-    folder: Path
+    folders: tuple
     group: np.ndarray | None = None
     problems: list = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.pins)
+
+    @property
+    def folder(self) -> Path:
+        """Where it was read from, for those who look at its pictures.
+
+        Raises
+        ------
+        FrameError
+            It was put together from several.
+        """
+        if len(self.folders) > 1:
+            raise FrameError(f"pictures are read from one recording at a time, these are {len(self.folders)}; give one --data")
+        return self.folders[0]
 
     def rows(self, index: np.ndarray) -> "Dataset":
         """The same data set with only some rows."""
@@ -139,6 +154,10 @@ def load_dataset(
     ------
     FrameError
         If there is no table, a chosen column is missing, or no row is usable.
+
+    Notes
+    -----
+    Corrected labels of a simulated data set tell depth and angle of the surface that was touched: see ``touched_labels``.
     """
     problems: list[str] = []
     if is_pins_only(Path(folder)):
@@ -152,6 +171,8 @@ def load_dataset(
     row_of = {name: k for k, name in enumerate(recording.names)}
     rows = np.array([row_of[name] for name in pins.image_name], int)
     targets = choose_targets(recording, columns, rows, depth_per_move, problems)
+    if (Path(folder) / TRUTH).is_dir():
+        targets = targets.instead(touched_labels(Path(folder), pins.image_name))
     unseen = ~pins.valid
     if unseen.any():
         problems.append(f"{_named(pins.image_name[unseen])}: pins not found; left out of training")
@@ -162,7 +183,46 @@ def load_dataset(
     if not len(good):
         raise FrameError(f"{folder}: no frame has both pins and labels; {'; '.join(problems[:3])}")
     group = recording.labels[GROUP_COLUMN][rows][good] if GROUP_COLUMN in recording.labels else None
-    return Dataset(pins.rows(good), targets.rows(good), Path(folder), group, list(recording.problems) + problems)
+    return Dataset(pins.rows(good), targets.rows(good), (Path(folder),), group, list(recording.problems) + problems)
+
+
+def joined(parts: list[Dataset]) -> Dataset:
+    """Data sets of one sensor as one; what belongs together in one of them does so still, and nothing else does.
+
+    They are put in the order of their folders' names, so that the order in which they are given does not matter. Pins are
+    counted from the first one's no-contact layout.
+
+    Raises
+    ------
+    FrameError
+        They are of different sensors, forms or labels, or one is given twice.
+    """
+    parts = sorted(parts, key=lambda part: part.folder.resolve().as_posix())
+    first = parts[0]
+    for before, part in zip(parts, parts[1:], strict=False):
+        if part.folder.resolve() == before.folder.resolve():
+            raise FrameError(f"{part.folder}: given twice; give every recording once")
+        for what, mine, others in (
+            ("sensor", part.pins.sensor.name, first.pins.sensor.name),
+            ("form", part.pins.form, first.pins.form),
+            ("labels", part.targets.names, first.targets.names),
+        ):
+            if mine != others:
+                raise FrameError(f"{part.folder}: its {what} ({mine}) differs from that of {first.folder} ({others}); train on one kind")
+    tables = [part.pins.seen_from(first.pins.reference) for part in parts]
+    columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in PIN_COLUMNS}
+    columns["image_name"] = np.concatenate([np.char.add(f"{part.folder.name}/", part.pins.image_name) for part in parts])
+    pins = replace(first.pins, **columns, measured=all(table.measured for table in tables))
+    targets = replace(
+        first.targets, **{key: np.concatenate([getattr(part.targets, key) for part in parts]) for key in first.targets.by_frame}
+    )
+    groups, taken = [], 0
+    for part in parts:
+        own = np.arange(len(part)) if part.group is None else np.unique(part.group, return_inverse=True)[1]
+        groups.append(taken + own)
+        taken += own.max() + 1
+    problems = [f"{part.folder.name}: {problem}" for part in parts for problem in part.problems]
+    return Dataset(pins, targets, tuple(part.folder for part in parts), np.concatenate(groups), problems)
 
 
 def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

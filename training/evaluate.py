@@ -114,8 +114,8 @@ def _bins(error: np.ndarray, targets) -> dict:
 
 
 def time_frames(estimator: PoseEstimator, data: Dataset) -> float | None:
-    """Median ms from frame to pose, one frame at a time on one thread; None where there are no pictures."""
-    if is_pins_only(data.folder):
+    """Median ms from frame to pose, one frame at a time on one thread; None where there are no pictures, or of several recordings."""
+    if len(data.folders) > 1 or is_pins_only(data.folder):
         return None
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
     threads = torch.get_num_threads()

@@ -156,7 +156,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
         "rows": {"usable": len(data), "train": len(train)},
         "sensor": pins.sensor.model_dump(mode="json"),
         "pipeline": {"form": str(pins.form), "graph": "voronoi", "detection": blob_spec(pins.sensor, pins.form).model_dump(mode="json")},
-        "data": str(data.folder),
+        "data": ", ".join(map(str, data.folders)),
         "problems": data.problems,
     } | ({"labelled": list(config.labelled)} if config.labelled else {})
 

@@ -1,17 +1,23 @@
-"""Simulated data sets without pictures, read like recordings: their pins come from the ground truth."""
+"""Simulated data sets: read like recordings where they have no pictures, and what is known of their contacts beyond the table."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
 import zarr
 
 from scenes.sensor import SensorSpec
+from training.generation.config import GenerationConfig
+from training.generation.store import CONFIG, DRAWS
 from training.generation.truth_file import TRUTH
 from twin.errors import FrameError
+from twin.kinematics import rig_of
+from twin.mounting import Mounting
 from twin.preprocess.forms import frame_size
 from twin.recordings import Recording
 from twin.recordings.folders import image_folders
 from twin.recordings.tables import order_by_table, read_table
+from twin.touch import Surface, surface_labels
 from twin.types import Form
 
 TABLE = "targets.csv"
@@ -44,3 +50,45 @@ def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str,
         raise FrameError(f"{folder}: {len(names)} rows in the table, pins {arrays['pins_px'].shape} in {TRUTH}; make the data set again")
     form = Form(truth.attrs["form"])
     return Recording(folder, form, names, frame_size(spec, form), labels, problems=problems), arrays
+
+
+def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
+    """Depth and angle of the surface that was touched, whatever its shape, as labels: see ``twin.touch.surface_labels``.
+
+    Where the object stood is taken from the ground truth, with the rig's numbers that were drawn for each contact, so that the
+    flat plate's are the table's own, with moves that were not executed taken out.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a simulated data set, with or without pictures.
+    names : (M,) str
+        Frames of it.
+
+    Returns
+    -------
+    dict of str to (M,) float
+        mm and deg by the table's columns; empty where depth and one angle do not tell how a surface is touched.
+    """
+    config = GenerationConfig.model_validate_json((folder / CONFIG).read_text())
+    truth = zarr.open_group(folder / TRUTH, mode="r")
+    with (folder / TABLE).open(newline="") as file:
+        row_of = {row["image_name"]: k for k, row in enumerate(csv.DictReader(file))}
+    with (folder / DRAWS).open(newline="") as file:
+        draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
+    rows = [row_of[name] for name in names.tolist()]
+    T_sensor_object, contact = truth["T_sensor_object"][:][rows], truth["path_id"][:][rows]
+    surface = Surface(config.object)
+    found: dict[str, np.ndarray] = {}
+    for path_id in np.unique(contact):
+        mine = contact == path_id
+        mounting = Mounting.of(_rigged(config.sensor, draws[int(path_id)]), config.experiment)
+        for label, values in surface_labels(config.experiment, mounting, surface, T_sensor_object[mine]).items():
+            found.setdefault(label, np.full(len(rows), np.nan))[mine] = values
+    return found
+
+
+def _rigged(sensor: SensorSpec, drawn: dict[str, str]) -> SensorSpec:
+    """The sensor with the rig that was drawn for a contact."""
+    rig = {key.removeprefix("rig."): float(value) for key, value in drawn.items() if key.startswith("rig.")}
+    return sensor.model_copy(update={"rig": rig_of(sensor).model_copy(update=rig)})

@@ -38,7 +38,8 @@ class Targets:
     raw : (M, K) float
         As in the table: mm and deg; NaN where a cell holds no number.
     corrected : (M, K) float
-        The same with moves that were not executed taken out; equal to ``raw`` where nothing is known.
+        The same with moves that were not executed taken out; equal to ``raw`` where nothing is known. Of simulated contacts
+        depth and angle of the surface that was touched, whatever its shape.
     executed : (M,) float
         Whether each move had been executed: 1, 0, or NaN where that isn't known.
     move : (M, 2) float
@@ -53,7 +54,17 @@ class Targets:
 
     def rows(self, index: np.ndarray) -> "Targets":
         """The same labels of only some frames."""
-        return replace(self, **{key: getattr(self, key)[index] for key in ("raw", "corrected", "executed", "move")})
+        return replace(self, **{key: getattr(self, key)[index] for key in self.by_frame})
+
+    @property
+    def by_frame(self) -> tuple:
+        """Names of the attributes that hold a row for each frame."""
+        return ("raw", "corrected", "executed", "move")
+
+    def instead(self, known: dict) -> "Targets":
+        """The same with other corrected labels: those (M,) of ``known`` whose columns these are."""
+        columns = [known.get(name, self.corrected[:, k]) for k, name in enumerate(self.names)]
+        return replace(self, corrected=np.column_stack(columns))
 
     @property
     def units(self) -> tuple:

@@ -16,7 +16,7 @@ from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
 from training.recorded_contact import read_arm_labels
 from training.run import fold_rows
-from training.targets import read_executed
+from training.targets import corrected, read_executed
 from twin.errors import ContactError, RenderError
 from twin.geometry.solid import Resolution
 from twin.kinematics import arm_path, rig_of
@@ -125,6 +125,9 @@ def test_pins_alone_are_read_like_frames_and_split_by_contact(made):
     assert np.abs(moved - (truth["pins_px"][:] - truth["rest_px"][:])).max() < SAME_PX, "displacements, from each sensor's own rest"
     assert np.allclose(data.pins.reference.pins_px, nominal_reference(config.sensor, Form.RECORDING).pins_px)
     assert np.isfinite(data.pins.area_px2).all() and np.array_equal(data.pins.lost, ~truth["visible"][:])
+    slope = np.tan(np.radians(rig_of(config.sensor).plate_tilt_deg))
+    flat = corrected(data.targets.names, data.targets.raw, data.targets.executed, data.targets.move, slope, truth["pose"][:, 0])
+    assert np.abs(data.targets.corrected - flat).max() < ARC_MM, "on a plate the surface that was touched has the arm's labels"
     undone = data.targets.executed == 0
     assert undone.any() and np.allclose(data.targets.corrected[undone, 2:], 0)
     train, held = split_rows(len(data), 0, data.group)

@@ -50,7 +50,7 @@ def data(tmp_path_factory):
     names = np.array([f"f_{k}.png" for k in range(FRAMES)])
     pins = PinTable(spec, Form.RECORDING, reference, names, nodes, area, np.zeros((FRAMES, 127), bool), np.ones(FRAMES, bool))
     targets = Targets(("pose_2", "pose_6"), raw[:, :2], true[:, :2], executed, raw[:, 2:])
-    return Dataset(pins, targets, tmp_path_factory.mktemp("drawn"))
+    return Dataset(pins, targets, (tmp_path_factory.mktemp("drawn"),))
 
 
 def config_of(model, **recipe):
@@ -141,7 +141,7 @@ def test_a_frame_without_pins_is_not_valid_and_says_why(trained):
 def test_rows_a_model_learnt_from_are_not_judged(data, trained):
     estimator = PoseEstimator.load(trained)
     assert len(rows_to_judge(estimator, data, "all")) == FRAMES
-    fewer = Dataset(data.pins.rows(np.arange(50)), data.targets.rows(np.arange(50)), data.folder)
+    fewer = Dataset(data.pins.rows(np.arange(50)), data.targets.rows(np.arange(50)), data.folders)
     with pytest.raises(TrainingError, match="trained on part of 90 rows"):
         rows_to_judge(estimator, fewer, "validation")
 

@@ -19,7 +19,7 @@ from training.generation.config import DatasetError, GenerationConfig
 from training.generation.make import REST, Outcome
 from training.generation.truth_file import TRUTH, TruthFile
 
-CONFIG, RECORDS = "generation.json", "records"
+CONFIG, RECORDS, DRAWS = "generation.json", "records", "draws.csv"
 FAILURE_COLUMNS = ("path_id", "attempt", "reason")
 
 
@@ -86,7 +86,7 @@ class Store:
 
     def finish(self, count: int) -> int:
         """Write tables and truth of the contacts 0 to ``count`` - 1; how many frames there are."""
-        tables = {"targets.csv": [], "move_executed.csv": [], "draws.csv": [], "failures.csv": []}
+        tables = {"targets.csv": [], "move_executed.csv": [], DRAWS: [], "failures.csv": []}
         truth = TruthFile(self.folder / f".{TRUTH}.part")
         try:
             for index in range(count):
@@ -106,7 +106,7 @@ class Store:
         return len(tables["targets.csv"])
 
     def _add_rows(self, tables: dict, index: int, arrays: dict, notes: dict) -> None:
-        tables["draws.csv"].append({"path_id": index, "attempt": len(notes["failures"]), **notes["draw"]})
+        tables[DRAWS].append({"path_id": index, "attempt": len(notes["failures"]), **notes["draw"]})
         for attempt, reason in enumerate(notes["failures"]):
             tables["failures.csv"].append(dict(zip(FAILURE_COLUMNS, (index, attempt, reason), strict=True)))
         for state in range(len(arrays["path_id"])):

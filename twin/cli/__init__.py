@@ -44,6 +44,7 @@ def main() -> None:
         robustness,
         servo,
         study,
+        study_objects,
         study_sim_to_real,
         study_tac_vgnn,
         train,

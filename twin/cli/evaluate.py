@@ -27,13 +27,13 @@ turn, 5 pins erased, each in a random direction), and by which part they are lar
 @app.command("evaluate", help=HELP)
 def evaluate(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights go with the package")],
-    data: Annotated[Path, typer.Option("--data", metavar="DIR", help="labelled recording")],
+    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; all that the run was trained on")],
     out: Out,
     rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
     labels: Annotated[str, typer.Option("--labels", help="truth in predictions.csv and errors.png: corrected or raw")] = "corrected",
     robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
 ) -> None:
-    from training.dataset import load_dataset
+    from training.dataset import joined, load_dataset
     from training.estimator import PoseEstimator
     from training.evaluate import judge, predict_rows_of, rows_to_judge, time_frames, write_evaluation
     from training.recipes import TrainingError
@@ -46,7 +46,8 @@ def evaluate(
             raise TrainingError(f"{option} must be {' or '.join(allowed)}, got {value!r}")
     estimator = PoseEstimator.load(run)
     with count_bar("frames") as progress:
-        found = load_dataset(data, estimator.sensor, estimator.names, form=estimator.form, progress=progress)
+        parts = [load_dataset(folder, estimator.sensor, estimator.names, form=estimator.form, progress=progress) for folder in data]
+    found = joined(parts) if len(parts) > 1 else parts[0]
     for problem in found.problems:
         print(f"note: {problem}")
     chosen = rows_to_judge(estimator, found, rows)

@@ -21,7 +21,11 @@ Labels are columns of the recording's table: a preset (surface-2d: pose_2 pose_6
 surface-3d: pose_3 pose_4 pose_5; edge-2d, edge-3d) or names with commas between. With --labels corrected, moves that
 were not executed are taken out, where move_executed.csv or labels_corrected.csv beside the table tells which.
 
-A random fifth of the rows is kept out of training for 'twin evaluate' (--split S: seed S; --split -1: train on all).
+Depth and angle of simulated contacts are those of the surface that was touched, whatever its shape: indentation along its normal
+at the nearest place, and the angle from that normal. So data sets of several objects can be joined: give --data once for each.
+
+A random fifth of the rows (of simulated contacts, with all their states) is kept out of training for 'twin evaluate' (--split S:
+seed S; --split -1: train on all).
 
 \b
 Writes to --out: config.json (resolved, with the sensor and the pipeline's parameters), curves.csv, weights.pt, and
@@ -33,7 +37,7 @@ while it runs checkpoint.pt: started again with the same options, a run that was
 def train(
     model: Annotated[str, typer.Option("--model", help="vgnn, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
     sensor: Sensor,
-    data: Annotated[Path, typer.Option("--data", metavar="DIR", help="labelled recording")],
+    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give it once for each of several")],
     out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
     target: Target = "surface-2d",
     labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
@@ -54,7 +58,7 @@ def train(
     import torch
 
     from scenes import load_sensor
-    from training.dataset import load_dataset
+    from training.dataset import joined, load_dataset
     from training.networks import choose_device
     from training.recipes import TrainingError, recipe_of
     from training.run import RunConfig, train_run
@@ -68,7 +72,8 @@ def train(
     device = choose_device(device)
     columns = columns_of(target)
     with count_bar("frames") as progress:
-        found = load_dataset(data, load_sensor(sensor), columns, form=form, progress=progress)
+        parts = [load_dataset(folder, load_sensor(sensor), columns, form=form, progress=progress) for folder in data]
+    found = joined(parts) if len(parts) > 1 else parts[0]
     for problem in found.problems:
         print(f"note: {problem}")
     helpers = ("move_1", "move_6") if columns == "surface-2d-shear" else ()

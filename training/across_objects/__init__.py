@@ -1,0 +1,1 @@
+"""A model trained on some objects, judged on others."""

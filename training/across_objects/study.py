@@ -1,0 +1,145 @@
+"""What training on several objects is worth on an object that was never touched, beside training on the first of them alone.
+
+All contacts are simulated, pins alone. Labels mean the same on every object (``twin.touch``). Both models learn from as many
+contacts; every object's errors are those on contacts of its own that no model has seen.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec
+from training.dataset import Dataset, joined
+from training.estimator import PoseEstimator
+from training.evaluate import predict_rows_of
+from training.generation import GenerationConfig
+from training.recipes import TrainingError, recipe_of
+from training.run import RunConfig, is_finished, train_run
+
+EPOCHS = 60  # on thousands of simulated states: more change nothing
+TESTS_APART = 1000  # of the draws, so that no contact is learnt and judged
+MIXED = "mixed"
+TIMES = 1.5  # the error on an unseen object over that on the first one: what is aimed at
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is simulated.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    experiment : ExperimentSpec
+        Whose ranges of labels are judged; ``wider`` the one that is trained on.
+    wider : ExperimentSpec
+    randomisation : RandomisationSpec
+    train, unseen : tuple of ObjectSpec
+        The first of ``train`` is the one that is also trained on alone.
+    count, tests : int
+        Contacts to train on, and to judge on, for each object.
+    seed, across : int
+    """
+
+    sensor: SensorSpec
+    experiment: ExperimentSpec
+    wider: ExperimentSpec
+    randomisation: RandomisationSpec
+    train: tuple
+    unseen: tuple
+    count: int
+    tests: int
+    seed: int
+    across: int
+
+    def __post_init__(self):
+        names = [each.name for each in (*self.train, *self.unseen)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise TrainingError(f"{', '.join(twice)}: given twice; an object is either trained on or never seen")
+        if len(self.train) < 2 or not self.unseen:
+            raise TrainingError("give at least two objects to train on and one never seen")
+
+    @property
+    def alone(self) -> ObjectSpec:
+        """The object that is also trained on alone."""
+        return self.train[0]
+
+    def sets(self) -> list[tuple[str, GenerationConfig, int]]:
+        """Folder, configuration and number of contacts of every data set."""
+        learnt = [
+            (f"sim/{o.name}", self._config(o, self.wider, 0), self.count * (len(self.train) if o is self.alone else 1)) for o in self.train
+        ]
+        judged = [(f"tests/{o.name}", self._config(o, self.experiment, TESTS_APART), self.tests) for o in (*self.train, *self.unseen)]
+        return learnt + judged
+
+    def _config(self, thing: ObjectSpec, experiment: ExperimentSpec, apart: int) -> GenerationConfig:
+        return GenerationConfig(
+            sensor=self.sensor,
+            object=thing,
+            experiment=experiment,
+            randomisation=self.randomisation,
+            friction=thing.friction,
+            seed=self.seed + apart,
+            images="none",
+            states="all",
+            across=self.across,
+        )
+
+    def trained_on(self, sets: dict[str, Dataset]) -> dict[str, Dataset]:
+        """Data set of each model, from those of all folders: as many contacts for both."""
+        parts = [sets[f"sim/{thing.name}"] for thing in self.train]
+        first = parts[0].rows(np.flatnonzero(parts[0].group < self.count))
+        return {MIXED: joined([first, *parts[1:]]), self.alone.name: parts[0]}
+
+
+def train(data: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Callable | None = None) -> None:
+    """A run on all contacts of a data set, or what is left of it to do."""
+    config = RunConfig("vgnn", recipe_of("vgnn", members=1, epochs=epochs or EPOCHS, kernel=False), seed=seed, split=None)
+    if not is_finished(config, data, out):
+        train_run(config, data, out, progress=progress)
+
+
+def rows_in_range(data: Dataset, experiment: ExperimentSpec) -> np.ndarray:
+    """Rows whose corrected labels lie within the experiment's ranges: the way there, and contacts beside an edge, may not."""
+    low, high = np.array([experiment.ranges()[name] for name in data.targets.names]).T
+    return np.flatnonzero(((data.targets.corrected >= low) & (data.targets.corrected <= high)).all(axis=1))
+
+
+def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[dict]:
+    """A row for each model and object: mean absolute errors, biases, and how many times the model's error on the first object."""
+    rows = []
+    for model, run in runs.items():
+        estimator = PoseEstimator.load(run)
+        learnt = {thing.name for thing in (plan.train if model == MIXED else (plan.alone,))}
+        flat: np.ndarray | None = None
+        for thing in (*plan.train, *plan.unseen):
+            data = sets[f"tests/{thing.name}"]
+            chosen = rows_in_range(data, plan.experiment)
+            if not len(chosen):
+                raise TrainingError(
+                    f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more --tests"
+                )
+            off = predict_rows_of(estimator, data, chosen).mean - data.targets.corrected[chosen]
+            error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)
+            flat = error if flat is None else flat
+            row: dict = {"model": model, "object": thing.name, "seen": thing.name in learnt}
+            row |= {"contacts": len(np.unique(data.group[chosen])), "states": len(chosen)}
+            for k, name in enumerate(data.targets.names):
+                row |= {f"{name}_error": float(error[k]), f"{name}_bias": float(bias[k]), f"{name}_times": float(error[k] / flat[k])}
+            rows.append(row)
+    return rows
+
+
+def verdicts(plan: Plan, rows: list[dict], names: tuple) -> list[str]:
+    """For each unseen object whether the mixed model's errors stay within ``TIMES`` those on the first one."""
+    lines = []
+    for row in rows:
+        if row["model"] != MIXED or row["object"] not in {thing.name for thing in plan.unseen}:
+            continue
+        held = all(row[f"{name}_times"] <= TIMES for name in names)
+        said = ", ".join(f"{name} {row[f'{name}_times']:.2f}" for name in names)
+        lines.append(
+            f"{row['object']}, never seen: {said} times the error on {plan.alone.name} ({'within' if held else 'not within'} {TIMES:g})"
+        )
+    return lines

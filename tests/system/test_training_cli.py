@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
 from drawn_frames import drawn_frame  # noqa: E402
+from small_generation import ACROSS, EXPERIMENT, SENSOR  # noqa: E402
 from test_training import drawn_pins  # noqa: E402
 
 from scenes import load_sensor  # noqa: E402
@@ -25,7 +26,7 @@ FRAMES = 70
 
 
 def twin(*arguments):
-    from twin.cli import audit, evaluate, predict, study_tac_vgnn, train  # noqa: F401  (each registers its command)
+    from twin.cli import audit, evaluate, predict, study_objects, study_tac_vgnn, train  # noqa: F401  (each registers its command)
 
     done = CliRunner().invoke(app, [str(a) for a in arguments])
     if isinstance(done.exception, TwinError):
@@ -93,6 +94,25 @@ def test_the_papers_comparison_is_one_command_and_goes_on_where_it_was(recording
     assert {"graphs.csv", "efficiency.csv", "efficiency.png", "contacts.csv", "contacts.png", "curves.png"} <= {
         p.name for p in tmp_path.iterdir()
     }
+
+
+def test_objects_never_seen_are_one_command_and_go_on_where_they_were(tmp_path):
+    (tmp_path / "gentle.toml").write_text(EXPERIMENT)
+    command = ("study", "objects", "--sensor", SENSOR, "--train", "plane,sphere", "--unseen", "cylinder", "--count", 3, "--tests", 2)
+    command += ("--experiment", tmp_path / "gentle.toml", "--epochs", 2, "--workers", 1, "--across", ACROSS, "--out", tmp_path / "study")
+    said = twin(*command)
+    rows = list(csv.DictReader((tmp_path / "study" / "objects.csv").open()))
+    assert [(row["model"], row["object"], row["seen"]) for row in rows] == [
+        *(("mixed", "plane", "True"), ("mixed", "sphere", "True"), ("mixed", "cylinder", "False")),
+        *(("plane", "plane", "True"), ("plane", "sphere", "False"), ("plane", "cylinder", "False")),
+    ]
+    assert "cylinder, never seen: pose_2" in said and "cylinder, never seen" in (tmp_path / "study" / "index.html").read_text()
+    weights = [(tmp_path / "study" / name / "weights.pt").stat().st_mtime_ns for name in ("mixed", "plane")]
+    assert twin(*command).splitlines() == said.splitlines(), "nothing is made or trained again"
+    assert weights == [(tmp_path / "study" / name / "weights.pt").stat().st_mtime_ns for name in ("mixed", "plane")]
+    sets = [option for name in ("plane", "sphere") for option in ("--data", tmp_path / "study" / "sim" / name)]
+    twin("train", "--model", "vgnn", "--sensor", SENSOR, *sets, "--epochs", 1, "--no-kernel", "--members", 1, "--out", tmp_path / "run")
+    assert "pose_2: mean error" in twin("evaluate", tmp_path / "run", *sets, "--out", tmp_path / "judged")
 
 
 def test_an_audit_writes_labels_that_training_reads(recording, tmp_path):

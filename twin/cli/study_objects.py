@@ -38,7 +38,7 @@ def study_objects(
     out: Out,
     train: Annotated[str, typer.Option("--train", help="objects to train on, with commas between; the first also alone")] = TRAIN,
     unseen: Annotated[str, typer.Option("--unseen", help="objects never trained on, with commas between")] = UNSEEN,
-    count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts of each object to train on")] = 100,
+    count: Annotated[int, typer.Option("--count", min=2, metavar="N", help="contacts of each object to train on")] = 100,
     tests: Annotated[int, typer.Option("--tests", min=1, metavar="N", help="other contacts of each object to judge on")] = 50,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="contacts to judge on ('twin experiments')")] = "objects-2d",
     randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="what differs from contact to contact")] = "moves",

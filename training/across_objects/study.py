@@ -4,7 +4,6 @@ All contacts are simulated, pins alone. Labels mean the same on every object (``
 contacts; every object's errors are those on contacts of its own that no model has seen.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +14,8 @@ from training.dataset import Dataset, joined
 from training.estimator import PoseEstimator
 from training.evaluate import predict_rows_of
 from training.generation import GenerationConfig
-from training.recipes import TrainingError, recipe_of
-from training.run import RunConfig, is_finished, train_run
+from training.recipes import TrainingError
 
-EPOCHS = 60  # on thousands of simulated states: more change nothing
 TESTS_APART = 1000  # of the draws, so that no contact is learnt and judged
 MIXED = "mixed"
 TIMES = 1.5  # the error on an unseen object over that on the first one: what is aimed at
@@ -91,13 +88,6 @@ class Plan:
         parts = [sets[f"sim/{thing.name}"] for thing in self.train]
         first = parts[0].rows(np.flatnonzero(parts[0].group < self.count))
         return {MIXED: joined([first, *parts[1:]]), self.alone.name: parts[0]}
-
-
-def train(data: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Callable | None = None) -> None:
-    """A run on all contacts of a data set, or what is left of it to do."""
-    config = RunConfig("vgnn", recipe_of("vgnn", members=1, epochs=epochs or EPOCHS, kernel=False), seed=seed, split=None)
-    if not is_finished(config, data, out):
-        train_run(config, data, out, progress=progress)
 
 
 def rows_in_range(data: Dataset, experiment: ExperimentSpec) -> np.ndarray:

@@ -69,11 +69,14 @@ def measured_of(real: Dataset, rows: np.ndarray) -> MeasuredFrames:
 
 
 def train_in_twin(
-    sim: Dataset, out: Path, *, seed: int, epochs: int | None, labelled: tuple = (), progress: Callable | None = None
+    sim: Dataset, out: Path, *, seed: int, split: int | None, epochs: int | None, labelled: tuple = (), progress: Callable | None = None
 ) -> None:
-    """A run on simulated contacts, or what is left of it to do; ``labelled`` names the real frames that told what they miss."""
+    """A run on simulated contacts, or what is left of it to do; ``labelled`` names the real frames that told what they miss.
+
+    ``split`` as in ``RunConfig``.
+    """
     config = RunConfig(
-        "vgnn", recipe_of("vgnn", members=1, epochs=epochs or TWIN_EPOCHS, kernel=False), seed=seed, split=seed, labelled=labelled
+        "vgnn", recipe_of("vgnn", members=1, epochs=epochs or TWIN_EPOCHS, kernel=False), seed=seed, split=split, labelled=labelled
     )
     if not is_finished(config, sim, out):
         train_run(config, sim, out, progress=progress)

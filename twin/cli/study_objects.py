@@ -8,11 +8,12 @@ from twin.cli.options import CORES, Across, Out, Sensor, Workers, writable_folde
 from twin.cli.study import study
 from twin.types import FINE
 
-TRAIN, UNSEEN = "plane,ball-10,sphere,ball-40,ball-80,hexagon-rod", "cylinder,edge"
+TRAIN = "plane,ball-10,sphere,ball-40,ball-80,hexagon-rod,square-rod,round-bar,triangle-rod"
+UNSEEN = "cylinder,edge"
 HELP = """Train in the twin on several objects, and judge on objects that were never touched.
 
 \b
-  twin study objects --sensor mg400-331 --train plane,sphere,ball-40 --unseen cylinder,edge --count 100 --out out/objects
+  twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod --unseen cylinder,edge --out out/objects
 
 Two models learn from as many simulated contacts (pins alone, every state on their way): 'mixed' from --count of each object of
 --train, the other from the first of them alone. Both are judged on --tests other contacts of every object, seen or not.
@@ -52,6 +53,7 @@ def study_objects(
     from training.across_objects import study as objects
     from training.dataset import load_dataset
     from training.generation import generate
+    from training.sim_to_real.study import train_in_twin
     from twin.cli.progress import count_bar, epoch_bar, rate_bar
     from twin.views.page import render_page
     from twin.views.table import write_table
@@ -80,7 +82,7 @@ def study_objects(
     for name, data in plan.trained_on(sets).items():
         runs[name] = out / name
         with epoch_bar(name) as progress:
-            objects.train(data, runs[name], seed=seed, epochs=epochs, progress=progress)
+            train_in_twin(data, runs[name], seed=seed, split=None, epochs=epochs, progress=progress)
     rows = objects.table(plan, runs, sets)
     said = objects.verdicts(plan, rows, judged.targets)
     page = render_page(across_objects.__name__, plan=plan, names=judged.targets, ranges=judged.ranges(), rows=rows, verdicts=said)

@@ -116,7 +116,7 @@ def study_sim_to_real(
         if name in simulated:
             taught_by = tuple(measured.names) if name == "sim_only" else ()
             with epoch_bar(name) as progress:
-                train_in_twin(simulated[name], out / name, seed=seed, epochs=epochs, labelled=taught_by, progress=progress)
+                train_in_twin(simulated[name], out / name, seed=seed, split=seed, epochs=epochs, labelled=taught_by, progress=progress)
             rows.append(judged(trained_on, 0, out / name, real, chosen.test))
     corrections = correct(out / "sim_only", out / "sim_plus_real", real, chosen.few)
     rows.insert(1, judged("simulated and real", labels, out / "sim_plus_real", real, chosen.test))

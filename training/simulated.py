@@ -68,7 +68,8 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     Returns
     -------
     dict of str to (M,) float
-        mm and deg by the table's columns; empty where depth and one angle do not tell how a surface is touched.
+        mm and deg by the table's columns, NaN for frames that it does not name; empty where depth and one angle do not tell how a
+        surface is touched.
     """
     config = GenerationConfig.model_validate_json((folder / CONFIG).read_text())
     truth = zarr.open_group(folder / TRUTH, mode="r")
@@ -76,11 +77,11 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         row_of = {row["image_name"]: k for k, row in enumerate(csv.DictReader(file))}
     with (folder / DRAWS).open(newline="") as file:
         draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
-    rows = [row_of[name] for name in names.tolist()]
-    T_sensor_object, contact = truth["T_sensor_object"][:][rows], truth["path_id"][:][rows]
+    rows = np.array([row_of.get(name, -1) for name in names.tolist()], int)
+    T_sensor_object, contact = truth["T_sensor_object"][:][rows], np.where(rows < 0, -1, truth["path_id"][:][rows])
     surface = Surface(config.object)
     found: dict[str, np.ndarray] = {}
-    for path_id in np.unique(contact):
+    for path_id in np.unique(contact[rows >= 0]):
         mine = contact == path_id
         mounting = Mounting.of(_rigged(config.sensor, draws[int(path_id)]), config.experiment)
         for label, values in surface_labels(config.experiment, mounting, surface, T_sensor_object[mine]).items():

@@ -14,7 +14,7 @@ from hardware.step import LoopSettings
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_of, write_csv
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
-from twin.cli.at_rest import FIRST, given_frame
+from twin.cli.at_rest import FIRST, counting_from_first, given_frame
 from twin.cli.rig import build_rig, servo_loop, steps_round
 from twin.errors import TwinError
 from twin.types import Form
@@ -135,7 +135,7 @@ def follow(
     def take_rest(frame):
         if session is not None:
             session.keep_rest(frame)
-        return estimator.at_rest(frame)
+        return counting_from_first(estimator, frame)
 
     failure, followed, session = "", None, None
     with rig:

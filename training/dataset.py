@@ -144,7 +144,7 @@ def load_dataset(
     if is_pins_only(Path(folder)):
         recording, truth = open_simulated(Path(folder), spec)
         pins = simulated_table(recording, spec, truth, missing, progress=progress)
-        depth_per_move = np.tan(np.radians(rig_of(spec).plate_tilt_deg))
+        depth_per_move = np.tan(np.radians(rig_of(spec).plate_tilt_deg))  # as it was simulated
     else:
         depth_per_move = DEPTH_PER_MOVE.get(spec.name, 0.0)
         recording = open_recording(folder, spec, form)

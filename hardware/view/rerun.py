@@ -1,5 +1,6 @@
 """A view in Rerun (``rerun-sdk``, an optional package): frame, pins, graph and estimates over time, in its viewer or in a file."""
 
+import re
 from pathlib import Path
 from socket import create_connection
 from urllib.parse import urlsplit
@@ -50,7 +51,7 @@ class RerunView:
         DeviceError
             No viewer answers there, or the file can't be written.
         """
-        self._stream = self._rerun.RecordingStream(self._title)
+        self._stream = self._rerun.RecordingStream(re.sub(r"\W+", "-", self._title))
         try:
             if self._target == VIEWER:
                 self._stream.spawn()

@@ -110,6 +110,22 @@ def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path
     assert np.linalg.norm(seen.graph.nodes_px - stand_in.pipeline.reference.pins_px, axis=1).max() > 4.0
 
 
+def test_a_follow_that_ends_early_is_written_and_is_an_exit_code(stand_in, tmp_path, monkeypatch):
+    monkeypatch.setattr(servo_run, "GIVE_UP_S", 0.2)
+    calls = []
+
+    def fails_later(model, frame):
+        calls.append(frame)
+        model.true.fail = "no pins" if len(calls) > 4 else ""
+        return model.true(frame)
+
+    monkeypatch.setattr(StandIn, "__call__", fails_later)
+    result = CliRunner().invoke(
+        app, ["servo", "--object", "can", "--model", "any", "--out", str(tmp_path), "--steps", "9", "--plain-light"]
+    )
+    assert result.exit_code == 1 and "ended early" in result.output and (tmp_path / "trajectory.csv").is_file()
+
+
 def test_pins_are_counted_from_a_frame_taken_clear_of_the_object_and_so_they_are_in_a_replay(tmp_path):
     out = tmp_path / "servo"
     run("servo", "--object", "can", "--out", out, "--steps", 4, "--plain-light", "--record")

@@ -100,8 +100,8 @@ def live(
             session.run(most=count, seconds=seconds, going=lambda: shower is None or shower.open)
         except KeyboardInterrupt:
             print("ended")
-    print("\n".join(session.timing().lines()))
-    if replay is not None:
-        print(f"{same_estimates(source.steps, found)} of {len(found)} estimates are those that were recorded")
-    if record is not None:
-        print(f"wrote {record} ({session.record.count} frames)")
+        print("\n".join(session.timing().lines()))
+        if replay is not None:
+            print(f"{same_estimates(source.steps, found)} of {len(found)} estimates are those that were recorded")
+        if record is not None:
+            print(f"wrote {record} ({session.record.count} frames)")

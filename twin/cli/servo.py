@@ -25,6 +25,7 @@ the model counts pins from (--at-rest none: the specification's layout; models o
 \b
 Writes to --out: trajectory.csv, trajectory.png, measures.json (smoothness S as the Tac-VGNN paper defines it, path, depth
 and angle errors, jerk, share of the way, lost contacts; rate, latency and age of the frames), session/ with --record.
+Exit code 1 if it ended early.
 """
 
 Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights go with the package")]
@@ -82,3 +83,5 @@ def servo(
     print("\n".join(followed.lines()))
     for name in followed.written:
         print(f"wrote {name}")
+    if followed.failure:
+        raise SystemExit(1)

@@ -30,7 +30,9 @@ bench: setup     ## speed, as ratios to named baselines in the same run
 	@$(BIN)/python tests/bench/bench_mechanics.py
 	@$(BIN)/python tests/bench/bench_render.py
 
-validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts
+validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts, Rerun (670 MB)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,rerun]'
+	@$(BIN)/python -m pytest -n 0 tests/unit/test_rerun_view.py
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests
 
 lint: setup

@@ -2,21 +2,33 @@
 
 import numpy as np
 
+from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 from hardware.safety import distance_to_axis
 
 MARGIN_MM = 10.0  # between the dome and the circle about the object
 STEP_DEG = 30.0  # along that circle
+SAMPLE_MM = 1.0  # along a straight way
 
 
 def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> list[np.ndarray]:
     """Poses (6,) to pass from ``start`` on, the last of them ``clear``.
 
     Straight, where the dome keeps out of a circle about the object's section. Else out of the circle if need be, and along
-    it the shorter way, the sensor turned towards the object. An object without an end (a plane) is not gone around.
+    it the shorter way, the sensor turned towards the object. The object counts as endlessly high: the way is level, whatever
+    the heights of its ends, and neither the arm's own links nor what holds the object are known.
+
+    An object without an end (a plane, an edge) is not gone around: nothing but its surface is assumed to be there, and the way
+    is straight.
+
+    Raises
+    ------
+    DeviceError
+        The straight way to an object without an end leads through it.
     """
     outline = placed.outline()
     if not np.allclose(outline[0], outline[-1]):
+        _require_in_front(placed, start, clear)
         return [clear]
     surface = outline @ placed.T_base_object[:2, [0, 2]].T + placed.T_base_object[:2, 3]
     middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
@@ -42,6 +54,18 @@ def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> li
     if outward_mm > 0:
         way.append(clear)
     return way
+
+
+def _require_in_front(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> None:
+    """That the dome's centre, on its straight way to a pose, stays in front of the surface; it may begin in contact."""
+    ends = [matrix_of(pose)[:3, :3] @ placed.mounting.centre_mm + pose[:3] for pose in (start, clear)]
+    samples = max(2, int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / SAMPLE_MM)))
+    gap_mm = min(placed.distance_mm(ends[0] + share * (ends[1] - ends[0])) for share in np.linspace(0.0, 1.0, samples))
+    if gap_mm < 0.0:
+        raise DeviceError(
+            f"the straight way to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, whose end is not known; jog the arm "
+            "to the side from which the sensor is to touch it, or correct the object's place ('placement' in the file for --servo)"
+        )
 
 
 def _spun(T: np.ndarray, angle: float, middle: np.ndarray) -> np.ndarray:

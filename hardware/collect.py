@@ -1,6 +1,7 @@
 """Collecting labelled frames: pose, tap, shear, frame; in the recordings' own format, resumable.
 
-The arm comes from ``CLEAR_MM`` away, and between contacts lifts off by ``LIFT_MM``. A frame is taken only after the arm has
+The arm comes from ``CLEAR_MM`` away, and between contacts lifts off by ``LIFT_MM``; to there, and from lift to lift, it goes
+around the object as ``hardware.approach`` has it, straight before one without an end. A frame is taken only after the arm has
 said that it stands at the commanded pose, and only one exposed after that; what the table holds is the pose that it said.
 """
 
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hardware.approach import way_around
 from hardware.arms.arm import Arm, ArmState
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
@@ -25,6 +27,7 @@ from twin.types import Form, Frame
 
 CLEAR_MM, LIFT_MM, NEAR_MM = 50.0, 10.0, 0.5
 MOVE_TIMEOUT_S, FRAME_TIMEOUT_S = 30.0, 5.0
+SPARE = 2.0  # times what a move takes, beside that: arms take whole percents of their speed
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
@@ -88,11 +91,16 @@ class Collection:
     @property
     def has_rest(self) -> bool:
         """Whether the frame without contact has been taken."""
-        return (self.pictures / REST).is_file()
+        return self.rest.is_file()
+
+    @property
+    def rest(self) -> Path:
+        """Where the frame without contact lies, once it has been taken."""
+        return self.pictures / REST
 
     def keep_rest(self, frame: Frame) -> None:
         """Keep the frame without contact."""
-        write_image(self.pictures / REST, frame.image)
+        write_image(self.rest, frame.image)
 
     def keep(self, index: int, frame: Frame, label: np.ndarray, move: np.ndarray, log: dict) -> None:
         """Write a contact: its picture, a line of the log, its row; a row's picture is always there."""
@@ -160,11 +168,12 @@ def collect(
     speed: tuple[float, float],
     guards: tuple = (),
     frame_timeout_s: float = FRAME_TIMEOUT_S,
+    on_rest: Callable[[Frame], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Collect up to ``count`` contacts; those that the collection holds already are not made again.
 
-    Whatever happens the arm is stopped, withdrawn and disabled.
+    Whatever happens the arm is stopped, withdrawn (once it has come to the object) and disabled.
 
     Parameters
     ----------
@@ -174,6 +183,8 @@ def collect(
         In mm/s and deg/s.
     frame_timeout_s : float
         For so long a frame of the arm where it stands is waited for.
+    on_rest : callable, optional
+        Called with the frame without contact when it has been kept.
 
     Returns
     -------
@@ -183,7 +194,8 @@ def collect(
     Raises
     ------
     DeviceError
-        The source is not live, the arm did not come to stand where it was sent or could not be let go of, or no frame came.
+        The source is not live, no way leads to the object, the arm did not come to stand where it was sent or could not be let go
+        of, or no frame came.
     """
     if not source.is_live:
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
@@ -191,14 +203,23 @@ def collect(
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
 
     def go(label: np.ndarray, away_mm: float = 0.0) -> ArmState:
+        return go_to(frame_of.base_pose(label, arm.state().pose, away_mm=away_mm))
+
+    def go_to(target: np.ndarray) -> ArmState:
         state = arm.state()
-        target = frame_of.base_pose(label, state.pose, away_mm=away_mm)
         for guard in guards:
             target = guard(state, target)
-        sent = arm.move_linear(target, wait=False, timeout_s=MOVE_TIMEOUT_S)
+        timeout_s = MOVE_TIMEOUT_S + SPARE * float(np.linalg.norm(target[:3] - state.pose[:3])) / speed[0]
+        sent = arm.move_linear(target, wait=False, timeout_s=timeout_s)
         if (short_mm := float(np.linalg.norm(sent[:3] - target[:3]))) > NEAR_MM:
             raise DeviceError(f"{arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg")
-        return arm.wait_settled(sent, timeout_s=MOVE_TIMEOUT_S)
+        return arm.wait_settled(sent, timeout_s=timeout_s)
+
+    def go_around(label: np.ndarray, away_mm: float) -> ArmState:
+        start = arm.state().pose
+        for pose in way_around(placed, start, frame_of.base_pose(label, start, away_mm=away_mm)):
+            state = go_to(pose)
+        return state
 
     def frame_after(state: ArmState) -> Frame:
         try:
@@ -212,18 +233,21 @@ def collect(
         frame_after(state)
         return state
 
-    here, begun = np.zeros(6), False
+    here, at_object = np.zeros(6), False
     try:
         arm.enable()
         arm.set_speed(*speed)
-        begun = True
-        state = go(here, CLEAR_MM)
+        state = go_around(here, CLEAR_MM)
+        at_object = True
         if not collection.has_rest:
-            collection.keep_rest(frame_after(state))
+            rest = frame_after(state)
+            collection.keep_rest(rest)
+            if on_rest is not None:
+                on_rest(rest)
         for index in range(collection.count, count):
             asked = draw_contact(experiment, seed, index)
             before = asked.pose - asked.move + clear
-            go(before, LIFT_MM)
+            go_around(before, LIFT_MM)
             here = before
             stop_at(before)
             stop_at(before + tap)
@@ -244,7 +268,7 @@ def collect(
             if progress is not None:
                 progress(index + 1, count)
     finally:
-        back = {"retreat": lambda: go(here, CLEAR_MM)} if begun else {}
+        back = {"retreat": lambda: go(here, CLEAR_MM)} if at_object else {}
         failed = try_each(stop=arm.stop, **back, disable=arm.disable)
     if failed:
         raise DeviceError("; ".join(failed))

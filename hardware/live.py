@@ -18,6 +18,7 @@ from twin.types import Frame
 KEPT_TIMES = 10_000
 RATE_SPAN = 30  # frames over which the rate is told
 SHOW_S = 0.1  # between pictures of the view
+CLOSE_S = 20.0  # a view may take to bring out what it was shown
 FRAME_TIMEOUT_S = 5.0
 
 
@@ -127,12 +128,17 @@ class Shower:
     session : LiveSession
     draw : callable
         From frame, estimate and lines to a picture (H, W, 3).
-    view : BrowserView or WindowView
+    view : BrowserView, WindowView or RerunView
+
+    Raises
+    ------
+    DeviceError
+        On entering, where the view can't be opened; on leaving, where it broke.
     """
 
     def __init__(self, session: LiveSession, draw: Callable[[Frame, Estimate, list], np.ndarray], view) -> None:
         self._session, self._draw, self._view = session, draw, view
-        self._end = threading.Event()
+        self._opened, self._end = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
         self._error: Exception | None = None
 
@@ -143,12 +149,21 @@ class Shower:
 
     def __enter__(self) -> "Shower":
         self._thread.start()
+        self._opened.wait()
+        self._tell()
         return self
 
     def __exit__(self, kind: type | None, *_: object) -> None:
         self._end.set()
-        self._thread.join(timeout=5.0)
-        if self._error is not None and kind is None:
+        self._thread.join(timeout=CLOSE_S)
+        if kind is None:
+            self._tell()
+
+    def _tell(self) -> None:
+        """Raise what the view ended with, if it did."""
+        if isinstance(self._error, DeviceError):
+            raise self._error
+        if self._error is not None:
             raise DeviceError(f"the view broke ({self._error}); without --rerun, --headless shows nothing") from self._error
 
     def _run(self) -> None:
@@ -157,10 +172,13 @@ class Shower:
         except Exception as error:
             self._error = error
             self._end.set()
+        finally:
+            self._opened.set()
 
     def _show(self) -> None:
         shown = None
         with self._view as view:
+            self._opened.set()
             while not self._end.wait(SHOW_S):
                 newest = self._session.newest
                 if newest is None or newest is shown:

@@ -1,6 +1,7 @@
 """Where tool, sensor and object are: poses of the arm as matrices, and what a sensor at a pose truly touches."""
 
 from dataclasses import fields
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -99,7 +100,11 @@ class PlacedObject:
         return float(self._surface.field.distance(local[None])[0]) - self._surface.raised_mm
 
     def outline(self) -> np.ndarray:
-        """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x."""
+        """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x; read-only."""
+        return self._outline
+
+    @cached_property
+    def _outline(self) -> np.ndarray:
         at, points = np.zeros(3), [np.zeros(2)]
         while len(points) * OUTLINE_STEP_MM < LONGEST_OUTLINE_MM:
             _, gradient, _ = self._surface.field.probe(at[None])
@@ -113,4 +118,6 @@ class PlacedObject:
             if len(points) > 10 and np.linalg.norm(points[-1]) < 0.75 * OUTLINE_STEP_MM:
                 points[-1] = np.zeros(2)
                 break
-        return np.array(points)
+        outline = np.array(points)
+        outline.flags.writeable = False
+        return outline

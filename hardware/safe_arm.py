@@ -37,7 +37,7 @@ class SafeArm:
     """Wraps an arm: every move is decided on first, and every decision is logged.
 
     Used as a context manager, it leaves by stopping; after any exception (Ctrl-C too) it stops, retreats along
-    the object's normal and disables. ``stop``, ``disable``, ``clear_error`` and ``disconnect`` are never refused.
+    the object's normal and disables. ``stop``, ``emergency_stop``, ``disable``, ``clear_error`` and ``disconnect`` are never refused.
 
     Parameters
     ----------
@@ -102,6 +102,10 @@ class SafeArm:
     def stop(self) -> None:
         self._note("stop", Decision(Action.MOVE, Code.UNGATED, ""))
         self.arm.stop()
+
+    def emergency_stop(self) -> None:
+        self._note("emergency_stop", Decision(Action.MOVE, Code.UNGATED, ""))
+        self.arm.emergency_stop()
 
     def state(self, *, max_age_s: float = 1.0) -> ArmState:
         return self.arm.state(max_age_s=max_age_s)

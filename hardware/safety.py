@@ -83,7 +83,7 @@ class Code(StrEnum):
     LINKAGE_LIMIT = "linkage-limit"
     LINE_BLOCKED = "line-blocked"
     STEP_TOO_LONG = "step-too-long"
-    UNGATED = "ungated"  # stop, disable, clear_error: never refused
+    UNGATED = "ungated"  # stop, emergency_stop, disable, clear_error: never refused
     SPEED_CAPPED = "speed-capped"
     SHUTDOWN = "shutdown"
 

@@ -25,7 +25,7 @@ Estimator = Callable[[Frame], Estimate]
 Guard = Callable[[ArmState, np.ndarray], np.ndarray]  # state and target (6,) to what may be sent; raises to refuse
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class StepRecord:
     """One decision.
 

@@ -58,13 +58,14 @@ class Timing:
     decided: dict = field(default_factory=dict)
 
     def lines(self) -> list[str]:
-        """For people."""
+        """For people; who decides nothing gives no commands but poses, and a recording's frames have no age."""
         total = sum(self.decided.values())
         decided = [f"decisions at {self.decided_hz:.1f} Hz: " + ", ".join(f"{n / total:.0%} {what}" for what, n in self.decided.items())]
+        made = "command" if total else "pose"
+        taken = "at each decision" if total else "when it was taken"
+        spreads = {f"exposure to {made}": self.latency_s, f"age of the frame {taken}": self.age_s, f"frame to {made}": self.compute_s}
         return [
             *(decided if total else []),
             f"{self.steps} steps at {self.rate_hz:.1f} Hz, fresh frames at {self.fresh_hz:.1f} Hz, {self.dropped} frames dropped",
-            f"exposure to command: {self.latency_s}",
-            f"age of the frame at each decision: {self.age_s}",
-            f"frame to command: {self.compute_s}",
+            *(f"{what}: {spread}" for what, spread in spreads.items() if np.isfinite(spread.p50)),
         ]

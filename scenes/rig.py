@@ -25,7 +25,8 @@ class RigSpec(Section):
     turn_sign : 1 or -1
         -1 where the robot's angles turn left-handed about its axes.
     plate_tilt_deg : float
-        Rise of the object's surface towards the sensor's far side, along the direction across.
+        Rise of the object's surface towards the sensor's far side, along the direction across. It governs where the twin has
+        its contacts, and the labels of simulated ones; corrected labels of recordings go by ``training.targets.DEPTH_PER_MOVE``.
     image_turn_deg : float
         Azimuth of the direction across in the sensor frame, from image x towards image y.
     friction : float

@@ -9,9 +9,7 @@ import numpy as np
 
 import twin.preprocess
 from scenes.sensor import SensorSpec
-from training.generation.truth_file import TRUTH
-from training.recorded_contact import read_arm_labels
-from training.simulated import is_pins_only, open_simulated, touched_labels
+from training.simulated import is_pins_only, is_simulated, open_simulated, touched_labels
 from training.targets import DEPTH_PER_MOVE, Targets, choose_targets
 from twin.cache import cached_arrays
 from twin.errors import FrameError
@@ -133,7 +131,6 @@ def load_dataset(
     columns: str | tuple = "surface-2d",
     *,
     form: Form | None = None,
-    missing: Callable | None = None,
     progress: Callable | None = None,
 ) -> Dataset:
     """Read a labelled recording, real or simulated.
@@ -144,9 +141,6 @@ def load_dataset(
         Anything ``open_recording`` takes that has a table of labels, or a simulated data set without pictures.
     columns : str or tuple of str
         A name of ``training.targets.PRESETS``, or the table's columns themselves.
-    missing : callable, optional
-        Called with labels (list of S ``ArmLabel``), displacements (S, N, 2) and contacts (S,) of a simulated data set without
-        pictures; what it gives (S, N, 2), px, is added to the displacements.
     progress : callable, optional
         Called with (done, total) while the pipeline runs.
 
@@ -160,18 +154,18 @@ def load_dataset(
     Corrected labels of a simulated data set tell depth and angle of the surface that was touched: see ``touched_labels``.
     """
     problems: list[str] = []
+    simulated = is_simulated(Path(folder))
+    depth_per_move = np.tan(np.radians(rig_of(spec).plate_tilt_deg)) if simulated else DEPTH_PER_MOVE.get(spec.name, 0.0)
     if is_pins_only(Path(folder)):
         recording, truth = open_simulated(Path(folder), spec)
-        pins = simulated_table(recording, spec, truth, missing, progress=progress)
-        depth_per_move = np.tan(np.radians(rig_of(spec).plate_tilt_deg))
+        pins = simulated_table(recording, spec, truth, progress=progress)
     else:
-        depth_per_move = DEPTH_PER_MOVE.get(spec.name, 0.0)
         recording = open_recording(folder, spec, form)
         pins = pin_table(recording, spec, problems=problems, progress=progress)
     row_of = {name: k for k, name in enumerate(recording.names)}
     rows = np.array([row_of[name] for name in pins.image_name], int)
     targets = choose_targets(recording, columns, rows, depth_per_move, problems)
-    if (Path(folder) / TRUTH).is_dir():
+    if simulated:
         targets = targets.instead(touched_labels(Path(folder), pins.image_name))
     unseen = ~pins.valid
     if unseen.any():
@@ -244,34 +238,36 @@ def simulated_table(
     recording: Recording,
     spec: SensorSpec,
     truth: dict[str, np.ndarray],
-    missing: Callable | None = None,
     *,
     progress: Callable | None = None,
 ) -> PinTable:
     """The table that a pipeline without a fault would make of simulated frames, from their pins; hidden caps count as lost.
 
     Each contact may have a sensor of its own (longer pins, a thinner skin): its pins are counted from where they are at rest
-    there, as those of a real sensor are from its own no-contact frame. ``missing`` as in ``load_dataset``.
+    there, as those of a real sensor are from its own no-contact frame.
     """
     reference = nominal_reference(spec, recording.form)
-    moved_px = truth["pins_px"].astype(float) - truth["rest_px"]
-    if missing:
-        moved_px = moved_px + missing(read_arm_labels(recording), moved_px, recording.labels[GROUP_COLUMN].astype(int))
-    nodes = reference.pins_px + moved_px
-
-    def compute() -> dict[str, np.ndarray]:
-        areas = np.empty(nodes.shape[:2])
-        for k, pins_px in enumerate(nodes):
-            areas[k] = make_graph("voronoi", pins_px, outmost=reference.outmost).area_px2
-            if progress:
-                progress(k + 1, len(nodes))
-        return {"area_px2": areas}
-
-    area_px2 = cached_arrays("simulated-areas", {"pins": nodes.tobytes(), "sensor": spec.name}, compute)["area_px2"]
+    nodes = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])
+    area_px2 = voronoi_areas(nodes, reference, progress=progress)
     seen = np.ones(len(nodes), bool)
     return PinTable(
         spec, recording.form, reference, np.array(recording.names, str), nodes, area_px2, ~truth["visible"], seen, measured=True
     )
+
+
+def voronoi_areas(nodes_px: np.ndarray, reference: Reference, *, progress: Callable | None = None) -> np.ndarray:
+    """Voronoi areas (S, N), px^2, of S times N pins (S, N, 2) with this no-contact layout; computed once, then kept on disk."""
+
+    def compute() -> dict[str, np.ndarray]:
+        areas = np.empty(nodes_px.shape[:2])
+        for k, pins_px in enumerate(nodes_px):
+            areas[k] = make_graph("voronoi", pins_px, outmost=reference.outmost).area_px2
+            if progress:
+                progress(k + 1, len(nodes_px))
+        return {"area_px2": areas}
+
+    key = {"pins": nodes_px.tobytes(), "rest": reference.pins_px.tobytes()}
+    return cached_arrays("simulated-areas", key, compute)["area_px2"]
 
 
 def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progress: Callable | None = None) -> PinTable:

@@ -1,5 +1,6 @@
 """A trained model, its sensor and its pipeline in one: frame in, pose out. The one thing a live loop calls."""
 
+import hashlib
 import json
 from copy import copy
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features, 
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.recipes import TrainingError
 from training.registration import Registration
+from twin.cache import code_digest
 from twin.errors import FrameError
 from twin.preprocess import Pipeline, make_reference, measure_reference
 from twin.types import Form, Frame
@@ -91,7 +93,7 @@ class PoseEstimator:
         TrainingError
             If it holds none.
         """
-        run = SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
+        run = folder_of(run)
         packed = (run / WEIGHTS).is_file()
         if not packed and not (run / "weights.pt").is_file():
             hint = (
@@ -202,6 +204,20 @@ class PoseEstimator:
     def _estimate(self, made: Prediction, started: float) -> PoseEstimate:
         value, half = made.mean[0], made.half_width[0]
         return PoseEstimate(self.names, self.units, value, value - half, value + half, float(made.executed[0]), True, "", _ms(started))
+
+
+def folder_of(run: str | Path) -> Path:
+    """The folder of a run, or of the weights that go with the package where there is no such folder and a sensor is named so."""
+    return SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
+
+
+def digest_of(run: str | Path) -> str:
+    """Digest of all that a model's answers depend on: its weights, its configuration, and the code that runs it."""
+    folder, digest = folder_of(run), hashlib.sha256(code_digest("scenes", "twin", "training").encode())
+    for name in ("config.json", WEIGHTS, "weights.pt"):
+        if (folder / name).is_file():
+            digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())
+    return digest.hexdigest()
 
 
 def _ms(started: float) -> float:

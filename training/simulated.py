@@ -23,9 +23,14 @@ from twin.types import Form
 TABLE = "targets.csv"
 
 
+def is_simulated(folder: Path) -> bool:
+    """Whether a folder holds a simulated data set."""
+    return (folder / TRUTH).is_dir()
+
+
 def is_pins_only(folder: Path) -> bool:
     """Whether a folder holds a simulated data set without pictures."""
-    return (folder / TRUTH).is_dir() and not image_folders(folder, None)
+    return is_simulated(folder) and not image_folders(folder, None)
 
 
 def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str, np.ndarray]]:

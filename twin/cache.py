@@ -52,6 +52,16 @@ def cached_arrays(kind: str, key: dict, compute: Callable[[], dict[str, np.ndarr
     return found
 
 
+@cache
+def code_digest(*packages: str) -> str:
+    """Digest of the Python and TOML files of packages beside this one: whatever is computed by them may be another where it changes."""
+    digest, root = hashlib.sha256(), Path(__file__).parents[1]
+    for path in sorted(path for package in packages for path in (root / package).rglob("*") if path.suffix in (".py", ".toml")):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
+
+
 def cache_folder() -> Path | None:
     """Where entries are kept; None where the cache is off."""
     chosen = os.environ.get(_VARIABLE, "")

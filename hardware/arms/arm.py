@@ -35,7 +35,7 @@ class Arm(Protocol):
     """A robot arm. Nothing moves or opens in a constructor; nothing moves before ``enable``.
 
     Every method but ``connect`` raises ``DeviceNotConnectedError`` when not connected, and ``DeviceError`` when the arm
-    refuses or fails; ``stop``, ``disable`` and ``clear_error`` are never gated.
+    refuses or fails; ``stop``, ``emergency_stop``, ``disable`` and ``clear_error`` are never gated.
     """
 
     name: str
@@ -61,6 +61,9 @@ class Arm(Protocol):
 
     def stop(self) -> None:
         """End the motion at once and forget what is queued."""
+
+    def emergency_stop(self) -> None:
+        """Stop and cut the motors' power, where the arm has a command for it; ``clear_error`` and ``enable`` bring it back."""
 
     def state(self, *, max_age_s: float = 1.0) -> ArmState:
         """The newest state; ``StaleDataError`` if it is older than ``max_age_s``."""

@@ -35,6 +35,14 @@ class BaseArm(Connection, ABC):
     def stop(self) -> None: ...
 
     @abstractmethod
+    def disable(self) -> None: ...
+
+    def emergency_stop(self) -> None:
+        """Stop and disable; see ``Arm``."""
+        self.stop()
+        self.disable()
+
+    @abstractmethod
     def state(self, *, max_age_s: float = 1.0) -> ArmState: ...
 
     def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:

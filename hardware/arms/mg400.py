@@ -128,8 +128,21 @@ class MG400(BaseArm):
         self._alarm_text = None
 
     def stop(self) -> None:
-        self._sent = None  # the queue is dropped
-        self._tell_in_any_case("ResetRobot()", "stopped")
+        """Stop and drop the queue; an arm that refuses to is switched off, which is an error."""
+        self._sent = None
+        try:
+            self._tell_in_any_case("ResetRobot()", "stopped")
+        except DeviceNotConnectedError:
+            raise
+        except DeviceError as error:
+            self.emergency_stop()
+            raise DeviceError(
+                f"{self.name}: would not stop and was switched off by its emergency stop; call clear_error() and enable(). {error}"
+            ) from error
+
+    def emergency_stop(self) -> None:
+        self._sent = None
+        self._tell_in_any_case("EmergencyStop()", "switched off")
 
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
         self._require_connected()

@@ -6,8 +6,6 @@ from hardware.cameras.source import FrameSource
 from hardware.devices import cameras
 from hardware.errors import StaleDataError
 
-WARMUP_S = 5.0
-
 
 class LeRobotCamera:
     """``connect``, ``read``, ``async_read``, ``read_latest`` and ``disconnect`` as LeRobot's cameras have them.
@@ -33,7 +31,7 @@ class LeRobotCamera:
         """Open it; with ``warmup`` return when the first frame has come."""
         self._source.connect()
         if warmup:
-            self._source.read(timeout_s=WARMUP_S)
+            self._source.read(timeout_s=self._source.first_frame_s)
 
     def read(self) -> np.ndarray:
         """The next image (H, W) or (H, W, 3), uint8 RGB."""

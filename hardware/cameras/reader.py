@@ -15,7 +15,8 @@ MOST_FAILED_READS = 10  # in a row; one more ends the reader
 FAILED_PAUSE_S = 0.2  # before the device is tried again
 FROZEN_S, FROZEN_N = 0.5, 5  # the same picture for so long, and so often: no live sensor does that, for its noise
 BLACK_LEVEL = 16  # nothing brighter: the lamps are off, or nothing is seen
-FIRST_FRAME_S = 10.0
+START_S = 4.0  # of a real camera, from opening it to its first picture ...
+FIRST_PERIODS = 5  # ... and so many periods of its frames
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class LiveSource(Connection, ABC):
 
     is_live = True
     notices_still = True  # whether a picture that doesn't change is a fault
+    fps = 5.0  # of the frames; where the device does not tell, the slowest that is of use
 
     def __init__(self, name: str, form: Form) -> None:
         self.name, self.form = name, Form(form)
@@ -61,6 +63,11 @@ class LiveSource(Connection, ABC):
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
         self._reset()
+
+    @property
+    def first_frame_s(self) -> float:
+        """So long after it was connected its first frame may take."""
+        return START_S + FIRST_PERIODS / self.fps
 
     @abstractmethod
     def _open(self) -> None:
@@ -126,7 +133,7 @@ class LiveSource(Connection, ABC):
         return self._take(lambda frame: frame.time_s > time_s, timeout_s, "no frame exposed since then")
 
     def read_latest(self, *, max_age_s: float = 0.5) -> Frame:
-        frame = self._take(lambda _: True, FIRST_FRAME_S, "no frame at all")
+        frame = self._take(lambda _: True, self.first_frame_s, "no frame at all")
         age_s = time.monotonic() - frame.time_s
         if age_s > max_age_s:
             raise StaleDataError(f"{self.name}: the newest frame is {age_s:.2f} s old (allowed {max_age_s:g} s); check camera and cable")

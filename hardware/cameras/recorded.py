@@ -21,6 +21,7 @@ class SequentialSource(Connection, ABC):
     """
 
     is_live = False
+    first_frame_s = 0.0
     dropped = 0
     fault = ""
 

@@ -18,6 +18,7 @@ class FrameSource(Protocol):
     name: str
     form: Form
     is_live: bool  # a recording waits for its reader, a live source does not
+    first_frame_s: float  # so long after it was connected its first frame may take
 
     @property
     def is_connected(self) -> bool: ...
@@ -54,14 +55,15 @@ class FrameSource(Protocol):
         """The first frame exposed after ``time_s``; ``TimeoutError``."""
 
 
-def await_frame(source: FrameSource, *, timeout_s: float, after_s: float | None = None) -> Frame:
-    """The next frame, or the first one exposed after a time.
+def await_frame(source: FrameSource, *, timeout_s: float | None = None, after_s: float | None = None) -> Frame:
+    """The next frame, or the first one exposed after a time; by default as late as a first frame may come.
 
     Raises
     ------
     DeviceError
         None comes.
     """
+    timeout_s = source.first_frame_s if timeout_s is None else timeout_s
     try:
         return source.read(timeout_s=timeout_s) if after_s is None else source.read_after(after_s, timeout_s=timeout_s)
     except (TimeoutError, EOFError) as error:

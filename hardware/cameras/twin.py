@@ -21,6 +21,7 @@ from twin.types import ContactState, Form, Frame
 
 PoseSource = Callable[[], ArmState]
 RETRY_S, ASKED_S = 0.05, 0.1
+FIRST_FRAME_S = 120.0  # kernels may have to be compiled
 STEADY_SD = 1.0  # gray levels of noise where the specification has none: a real sensor's measured temporal noise
 
 
@@ -48,6 +49,7 @@ class TwinCamera(LiveSource):
     """
 
     notices_still = False  # the twin has a memory, not a cable
+    first_frame_s = FIRST_FRAME_S
 
     def __init__(
         self,

@@ -54,6 +54,7 @@ class UvcCamera(LiveSource):
         self._node, self._spec = node, spec
         size = {"width_px": spec.camera.width_px, "height_px": spec.camera.height_px} if spec else {}
         self.settings = settings or UvcSettings(**size)
+        self.fps = self.settings.fps
         self.report: list[tuple[str, float, float]] = []  # what was asked, and what the camera says it does
         self._device: cv2.VideoCapture | None = None
 
@@ -65,6 +66,8 @@ class UvcCamera(LiveSource):
                 f"{self.name}: can't be opened; see 'twin doctor' for the cameras there are, and whether another program uses it"
             )
         self.report = apply_settings(device, self.settings)
+        told = next(told for name, _, told in self.report if name == "fps")
+        self.fps = told if told > 0 else self.settings.fps  # a camera may be slower than it was asked to be
         self._device = device
 
     def _close(self) -> None:

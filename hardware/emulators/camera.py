@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import Faults
 from hardware.errors import DeviceError
 from hardware.stream import CONTENT_TYPE, jpeg_of, write_part
@@ -81,6 +81,12 @@ class CameraEmulator:
             ) from error
         self._end.clear()
         self._source.connect()
+        try:
+            await_frame(self._source)  # who finds it listening is not made to wait for kernels to be compiled
+        except BaseException:
+            self._server.server_close()
+            self._source.disconnect()
+            raise
         for target in (self._make, self._server.serve_forever):
             self._threads.append(threading.Thread(target=target, name="camera emulator", daemon=True))
             self._threads[-1].start()

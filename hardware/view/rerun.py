@@ -1,6 +1,9 @@
 """A view in Rerun (``rerun-sdk``, an optional package): frame, pins, graph and estimates over time, in its viewer or in a file."""
 
+import re
 from pathlib import Path
+from socket import create_connection
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -9,6 +12,7 @@ from hardware.step import Estimate
 from twin.types import Frame, Observation
 
 VIEWER, SUFFIX = "viewer", ".rrd"
+ANSWER_S = 8.0  # for so long a viewer is waited for, at the start and at the end; a new one takes a second or two
 
 
 class RerunView:
@@ -40,19 +44,36 @@ class RerunView:
         self.url = "Rerun's viewer" if target == VIEWER else target
 
     def __enter__(self) -> "RerunView":
-        self._stream = self._rerun.RecordingStream(self._title)
-        if self._target == VIEWER:
-            self._stream.spawn()
-        elif "://" in self._target:
-            self._stream.connect_grpc(self._target)
-        else:
-            Path(self._target).parent.mkdir(parents=True, exist_ok=True)
-            self._stream.save(self._target)
+        """Open the target.
+
+        Raises
+        ------
+        DeviceError
+            No viewer answers there, or the file can't be written.
+        """
+        self._stream = self._rerun.RecordingStream(re.sub(r"\W+", "-", self._title))
+        try:
+            if self._target == VIEWER:
+                self._stream.spawn()
+            elif "://" in self._target:
+                with create_connection(_address(self._target), timeout=ANSWER_S):  # a refusal is told at once, and in few words
+                    self._stream.connect_grpc(self._target)
+            else:
+                Path(self._target).parent.mkdir(parents=True, exist_ok=True)
+                self._stream.save(self._target)
+            self._stream.flush(timeout_sec=ANSWER_S)  # connecting tells nothing, this does
+        except (RuntimeError, OSError, ValueError) as error:
+            remedy = "start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file"
+            raise DeviceError(f"--rerun {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stream.flush()
-        self._stream.disconnect()
+        try:
+            self._stream.flush(timeout_sec=ANSWER_S)
+        except RuntimeError as error:
+            raise DeviceError(f"--rerun {self._target}: gone before the end ({error}); the last that was shown is missing there") from error
+        finally:
+            self._stream.disconnect()
 
     def log(self, frame: Frame, seen: Observation, estimate: Estimate) -> None:
         """A frame with its pins and graph, and the estimate's values with their intervals, on the timelines ``frame`` and ``time``."""
@@ -72,3 +93,11 @@ class RerunView:
         self._stream.log("view", self._rerun.Image(picture))
         self._stream.log("figures", self._rerun.TextDocument("\n".join(stats.values())))
         return True
+
+
+def _address(target: str) -> tuple[str, int]:
+    """Host and port of a viewer's address; ``ValueError`` where it has none."""
+    parts = urlsplit(target)
+    if not parts.hostname or not parts.port:
+        raise ValueError("no host and port")
+    return parts.hostname, parts.port

@@ -13,6 +13,7 @@ class NoisyCamera(LiveSource):
 
     def __init__(self, *, fps: float = 100.0, color: bool = False) -> None:
         super().__init__("noisy camera", Form.RAW)
+        self.fps = fps
         self._period_s, self._shape = 1.0 / fps, (48, 64, 3) if color else (48, 64)
         self._rng, self._number = np.random.default_rng(0), 0
 

@@ -37,6 +37,7 @@ def test_nothing_works_before_connect_and_nothing_moves_before_enable(at):
         arm.disable,
         arm.clear_error,
         arm.stop,
+        arm.emergency_stop,
         arm.state,
         lambda: arm.move_linear(at.home),
         lambda: arm.set_speed(1, 1),
@@ -101,6 +102,22 @@ def test_stop_ends_a_move_and_what_is_queued(ready):
     assert np.array_equal(ready.reads(), still) and not ready.arm.state().moving
     assert np.linalg.norm(still[:3] - ready.home[:3]) < 20
     ready.arm.move_linear(ready.home)  # and it can go on
+
+
+def test_an_emergency_stop_ends_all_and_is_recovered_from(ready):
+    ready.arm.set_speed(SLOW_MM_S, SLOW_MM_S)
+    ready.arm.move_linear(ready.home + [0, 20, 0, 0, 0, 0], wait=False)
+    time.sleep(0.1)
+    ready.arm.emergency_stop()
+    time.sleep(0.1)
+    still = ready.reads()
+    time.sleep(0.2)
+    assert np.array_equal(ready.reads(), still) and not ready.arm.state().enabled
+    with pytest.raises(DeviceError, match="enable"):
+        ready.arm.move_linear(ready.home)
+    ready.arm.clear_error()
+    ready.arm.enable()
+    ready.arm.move_linear(ready.home)
 
 
 def test_without_wait_it_returns_at_once_and_settles_later(ready):

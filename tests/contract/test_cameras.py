@@ -9,13 +9,14 @@ import pytest
 from noisy_camera import NoisyCamera, number_of
 
 from hardware.arms.simulated import SimulatedArm
+from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
 from hardware.cameras.lerobot import LeRobotCamera
 from hardware.cameras.mjpeg import MjpegCamera
-from hardware.cameras.reader import MOST_FAILED_READS, ReadFailed
+from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
-from hardware.cameras.uvc import UvcSettings, apply_settings, exposed_s
+from hardware.cameras.uvc import UvcCamera, UvcSettings, apply_settings, exposed_s
 from hardware.devices import cameras
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
@@ -343,6 +344,19 @@ def test_check_says_what_to_do_about_a_camera_that_gives_nothing(monkeypatch):
             raise ReadFailed("ended")
 
     monkeypatch.setattr("hardware.cameras.choose.open_camera", lambda *_: Silent())
-    monkeypatch.setattr(check, "LIVE_TIMEOUT_S", 0.1)
-    with pytest.raises(DeviceError, match="check the camera"):
+    monkeypatch.setattr(reader, "START_S", 0.1)
+    with pytest.raises(DeviceError, match=r"noisy camera: no new frame within 0\.15 s; check the camera"):
         check.frames_of("0", None, None, 2)
+
+
+def test_a_first_frame_is_waited_for_as_long_as_its_source_may_need():
+    """Some periods beside the start of a device; minutes only in the twin, which may have to compile kernels, and not behind a stream."""
+    slow, fast = NoisyCamera(fps=2.0), NoisyCamera(fps=30.0)
+    assert slow.first_frame_s - fast.first_frame_s == pytest.approx(FIRST_PERIODS * (1 / 2.0 - 1 / 30.0))
+    assert MjpegCamera("http://127.0.0.1:9/").first_frame_s <= 5.0 and UvcCamera(97).first_frame_s <= 5.0
+    assert twin_camera()[1].first_frame_s >= 60.0
+    late = NoisyCamera(fps=1.0)
+    with CameraEmulator(late) as emulator:  # it listens when there is something to be seen
+        assert late.delivered == 1
+        with MjpegCamera(emulator.url) as camera:
+            assert number_of(camera.read(timeout_s=camera.first_frame_s).image) >= 1

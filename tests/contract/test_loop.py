@@ -21,6 +21,7 @@ from scenes import PlacementSpec, load_experiment, load_object, load_sensor, loa
 from twin.mounting import Mounting
 
 SPEED = 20.0  # of the simulated arm, times real
+ALLOCATOR_BYTES = 4_000_000  # that it may take at a time
 CLEAR_INDENT_MM = -10.0  # a sensor that has let go is farther than this from the surface
 
 
@@ -341,14 +342,19 @@ def test_a_replayed_session_decides_the_same(rig, tmp_path):
 
 @pytest.mark.slow
 def test_an_hour_of_it_neither_grows_nor_slows(rig):
-    """Bounded by TACTIP_ENDURANCE_MIN minutes (1 by default): memory, latency, and every frame accounted for."""
+    """Bounded by TACTIP_ENDURANCE_MIN minutes (1 by default): memory, latency, and every frame accounted for.
+
+    What may grow is the record of every decision.
+    """
     import os
     import resource
+    import sys
 
     minutes = float(os.environ.get("TACTIP_ENDURANCE_MIN", "1"))
     _, arm = rig
     halves: list[list[float]] = [[], []]
     memory_kib: list[int] = []
+    decisions: list[int] = []
     end_s = time.monotonic() + 60 * minutes
     middle_s = end_s - 30 * minutes
 
@@ -360,6 +366,7 @@ def test_an_hour_of_it_neither_grows_nor_slows(rig):
         halves[now_s > middle_s].append(record.latency_s)
         if record.index % 100 == 0:
             memory_kib.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+            decisions.append(len(loop.decided))
         if now_s > end_s:
             raise Enough
 
@@ -373,9 +380,12 @@ def test_an_hour_of_it_neither_grows_nor_slows(rig):
         assert source.failed == 0
     third = len(memory_kib) // 3
     print(f"\n{minutes:g} min, {source.arrived} frames arrived, {source.delivered} read, {source.dropped} dropped, {source.failed} failed")
-    print(f"{len(loop.decided)} decisions; memory +{memory_kib[-1] - memory_kib[third]} KiB in the last two thirds")
+    grown_kib, taken = memory_kib[-1] - memory_kib[third], decisions[-1] - decisions[third]
+    print(f"{len(loop.decided)} decisions; memory +{grown_kib} KiB in the last two thirds, {1024 * grown_kib / taken:.0f} bytes a decision")
     for name, half in zip(("first", "second"), halves, strict=True):
         print(f"{name} half: exposure to command {1e3 * np.median(half):.1f} ms, 95 % {1e3 * np.percentile(half, 95):.1f} ms")
-    assert memory_kib[-1] - memory_kib[third] < 20_000  # what the records take, and no more
+    record = loop.records[-1]
+    own = sum(sys.getsizeof(getattr(record, slot)) for slot in record.__slots__) + sys.getsizeof(record)
+    assert 1024 * grown_kib < 1.5 * own * taken + ALLOCATOR_BYTES, "what the records take, and no more"
     assert np.median(halves[1]) < 1.5 * np.median(halves[0])
     assert np.percentile(halves[1], 95) < 2.0 * np.percentile(halves[0], 95)

@@ -12,9 +12,10 @@ from tried_faults import tried_in
 
 from hardware.arms import kinematics as arms
 from hardware.arms.mg400 import Mg400Ports
-from hardware.arms.mg400_link import Feedback
+from hardware.arms.mg400_link import CommandPort, Feedback
 from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet
 from hardware.emulators.mg400 import FAULTS, Mg400Emulator
+from hardware.emulators.mg400_grammar import RefusedError
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.errors import TwinError
 
@@ -128,6 +129,32 @@ def test_recovery_from_an_emergency_stop():
         assert np.array_equal(emulator.pose(), stopped)  # nothing of the old queue goes on
         arm.set_speed_percent(linear=100)
         arm.move_linear(AWAY)
+
+
+def test_an_arm_that_will_not_stop_is_switched_off():
+    def refuse(request):
+        raise RefusedError(-1)
+
+    with emulated() as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        arm.set_speed_percent(linear=SLOW_SHARE_PERCENT)
+        arm.move_linear(AWAY, wait=False)
+        emulator._commands.dashboard["resetrobot"] = refuse
+        with pytest.raises(DeviceError, match="would not stop and was switched off"):
+            arm.stop()
+        stopped = emulator.pose()
+        time.sleep(0.1)
+        assert np.array_equal(emulator.pose(), stopped) and "alarm 85" in arm.state().error and not emulator.arm.enabled
+
+
+@pytest.mark.parametrize("text", ["ServoJ(0,10,50,0)", "ServoP(300,0,0,0)", "NoSuchThing()"])
+def test_there_is_no_such_command_and_no_streaming_of_places(text):
+    with emulated() as emulator:
+        for number in (29999, 30003):
+            port = CommandPort("mg400", "127.0.0.1", emulator.ports[number])
+            port.open()
+            assert port.request(text).error_id == -10000
+            port.close()
 
 
 def test_recovery_from_a_collision():

@@ -9,6 +9,7 @@ import time
 import urllib.request
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ import twin.cli.collect
 import twin.cli.live
 import twin.cli.servo
 import twin.cli.study  # noqa: F401  (each registers its commands)
+from hardware.arms.arm import ArmState
+from hardware.arms.kinematics import MG400
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.twin import preview_of
@@ -33,7 +36,7 @@ from training.estimator import PoseEstimator
 from twin.camera import expose, record
 from twin.cli import app, servo_run
 from twin.cli.emulate import run_until_told
-from twin.cli.rig import build_rig, steps_round
+from twin.cli.rig import _no_full_turn, build_rig, steps_round
 from twin.errors import TwinError
 from twin.mounting import Mounting
 from twin.preprocess import Pipeline
@@ -41,7 +44,8 @@ from twin.recordings import open_recording
 from twin.recordings.images import write_image
 from twin.types import Form, Frame
 
-sys.path.append(str(Path(__file__).parents[1] / "contract"))
+sys.path += [str(Path(__file__).parents[1] / folder) for folder in ("contract", "unit")]
+from drawn_frames import drawn_frame  # noqa: E402
 from free_ports import free_offset  # noqa: E402
 from noisy_camera import NoisyCamera, number_of  # noqa: E402
 from true_estimator import TrueEstimate, TrueEstimator  # noqa: E402
@@ -104,6 +108,22 @@ def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path
     seen = stand_in.pipeline(frames[-1])
     assert seen.valid
     assert np.linalg.norm(seen.graph.nodes_px - stand_in.pipeline.reference.pins_px, axis=1).max() > 4.0
+
+
+def test_a_follow_that_ends_early_is_written_and_is_an_exit_code(stand_in, tmp_path, monkeypatch):
+    monkeypatch.setattr(servo_run, "GIVE_UP_S", 0.2)
+    calls = []
+
+    def fails_later(model, frame):
+        calls.append(frame)
+        model.true.fail = "no pins" if len(calls) > 4 else ""
+        return model.true(frame)
+
+    monkeypatch.setattr(StandIn, "__call__", fails_later)
+    result = CliRunner().invoke(
+        app, ["servo", "--object", "can", "--model", "any", "--out", str(tmp_path), "--steps", "9", "--plain-light"]
+    )
+    assert result.exit_code == 1 and "ended early" in result.output and (tmp_path / "trajectory.csv").is_file()
 
 
 def test_pins_are_counted_from_a_frame_taken_clear_of_the_object_and_so_they_are_in_a_replay(tmp_path):
@@ -254,6 +274,38 @@ def test_a_view_that_breaks_ends_the_session_with_its_error():
     with session.source, pytest.raises(DeviceError, match="no such colour.*--headless"), shower:
         session.run(seconds=30.0, going=lambda: shower.open)
     assert session.timing().steps < 1000  # it did not go on for half a minute
+
+
+def test_a_view_that_can_not_be_opened_is_told_before_anything_is_recorded(stand_in, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", SimpleNamespace(RecordingStream=lambda title: None))
+    (tmp_path / "frames").mkdir()
+    write_image(tmp_path / "frames" / "frame_0.png", np.full((360, 360), 99, np.uint8))
+    common = ("live", "--camera", tmp_path / "frames", "--model", "any", "--record", tmp_path / "s")
+    told = refused(*common, "--rerun", "rerun+http://127.0.0.1:1/proxy")
+    assert "start a viewer" in told and not (tmp_path / "s").exists()
+
+
+def test_pins_are_not_counted_from_a_pressed_sensor(tmp_path):
+    sensor = load_sensor("mg400-331")
+    pipeline = Pipeline(sensor, Form.RECORDING)
+    rest_px = pipeline.reference.pins_px
+    away = rest_px - rest_px.mean(axis=0)
+    pressed_px = rest_px + 0.15 * away * np.exp(-((np.linalg.norm(away, axis=1) / 60.0)[:, None] ** 2))
+    (tmp_path / "pressed").mkdir()
+    write_image(tmp_path / "pressed" / "frame_0.png", drawn_frame(sensor, Form.RECORDING, pressed_px).image)
+    common = ("live", "--camera", tmp_path / "pressed", "--headless", "--record", tmp_path / "s", "--at-rest")
+    told = refused(*common, "first")
+    assert "seems pressed" in told and "--at-rest FRAME" in told and not (tmp_path / "s").exists()
+    assert "1 steps" in run(*common, tmp_path / "pressed" / "frame_0.png")  # who gives a frame is believed
+
+
+def test_an_arm_that_can_turn_no_farther_says_how_to_go_on():
+    guard = _no_full_turn(SimpleNamespace(name="mg400", kinematics=MG400))
+    here = ArmState(np.array([300.0, 0, 0, 0, 0, 179.0]), np.array([0.0, 30, 30, 179]), 0.0, True, False)
+    within = np.array([300.0, 0, 0, 0, 0, 170.0])
+    assert guard(here, within) is within
+    with pytest.raises(DeviceError, match=r"no farther than here \(R 179 deg, J4 179 deg\).*full turn.*--steps.*placement\.turn_deg"):
+        guard(here, np.array([300.0, 0, 0, 0, 0, 181.0]))
 
 
 def test_an_emulator_that_fails_ends_with_its_error():

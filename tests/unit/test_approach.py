@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hardware.approach import way_around
+from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject, matrix_of, moved
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.mounting import Mounting
@@ -11,10 +12,14 @@ from twin.mounting import Mounting
 SAMPLES = 200  # along each straight piece
 
 
+def before(name):
+    sensor, servo = load_sensor("mg400-331"), load_servo("surface")
+    return PlacedObject(load_object(name), servo.placement, Mounting.of(sensor, load_experiment("surface-2d")))
+
+
 @pytest.fixture
 def placed():
-    sensor, servo = load_sensor("mg400-331"), load_servo("surface")
-    return PlacedObject(load_object("square"), servo.placement, Mounting.of(sensor, load_experiment("surface-2d")))
+    return before("square")
 
 
 def clear_of(placed):
@@ -54,3 +59,21 @@ def test_from_behind_and_near_it_first_goes_outward(placed):
     assert np.allclose((way[1] - start)[:3] / np.linalg.norm((way[1] - start)[:3]), inward)
     gaps = gaps_mm(placed, way)
     assert gaps.min() == pytest.approx(5.0, abs=0.1) and gaps[SAMPLES:].min() > 5.0
+
+
+@pytest.mark.parametrize("name", ["plane", "edge"])
+def test_to_an_object_without_an_end_it_is_straight_from_the_front_and_from_contact(name):
+    placed = before(name)
+    clear = clear_of(placed)
+    for start in (moved(clear, 60.0 * placed.mounting.across), placed.start_pose(4.0)):
+        (only,) = way_around(placed, start, clear)
+        assert only is clear
+
+
+@pytest.mark.parametrize("name", ["plane", "edge"])
+def test_through_an_object_without_an_end_there_is_no_way(name):
+    placed = before(name)
+    behind = placed.start_pose(70.0)
+    behind[:3] += 30.0 * placed.T_base_object[:3, 0]  # of the edge, too
+    with pytest.raises(DeviceError, match=f"the {name} leads .* behind its surface.*jog the arm"):
+        way_around(placed, behind, clear_of(placed))

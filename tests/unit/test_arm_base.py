@@ -28,6 +28,8 @@ class ToldArm(BaseArm):
     def stop(self):
         self.stopped = True
 
+    def disable(self): ...
+
     def state(self, *, max_age_s=1.0):
         age_s, pose, moving, error = self.told.pop(0) if len(self.told) > 1 else self.told[0]
         return ArmState(pose, np.zeros(4), time.monotonic() - age_s, True, moving, error)

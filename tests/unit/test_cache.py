@@ -239,3 +239,21 @@ def test_processes_share_a_folder(folder):
         _, said = worker.communicate(timeout=120)
         assert worker.returncode == 0, said
     assert not list(folder.glob("*.part"))
+
+
+def test_the_codes_digest_is_that_of_its_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "__file__", str(tmp_path / "twin" / "cache.py"))
+    (tmp_path / "twin" / "inner").mkdir(parents=True)
+    file = tmp_path / "twin" / "inner" / "a.py"
+    found = []
+    for change in (
+        lambda: file.write_text("a = 1\n"),
+        lambda: file.write_text("a = 2\n"),
+        lambda: file.rename(file.with_name("b.py")),
+        lambda: (tmp_path / "twin" / "c.toml").write_text("c = 1\n"),
+    ):
+        change()
+        found.append(cache.code_digest.__wrapped__("twin"))
+    assert len(set(found)) == 4
+    (tmp_path / "twin" / "inner" / "b.cpython-311.pyc").write_bytes(b"compiled")
+    assert cache.code_digest.__wrapped__("twin") == found[-1] == cache.code_digest.__wrapped__("twin", "none")

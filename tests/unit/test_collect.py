@@ -20,6 +20,7 @@ from twin.types import Form
 LATE_S = 0.15  # of the late camera: a frame arrives so long after its exposure
 SCALE = 1e-2  # mm a gray level in the pictures of ``PoseCamera``
 FAST = 20.0  # times the arm's speed
+SAMPLES = 40  # along a move
 
 
 class PoseCamera(LiveSource):
@@ -178,3 +179,57 @@ def test_limits_that_shorten_its_moves_are_refused(rig, tmp_path):
     with pytest.raises(DeviceError, match="--limits"):
         run(rig, tmp_path, 1)
     assert rows(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["square", "can"])
+def test_it_goes_around_an_object_to_its_contacts(rig, tmp_path, name):
+    """From behind the object to the first contact, and from lift to lift, the dome touches nothing."""
+    experiment, plane, _ = rig
+    placed = PlacedObject(load_object(name), PlacementSpec(), plane.mounting)
+    behind = placed.start_pose(0.0)
+    behind[:3] += 180.0 * placed.T_base_object[:3, 2]
+    arm = SimulatedArm(axes=6, pose=behind, time_scale=FAST)
+    run((experiment, placed, arm), tmp_path, 2)
+    pieces = [piece for piece in arm.track._pieces if piece.linear]
+    indents = [[placed.touch(p.pose(s)).indent_mm for s in np.linspace(p.start_s, p.end_s, SAMPLES)] for p in pieces]
+    first = next(k for k, each in enumerate(indents) if max(each) > 0)
+    assert first > 3  # around, and then the tap
+    assert np.max(indents[: first - 2]) < -8.0  # on the way; then off the lift, to the tap's start
+    lifted = [each for each in indents if max(each[0], each[-1]) < -8.0]
+    assert len(lifted) > first and np.max(lifted) < -8.0
+
+
+def test_stopped_on_the_way_it_does_not_cross_the_object(rig, tmp_path):
+    experiment, plane, _ = rig
+    placed = PlacedObject(load_object("can"), PlacementSpec(), plane.mounting)
+    behind = placed.start_pose(0.0)
+    behind[:3] += 180.0 * placed.T_base_object[:3, 2]
+    arm = SimulatedArm(axes=6, pose=behind, time_scale=FAST)
+    calls = []
+
+    def interrupted(state, target):
+        calls.append(target)
+        if len(calls) > 2:
+            raise KeyboardInterrupt
+        return target
+
+    with arm, PoseCamera(arm) as camera, pytest.raises(KeyboardInterrupt):
+        options = {"seed": 1, "speed": (100.0, 100.0), "guards": (interrupted,)}
+        collect(camera, arm, experiment, placed, Collection(tmp_path, {"seed": 1}, Form.RAW), 1, **options)
+    assert len(calls) == 3 and not arm._enabled  # no fourth move, which would lead straight to the front
+
+
+def test_a_frame_at_rest_that_is_refused_is_kept_to_go_on_with(rig, tmp_path):
+    experiment, placed, arm = rig
+
+    def refuse(frame):
+        raise DeviceError("pressed")
+
+    collection = Collection(tmp_path, {"seed": 1}, Form.RAW)
+    options = {"seed": 1, "speed": (100.0, 100.0), "on_rest": refuse}
+    with arm, PoseCamera(arm) as camera, pytest.raises(DeviceError, match="pressed"):
+        collect(camera, arm, experiment, placed, collection, 1, **options)
+    assert collection.rest.is_file() and rows(tmp_path) == []
+    again = SimulatedArm(axes=6, time_scale=FAST)
+    with again, PoseCamera(again) as camera:
+        assert collect(camera, again, experiment, placed, collection, 1, **options) == 1

@@ -9,13 +9,15 @@ from drawn_frames import drawn_frame, smooth_warp
 
 from scenes import load_sensor
 from training.dataset import load_dataset, split_rows
-from training.targets import corrected, unit_of
+from training.targets import DEPTH_PER_MOVE, corrected, unit_of
 from twin.errors import FrameError
 from twin.preprocess import make_reference, nominal_reference
 from twin.types import Form
 
 SENSOR = "mg400-127"
 HEADER = "image_name,pose_2,pose_6,move_1,move_6"
+LARGEST_MOVE_MM = 5.0  # of the published recordings
+SAME_PLATE_MM = 0.025  # about what the best models of the recordings err by
 
 
 def write_recording(folder, rows, frames, *, table_header=HEADER):
@@ -115,3 +117,10 @@ def test_copies_of_a_row_stay_together(tmp_path):
     assert np.array_equal(both.pins.nodes_px, np.concatenate([data.pins.nodes_px, other.nodes_px]))
     train, held = split_rows(len(both), 0, both.group)
     assert not set(both.group[train]) & set(both.group[held])
+
+
+def test_the_plates_tilt_of_labels_and_twin_is_the_same_plates():
+    """Two fits of one plate: what labels are corrected by, and where the twin has the plate."""
+    for name, depth_per_move in DEPTH_PER_MOVE.items():
+        twins = np.tan(np.radians(load_sensor(name).rig.plate_tilt_deg))
+        assert abs(LARGEST_MOVE_MM * (twins - depth_per_move)) < SAME_PLATE_MM

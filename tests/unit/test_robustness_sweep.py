@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drawn_frames import drawn_frame, smooth_warp
+from plain_sensor import changed
 
 from scenes import load_sensor
 from twin.detectors import Found, make_detector, shipped_detector
@@ -176,7 +177,7 @@ def levels_of_light():
 
 
 def test_models_are_asked_about_every_frame(spec, frames, tmp_path):
-    plan = replace(real_plan(spec, frames), severities=(0.0, 1.0), models=levels_of_light, model_names=("meter",))
+    plan = replace(real_plan(spec, frames), severities=(0.0, 1.0), models=levels_of_light, model_digests={"meter": "1"})
     rows = run_sweep(plan, tmp_path, jobs=1, progress=lambda done, total: None)
     asked = [row for row in rows if row["pipeline"] == "meter"]
     assert len(asked) == 3 * 2 * 2
@@ -191,6 +192,17 @@ def test_cells_depend_on_what_they_were_computed_from(spec, frames):
     other = Plan(plan.source, plan.detectors[:1], plan.cases, plan.severities)
     assert names.isdisjoint(cell.file for cell in cells_of(other))
     assert names == {cell.file for cell in cells_of(real_plan(spec, frames))}
+
+
+def test_cells_are_those_of_their_weights_specification_and_code(spec, frames, monkeypatch):
+    plan = replace(real_plan(spec, frames), model_digests={"meter": "1"})
+    names = {cell.file for cell in cells_of(plan)}
+    retrained = replace(plan, model_digests={"meter": "2"})
+    assert names.isdisjoint(cell.file for cell in cells_of(retrained))
+    softer = replace(plan.source, spec=changed(spec, gel={"poisson_ratio": spec.gel.poisson_ratio - 0.001}))
+    assert names.isdisjoint(cell.file for cell in cells_of(replace(plan, source=softer)))
+    monkeypatch.setattr("twin.robustness.sweep.code_digest", lambda *packages: "of another version")
+    assert names.isdisjoint(cell.file for cell in cells_of(plan))
 
 
 def test_undegraded_real_frames_stay_as_they_are(spec, frames, rest):

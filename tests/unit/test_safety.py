@@ -194,7 +194,7 @@ def test_a_retreat_stays_within_the_box():
 def test_stop_and_its_like_are_never_refused(arm):
     safe = SafeArm(arm, FREE)
     safe.sense(depth_mm=99.0, frame_time_s=-np.inf)
-    for call in (safe.stop, safe.clear_error, safe.disable, safe.disconnect):
+    for call in (safe.stop, safe.emergency_stop, safe.clear_error, safe.disable, safe.disconnect):
         call()
     assert {entry.decision.code for entry in safe.decisions} == {Code.UNGATED} and not arm.is_connected
 

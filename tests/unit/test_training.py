@@ -1,6 +1,7 @@
 """Runs: kept, continued, judged; and what a trained model refuses."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from drawn_frames import drawn_frame
 
 from scenes import load_sensor
 from training.dataset import Dataset, PinTable
-from training.estimator import PoseEstimator
+from training.estimator import PoseEstimator, digest_of, folder_of
 from training.evaluate import judge, leak_slope, predict_rows_of, rows_to_judge, write_evaluation
 from training.recipes import TrainingError, recipe_of
 from training.run import RunConfig, fold_rows, train_run
@@ -169,3 +170,18 @@ def test_unknown_models_and_settings_are_named():
         recipe_of("vgnn", epoch=3)
     with pytest.raises(TrainingError, match="no trained model"):
         PoseEstimator.load("nowhere")
+
+
+def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkeypatch):
+    copy = tmp_path / "run"
+    shutil.copytree(folder_of("mg400-127"), copy)
+    found = [digest_of("mg400-127"), digest_of(copy)]
+    assert found[0] == found[1]  # whatever it is called
+    for file in sorted(copy.iterdir()):
+        content = bytearray(file.read_bytes())
+        content[-1] ^= 1
+        file.write_bytes(content)
+        found.append(digest_of(copy))
+    monkeypatch.setattr("training.estimator.code_digest", lambda *packages: "of another version")
+    found.append(digest_of(copy))
+    assert len(set(found)) == 4

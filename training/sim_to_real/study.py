@@ -2,21 +2,24 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from training.correction import corrected_content
-from training.dataset import Dataset, split_rows
+from training.dataset import Dataset, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_slope, predict_rows_of
 from training.recipes import TrainingError, recipe_of
 from training.recorded_contact import read_arm_labels
 from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors, write_text
+from training.sim_to_real.discrepancy import Discrepancy
+from training.simulated import is_pins_only, open_simulated
 from training.validation.model import MeasuredFrames
+from twin.kinematics import ArmLabel
 from twin.recordings import open_recording
 
 TWIN_EPOCHS = 60  # on thousands of simulated states: more change nothing
@@ -59,13 +62,27 @@ def choose_frames(count: int, labels: int, seed: int) -> Frames:
     return Frames(test, np.sort(order[:labels]), trained | {"all": rest})
 
 
+def arm_labels(data: Dataset) -> list[ArmLabel]:
+    """The arm's label of each row."""
+    folder, pins = data.folder, data.pins
+    recording = open_simulated(folder, pins.sensor)[0] if is_pins_only(folder) else open_recording(folder, pins.sensor, pins.form)
+    labels = dict(zip(recording.names, read_arm_labels(recording), strict=True))
+    return [labels[name] for name in pins.image_name.tolist()]
+
+
+def with_missing(simulated: Dataset, discrepancy: Discrepancy, seed: int, progress: Callable | None = None) -> Dataset:
+    """A simulated data set whose pins have moved by what the twin may miss, drawn for each contact."""
+    pins = simulated.pins
+    missing_px = discrepancy.draw_px(arm_labels(simulated), pins.nodes_px - pins.reference.pins_px, simulated.group.astype(int), seed)
+    nodes_px = pins.nodes_px + missing_px
+    return replace(simulated, pins=replace(pins, nodes_px=nodes_px, area_px2=voronoi_areas(nodes_px, pins.reference, progress=progress)))
+
+
 def measured_of(real: Dataset, rows: np.ndarray) -> MeasuredFrames:
     """Some frames of a recording with the arm's labels, as contacts are fitted to them."""
-    recording = open_recording(real.folder, real.pins.sensor, real.pins.form)
-    labels = dict(zip(recording.names, read_arm_labels(recording), strict=True))
-    names = real.pins.image_name[rows].tolist()
-    pins_px = np.where(real.pins.lost[rows, :, None], np.nan, real.pins.nodes_px[rows])
-    return MeasuredFrames(real.pins.form, names, [labels[name] for name in names], pins_px, real.pins.reference.pins_px, [])
+    part = real.rows(rows)
+    pins_px = np.where(part.pins.lost[..., None], np.nan, part.pins.nodes_px)
+    return MeasuredFrames(part.pins.form, part.pins.image_name.tolist(), arm_labels(part), pins_px, part.pins.reference.pins_px, [])
 
 
 def train_in_twin(

@@ -12,7 +12,8 @@ AtRest = Annotated[
     typer.Option(
         "--at-rest",
         metavar="FRAME|first|none",
-        help="no-contact frame that pins are counted from: a file, the first that is taken, or none (the specification's layout)",
+        help="no-contact frame that pins are counted from: a file, the first that is taken (an error if the sensor seems pressed in it), "
+        "or none (the specification's layout)",
     ),
 ]
 
@@ -34,3 +35,19 @@ def given_frame(text: str, estimator):
         raise FrameError(f"--at-rest {text}: no such file; expected a frame without contact, 'first' or 'none'")
     recording = open_recording(text, estimator.sensor, estimator.form)
     return recording.reference if recording.reference is not None else recording.read(0)
+
+
+def counting_from_first(estimator, frame):
+    """The estimator that counts pins from the first frame that was taken.
+
+    Raises
+    ------
+    FrameError
+        The sensor seems pressed in it, or the model can't count from it.
+    """
+    from twin.preprocess import require_untouched
+
+    found = estimator.at_rest(frame)
+    remedy = "move it clear of everything and begin again, or give a frame that was taken without contact: --at-rest FRAME"
+    require_untouched(estimator.sensor, estimator.form, frame, remedy)
+    return found

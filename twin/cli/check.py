@@ -8,8 +8,6 @@ import typer
 from twin.cli import app
 from twin.cli.options import FormOrAuto, Sensor
 
-LIVE_TIMEOUT_S = 5.0
-
 HELP = """Is the sensor well? Brightness, focus, missing pins, specks, glare, and drift from its calibration; and what to do.
 
 Looks at a frame, a folder of frames, a video or a camera, in contact or not, and compares with what the sensor's specification
@@ -68,7 +66,7 @@ def frames_of(source: str, spec, form, limit: int) -> list:
     if not camera.is_live:
         return recorded_frames(Path(source), spec, form, limit)
     with camera:
-        return [await_frame(camera, timeout_s=LIVE_TIMEOUT_S) for _ in range(limit)]
+        return [await_frame(camera) for _ in range(limit)]
 
 
 def recorded_frames(path: Path, spec, form, limit: int) -> list:

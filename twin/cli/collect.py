@@ -11,7 +11,9 @@ from twin.cli.servo import ArmOption, Camera, PlainLight, ServoName
 HELP = """Collect labelled frames: for each contact a random pose and shear, a tap, and one frame.
 
 A frame is taken only after the arm has said that it stands at the commanded pose, and only one exposed after that; the
-pose that it said is the label. The arm comes from 50 mm away, lifts between contacts, and ends 50 mm clear, disabled.
+pose that it said is the label. The arm goes around the object to 50 mm before it (straight, and in front of it, where the
+object has no end: a plane, an edge), lifts between contacts, and ends 50 mm clear, disabled. Its links and the object's holder
+are not known: look that both have room. The frame without contact is refused where the sensor seems pressed in it.
 The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json);
 contacts.jsonl has the times. The same command goes on where it was ended.
 
@@ -44,6 +46,7 @@ def collect_command(
     from twin.cli.options import writable_folder
     from twin.cli.progress import count_bar
     from twin.cli.rig import build_rig
+    from twin.preprocess import require_untouched
 
     asked, spec, servo = load_experiment(experiment), load_sensor(sensor), load_servo(parameters)
     stimulus = load_object(object_name or asked.object)
@@ -79,10 +82,18 @@ def collect_command(
     }
     collection = Collection(writable_folder(out), about, rig.source.form)
     begun = collection.count
+
+    def on_rest(frame) -> None:
+        remedy = (
+            f"look what touches it, remove {collection.rest} and give the same command again to have it taken anew; "
+            "or the same command alone, to go on with it"
+        )
+        require_untouched(spec, rig.source.form, frame, remedy)
+
     if begun < count:
         with signals_as_ctrl_c(), rig, count_bar("contacts") as progress:
             rig.await_frame()
             speed = (servo.linear_mm_s, servo.angular_deg_s)
-            options = {"seed": seed, "speed": speed, "frame_timeout_s": rig.frame_timeout_s, "progress": progress}
+            options = {"seed": seed, "speed": speed, "frame_timeout_s": rig.frame_timeout_s, "on_rest": on_rest, "progress": progress}
             collect(rig.source, rig.arm, asked, rig.placed, collection, count, **options)
     print(f"{collection.count} contacts in {out} ({collection.count - begun} new)")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.at_rest import FIRST, NONE, AtRest, given_frame
+from twin.cli.at_rest import FIRST, NONE, AtRest, counting_from_first, given_frame
 from twin.cli.servo import SHIPPED_MODEL, Camera, Model
 
 HELP = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
@@ -44,7 +44,7 @@ def live(
     from hardware.cameras.choose import open_camera
     from hardware.cameras.source import await_frame
     from hardware.errors import DeviceError
-    from hardware.live import FRAME_TIMEOUT_S, LiveSession, Shower, same_estimates
+    from hardware.live import LiveSession, Shower, same_estimates
     from hardware.session import SessionSource, SessionWriter
     from hardware.view.draw import draw_view
     from hardware.view.rerun import RerunView
@@ -67,22 +67,17 @@ def live(
         stack.enter_context(signals_as_ctrl_c())
         stack.enter_context(source)
         if at_rest == FIRST:
-            rest = await_frame(source, timeout_s=FRAME_TIMEOUT_S)
-        if rest is not None and (estimator.counts_from_rest or not replay):  # a session may be replayed with another model than its own
+            rest = await_frame(source)
+            estimator = counting_from_first(estimator, rest)
+        elif rest is not None and (estimator.counts_from_rest or not replay):  # a session may be replayed with another model than its own
             estimator = estimator.at_rest(rest)
         view, title = None, f"{estimator.sensor.name}, {source.name}"
         if rerun is not None:
             view = RerunView(title, rerun)
         elif not headless:
             view = WindowView(title) if has_window() else BrowserView(title, port=port)
-        writer = None
-        if record is not None:  # last: a folder is begun only where there is something to keep
-            about = {"sensor": estimator.sensor.name, "form": str(source.form), "camera": source.name, "model": str(model)}
-            writer = stack.enter_context(SessionWriter(record, about))
-            if rest is not None:
-                writer.keep_rest(rest)
         keep = (lambda frame, estimate: found.append(estimate)) if replay else None
-        session = LiveSession(source, estimator, writer, keep)
+        session = LiveSession(source, estimator, on_estimate=keep)
         shower = None
         if view is not None:
             pipeline = Pipeline(estimator.sensor, estimator.form, estimator.pipeline.reference)
@@ -94,14 +89,19 @@ def live(
                     view.log(frame, seen, estimate)
                 return draw_view(frame, seen, rest_px2, lines)
 
-            print(f"showing in {view.url}; Ctrl-C ends it", flush=True)
             shower = stack.enter_context(Shower(session, draw, view))
+            print(f"showing in {view.url}; Ctrl-C ends it", flush=True)
+        if record is not None:  # last: a folder is begun only where there is something to keep
+            about = {"sensor": estimator.sensor.name, "form": str(source.form), "camera": source.name, "model": str(model)}
+            session.record = stack.enter_context(SessionWriter(record, about))
+            if rest is not None:
+                session.record.keep_rest(rest)
         try:
             session.run(most=count, seconds=seconds, going=lambda: shower is None or shower.open)
         except KeyboardInterrupt:
             print("ended")
-    print("\n".join(session.timing().lines()))
-    if replay is not None:
-        print(f"{same_estimates(source.steps, found)} of {len(found)} estimates are those that were recorded")
-    if record is not None:
-        print(f"wrote {record} ({writer.count} frames)")
+        print("\n".join(session.timing().lines()))
+        if replay is not None:
+            print(f"{same_estimates(source.steps, found)} of {len(found)} estimates are those that were recorded")
+        if record is not None:
+            print(f"wrote {record} ({session.record.count} frames)")

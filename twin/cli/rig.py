@@ -28,7 +28,6 @@ from twin.types import Form, Frame
 
 TWIN = "twin"
 SHADING_QUALITY = "standard"
-FIRST_FRAME_S = 120.0  # kernels may have to be compiled
 FRAME_S, TWIN_FRAME_S = 5.0, 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 
@@ -61,14 +60,14 @@ class Rig:
         return TWIN_FRAME_S if self.knows_truth else FRAME_S
 
     def await_frame(self) -> Frame:
-        """The first frame, for which the camera is given time.
+        """The first frame, for which the camera is given the time that one of its kind may need.
 
         Raises
         ------
         DeviceError
-            It does not.
+            None comes; it names the camera.
         """
-        return await_frame(self.source, timeout_s=FIRST_FRAME_S)
+        return await_frame(self.source)
 
     def __enter__(self) -> "Rig":
         self.arm.connect()
@@ -184,12 +183,16 @@ def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[
 
 
 def _no_full_turn(arm: Arm):
-    """A guard: where an arm of four axes would have to turn back by a full turn in contact, it ends."""
+    """A guard: where an arm of four axes would have to turn back by a full turn at the object, it ends."""
     kinematics = getattr(arm, "kinematics", None)
 
     def guard(state: ArmState, target: np.ndarray) -> np.ndarray:
         if kinematics is not None and abs(kinematics.nearest_pose(target)[5] - state.pose[5]) > 180.0:
-            raise DeviceError(f"{arm.name}: its last axis is at its end at {state.pose[5]:.0f} deg; give fewer --steps")
+            raise DeviceError(
+                f"{arm.name}: its last axis turns no farther than here (R {state.pose[5]:.0f} deg, J4 {state.joints_deg[3]:.0f} deg), and "
+                "to go on it would have to turn the sensor back by a full turn at the object; give no more --steps than were made, or "
+                "turn the object ('placement.turn_deg' in a file for --servo) so that the way begins near the axis' other end"
+            )
         return target
 
     return guard

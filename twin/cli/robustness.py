@@ -23,7 +23,8 @@ Writes:
   curves.csv      every measure against severity, with its 90 % interval
   frames.csv      every frame
   real-on-rendered.csv  with --frames: where real and rendered frames fail, and their ratio
-  cells/          finished work: an interrupted run goes on where it was
+  cells/          finished work: an interrupted run goes on where it was; what was computed from another sensor, other weights
+                  or another version is not taken for it
 
 \b
 With --frames DIR real frames take the place of rendered ones: conditions that act on a frame
@@ -80,9 +81,10 @@ def robustness(
     runs = tuple(model or ())
     check_pipelines(names, tuple(run.name for run in runs))
     writable_folder(out)
-    options = {"jobs": jobs, "models": partial(load_models, runs, spec) if runs else None, "model_names": tuple(run.name for run in runs)}
+    options: dict = {"jobs": jobs}
     if runs:
         load_models(runs, spec)  # each process loads its own: what can't be is told here, and once
+        options |= {"models": partial(load_models, runs, spec), "model_digests": digests_of(runs)}
     sweep = (names, cases, plan.severities(), out, count_bar)
     if frames is None:
         envelopes, written = rendered_study(spec, *sweep, **options)
@@ -92,6 +94,13 @@ def robustness(
         print(f"{found.pipeline:10} {found.case.name:18} {found.label}{f' ({found.measure})' if found.measure else ''}")
     for file in written:
         print(f"wrote {file}")
+
+
+def digests_of(runs: tuple[Path, ...]) -> dict[str, str]:
+    """Digests by name of all that the models' answers depend on."""
+    from training.estimator import digest_of
+
+    return {run.name: digest_of(run) for run in runs}
 
 
 def load_models(runs: tuple[Path, ...], spec) -> dict:

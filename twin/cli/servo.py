@@ -12,9 +12,10 @@ from twin.cli.options import Out
 HELP = """Follow an object's outline with the sensor, frame by frame: pose-based tactile servoing.
 
 In the twin unless told otherwise: the arm is simulated, the frames are drawn for the contact that its pose makes. With
---camera and --arm the same loop runs on devices, real or emulated. The arm comes from 50 mm away, and whatever happens
-(Ctrl-C too) it stops, retreats along the surface's normal and is disabled. Before it touches anything a frame is taken that the
-model counts pins from (--at-rest none: the specification's layout; models on graphs always do).
+--camera and --arm the same loop runs on devices, real or emulated. The arm goes around the object to 50 mm before it (straight,
+and in front of it, where the object has no end: a plane, an edge; its links and the object's holder are not known), and whatever
+happens (Ctrl-C too) it stops, retreats along the surface's normal and is disabled. Before it touches anything a frame is taken that
+the model counts pins from (--at-rest none: the specification's layout; models on graphs always do).
 
 \b
   twin servo --object can --model RUN --out out/servo
@@ -24,6 +25,7 @@ model counts pins from (--at-rest none: the specification's layout; models on gr
 \b
 Writes to --out: trajectory.csv, trajectory.png, measures.json (smoothness S as the Tac-VGNN paper defines it, path, depth
 and angle errors, jerk, share of the way, lost contacts; rate, latency and age of the frames), session/ with --record.
+Exit code 1 if it ended early.
 """
 
 Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights go with the package")]
@@ -81,3 +83,5 @@ def servo(
     print("\n".join(followed.lines()))
     for name in followed.written:
         print(f"wrote {name}")
+    if followed.failure:
+        raise SystemExit(1)

@@ -14,7 +14,7 @@ from hardware.step import LoopSettings
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_of, write_csv
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
-from twin.cli.at_rest import FIRST, given_frame
+from twin.cli.at_rest import FIRST, counting_from_first, given_frame
 from twin.cli.rig import build_rig, servo_loop, steps_round
 from twin.errors import TwinError
 from twin.types import Form
@@ -67,16 +67,23 @@ class Followed:
     written: list = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """For people."""
+        """For people; what is not known is left out."""
         m = self.measures
+        smooth = {"smoothness S": m.smoothness, "local": m.local_smoothness, "jerk in mm per step^3": m.jerk}
         out = [
-            f"{m.steps} steps on fresh frames, {m.completed:.0%} of the way, contact lost {m.lost_contacts:g} times",
-            f"smoothness S {m.smoothness:.3f}, local {m.local_smoothness:.3f}, jerk {m.jerk:.3f} mm per step^3",
-            f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
-            f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg",
+            f"{m.steps} steps on fresh frames",
+            ", ".join(f"{what} {value:.3f}" for what, value in smooth.items() if np.isfinite(value)),
             *self.timing.lines(),
             *(f"note: {note}" for note in self.notes),
         ]
+        if np.isfinite(m.completed):
+            out[0] += f", {m.completed:.0%} of the way, contact lost {m.lost_contacts:g} times"
+            out[2:2] = [
+                f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
+                f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
+            ]
+        else:
+            out[0] += "; where the object truly stands is not known, so nothing is measured against it ('--known-place' says it is)"
         return out + ([f"ended early: {self.failure}"] if self.failure else [])
 
 
@@ -135,7 +142,7 @@ def follow(
     def take_rest(frame):
         if session is not None:
             session.keep_rest(frame)
-        return estimator.at_rest(frame)
+        return counting_from_first(estimator, frame)
 
     failure, followed, session = "", None, None
     with rig:

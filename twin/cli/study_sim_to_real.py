@@ -27,8 +27,8 @@ them first ('twin calibrate contact'; about an hour). Judged on the random fifth
                        frames, on 500 and on all
   --ablate             simulated contacts as the bare specification has them
 
-Contacts are simulated in --out/sim unless --sim names a finished data set of 'twin dataset' without pictures. The same command
-goes on where it was ended.
+Contacts are simulated in --out/sim, without pictures, unless --sim names a finished data set of 'twin dataset'; of one with pictures
+the pins are those that the pipeline sees. The same command goes on where it was ended.
 
 \b
 Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv, index.html.
@@ -58,8 +58,6 @@ def study_sim_to_real(
     workers: Workers = CORES,
     across: Across = FINE,
 ) -> None:
-    from functools import partial
-
     import numpy as np
 
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
@@ -68,7 +66,16 @@ def study_sim_to_real(
     from training.dataset import load_dataset
     from training.generation import GenerationConfig, generate
     from training.sim_to_real.discrepancy import Discrepancy, measure_residuals
-    from training.sim_to_real.study import choose_frames, correct, judged, measured_of, quadratic_row, train_in_twin, train_on_real
+    from training.sim_to_real.study import (
+        choose_frames,
+        correct,
+        judged,
+        measured_of,
+        quadratic_row,
+        train_in_twin,
+        train_on_real,
+        with_missing,
+    )
     from twin.cli.progress import count_bar, epoch_bar, rate_bar
     from twin.kinematics import rig_of
     from twin.views.page import render_page
@@ -105,12 +112,13 @@ def study_sim_to_real(
         with rate_bar(f"{simulated_plan.name}, {spec.name}") as progress:
             generate(sim, config, count, workers=workers, progress=progress)
 
-    def simulated_as(missing):
-        with count_bar("simulated states") as progress:
-            return load_dataset(sim, spec, plan.targets, form=real.pins.form, missing=missing, progress=progress)
-
-    drawn = [simulated_as(partial(discrepancy.draw_px, seed=seed + SEEDS_APART * k)) for k in range(draws)]
-    simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": simulated_as(None)} if ablate else {})
+    with count_bar("simulated states") as progress:
+        bare = load_dataset(sim, spec, plan.targets, form=real.pins.form, progress=progress)
+    drawn = []
+    for k in range(draws):
+        with count_bar(f"draw {k + 1}") as progress:
+            drawn.append(with_missing(bare, discrepancy, seed + SEEDS_APART * k, progress))
+    simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": bare} if ablate else {})
     rows = []
     for name, trained_on in (("sim_only", "simulated"), ("sim_bare", "simulated, bare")):
         if name in simulated:

@@ -4,6 +4,7 @@ from twin.preprocess.forms import raw_to_recording, recording_to_raw
 from twin.preprocess.graph import features, make_graph
 from twin.preprocess.pipeline import Pipeline, measure_reference
 from twin.preprocess.reference import Reference, make_reference, nominal_reference
+from twin.preprocess.touch import require_untouched
 
 __all__ = [
     "Pipeline",
@@ -15,4 +16,5 @@ __all__ = [
     "nominal_reference",
     "raw_to_recording",
     "recording_to_raw",
+    "require_untouched",
 ]

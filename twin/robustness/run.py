@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.sensor import SensorSpec
+from twin.cache import code_digest
 from twin.detectors import METHODS, DetectorSpec, load_detector, shipped_detector, tune, write_detector
 from twin.errors import TwinError
 from twin.recordings import open_recording
@@ -31,7 +32,7 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
         A file can't be read; `check_pipelines` tells so sooner.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    chosen, digest = [], zlib.crc32(b"".join(frame.image.tobytes() for frame in frames))
+    chosen, digest = [], zlib.crc32(code_digest("scenes", "twin").encode() + b"".join(frame.image.tobytes() for frame in frames))
     for k, name in enumerate(names):
         progress(k, len(names))
         kept = folder / f"{name}-{spec.name}-{digest:08x}.toml"
@@ -119,7 +120,7 @@ def study(
     *,
     jobs: int = 1,
     models: Models | None = None,
-    model_names: tuple[str, ...] = (),
+    model_digests: dict[str, str] | None = None,
     notes: list[str] | None = None,
     rendered: RenderedSource | None = None,
 ) -> tuple[list[Envelope], list[Path]]:
@@ -135,14 +136,14 @@ def study(
         ``bar(title)`` is a context manager that yields ``progress(done, total)``.
     jobs : int
         Processes.
-    models, model_names : callable, tuple of str
+    models, model_digests : callable, dict of str to str
         As `Plan` takes them.
     notes : list of str, optional
         For the page.
     rendered : RenderedSource, optional
         Frames of the same sensor to sweep likewise (in ``out/rendered``) and to show the plan's beside.
     """
-    plan = replace(plan, models=models, model_names=model_names)
+    plan = replace(plan, models=models, model_digests=model_digests or {})
     with bar("conditions x steps") as progress:
         judged = judge_sweep(plan, out, jobs=jobs, progress=progress)
     beside = None

@@ -6,20 +6,20 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from twin.cache import code_digest
 from twin.detectors import DetectorSpec, Found, make_detector
 from twin.errors import TwinError
 from twin.robustness.condition import Case
 from twin.robustness.measures import judge
 from twin.robustness.shots import RealSource, RenderedSource, Shot
 
-FORMAT = 2  # raised whenever older cells must not be read: the file's content or the pipeline has changed
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 Models = Callable[[], dict]  # gives {name: estimate}, estimate(frame) -> (values, units, valid)
 
@@ -38,7 +38,8 @@ class Plan:
         From 0 up.
     models : callable, optional
         Gives estimators by name; called in each process.
-    model_names : tuple of str
+    model_digests : dict of str to str
+        By their names: digests of all that their answers depend on.
     """
 
     source: RenderedSource | RealSource
@@ -46,7 +47,7 @@ class Plan:
     cases: tuple[Case, ...]
     severities: tuple[float, ...] = SEVERITIES
     models: Models | None = None
-    model_names: tuple[str, ...] = ()
+    model_digests: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ def cells_of(plan: Plan) -> list[Cell]:
 def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> list[dict]:
     """All rows of a sweep: one for each case, severity, frame and detector (or model).
 
-    Finished cells lie in ``folder/cells``; what lies there is not computed again.
+    Finished cells lie in ``folder/cells``; what lies there, computed from the same sensor, pipelines, models and code, is not
+    computed again.
     """
     cells = cells_of(plan)
     (folder / "cells").mkdir(parents=True, exist_ok=True)
@@ -161,9 +163,9 @@ def _read(folder: Path, cell: Cell) -> list[dict] | None:
 
 
 def _source_key(plan: Plan) -> str:
-    """Everything that all cells depend on."""
-    source = plan.source
-    content = [FORMAT, source.spec.model_dump(mode="json"), [d.model_dump(mode="json") for d in plan.detectors], list(plan.model_names)]
+    """Everything that all cells depend on, the code that computes them too."""
+    source, code = plan.source, code_digest("scenes", "twin")
+    content = [code, source.spec.model_dump(mode="json"), [d.model_dump(mode="json") for d in plan.detectors], plan.model_digests]
     if isinstance(source, RenderedSource):
         content.append([[c.name, c.stimulus, vars(c.pose)] for c in source.contacts])
     else:

@@ -1,0 +1,52 @@
+"""Whether a frame that should show no contact shows one: what of the pins' motion no camera makes."""
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.preprocess.pipeline import Pipeline
+from twin.preprocess.reference import Reference
+from twin.types import Form, Frame
+
+# At rest 0.0026 to 0.0041 in three real sensors, 0.005 with a camera tilted by 2 deg; in real contacts at least 0.003 from about 1 mm on,
+# 0.009 from 2 mm, 0.012 from 3 mm. A lighter touch passes: it moves the pins less than cameras differ.
+MOST_DENT = 0.008
+
+
+def dent_of(pins_px: np.ndarray, reference: Reference) -> float:
+    """How much pins (N, 2), NaN where lost, are moved together otherwise than by a camera, in the rim's mean radius.
+
+    What another place, tilt, focal length or radial distortion of the camera makes of the reference is, to first order,
+    ``u = t + G x + (h . x) x + k |x|^2 x``; it is taken out by least squares. Of what is left, the mean over a pin and its
+    neighbours counts, so that a print's own tolerances, which differ from pin to pin, do not; the largest is told.
+    """
+    rim = reference.pins_px[reference.outmost]
+    middle = rim.mean(axis=0)
+    radius_px = float(np.linalg.norm(rim - middle, axis=1).mean())
+    place, moved = (reference.pins_px - middle) / radius_px, (pins_px - reference.pins_px) / radius_px
+    seen = np.isfinite(moved[:, 0])
+    x, y = place.T
+    one, none, square = np.ones_like(x), np.zeros_like(x), x * x + y * y
+    along_x = np.column_stack([one, none, x, y, none, none, x * x, x * y, square * x])
+    along_y = np.column_stack([none, one, none, none, x, y, x * y, y * y, square * y])
+    camera = np.linalg.lstsq(np.concatenate([along_x[seen], along_y[seen]]), moved[seen].T.ravel(), rcond=None)[0]
+    left = moved - np.column_stack([along_x @ camera, along_y @ camera])
+    around = np.column_stack([np.arange(len(left)), reference.neighbours])[seen]
+    return float(np.linalg.norm(np.nanmean(left[around], axis=1), axis=1).max())
+
+
+def require_untouched(spec: SensorSpec, form: Form, frame: Frame, remedy: str) -> None:
+    """Refuse a frame, meant to show no contact, whose pins say otherwise. One in which they can't be found tells nothing, and passes.
+
+    Raises
+    ------
+    FrameError
+        Ends with ``remedy``: what to do.
+    """
+    pipeline = Pipeline(spec, form, graph="delaunay")
+    seen = pipeline(frame)
+    if seen.valid and (dent := dent_of(seen.pins_px, pipeline.reference)) > MOST_DENT:
+        raise FrameError(
+            f"{frame.name or 'frame'}: the sensor seems pressed: its pins are dented by {dent:.1%} of their rim's radius from where "
+            f"{spec.name} has them without contact (allowed {MOST_DENT:.1%}); {remedy}"
+        )

@@ -54,7 +54,7 @@ def _client(workers: int, scheduler: str) -> Iterator:
         options = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None, "silence_logs": 60}
         options["scheduler_kwargs"] = {
             "dashboard_address": ":0"
-        }  # any free port for its HTTP server: another data set may be made beside this one
+        }  # any free port: other clusters may run
         with LocalCluster(**options) as cluster, Client(cluster) as client:
             yield client
 

@@ -52,9 +52,7 @@ def _client(workers: int, scheduler: str) -> Iterator:
                 client.close(timeout=2)
             return
         options = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None, "silence_logs": 60}
-        options["scheduler_kwargs"] = {
-            "dashboard_address": ":0"
-        }  # any free port: other clusters may run
+        options["scheduler_kwargs"] = {"dashboard_address": ":0"}  # any free port: other clusters may run
         with LocalCluster(**options) as cluster, Client(cluster) as client:
             yield client
 

@@ -27,8 +27,9 @@ them first ('twin calibrate contact'; about an hour). Judged on the random fifth
                        frames, on 500 and on all
   --ablate             simulated contacts as the bare specification has them
 
-Contacts are simulated in --out/sim, without pictures, unless --sim names a finished data set of 'twin dataset'; of one with pictures
-the pins are those that the pipeline sees. The same command goes on where it was ended.
+Contacts are simulated in --out/sim, without pictures, unless --sim (may be given several times: other objects) names finished data
+sets of 'twin dataset' or 'twin study objects'; of one with pictures the pins are those that the pipeline sees. The same command
+goes on where it was ended.
 
 \b
 Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv, index.html.
@@ -51,7 +52,7 @@ def study_sim_to_real(
     ] = None,
     draws: Annotated[int, typer.Option("--draws", min=1, help="of what the twin misses, for each contact")] = 2,
     count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts to simulate")] = 500,
-    sim: Annotated[Path | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead")] = None,
+    sim: Annotated[list[Path] | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead; several are joined")] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
     ablate: Annotated[bool, typer.Option("--ablate", help="also train without what was learnt of the twin's errors")] = False,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="of every training, instead of the model's own number")] = None,
@@ -63,7 +64,7 @@ def study_sim_to_real(
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.contact_calibration import fit_contact
     from training.contact_calibration.simulate import Setup
-    from training.dataset import load_dataset
+    from training.dataset import joined, load_dataset
     from training.generation import GenerationConfig, generate
     from training.sim_to_real.discrepancy import Discrepancy, measure_residuals
     from training.sim_to_real.study import (
@@ -96,8 +97,8 @@ def study_sim_to_real(
     with rate_bar("labelled frames") as progress:
         residuals = measure_residuals(setup, measured, progress)
     discrepancy = Discrepancy(residuals)
-    if sim is None:
-        sim = out / "sim"
+    if not sim:
+        sim = [out / "sim"]
         config = GenerationConfig(
             sensor=spec,
             object=touched,
@@ -110,15 +111,17 @@ def study_sim_to_real(
             across=across,
         )
         with rate_bar(f"{simulated_plan.name}, {spec.name}") as progress:
-            generate(sim, config, count, workers=workers, progress=progress)
+            generate(sim[0], config, count, workers=workers, progress=progress)
 
-    with count_bar("simulated states") as progress:
-        bare = load_dataset(sim, spec, plan.targets, form=real.pins.form, progress=progress)
+    bare = []
+    for folder in sim:
+        with count_bar(f"states of {folder.name}") as progress:
+            bare.append(load_dataset(folder, spec, plan.targets, form=real.pins.form, progress=progress))
     drawn = []
     for k in range(draws):
         with count_bar(f"draw {k + 1}") as progress:
-            drawn.append(with_missing(bare, discrepancy, seed + SEEDS_APART * k, progress))
-    simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": bare} if ablate else {})
+            drawn.append(joined([with_missing(each, discrepancy, seed + SEEDS_APART * k, progress) for each in bare]))
+    simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": joined(bare)} if ablate else {})
     rows = []
     for name, trained_on in (("sim_only", "simulated"), ("sim_bare", "simulated, bare")):
         if name in simulated:

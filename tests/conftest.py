@@ -16,15 +16,6 @@ def own_cache(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def one_thread_each():
-    """Test processes that share the machine render on one thread each."""
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        import drjit
-
-        drjit.set_thread_count(1)
-
-
 @pytest.fixture(scope="session")
 def real_dir() -> Path:
     """Folder of real recordings; tests that need it skip, with the reason, where it is missing."""

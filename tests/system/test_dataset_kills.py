@@ -103,6 +103,7 @@ def test_a_killed_worker_is_replaced_and_a_killed_main_takes_its_workers_along(t
     assert contents(job.out) == undisturbed(COUNT)
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_ends_the_run_in_one_line(tmp_path, undisturbed):
     job, running = Job(tmp_path, COUNT), []
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}

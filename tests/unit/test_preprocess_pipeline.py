@@ -424,6 +424,7 @@ def test_a_damaged_frame_names_its_pins_as_the_whole_one(real_dir, name, folder)
         assert np.isnan(np.delete(error, gone)).sum() <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_published_method_throws_away_what_it_did(real_dir):
     spec = load_sensor("mg400-331")

@@ -191,6 +191,8 @@ def joined(parts: list[Dataset]) -> Dataset:
     FrameError
         They are of different sensors, forms or labels, or one is given twice.
     """
+    if len(parts) == 1:
+        return parts[0]
     parts = sorted(parts, key=lambda part: part.folder.resolve().as_posix())
     first = parts[0]
     for before, part in zip(parts, parts[1:], strict=False):

@@ -16,7 +16,7 @@ from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
 from training.recorded_contact import read_arm_labels
 from training.run import fold_rows
-from training.sim_to_real.study import with_missing
+from training.sim_to_real.study import arm_labels, with_missing
 from training.targets import corrected, read_executed
 from twin.errors import ContactError, RenderError
 from twin.geometry.solid import Resolution
@@ -235,6 +235,6 @@ def test_pictures_are_those_of_the_states(tmp_path):
     truth = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")
     assert len(data) == 1 and data.pins.form == Form.RECORDING and not data.problems
     assert np.median(np.linalg.norm(data.pins.nodes_px - truth["caps_px"][:], axis=2)) < 0.5
-    moved = with_missing(data, SimpleNamespace(draw_px=lambda labels, moved_px, contact, seed: -moved_px), 0)
+    moved = with_missing(data, arm_labels(data), SimpleNamespace(draw_px=lambda labels, moved_px, contact, seed: -moved_px), 0)
     assert moved.pins.nodes_px == pytest.approx(np.tile(data.pins.reference.pins_px, (1, 1, 1))), "pictures' pins, what is missing added"
     assert moved.pins.area_px2[0] == pytest.approx(data.pins.reference.area_px2)

@@ -1,19 +1,17 @@
 """Handing out work: in this process, to processes of this machine, or to a cluster's workers (Dask)."""
 
-import hashlib
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
-from pathlib import Path
 
 from training.generation.config import DatasetError
+from twin.cache import code_digest
 from twin.errors import TwinError
 
 AHEAD = 2  # tasks for each worker on the way: a free one need not wait, and little is lost when all ends
 LOOK_S = 1.0
 JOIN_S = 60.0  # for the scheduler's first worker
-PACKAGES = ("scenes", "twin", "training")
+PACKAGES = ("scenes", "twin", "training")  # workers of another version of them would make other frames
 AGAIN = "what is done is kept, and the same command goes on from there"
 
 
@@ -79,7 +77,7 @@ def _by_cluster(client, make: Callable, text: str, todo: list[int], scheduler: s
         client.wait_for_workers(1, timeout=JOIN_S)
     except TimeoutError as error:
         raise DatasetError(f"{where}: no worker has come within {JOIN_S:g} s; start some with 'dask worker {scheduler}'") from error
-    waiting, flying, own = list(reversed(todo)), {}, fingerprint()
+    waiting, flying, own = list(reversed(todo)), {}, code_digest(*PACKAGES)
     while waiting or flying:
         try:
             room = AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])) - len(flying)
@@ -114,18 +112,6 @@ def _result(future, index: int, where: str):
 
 
 def _checked(make: Callable, text: str, index: int, expected: str):
-    if fingerprint() != expected:
+    if code_digest(*PACKAGES) != expected:
         raise DatasetError("a worker runs another version of this program, its frames would differ; install the same one there")
     return make(text, index)
-
-
-@cache
-def fingerprint() -> str:
-    """Hash of this program's own text: workers of another version would make other frames."""
-    root = Path(__file__).parents[2]
-    digest = hashlib.sha256()
-    for package in PACKAGES:
-        for path in sorted((root / package).rglob("*.py")):
-            digest.update(str(path.relative_to(root)).encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()

@@ -70,10 +70,12 @@ def arm_labels(data: Dataset) -> list[ArmLabel]:
     return [labels[name] for name in pins.image_name.tolist()]
 
 
-def with_missing(simulated: Dataset, discrepancy: Discrepancy, seed: int, progress: Callable | None = None) -> Dataset:
-    """A simulated data set whose pins have moved by what the twin may miss, drawn for each contact."""
+def with_missing(
+    simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, progress: Callable | None = None
+) -> Dataset:
+    """A simulated data set whose pins have moved by what the twin may miss, drawn for each contact; ``labels`` are its ``arm_labels``."""
     pins = simulated.pins
-    missing_px = discrepancy.draw_px(arm_labels(simulated), pins.nodes_px - pins.reference.pins_px, simulated.group.astype(int), seed)
+    missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, simulated.group.astype(int), seed)
     nodes_px = pins.nodes_px + missing_px
     return replace(simulated, pins=replace(pins, nodes_px=nodes_px, area_px2=voronoi_areas(nodes_px, pins.reference, progress=progress)))
 

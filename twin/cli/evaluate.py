@@ -47,7 +47,7 @@ def evaluate(
     estimator = PoseEstimator.load(run)
     with count_bar("frames") as progress:
         parts = [load_dataset(folder, estimator.sensor, estimator.names, form=estimator.form, progress=progress) for folder in data]
-    found = joined(parts) if len(parts) > 1 else parts[0]
+    found = joined(parts)
     for problem in found.problems:
         print(f"note: {problem}")
     chosen = rows_to_judge(estimator, found, rows)

@@ -36,6 +36,11 @@ def _even(value: int) -> int:
 Across = Annotated[int, typer.Option("--across", min=6, max=64, callback=_even, help="elements along each side of the skin's grid; even")]
 
 
+def names_in(text: str) -> list[str]:
+    """What stands between commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
 def writable_folder(path: Path) -> Path:
     """Make the folder, or say in one line why it can't be written to."""
     try:

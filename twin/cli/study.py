@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Out, writable_folder
+from twin.cli.options import Out, names_in, writable_folder
 from twin.cli.servo import PlainLight, ServoName
 
 OBJECTS = "can,mesh-can,square,prism,tin-box"  # the Tac-VGNN paper's
@@ -35,7 +35,7 @@ def study_servo(
     from training.estimator import PoseEstimator
     from twin.cli.servo_study import run_study
 
-    names = [name.strip() for name in objects.split(",") if name.strip()]
+    names = names_in(objects)
     labels = [model.name for model in models]
     if len(set(labels)) < len(labels):
         labels = [str(model) for model in models]

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from twin.cli.options import CORES, Across, Out, Sensor, Workers, writable_folder
+from twin.cli.options import CORES, Across, Out, Sensor, Workers, names_in, writable_folder
 from twin.cli.study import study
 from twin.types import FINE
 
@@ -64,8 +64,8 @@ def study_objects(
         experiment=judged,
         wider=load_experiment(judged.wider or experiment),
         randomisation=load_randomisation(randomise),
-        train=tuple(load_object(name) for name in _names(train)),
-        unseen=tuple(load_object(name) for name in _names(unseen)),
+        train=tuple(load_object(name) for name in names_in(train)),
+        unseen=tuple(load_object(name) for name in names_in(unseen)),
         count=count,
         tests=tests,
         seed=seed,
@@ -93,7 +93,3 @@ def study_objects(
     print("\n".join(said))
     for path in (write_table(out / "objects.csv", rows), out / "index.html"):
         print(f"wrote {path}")
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]

@@ -68,6 +68,7 @@ def study_sim_to_real(
     from training.generation import GenerationConfig, generate
     from training.sim_to_real.discrepancy import Discrepancy, measure_residuals
     from training.sim_to_real.study import (
+        arm_labels,
         choose_frames,
         correct,
         judged,
@@ -117,10 +118,11 @@ def study_sim_to_real(
     for folder in sim:
         with count_bar(f"states of {folder.name}") as progress:
             bare.append(load_dataset(folder, spec, plan.targets, form=real.pins.form, progress=progress))
-    drawn = []
+    told, drawn = [arm_labels(each) for each in bare], []
     for k in range(draws):
         with count_bar(f"draw {k + 1}") as progress:
-            drawn.append(joined([with_missing(each, discrepancy, seed + SEEDS_APART * k, progress) for each in bare]))
+            parts = zip(bare, told, strict=True)
+            drawn.append(joined([with_missing(each, told_by, discrepancy, seed + SEEDS_APART * k, progress) for each, told_by in parts]))
     simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": joined(bare)} if ablate else {})
     rows = []
     for name, trained_on in (("sim_only", "simulated"), ("sim_bare", "simulated, bare")):

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from twin.cli.options import Device, FormOrAuto, Out, Sensor, Target, columns_of, writable_folder
+from twin.cli.options import Device, FormOrAuto, Out, Sensor, Target, columns_of, names_in, writable_folder
 from twin.cli.study import study
 
 MODELS = "gnn,tac-vgnn,vgnn,cnn-v2,cnn-v1"
@@ -68,7 +68,7 @@ def study_tac_vgnn(
     if threads:
         torch.set_num_threads(threads)
     numbers = {"--seeds": _numbers(seeds, "--seeds"), "--batches": _numbers(batches, "--batches")}
-    names = [name.strip() for name in models.split(",") if name.strip()]
+    names = names_in(models)
     plans = [plan_run(name, labels=labels, seed=seed, split=split, epochs=epochs) for seed in numbers["--seeds"] for name in names]
     if not plans:
         raise TrainingError("nothing to compare: give at least one of --models and of --seeds")

@@ -73,7 +73,7 @@ def train(
     columns = columns_of(target)
     with count_bar("frames") as progress:
         parts = [load_dataset(folder, load_sensor(sensor), columns, form=form, progress=progress) for folder in data]
-    found = joined(parts) if len(parts) > 1 else parts[0]
+    found = joined(parts)
     for problem in found.problems:
         print(f"note: {problem}")
     helpers = ("move_1", "move_6") if columns == "surface-2d-shear" else ()

@@ -1,7 +1,10 @@
 """The convolutional baselines: PoseNet (Lepora 2020) and the paper's smaller version of it.
 
-Five convolutions 3x3 with ELU, each followed by max-pooling, then dense layers with ELU and a little dropout, on frames
+Five convolutions 3x3 with ELU and max-pooling, then dense layers with ELU and a little dropout, on frames
 resized to 128 x 128. ``cnn-v1``: 256 filters, dense 64 and the outputs. ``cnn-v2``: 48 filters and one more dense layer.
+
+The pooling stands before the ELU: as ELU is increasing, the maximum is the same, and a quarter of the values is left for it.
+With the channels last in memory ``cnn-v2`` then trains twice as fast on a processor as in the usual order.
 """
 
 import torch
@@ -30,8 +33,8 @@ class Cnn(nn.Module):
         filters = FILTERS[name]
         layers: list[nn.Module] = []
         for k in range(LAYERS):
-            layers += [nn.Conv2d(1 if k == 0 else filters, filters, 3), nn.ELU(), nn.MaxPool2d(2)]
-        self.convolutions = nn.Sequential(*layers)
+            layers += [nn.Conv2d(1 if k == 0 else filters, filters, 3), nn.MaxPool2d(2), nn.ELU()]
+        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)
         with torch.no_grad():
             width = self.convolutions(torch.zeros(1, 1, INPUT_PX, INPUT_PX)).numel()
         dense: list[nn.Module] = [nn.Dropout(DROPOUT)]
@@ -42,7 +45,8 @@ class Cnn(nn.Module):
 
     def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
         """Labels ``mean`` (B, K) from frames (B, 128, 128) uint8."""
-        return {"mean": self.dense(self.convolutions(images[:, None].float() / 255).flatten(1))}
+        pixels = (images[:, None].float() / 255).contiguous(memory_format=torch.channels_last)
+        return {"mean": self.dense(self.convolutions(pixels).flatten(1))}
 
     def penalty(self) -> torch.Tensor:
         """The regularisation of the hidden dense weights."""

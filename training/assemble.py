@@ -9,12 +9,12 @@ whole move where it was not executed, so frames that look executed and frames th
 (Mondrian conformal prediction, Vovk et al. 2005, 4.5): a narrow and a wide interval instead of one that is wrong for both.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from training.cokriging import CoKriging
 from training.inputs import PinInputs, graph_inputs, image_inputs, pin_features
 from training.kernel import KernelHead, fit_kernel
 from training.networks import build_network, predict_rows
@@ -55,12 +55,10 @@ class Ensemble:
     Parameters
     ----------
     content : dict
-        As ``calibrate`` gives it and ``weights.pt`` holds it.
-    correction : callable, optional
-        Gives what is added to standardised labels (B, K) of frames with amplitudes (B, D): see ``training.correction``.
+        As ``calibrate`` gives it and ``weights.pt`` holds it; with ``beside``, a ``CoKriging`` that is averaged with the labels.
     """
 
-    def __init__(self, model: str, reference: Reference, content: dict, size: dict, correction: Callable | None = None) -> None:
+    def __init__(self, model: str, reference: Reference, content: dict, size: dict) -> None:
         self.shift, self.scale = np.asarray(content["shift"]), np.asarray(content["scale"])
         self.networks = []
         for weights in content["networks"]:
@@ -71,7 +69,7 @@ class Ensemble:
         self.kernel_labels = list(content["kernel_labels"])
         self.blend, self.quantile = np.asarray(content["blend"]), np.asarray(content["quantile"])
         self.raw_quantile = np.asarray(content["raw_quantile"])
-        self.correction = correction
+        self.beside = CoKriging(**content["beside"]) if "beside" in content else None
 
     def outputs(self, inputs, rows: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Standardised mean and scale (B, K) and the probability (B,) of an executed move."""
@@ -94,8 +92,8 @@ class Ensemble:
     def __call__(self, inputs, rows: torch.Tensor) -> Prediction:
         """Labels of some rows."""
         mean, scale, executed = self.outputs(inputs, rows)
-        if self.correction is not None:
-            mean = mean + self.correction(mean, kernel_inputs(self.networks[0], inputs, rows).numpy())
+        if self.beside is not None:
+            mean = (mean + self.beside(kernel_inputs(self.networks[0], inputs, rows)).numpy()) / 2
         scale = self.scale * scale
         raw = self.raw_quantile[undone(executed)]
         return Prediction(self.shift + self.scale * mean, self.quantile * scale, raw * scale, executed)

@@ -13,7 +13,6 @@ import torch
 
 from scenes.sensor import SensorSpec
 from training.assemble import Ensemble, Prediction, filled, pin_inputs
-from training.correction import Correction
 from training.dataset import PinTable
 from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features, small_image
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
@@ -74,8 +73,7 @@ class PoseEstimator:
         self.names, self.units = tuple(config["columns"]), tuple(config["units"])
         self.trained = make_reference(content["reference_px"].numpy(), self.sensor.pins.rings)
         self.pipeline = Pipeline(self.sensor, self.form, self.trained, graph=config["pipeline"]["graph"])
-        correction = Correction(content["correction"]["weight"].numpy()) if "correction" in content else None
-        self.ensemble = Ensemble(self.model, self.trained, content, config["size"], correction)
+        self.ensemble = Ensemble(self.model, self.trained, content, config["size"])
         aside = content["aside"]
         self.registration = Registration(**{key: value.numpy() for key, value in aside["registration"].items()}) if aside else None
 

@@ -5,9 +5,10 @@ likelihood on some of the rows (Rasmussen and Williams 2006, eq. 5.8), the solut
 is predicted as without itself comes in closed form (eq. 5.12).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
-import numpy as np
 import torch
 
 FIT_ROWS = 1000
@@ -69,38 +70,45 @@ def fit_kernel(inputs: torch.Tensor, labels: torch.Tensor, *, seed: int, progres
     chosen = torch.randperm(len(inputs), generator=torch.Generator().manual_seed(seed))[:FIT_ROWS]
     found, left_out = [], []
     for k in range(labels.shape[1]):
-        lengths, sizes = _likeliest(inputs[chosen] / usual, labels[chosen, k])
-        lengths = lengths * usual
-        factor = torch.linalg.cholesky(_with_noise(_kernel(inputs / lengths, inputs / lengths, sizes[0], sizes[1]), sizes[2]))
+
+        def matrix(lengths: torch.Tensor, sizes: torch.Tensor, rows: torch.Tensor | slice) -> torch.Tensor:
+            scaled = inputs[rows] / (usual * lengths)
+            return with_noise(covariance(scaled, scaled, sizes[0], sizes[1]), sizes[2])
+
+        lengths, sizes = likeliest(partial(matrix, rows=chosen), labels[chosen, k], [5.0] * inputs.shape[1], (1.0, 0.3, 0.05))
+        factor = torch.linalg.cholesky(matrix(lengths, sizes, slice(None)))
         weight = torch.cholesky_solve(labels[:, k : k + 1], factor)[:, 0]
         left_out.append(labels[:, k] - weight / torch.cholesky_inverse(factor).diagonal())
-        found.append((lengths, sizes, weight))
+        found.append((usual * lengths, sizes, weight))
         if progress:
             progress(k + 1, labels.shape[1])
     lengths, sizes, weight = (torch.stack(part) for part in zip(*found, strict=True))
     return KernelHead(inputs, lengths, sizes[:, 0], sizes[:, 1], sizes[:, 2], weight.T.contiguous()), torch.stack(left_out, dim=1)
 
 
-def _kernel(a: torch.Tensor, b: torch.Tensor, smooth: torch.Tensor, linear: torch.Tensor) -> torch.Tensor:
+def covariance(a: torch.Tensor, b: torch.Tensor, smooth: torch.Tensor, linear: torch.Tensor) -> torch.Tensor:
+    """(A, B) the module's kernel between inputs (A, D) and (B, D) in units of their lengths."""
     inner = a @ b.T
     squared = (a.square().sum(1)[:, None] + b.square().sum(1) - 2 * inner).clamp(min=0)
     return smooth**2 * torch.exp(-0.5 * squared) + linear**2 * inner
 
 
-def _with_noise(kernel: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-    return kernel + (noise**2 + JITTER) * torch.eye(len(kernel), dtype=kernel.dtype)
+def with_noise(kernel: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+    """A kernel (A, A) of rows that each have noise of a standard deviation, one number or (A,)."""
+    return kernel + torch.diag((noise**2 + JITTER).expand(len(kernel)))
 
 
-def _likeliest(inputs: torch.Tensor, label: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lengths (D,) and (s, l, noise) of the largest marginal likelihood."""
-    count = inputs.shape[1]
-    start = [np.log(5.0)] * count + [0.0, np.log(0.3), np.log(0.05)]
-    logs = torch.tensor(start, dtype=torch.float64, requires_grad=True)
+def likeliest(matrix: Callable, label: torch.Tensor, lengths: Sequence, sizes: Sequence) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lengths and sizes of the largest marginal likelihood of ``label`` (A,), where ``matrix(lengths, sizes)`` (A, A) is its covariance.
+
+    ``lengths`` and ``sizes`` are where the search begins.
+    """
+    count = len(lengths)
+    logs = torch.tensor([*lengths, *sizes], dtype=torch.float64).log().requires_grad_(True)
     optimiser = torch.optim.Adam([logs], lr=0.1)
     for _ in range(FIT_STEPS):
         optimiser.zero_grad()
-        scaled, sizes = inputs / logs[:count].exp(), logs[count:].exp()
-        factor = torch.linalg.cholesky(_with_noise(_kernel(scaled, scaled, sizes[0], sizes[1]), sizes[2]))
+        factor = torch.linalg.cholesky(matrix(logs[:count].exp(), logs[count:].exp()))
         weight = torch.cholesky_solve(label[:, None], factor)[:, 0]
         loss = 0.5 * label @ weight + factor.diagonal().log().sum()
         loss.backward()

@@ -2,7 +2,8 @@
 
 The file is in the safetensors format (https://github.com/huggingface/safetensors): 8 bytes with the length of a JSON
 header, the header with type, shape and place of each array, the arrays. Nothing in it can be run. Large arrays are kept in
-half precision; what the network's graph tells anyway, and attention between pins that are no neighbours, is left out.
+half precision, but for a Gaussian process, whose terms cancel; what the network's graph tells anyway, and attention between
+pins that are no neighbours, is left out.
 """
 
 import json
@@ -50,7 +51,8 @@ def pack(run: Path, out: Path) -> int:
             attention = key.replace("adjacency", "attention")
             arrays[attention] = arrays[attention][arrays[key] > 0]
         del arrays[key]
-    small = {key: value.astype(np.float16) if value.size > LARGE and value.dtype != np.int64 else value for key, value in arrays.items()}
+    whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith("beside.")}
+    small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
     small["reference_px"] = content["reference_px"].numpy()  # the graph is made from it
     out.mkdir(parents=True, exist_ok=True)
     write_arrays(out / WEIGHTS, small)

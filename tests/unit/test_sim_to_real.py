@@ -5,15 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from test_training import config_of, data  # noqa: F401  (a fixture)
 
-from training.correction import KINDS, fit_terms, terms
+from training.cokriging import fit_cokriging
 from training.estimator import PoseEstimator
 from training.models import vgnn
 from training.packed import pack, read_arrays, shipped_names, write_arrays
 from training.recipes import TrainingError
 from training.run import train_run
-from training.sim_to_real.study import choose_frames, correct, quadratic_row
+from training.sim_to_real.study import choose_frames, put_beside, quadratic_row
 from twin.preprocess import make_reference
 
 SAME = 1e-6  # mm or deg: rounding of the areas' logarithms
@@ -41,29 +42,44 @@ def test_pins_are_counted_from_the_no_contact_frame_in_hand(data, run):  # noqa:
     assert np.abs(here.mean - unknown.mean).max() > 100 * SAME
 
 
-def test_a_correction_uses_what_helps_frames_left_out_and_nothing_else():
-    rng = np.random.default_rng(0)
-    mean, amplitudes = rng.normal(size=(40, 2)), rng.normal(size=(40, 12))
-    parts = terms(mean, amplitudes)
-    missing = np.column_stack([0.5 - 0.3 * mean[:, 0], rng.normal(size=40) - 1e-3])
-    weight, left_out, chosen = fit_terms(parts, missing)
-    assert chosen[0]["kind"] in KINDS[1:] and np.abs(left_out[:, 0] - missing[:, 0]).mean() < 0.01
-    assert np.abs(left_out[:, 1] - missing[:, 1]).mean() <= np.abs(missing[:, 1]).mean()
-    rows = np.arange(40) != 7  # closed form against leaving one out
-    again, _, _ = fit_terms({key: part[rows] for key, part in parts.items()}, missing[rows, :1])
-    everything = np.concatenate(list(parts.values()), axis=1)
-    assert everything[7] @ again[:, 0] == pytest.approx(left_out[7, 0], abs=0.02)
+def test_what_the_twin_misses_is_learnt_from_few_frames_and_told_honestly():
+    rng = np.random.default_rng(1)
+    simulated, real = rng.normal(size=(400, 6)), rng.normal(size=(240, 6))
+
+    def in_twin(x):
+        return np.column_stack([np.sin(x[:, 0]) + 0.5 * x[:, 1], x[:, 2] * x[:, 3]])
+
+    truth = in_twin(real) + np.column_stack([0.5 + 0.3 * real[:, 0], 0.4 * real[:, 4]])
+    few, rest = slice(0, 40), slice(40, None)
+    told, left_out = fit_cokriging(*(torch.from_numpy(part) for part in (simulated, in_twin(simulated), real[few], truth[few])), seed=0)
+    error = np.abs(told(torch.from_numpy(real[rest])).numpy() - truth[rest]).mean(axis=0)
+    assert (error < 0.3 * np.abs(in_twin(real[rest]) - truth[rest]).mean(axis=0)).all()
+    said = np.abs(left_out.numpy() - truth[few]).mean(axis=0)
+    assert (said < 2 * error).all() and (said > 0.5 * error).all()
 
 
-def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, tmp_path):  # noqa: F811
-    off = replace(data.targets, corrected=data.targets.corrected + [1.0, -3.0])  # another sensor's labels
-    few, rest = np.arange(40), np.arange(40, 90)
-    chosen = correct(run, tmp_path / "plus", replace(data, targets=off), few)
-    assert all(found["kind"] != "none" for found in chosen)
-    plain, plus = (PoseEstimator.load(path).predict_table(data.pins.rows(rest)) for path in (run, tmp_path / "plus"))
+@pytest.fixture(scope="module")
+def corrected(data, run, tmp_path_factory):  # noqa: F811
+    """The run beside a process that knows 40 frames of a sensor whose labels are off; its targets; and the process's own error."""
+    off = replace(data.targets, corrected=data.targets.corrected + [1.0, -3.0])
+    out = tmp_path_factory.mktemp("corrected")
+    return out, off, put_beside(run, out, data, replace(data, targets=off), np.arange(40), seed=0)
+
+
+def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, corrected):  # noqa: F811
+    out, off, left_out = corrected
+    assert (left_out < [0.3, 1.0]).all()
+    rest = np.arange(40, 90)
+    plain, plus = (PoseEstimator.load(path).predict_table(data.pins.rows(rest)) for path in (run, out))
     before, after = (np.abs(made.mean - off.corrected[rest]).mean(axis=0) for made in (plain, plus))
     assert (after < 0.6 * before).all()
-    assert json.loads((tmp_path / "plus" / "config.json").read_text())["correction"]["frames"] == data.pins.image_name[:40].tolist()
+    assert json.loads((out / "config.json").read_text())["beside"]["frames"] == data.pins.image_name[:40].tolist()
+
+
+def test_a_small_copy_of_a_corrected_run_says_the_same(data, corrected, tmp_path):  # noqa: F811
+    pack(corrected[0], tmp_path)
+    whole, small = (PoseEstimator.load(path).predict_table(data.pins) for path in (corrected[0], tmp_path))
+    assert (np.abs(whole.mean - small.mean).max(axis=0) < HALF * data.targets.corrected.std(axis=0)).all()
 
 
 def test_a_small_copy_says_the_same_on_any_machine(data, run, tmp_path, monkeypatch):  # noqa: F811

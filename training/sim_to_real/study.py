@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from training.correction import corrected_content
+from training.assemble import conformal_quantile, group_quantiles, kernel_inputs, undone
+from training.cokriging import fit_cokriging
 from training.dataset import Dataset, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_slope, predict_rows_of
@@ -24,6 +25,7 @@ from twin.recordings import open_recording
 
 TWIN_EPOCHS = 60  # on thousands of simulated states: more change nothing
 MANY = 500  # labelled frames: a morning's work with the rig
+RANGE_MARGIN = 0.1  # of the labelled frames' range of a label: simulated states beyond it are none of the process's business
 MODES, RIDGES = 20, 10.0 ** np.arange(-4, 3.1, 0.5)  # of the quadratic regression
 
 
@@ -108,22 +110,58 @@ def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, pr
         train_run(config, real, out, progress=progress)
 
 
-def correct(run: Path, out: Path, real: Dataset, few: np.ndarray) -> list:
-    """Write the finished run ``run`` to ``out``, its labels corrected by some frames of a recording that it has not seen.
+def put_beside(run: Path, out: Path, simulated: Dataset, real: Dataset, few: np.ndarray, *, seed: int) -> np.ndarray:
+    """Write the finished run ``run`` of ``vgnn`` to ``out``, averaged with a Gaussian process that knows labelled frames.
+
+    The two err differently, and neither can be weighed by the labelled frames, which have taught both. The process sees
+    simulated states among the labelled frames' labels.
+
+    Parameters
+    ----------
+    simulated : Dataset
+        Contacts as the bare specification has them.
+    few : (n,) int
+        Rows of ``real`` that are labelled.
+    seed : int
+        Of the simulated states drawn.
 
     Returns
     -------
-    list of dict
-        ``kind`` and ``ridge`` of the correction of each label.
+    (K,) float
+        Mean absolute error (mm, deg) of the process alone, on labelled frames that are left out of it one after another.
+
+    Raises
+    ------
+    TrainingError
+        No simulated state has labels like those of the labelled frames.
     """
     estimator, part = PoseEstimator.load(run), real.rows(few)
-    content = torch.load(run / "weights.pt", weights_only=True)
-    content, chosen = corrected_content(estimator, content, part.pins, part.targets, estimator.config["labels"])
-    about = {"data": str(real.folder), "frames": part.pins.image_name.tolist(), "chosen": chosen}
+    ensemble, labels = estimator.ensemble, estimator.config["labels"]
+    inputs, rows = estimator.inputs_of(part.pins, together=not part.pins.measured)
+    mean, scale, executed = ensemble.outputs(inputs, rows)
+    seen = kernel_inputs(ensemble.networks[0], inputs, rows)
+    truth, raw, told = (
+        (labelled - ensemble.shift) / ensemble.scale
+        for labelled in (getattr(part.targets, labels), part.targets.raw, getattr(simulated.targets, labels))
+    )
+    margin = RANGE_MARGIN * np.ptp(truth, axis=0)
+    among = np.flatnonzero(((told >= truth.min(axis=0) - margin) & (told <= truth.max(axis=0) + margin)).all(axis=1))
+    if not len(among):
+        raise TrainingError("no simulated state has labels like those of the labelled frames; simulate the experiment they come from")
+    like = simulated.rows(among)
+    known = kernel_inputs(ensemble.networks[0], *estimator.inputs_of(like.pins, together=not like.pins.measured))
+    process, left_out = fit_cokriging(known, torch.from_numpy(told[among]), seen, torch.from_numpy(truth), seed=seed)
+    made = (mean + left_out.numpy()) / 2
+    content = torch.load(run / "weights.pt", weights_only=True) | {
+        "quantile": conformal_quantile(np.abs(made - truth) / scale),
+        "raw_quantile": group_quantiles(np.abs(made - raw) / scale, undone(executed)),
+        "beside": process.arrays(),
+    }
     out.mkdir(parents=True, exist_ok=True)
     write_tensors(out / "weights.pt", content)
-    write_text(out / "config.json", json.dumps(estimator.config | {"correction": about}, indent=1) + "\n")
-    return chosen
+    about = {"data": str(real.folder), "frames": part.pins.image_name.tolist()}
+    write_text(out / "config.json", json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
+    return np.abs(left_out.numpy() - truth).mean(axis=0) * ensemble.scale
 
 
 def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict:

@@ -22,7 +22,8 @@ them first ('twin calibrate contact'; about an hour). Judged on the random fifth
 
 \b
   simulated            vgnn trained on simulated contacts alone
-  simulated and real   the same, its labels corrected by the labelled frames
+  simulated and real   the same, averaged with a Gaussian process of the pins
+                       of both simulated contacts and labelled frames
   real                 vgnn and a quadratic regression trained on as many real
                        frames, on 500 and on all
   --ablate             simulated contacts as the bare specification has them
@@ -70,9 +71,9 @@ def study_sim_to_real(
     from training.sim_to_real.study import (
         arm_labels,
         choose_frames,
-        correct,
         judged,
         measured_of,
+        put_beside,
         quadratic_row,
         train_in_twin,
         train_on_real,
@@ -123,7 +124,8 @@ def study_sim_to_real(
         with count_bar(f"draw {k + 1}") as progress:
             parts = zip(bare, told, strict=True)
             drawn.append(joined([with_missing(each, told_by, discrepancy, seed + SEEDS_APART * k, progress) for each, told_by in parts]))
-    simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": joined(bare)} if ablate else {})
+    bare = joined(bare)
+    simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": bare} if ablate else {})
     rows = []
     for name, trained_on in (("sim_only", "simulated"), ("sim_bare", "simulated, bare")):
         if name in simulated:
@@ -131,7 +133,7 @@ def study_sim_to_real(
             with epoch_bar(name) as progress:
                 train_in_twin(simulated[name], out / name, seed=seed, split=seed, epochs=epochs, labelled=taught_by, progress=progress)
             rows.append(judged(trained_on, 0, out / name, real, chosen.test))
-    corrections = correct(out / "sim_only", out / "sim_plus_real", real, chosen.few)
+    left_out = put_beside(out / "sim_only", out / "sim_plus_real", bare, real, chosen.few, seed=seed)
     rows.insert(1, judged("simulated and real", labels, out / "sim_plus_real", real, chosen.test))
     for name, index in chosen.trained.items():
         run = out / f"real_{name}"
@@ -152,7 +154,7 @@ def study_sim_to_real(
         simulated=len(drawn[0]),
         contacts=len(np.unique(drawn[0].group)),
         names=real.targets.names,
-        chosen=corrections,
+        left_out=left_out,
         columns=columns,
         rows=rows,
         problems=real.problems,

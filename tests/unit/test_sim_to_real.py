@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -60,10 +61,14 @@ def test_what_the_twin_misses_is_learnt_from_few_frames_and_told_honestly():
 
 @pytest.fixture(scope="module")
 def corrected(data, run, tmp_path_factory):  # noqa: F811
-    """The run beside a process that knows 40 frames of a sensor whose labels are off; its targets; and the process's own error."""
+    """The run beside a process that knows 40 frames of a sensor whose labels are off; its targets; and the process's own error.
+
+    The run itself is ``sim_only`` in the same folder's parent.
+    """
     off = replace(data.targets, corrected=data.targets.corrected + [1.0, -3.0])
-    out = tmp_path_factory.mktemp("corrected")
-    return out, off, put_beside(run, out, data, replace(data, targets=off), np.arange(40), seed=0)
+    out = tmp_path_factory.mktemp("study") / "sim_plus_real"
+    alone = copytree(run, out.with_name("sim_only"))
+    return out, off, put_beside(alone, out, data, replace(data, targets=off), np.arange(40), seed=0)
 
 
 def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, corrected):  # noqa: F811
@@ -74,6 +79,15 @@ def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, 
     before, after = (np.abs(made.mean - off.corrected[rest]).mean(axis=0) for made in (plain, plus))
     assert (after < 0.6 * before).all()
     assert json.loads((out / "config.json").read_text())["beside"]["frames"] == data.pins.image_name[:40].tolist()
+
+
+def test_intervals_are_widened_to_what_labelled_frames_say(data, run, corrected):  # noqa: F811
+    out, off, _ = corrected
+    told, before = (PoseEstimator.load(path).predict_table(data.pins) for path in (out.with_name("sim_only"), run))
+    assert np.array_equal(told.mean, before.mean) and (told.half_width >= before.half_width).all()
+    plus = PoseEstimator.load(out).predict_table(data.pins.rows(np.arange(40, 90)))
+    inside = np.abs(plus.mean - off.corrected[40:90]) <= plus.half_width
+    assert (inside.mean(axis=0) > 0.7).all()
 
 
 def test_a_small_copy_of_a_corrected_run_says_the_same(data, corrected, tmp_path):  # noqa: F811

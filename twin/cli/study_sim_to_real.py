@@ -126,15 +126,14 @@ def study_sim_to_real(
             drawn.append(joined([with_missing(each, told_by, discrepancy, seed + SEEDS_APART * k, progress) for each, told_by in parts]))
     bare = joined(bare)
     simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": bare} if ablate else {})
-    rows = []
-    for name, trained_on in (("sim_only", "simulated"), ("sim_bare", "simulated, bare")):
-        if name in simulated:
-            taught_by = tuple(measured.names) if name == "sim_only" else ()
-            with epoch_bar(name) as progress:
-                train_in_twin(simulated[name], out / name, seed=seed, split=seed, epochs=epochs, labelled=taught_by, progress=progress)
-            rows.append(judged(trained_on, 0, out / name, real, chosen.test))
+    for name, states in simulated.items():
+        taught_by = tuple(measured.names) if name == "sim_only" else ()
+        with epoch_bar(name) as progress:
+            train_in_twin(states, out / name, seed=seed, split=seed, epochs=epochs, labelled=taught_by, progress=progress)
     left_out = put_beside(out / "sim_only", out / "sim_plus_real", bare, real, chosen.few, seed=seed)
-    rows.insert(1, judged("simulated and real", labels, out / "sim_plus_real", real, chosen.test))
+    trained = [("simulated", 0, "sim_only"), ("simulated and real", labels, "sim_plus_real")]
+    trained += [("simulated, bare", 0, "sim_bare")] if ablate else []
+    rows = [judged(trained_on, told_by, out / name, real, chosen.test) for trained_on, told_by, name in trained]
     for name, index in chosen.trained.items():
         run = out / f"real_{name}"
         with epoch_bar(run.name) as progress:

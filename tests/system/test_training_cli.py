@@ -26,7 +26,16 @@ FRAMES = 70
 
 
 def twin(*arguments):
-    from twin.cli import audit, evaluate, predict, study_objects, study_tac_vgnn, train  # noqa: F401  (each registers its command)
+    from twin.cli import (  # noqa: F401  (each registers its command)
+        audit,
+        dataset,
+        evaluate,
+        predict,
+        study_objects,
+        study_sim_to_real,
+        study_tac_vgnn,
+        train,
+    )
 
     done = CliRunner().invoke(app, [str(a) for a in arguments])
     if isinstance(done.exception, TwinError):
@@ -114,6 +123,26 @@ def test_objects_never_seen_are_one_command_and_go_on_where_they_were(tmp_path):
     sets = [option for name in ("plane", "sphere") for option in ("--data", tmp_path / "study" / "sim" / name)]
     twin("train", "--model", "vgnn", "--sensor", SENSOR, *sets, "--epochs", 1, "--no-kernel", "--members", 1, "--out", tmp_path / "run")
     assert "pose_2: mean error" in twin("evaluate", tmp_path / "run", *sets, "--out", tmp_path / "judged")
+
+
+def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_was(tmp_path):
+    (tmp_path / "gentle.toml").write_text(EXPERIMENT)
+    gentle = ("--sensor", SENSOR, "--experiment", tmp_path / "gentle.toml", "--across", ACROSS, "--workers", 1)
+    twin("dataset", *gentle, "--images", "none", "--count", 24, "--seed", 7, "--randomise", "contact", "--out", tmp_path / "frames")
+    command = ("study", "sim-to-real", *gentle, "--frames", tmp_path / "frames", "--labels", 12, "--count", 12, "--draws", 1, "--ablate")
+    command += ("--epochs", 2, "--out", tmp_path / "study")
+    said = twin(*command)
+    rows = list(csv.DictReader((tmp_path / "study" / "study.csv").open()))
+    assert [(row["trained_on"], row["labelled_frames"]) for row in rows[:4]] == [
+        *(("simulated", "0"), ("simulated and real", "12"), ("simulated, bare", "0"), ("real", "12"))
+    ]
+    assert all(np.isfinite(float(row["pose_2_corrected"])) for row in rows)
+    assert "Gaussian process" in (tmp_path / "study" / "index.html").read_text()
+    judged = [line for line in said.splitlines() if "labelled" in line and "pose_2" in line]
+    assert len(judged) == len(rows) and [line for line in twin(*command).splitlines() if line in judged] == judged
+    for run in ("sim_only", "sim_plus_real"):
+        told = twin("evaluate", tmp_path / "study" / run, "--data", tmp_path / "frames", "--rows", "all", "--out", tmp_path / run)
+        assert "pose_6: mean error" in told
 
 
 def test_an_audit_writes_labels_that_training_reads(recording, tmp_path):

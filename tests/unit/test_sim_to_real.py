@@ -90,6 +90,12 @@ def test_intervals_are_widened_to_what_labelled_frames_say(data, run, corrected)
     assert (inside.mean(axis=0) > 0.7).all()
 
 
+def test_contacts_of_another_experiment_are_refused(data, run, tmp_path):  # noqa: F811
+    far = replace(data, targets=replace(data.targets, corrected=data.targets.corrected + [50.0, 0.0]))
+    with pytest.raises(TrainingError, match="^0 simulated states .*--contacts"):
+        put_beside(run, tmp_path, far, data, np.arange(40), seed=0)
+
+
 def test_a_small_copy_of_a_corrected_run_says_the_same(data, corrected, tmp_path):  # noqa: F811
     pack(corrected[0], tmp_path)
     whole, small = (PoseEstimator.load(path).predict_table(data.pins) for path in (corrected[0], tmp_path))

@@ -134,7 +134,7 @@ def put_beside(run: Path, out: Path, simulated: Dataset, real: Dataset, few: np.
     Raises
     ------
     TrainingError
-        No simulated state has labels like those of the labelled frames.
+        There are fewer simulated states with labels like those of the labelled frames than such frames.
     """
     estimator, part = PoseEstimator.load(run), real.rows(few)
     ensemble, labels = estimator.ensemble, estimator.config["labels"]
@@ -147,8 +147,11 @@ def put_beside(run: Path, out: Path, simulated: Dataset, real: Dataset, few: np.
     )
     margin = RANGE_MARGIN * np.ptp(truth, axis=0)
     among = np.flatnonzero(((told >= truth.min(axis=0) - margin) & (told <= truth.max(axis=0) + margin)).all(axis=1))
-    if not len(among):
-        raise TrainingError("no simulated state has labels like those of the labelled frames; simulate the experiment they come from")
+    if len(among) < len(few):
+        raise TrainingError(
+            f"{len(among)} simulated states have labels like those of the {len(few)} labelled frames, there must be as many; "
+            "simulate the experiment that the frames come from (--contacts), or more of it (--count)"
+        )
     like = simulated.rows(among)
     known = kernel_inputs(ensemble.networks[0], *estimator.inputs_of(like.pins, together=not like.pins.measured))
     process, left_out = fit_cokriging(known, torch.from_numpy(told[among]), seen, torch.from_numpy(truth), seed=seed)

@@ -55,7 +55,8 @@ class Ensemble:
     Parameters
     ----------
     content : dict
-        As ``calibrate`` gives it and ``weights.pt`` holds it; with ``beside``, a ``CoKriging`` that is averaged with the labels.
+        As ``calibrate`` gives it and ``weights.pt`` holds it; with ``beside``, a ``CoKriging`` that is averaged with
+        the labels of frames as they are.
     """
 
     def __init__(self, model: str, reference: Reference, content: dict, size: dict) -> None:
@@ -93,7 +94,8 @@ class Ensemble:
         """Labels of some rows."""
         mean, scale, executed = self.outputs(inputs, rows)
         if self.beside is not None:
-            mean = (mean + self.beside(kernel_inputs(self.networks[0], inputs, rows)).numpy()) / 2
+            share = (1 - inputs.displaced[rows, None].numpy()) / 2  # nothing to the process, which knows no displaced camera
+            mean = (1 - share) * mean + share * self.beside(kernel_inputs(self.networks[0], inputs, rows)).numpy()
         scale = self.scale * scale
         raw = self.raw_quantile[undone(executed)]
         return Prediction(self.shift + self.scale * mean, self.quantile * scale, raw * scale, executed)

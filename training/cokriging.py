@@ -66,11 +66,12 @@ def fit_cokriging(
     -------
     CoKriging
     left_out : (n, K) float64
-        What each real frame is predicted as when it is left out (Rasmussen and Williams 2006, eq. 5.12).
+        What each real frame is predicted as when it is left out (Rasmussen and Williams 2006, eq. 5.12); lengths, sizes and
+        noises have seen it.
     """
     chosen = torch.randperm(len(simulated), generator=torch.Generator().manual_seed(seed))[:SIMULATED]
-    usual = simulated.double().std(dim=0).clamp(min=1e-9)
     inputs = torch.cat([simulated[chosen], real]).double()
+    usual = inputs.std(dim=0).clamp(min=1e-9)
     labels = torch.cat([simulated_labels[chosen], real_labels]).double()
     is_real = torch.cat([torch.zeros(len(chosen)), torch.ones(len(real))]).double()
     found = []

@@ -103,6 +103,8 @@ class PoseEstimator:
         try:
             config = json.loads((run / "config.json").read_text())
             content = unpack(config, run / WEIGHTS) if packed else torch.load(run / "weights.pt", weights_only=True)
+            if "correction" in content:
+                raise ValueError("it is corrected by a regression")
             return cls(config, content)
         except (OSError, ValueError, KeyError, RuntimeError, UnpicklingError) as error:
             raise TrainingError(f"{run}: not a run of this version, or a damaged one ({error}); train again") from error

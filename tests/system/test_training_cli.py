@@ -137,9 +137,12 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
         *(("simulated", "0"), ("simulated and real", "12"), ("simulated, bare", "0"), ("real", "12"))
     ]
     assert all(np.isfinite(float(row["pose_2_corrected"])) for row in rows)
-    assert "Gaussian process" in (tmp_path / "study" / "index.html").read_text()
+    assert "averaged with a Gaussian process" in (tmp_path / "study" / "index.html").read_text()
+    trained = [tmp_path / "study" / run / "weights.pt" for run in ("sim_bare", "real_12", "real_all")]
+    written = [weights.stat().st_mtime_ns for weights in trained]
     judged = [line for line in said.splitlines() if "labelled" in line and "pose_2" in line]
     assert len(judged) == len(rows) and [line for line in twin(*command).splitlines() if line in judged] == judged
+    assert [weights.stat().st_mtime_ns for weights in trained] == written, "trained once"
     for run in ("sim_only", "sim_plus_real"):
         told = twin("evaluate", tmp_path / "study" / run, "--data", tmp_path / "frames", "--rows", "all", "--out", tmp_path / run)
         assert "pose_6: mean error" in told

@@ -15,7 +15,8 @@ from training.models import vgnn
 from training.packed import pack, read_arrays, shipped_names, write_arrays
 from training.recipes import TrainingError
 from training.run import train_run
-from training.sim_to_real.study import choose_frames, put_beside, quadratic_row
+from training.run_files import write_tensors
+from training.sim_to_real.study import choose_frames, put_beside, quadratic_row, states_like
 from twin.preprocess import make_reference
 
 SAME = 1e-6  # mm or deg: rounding of the areas' logarithms
@@ -59,41 +60,53 @@ def test_what_the_twin_misses_is_learnt_from_few_frames_and_told_honestly():
     assert (said < 2 * error).all() and (said > 0.5 * error).all()
 
 
+FEW, REST, SIMULATED = np.arange(24), np.arange(24, 44), np.arange(44, 90)
+
+
 @pytest.fixture(scope="module")
 def corrected(data, run, tmp_path_factory):  # noqa: F811
-    """The run beside a process that knows 40 frames of a sensor whose labels are off; its targets; and the process's own error.
+    """The run beside a process that knows some frames of a sensor whose labels are off; its targets; and the process's own error.
 
-    The run itself is ``sim_only`` in the same folder's parent.
+    A copy of the run, ``sim_only`` in the same folder's parent, is too sure of itself.
     """
-    off = replace(data.targets, corrected=data.targets.corrected + [1.0, -3.0])
+    off = replace(data, targets=replace(data.targets, corrected=data.targets.corrected + [1.0, -3.0]))
     out = tmp_path_factory.mktemp("study") / "sim_plus_real"
     alone = copytree(run, out.with_name("sim_only"))
-    return out, off, put_beside(alone, out, data, replace(data, targets=off), np.arange(40), seed=0)
+    content = torch.load(alone / "weights.pt", weights_only=True)
+    write_tensors(alone / "weights.pt", content | {"quantile": 1e-3 * content["quantile"]})
+    return out, off.targets, put_beside(alone, out, data.rows(SIMULATED), off.rows(FEW), seed=0)
 
 
 def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, corrected):  # noqa: F811
     out, off, left_out = corrected
-    assert (left_out < [0.3, 1.0]).all()
-    rest = np.arange(40, 90)
-    plain, plus = (PoseEstimator.load(path).predict_table(data.pins.rows(rest)) for path in (run, out))
-    before, after = (np.abs(made.mean - off.corrected[rest]).mean(axis=0) for made in (plain, plus))
-    assert (after < 0.6 * before).all()
-    assert json.loads((out / "config.json").read_text())["beside"]["frames"] == data.pins.image_name[:40].tolist()
+    assert (left_out < [0.5, 3.0]).all()
+    plain, plus = (PoseEstimator.load(path).predict_table(data.pins.rows(REST)) for path in (run, out))
+    before, after = (np.abs(made.mean - off.corrected[REST]).mean(axis=0) for made in (plain, plus))
+    assert (after < 0.7 * before).all()
+    assert json.loads((out / "config.json").read_text())["beside"]["frames"] == data.pins.image_name[FEW].tolist()
 
 
-def test_intervals_are_widened_to_what_labelled_frames_say(data, run, corrected):  # noqa: F811
+def test_intervals_are_widened_to_what_labelled_frames_say(data, corrected):  # noqa: F811
     out, off, _ = corrected
-    told, before = (PoseEstimator.load(path).predict_table(data.pins) for path in (out.with_name("sim_only"), run))
-    assert np.array_equal(told.mean, before.mean) and (told.half_width >= before.half_width).all()
-    plus = PoseEstimator.load(out).predict_table(data.pins.rows(np.arange(40, 90)))
-    inside = np.abs(plus.mean - off.corrected[40:90]) <= plus.half_width
-    assert (inside.mean(axis=0) > 0.7).all()
+    for run in (out, out.with_name("sim_only")):
+        told = PoseEstimator.load(run).predict_table(data.pins.rows(REST))
+        inside = np.abs(told.mean - off.corrected[REST]) <= told.half_width
+        assert (inside.mean(axis=0) > 0.7).all()
 
 
-def test_contacts_of_another_experiment_are_refused(data, run, tmp_path):  # noqa: F811
+def test_contacts_of_another_experiment_are_refused(data):  # noqa: F811
     far = replace(data, targets=replace(data.targets, corrected=data.targets.corrected + [50.0, 0.0]))
     with pytest.raises(TrainingError, match="^0 simulated states .*--contacts"):
-        put_beside(run, tmp_path, far, data, np.arange(40), seed=0)
+        states_like(far, data.rows(FEW))
+    assert len(states_like(data, data.rows(FEW))) >= len(FEW)
+
+
+def test_a_displaced_camera_is_left_to_the_network(data, run, corrected):  # noqa: F811
+    plain, plus = (PoseEstimator.load(path) for path in (run, corrected[0]))
+    inputs, rows = plus.inputs_of(data.pins, together=False)
+    assert np.abs(plus.ensemble(inputs, rows).mean - plain.ensemble(inputs, rows).mean).max() > 0.5
+    inputs.displaced[:] = 1
+    assert np.array_equal(plus.ensemble(inputs, rows).mean, plain.ensemble(inputs, rows).mean)
 
 
 def test_a_small_copy_of_a_corrected_run_says_the_same(data, corrected, tmp_path):  # noqa: F811

@@ -110,19 +110,38 @@ def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, pr
         train_run(config, real, out, progress=progress)
 
 
-def put_beside(run: Path, out: Path, simulated: Dataset, real: Dataset, few: np.ndarray, *, seed: int) -> np.ndarray:
+def states_like(simulated: Dataset, labelled: Dataset) -> np.ndarray:
+    """Rows of simulated states whose labels are about those of labelled frames.
+
+    Raises
+    ------
+    TrainingError
+        They are fewer than the labelled frames.
+    """
+    told, truth = simulated.targets.corrected, labelled.targets.corrected
+    margin = RANGE_MARGIN * np.ptp(truth, axis=0)
+    found = np.flatnonzero(((told >= truth.min(axis=0) - margin) & (told <= truth.max(axis=0) + margin)).all(axis=1))
+    if len(found) < len(labelled):
+        raise TrainingError(
+            f"{len(found)} simulated states have labels like those of the {len(labelled)} labelled frames, there must be as many; "
+            "simulate the experiment that the frames come from (--contacts, or another --sim), or more of it (--count)"
+        )
+    return found
+
+
+def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> np.ndarray:
     """Write the finished run ``run`` of ``vgnn`` to ``out``, averaged with a Gaussian process that knows labelled frames.
 
-    The two err differently, and neither can be weighed by the labelled frames, which have taught both. The process sees
-    simulated states among the labelled frames' labels. Intervals come from its errors on labelled frames that are left out of it
-    one after another; those of ``run`` itself, which simulated contacts make too narrow, are widened to its errors alone.
+    The two err differently, and neither can be weighed by the labelled frames, which have taught both. Intervals of ``run``, which
+    simulated contacts make too narrow, are widened to its errors on the labelled frames and to those of the process on frames
+    that are left out of it one after another; those of ``out`` are the average's.
 
     Parameters
     ----------
     simulated : Dataset
-        Contacts as the bare specification has them.
-    few : (n,) int
-        Rows of ``real`` that are labelled.
+        Contacts as the bare specification has them, with labels like the labelled frames' (``states_like``).
+    labelled : Dataset
+        n frames.
     seed : int
         Of the simulated states drawn.
 
@@ -130,31 +149,18 @@ def put_beside(run: Path, out: Path, simulated: Dataset, real: Dataset, few: np.
     -------
     (K,) float
         Mean absolute error (mm, deg) of the process alone, on labelled frames that are left out of it one after another.
-
-    Raises
-    ------
-    TrainingError
-        There are fewer simulated states with labels like those of the labelled frames than such frames.
     """
-    estimator, part = PoseEstimator.load(run), real.rows(few)
+    estimator = PoseEstimator.load(run)
     ensemble, labels = estimator.ensemble, estimator.config["labels"]
-    inputs, rows = estimator.inputs_of(part.pins, together=not part.pins.measured)
+    inputs, rows = estimator.inputs_of(labelled.pins, together=not labelled.pins.measured)
     mean, scale, executed = ensemble.outputs(inputs, rows)
     seen = kernel_inputs(ensemble.networks[0], inputs, rows)
+    known = kernel_inputs(ensemble.networks[0], *estimator.inputs_of(simulated.pins, together=not simulated.pins.measured))
     truth, raw, told = (
-        (labelled - ensemble.shift) / ensemble.scale
-        for labelled in (getattr(part.targets, labels), part.targets.raw, getattr(simulated.targets, labels))
+        (values - ensemble.shift) / ensemble.scale
+        for values in (getattr(labelled.targets, labels), labelled.targets.raw, getattr(simulated.targets, labels))
     )
-    margin = RANGE_MARGIN * np.ptp(truth, axis=0)
-    among = np.flatnonzero(((told >= truth.min(axis=0) - margin) & (told <= truth.max(axis=0) + margin)).all(axis=1))
-    if len(among) < len(few):
-        raise TrainingError(
-            f"{len(among)} simulated states have labels like those of the {len(few)} labelled frames, there must be as many; "
-            "simulate the experiment that the frames come from (--contacts), or more of it (--count)"
-        )
-    like = simulated.rows(among)
-    known = kernel_inputs(ensemble.networks[0], *estimator.inputs_of(like.pins, together=not like.pins.measured))
-    process, left_out = fit_cokriging(known, torch.from_numpy(told[among]), seen, torch.from_numpy(truth), seed=seed)
+    process, left_out = fit_cokriging(known, torch.from_numpy(told), seen, torch.from_numpy(truth), seed=seed)
 
     def intervals(made: np.ndarray) -> dict:
         return {
@@ -164,12 +170,13 @@ def put_beside(run: Path, out: Path, simulated: Dataset, real: Dataset, few: np.
 
     alone = left_out.numpy()
     content = torch.load(run / "weights.pt", weights_only=True)
-    wider = {key: np.maximum(content[key].numpy(), least) for key, least in intervals(alone).items()}
+    missed = (intervals(mean), intervals(alone))
+    wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
     write_tensors(run / "weights.pt", content | wider)
     content |= intervals((mean + alone) / 2) | {"beside": process.arrays()}
     out.mkdir(parents=True, exist_ok=True)
     write_tensors(out / "weights.pt", content)
-    about = {"data": str(real.folder), "frames": part.pins.image_name.tolist()}
+    about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}
     write_text(out / "config.json", json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
     return np.abs(alone - truth).mean(axis=0) * ensemble.scale
 

@@ -21,7 +21,8 @@ Gaussian process of the label, and drawn --draws times for every simulated conta
 them first ('twin calibrate contact'; about an hour). Judged on the random fifth that is left:
 
 \b
-  simulated            vgnn trained on simulated contacts alone
+  simulated            vgnn trained on simulated contacts alone; its 90 %
+                       intervals are what the labelled frames say
   simulated and real   the same, averaged with a Gaussian process of the pins
                        of both simulated contacts and labelled frames
   real                 vgnn and a quadratic regression trained on as many real
@@ -75,6 +76,7 @@ def study_sim_to_real(
         measured_of,
         put_beside,
         quadratic_row,
+        states_like,
         train_in_twin,
         train_on_real,
         with_missing,
@@ -124,13 +126,14 @@ def study_sim_to_real(
         with count_bar(f"draw {k + 1}") as progress:
             parts = zip(bare, told, strict=True)
             drawn.append(joined([with_missing(each, told_by, discrepancy, seed + SEEDS_APART * k, progress) for each, told_by in parts]))
-    bare = joined(bare)
+    bare, few = joined(bare), real.rows(chosen.few)
+    like = bare.rows(states_like(bare, few))
     simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": bare} if ablate else {})
     for name, states in simulated.items():
         taught_by = tuple(measured.names) if name == "sim_only" else ()
         with epoch_bar(name) as progress:
             train_in_twin(states, out / name, seed=seed, split=seed, epochs=epochs, labelled=taught_by, progress=progress)
-    left_out = put_beside(out / "sim_only", out / "sim_plus_real", bare, real, chosen.few, seed=seed)
+    left_out = put_beside(out / "sim_only", out / "sim_plus_real", like, few, seed=seed)
     trained = [("simulated", 0, "sim_only"), ("simulated and real", labels, "sim_plus_real")]
     trained += [("simulated, bare", 0, "sim_bare")] if ablate else []
     rows = [judged(trained_on, told_by, out / name, real, chosen.test) for trained_on, told_by, name in trained]

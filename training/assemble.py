@@ -199,9 +199,15 @@ def calibrate(config, data, inputs, train: np.ndarray, networks: list, scaling: 
         errors = [np.abs(b * kernel + (1 - b) * mean - truth).mean(axis=0) for b in BLENDS]
         content["blend"][main] = BLENDS[np.argmin(errors, axis=0)][main]
         mean = np.where(content["blend"] > 0, content["blend"] * kernel + (1 - content["blend"]) * mean, mean)
-    content["quantile"] = conformal_quantile(np.abs(mean - truth) / spread)
-    content["raw_quantile"] = group_quantiles(np.abs(mean - published) / spread, undone(executed))
-    return content
+    return content | intervals(mean, truth, published, spread, executed)
+
+
+def intervals(made: np.ndarray, truth: np.ndarray, published: np.ndarray, scale: np.ndarray, executed: np.ndarray) -> dict:
+    """Quantiles of both kinds of labels (n, K), given predictions and their expected scales (n, K) and the probability of a move (n,)."""
+    return {
+        "quantile": conformal_quantile(np.abs(made - truth) / scale),
+        "raw_quantile": group_quantiles(np.abs(made - published) / scale, undone(executed)),
+    }
 
 
 def undone(executed: np.ndarray) -> np.ndarray:

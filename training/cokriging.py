@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import torch
 
-from training.kernel import covariance, likeliest, with_noise
+from training.kernel import covariance, likeliest, solved, with_noise
 
 SIMULATED = 1000  # states used, drawn at random
 # of s, l, r, t, m, c and the two noises, to begin with: the twin's alone as in training.kernel
@@ -83,10 +83,8 @@ def fit_cokriging(
             return with_noise(_between(scaled, scaled, is_real, is_real, sizes), noise)
 
         lengths, sizes = likeliest(matrix, label, [START_LENGTH] * inputs.shape[1], START)
-        factor = torch.linalg.cholesky(matrix(lengths, sizes))
-        weight = torch.cholesky_solve(label[:, None], factor)[:, 0]
-        left_out = (label - weight / torch.cholesky_inverse(factor).diagonal())[len(chosen) :]
-        found.append((usual * lengths, sizes[:6], weight, left_out))
+        weight, left_out = solved(matrix(lengths, sizes), label)
+        found.append((usual * lengths, sizes[:6], weight, left_out[len(chosen) :]))
     lengths, sizes, weight, left_out = (torch.stack(part) for part in zip(*found, strict=True))
     return CoKriging(inputs, is_real, lengths, sizes, weight.T.contiguous()), left_out.T
 

@@ -76,9 +76,8 @@ def fit_kernel(inputs: torch.Tensor, labels: torch.Tensor, *, seed: int, progres
             return with_noise(covariance(scaled, scaled, sizes[0], sizes[1]), sizes[2])
 
         lengths, sizes = likeliest(partial(matrix, rows=chosen), labels[chosen, k], [5.0] * inputs.shape[1], (1.0, 0.3, 0.05))
-        factor = torch.linalg.cholesky(matrix(lengths, sizes, slice(None)))
-        weight = torch.cholesky_solve(labels[:, k : k + 1], factor)[:, 0]
-        left_out.append(labels[:, k] - weight / torch.cholesky_inverse(factor).diagonal())
+        weight, left = solved(matrix(lengths, sizes, slice(None)), labels[:, k])
+        left_out.append(left)
         found.append((usual * lengths, sizes, weight))
         if progress:
             progress(k + 1, labels.shape[1])
@@ -96,6 +95,13 @@ def covariance(a: torch.Tensor, b: torch.Tensor, smooth: torch.Tensor, linear: t
 def with_noise(kernel: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
     """A kernel (A, A) of rows that each have noise of a standard deviation, one number or (A,)."""
     return kernel + torch.diag((noise**2 + JITTER).expand(len(kernel)))
+
+
+def solved(matrix: torch.Tensor, label: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Weights (A,) of the rows in a prediction, ``matrix`` (A, A) being their covariance, and what each is predicted as when left out."""
+    factor = torch.linalg.cholesky(matrix)
+    weight = torch.cholesky_solve(label[:, None], factor)[:, 0]
+    return weight, label - weight / torch.cholesky_inverse(factor).diagonal()
 
 
 def likeliest(matrix: Callable, label: torch.Tensor, lengths: Sequence, sizes: Sequence) -> tuple[torch.Tensor, torch.Tensor]:

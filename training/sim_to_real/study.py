@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from training.assemble import conformal_quantile, group_quantiles, kernel_inputs, undone
+from training.assemble import intervals, kernel_inputs
 from training.cokriging import fit_cokriging
 from training.dataset import Dataset, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
@@ -82,9 +82,8 @@ def with_missing(
     return replace(simulated, pins=replace(pins, nodes_px=nodes_px, area_px2=voronoi_areas(nodes_px, pins.reference, progress=progress)))
 
 
-def measured_of(real: Dataset, rows: np.ndarray) -> MeasuredFrames:
-    """Some frames of a recording with the arm's labels, as contacts are fitted to them."""
-    part = real.rows(rows)
+def measured_of(part: Dataset) -> MeasuredFrames:
+    """Frames of a recording with the arm's labels, as contacts are fitted to them."""
     pins_px = np.where(part.pins.lost[..., None], np.nan, part.pins.nodes_px)
     return MeasuredFrames(part.pins.form, part.pins.image_name.tolist(), arm_labels(part), pins_px, part.pins.reference.pins_px, [])
 
@@ -161,19 +160,12 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
         for values in (getattr(labelled.targets, labels), labelled.targets.raw, getattr(simulated.targets, labels))
     )
     process, left_out = fit_cokriging(known, torch.from_numpy(told), seen, torch.from_numpy(truth), seed=seed)
-
-    def intervals(made: np.ndarray) -> dict:
-        return {
-            "quantile": conformal_quantile(np.abs(made - truth) / scale),
-            "raw_quantile": group_quantiles(np.abs(made - raw) / scale, undone(executed)),
-        }
-
     alone = left_out.numpy()
     content = torch.load(run / "weights.pt", weights_only=True)
-    missed = (intervals(mean), intervals(alone))
+    missed = [intervals(made, truth, raw, scale, executed) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
     write_tensors(run / "weights.pt", content | wider)
-    content |= intervals((mean + alone) / 2) | {"beside": process.arrays()}
+    content |= intervals((mean + alone) / 2, truth, raw, scale, executed) | {"beside": process.arrays()}
     out.mkdir(parents=True, exist_ok=True)
     write_tensors(out / "weights.pt", content)
     about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}

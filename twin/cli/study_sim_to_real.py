@@ -92,7 +92,8 @@ def study_sim_to_real(
         real = load_dataset(frames, spec, plan.targets, progress=progress)
     chosen = choose_frames(len(real), labels, seed)
     writable_folder(out)
-    measured = measured_of(real, chosen.few)
+    few = real.rows(chosen.few)
+    measured = measured_of(few)
     if calibrate:
         setup = Setup(spec, plan, touched, measured.form, across, out / "calibration", workers)
         with rate_bar("calibration") as progress:
@@ -126,7 +127,7 @@ def study_sim_to_real(
         with count_bar(f"draw {k + 1}") as progress:
             parts = zip(bare, told, strict=True)
             drawn.append(joined([with_missing(each, told_by, discrepancy, seed + SEEDS_APART * k, progress) for each, told_by in parts]))
-    bare, few = joined(bare), real.rows(chosen.few)
+    bare = joined(bare)
     like = bare.rows(states_like(bare, few))
     simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": bare} if ablate else {})
     for name, states in simulated.items():

@@ -57,6 +57,11 @@ def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str,
     return Recording(folder, form, names, frame_size(spec, form), labels, problems=problems), arrays
 
 
+def config_of(folder: Path) -> GenerationConfig:
+    """What a simulated data set was made with."""
+    return GenerationConfig.model_validate_json((folder / CONFIG).read_text())
+
+
 def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     """Depth and angle of the surface that was touched, whatever its shape, as labels: see ``twin.touch.surface_labels``.
 
@@ -76,7 +81,7 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         mm and deg by the table's columns, NaN for frames that it does not name; empty where depth and one angle do not tell how a
         surface is touched.
     """
-    config = GenerationConfig.model_validate_json((folder / CONFIG).read_text())
+    config = config_of(folder)
     truth = zarr.open_group(folder / TRUTH, mode="r")
     with (folder / TABLE).open(newline="") as file:
         row_of = {row["image_name"]: k for k, row in enumerate(csv.DictReader(file))}

@@ -204,6 +204,17 @@ def test_the_cameras_own_motion_is_taken_out_and_contact_is_left():
     assert np.allclose(shrunk, 1, atol=0.01) and (share == 1).all()
 
 
+@pytest.mark.parametrize("known", [8, 12, 40])
+def test_what_few_frames_tell_of_the_camera_never_throws_others_far_off(known):
+    rng = np.random.default_rng(11)
+    rest = rng.uniform(-100, 100, (60, 2)) + 128
+    waves = np.stack([np.sin((rest - 128) / scale) for scale in (30, 50, 90)])
+    frames = rest + np.einsum("mk,knd->mnd", rng.normal(0, 2, (200, 3)), waves) + rng.normal(0, 0.1, (200, 60, 2))
+    registration, _ = fit_registration(frames[:known], rest)
+    nodes, area, taken, _ = registration(frames[known:], np.ones((200 - known, 60)))
+    assert np.isfinite(area).all() and np.abs(taken[:, 2:]).max() < 10 and np.abs(nodes - frames[known:]).max() < 20  # px; pins move by 2
+
+
 def test_with_all_of_a_difference_taken_out_a_displaced_frame_is_the_same():
     rng = np.random.default_rng(10)
     rest = rng.uniform(-100, 100, (60, 2)) + 128

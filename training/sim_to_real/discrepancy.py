@@ -67,7 +67,9 @@ def label_axes(labels: list[ArmLabel]) -> np.ndarray:
     return np.stack([np.concatenate([label.pose - label.move, label.move * label.executed]) for label in labels])
 
 
-def measure_residuals(setup: Setup, measured: MeasuredFrames, progress: Callable | None = None) -> Residuals:
+def measure_residuals(
+    setup: Setup, measured: MeasuredFrames, progress: Callable | None = None, *, frictions: tuple = FRICTIONS
+) -> Residuals:
     """Simulate labelled frames after the tap and after the move, with several frictions; the likeliest story of each is compared.
 
     Friction differs from frame to frame, and simulated data sets draw it: what is left must not hold it once more.
@@ -79,7 +81,7 @@ def measure_residuals(setup: Setup, measured: MeasuredFrames, progress: Callable
     """
     labels, real_px = measured.labels, measured.pins_px - measured.no_contact_px
     setup = replace(setup, parameters=(FRICTION,))
-    moved = simulate(setup, measured, [[np.log(friction)] for friction in FRICTIONS], rig_of(setup.sensor).turn_sign, progress)
+    moved = simulate(setup, measured, [[np.log(friction)] for friction in frictions], rig_of(setup.sensor).turn_sign, progress)
     squared = np.stack([mean_squared(each, real_px) for each in moved])
     best = np.where(np.isfinite(squared).all(axis=2), squared.min(axis=2), np.inf).argmin(axis=0)
     rows = np.arange(len(labels))

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from scenes.object import ObjectSpec
 from training.assemble import intervals, kernel_inputs
 from training.cokriging import fit_cokriging
-from training.dataset import Dataset, split_rows, voronoi_areas
+from training.dataset import Dataset, joined, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_slope, predict_rows_of
 from training.recipes import TrainingError, recipe_of
@@ -18,7 +19,7 @@ from training.recorded_contact import read_arm_labels
 from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors, write_text
 from training.sim_to_real.discrepancy import Discrepancy
-from training.simulated import is_pins_only, open_simulated
+from training.simulated import config_of, is_pins_only, open_simulated
 from training.validation.model import MeasuredFrames
 from twin.kinematics import ArmLabel
 from twin.recordings import open_recording
@@ -126,6 +127,11 @@ def states_like(simulated: Dataset, labelled: Dataset) -> np.ndarray:
             "simulate the experiment that the frames come from (--contacts, or another --sim), or more of it (--count)"
         )
     return found
+
+
+def states_touching(parts: list[Dataset], touched: ObjectSpec) -> Dataset:
+    """Of simulated data sets those of one object, joined; all of them if none is."""
+    return joined([part for part in parts if config_of(part.folder).object.name == touched.name] or parts)
 
 
 def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> np.ndarray:

@@ -27,7 +27,10 @@ them first ('twin calibrate contact'; about an hour). Judged on the random fifth
                        of both simulated contacts and labelled frames
   real                 vgnn and a quadratic regression trained on as many real
                        frames, on 500 and on all
-  --ablate             simulated contacts as the bare specification has them
+  --ablate             simulated: without what the twin misses, with a fifth
+                       of the contacts, a coarse mesh, one friction, no
+                       moves, tolerances of skin and gel drawn as well, and
+                       uncalibrated; it simulates five more sets of contacts
 
 Contacts are simulated in --out/sim, without pictures, unless --sim (may be given several times: other objects) names finished data
 sets of 'twin dataset' or 'twin study objects'; of one with pictures the pins are those that the pipeline sees. The same command
@@ -56,7 +59,7 @@ def study_sim_to_real(
     count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts to simulate")] = 500,
     sim: Annotated[list[Path] | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead; several are joined")] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
-    ablate: Annotated[bool, typer.Option("--ablate", help="also train without what was learnt of the twin's errors")] = False,
+    ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time")] = False,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="of every training, instead of the model's own number")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
@@ -67,7 +70,7 @@ def study_sim_to_real(
     from training.contact_calibration import fit_contact
     from training.contact_calibration.simulate import Setup
     from training.dataset import joined, load_dataset
-    from training.generation import GenerationConfig, generate
+    from training.generation import generate
     from training.sim_to_real.discrepancy import Discrepancy, measure_residuals
     from training.sim_to_real.study import (
         arm_labels,
@@ -77,12 +80,13 @@ def study_sim_to_real(
         put_beside,
         quadratic_row,
         states_like,
+        states_touching,
         train_in_twin,
         train_on_real,
         with_missing,
     )
+    from training.sim_to_real.twins import Twin, as_mounted, without_one_ingredient
     from twin.cli.progress import count_bar, epoch_bar, rate_bar
-    from twin.kinematics import rig_of
     from twin.views.page import render_page
     from twin.views.table import write_table
 
@@ -93,51 +97,57 @@ def study_sim_to_real(
     chosen = choose_frames(len(real), labels, seed)
     writable_folder(out)
     few = real.rows(chosen.few)
-    measured = measured_of(few)
+    measured, uncalibrated = measured_of(few), as_mounted(spec)
     if calibrate:
         setup = Setup(spec, plan, touched, measured.form, across, out / "calibration", workers)
         with rate_bar("calibration") as progress:
             spec = fit_contact(setup, measured, progress=progress).sensor
-    setup = Setup(spec, plan, touched, measured.form, across, out / "labelled", workers, ())
-    with rate_bar("labelled frames") as progress:
-        residuals = measure_residuals(setup, measured, progress)
-    discrepancy = Discrepancy(residuals)
-    if not sim:
-        sim = [out / "sim"]
-        config = GenerationConfig(
-            sensor=spec,
-            object=touched,
-            experiment=simulated_plan,
-            randomisation=load_randomisation("moves"),
-            friction=rig_of(spec).friction,
-            seed=seed,
-            images="none",
-            states="all",
-            across=across,
-        )
-        with rate_bar(f"{simulated_plan.name}, {spec.name}") as progress:
-            generate(sim[0], config, count, workers=workers, progress=progress)
+    full = Twin("sim_only", "simulated", "sim", spec, simulated_plan, load_randomisation("moves"), across)
+    twins = [full, *(without_one_ingredient(full, uncalibrated, load_randomisation("contact")) if ablate else ())]
 
-    bare = []
-    for folder in sim:
-        with count_bar(f"states of {folder.name}") as progress:
-            bare.append(load_dataset(folder, spec, plan.targets, form=real.pins.form, progress=progress))
-    told, drawn = [arm_labels(each) for each in bare], []
-    for k in range(draws):
-        with count_bar(f"draw {k + 1}") as progress:
-            parts = zip(bare, told, strict=True)
-            drawn.append(joined([with_missing(each, told_by, discrepancy, seed + SEEDS_APART * k, progress) for each, told_by in parts]))
-    bare = joined(bare)
-    like = bare.rows(states_like(bare, few))
-    simulated = {"sim_only": drawn[0].beside([each.pins for each in drawn[1:]])} | ({"sim_bare": bare} if ablate else {})
-    for name, states in simulated.items():
-        taught_by = tuple(measured.names) if name == "sim_only" else ()
-        with epoch_bar(name) as progress:
-            train_in_twin(states, out / name, seed=seed, split=seed, epochs=epochs, labelled=taught_by, progress=progress)
-    left_out = put_beside(out / "sim_only", out / "sim_plus_real", like, few, seed=seed)
-    trained = [("simulated", 0, "sim_only"), ("simulated and real", labels, "sim_plus_real")]
-    trained += [("simulated, bare", 0, "sim_bare")] if ablate else []
-    rows = [judged(trained_on, told_by, out / name, real, chosen.test) for trained_on, told_by, name in trained]
+    sets, rows, about, left_out = {}, [], {}, np.empty(0)
+    for twin in twins:
+        missing = None
+        if twin.learns:
+            setup = Setup(twin.sensor, plan, touched, measured.form, twin.across, out / "labelled", workers, ())
+            with rate_bar(f"{twin.name}: labelled frames") as progress:
+                residuals = measure_residuals(setup, measured, progress, frictions=twin.frictions)
+            missing = Discrepancy(residuals)
+        if twin.contacts not in sets:
+            folders = sim if sim and twin is full else [out / twin.contacts]
+            if folders is not sim:
+                with rate_bar(f"{twin.name}: {twin.experiment.name}") as progress:
+                    generate(folders[0], twin.config(touched, seed), count, workers=workers, progress=progress)
+            sets[twin.contacts] = []
+            for folder in folders:
+                with count_bar(f"states of {folder.name}") as progress:
+                    sets[twin.contacts].append(load_dataset(folder, spec, plan.targets, form=real.pins.form, progress=progress))
+        states, drawn = sets[twin.contacts], []
+        told = [arm_labels(each) for each in states]
+        for k in range(draws if missing else 0):
+            with count_bar(f"{twin.name}: draw {k + 1}") as progress:
+                pairs = zip(states, told, strict=True)
+                drawn.append(joined([with_missing(each, by, missing, seed + SEEDS_APART * k, progress) for each, by in pairs]))
+        learnt = [twin.part(each) for each in drawn or [joined(states)]]
+        run = out / twin.name
+        with epoch_bar(twin.name) as progress:
+            train_in_twin(
+                learnt[0].beside([each.pins for each in learnt[1:]]),
+                run,
+                seed=seed,
+                split=seed,
+                epochs=epochs,
+                labelled=tuple(measured.names) if missing else (),
+                progress=progress,
+            )
+        if twin is full:
+            bare = states_touching(states, touched)
+            left_out = put_beside(run, out / "sim_plus_real", bare.rows(states_like(bare, few)), few, seed=seed)
+            about = {"error_px": residuals.error_px, "modes": missing.summary()[:4]}
+            about |= {"simulated": len(learnt[0]), "contacts": len(np.unique(learnt[0].group))}
+        rows.append(judged(twin.says, 0, run, real, chosen.test))
+        if twin is full:
+            rows.append(judged("simulated and real", labels, out / "sim_plus_real", real, chosen.test))
     for name, index in chosen.trained.items():
         run = out / f"real_{name}"
         with epoch_bar(run.name) as progress:
@@ -152,10 +162,7 @@ def study_sim_to_real(
         labelled=labels,
         seed=seed,
         calibrated=calibrate,
-        error_px=residuals.error_px,
-        modes=discrepancy.summary()[:4],
-        simulated=len(drawn[0]),
-        contacts=len(np.unique(drawn[0].group)),
+        **about,
         names=real.targets.names,
         left_out=left_out,
         columns=columns,

@@ -1,0 +1,111 @@
+"""The twins of a study: the one that a model is to learn in, and the same without one of its ingredients at a time."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scenes.experiment import ExperimentSpec, MoveRanges
+from scenes.object import ObjectSpec
+from scenes.randomisation import RandomisationSpec
+from scenes.rig import RigSpec
+from scenes.sensor import SensorSpec
+from training.dataset import Dataset
+from training.generation import GenerationConfig
+from training.sim_to_real.discrepancy import FRICTIONS
+from twin.kinematics import rig_of
+
+COARSE = 12  # elements across
+FEW = 0.2  # of the contacts
+QUARTER_DEG = 90.0
+
+
+@dataclass(frozen=True)
+class Twin:
+    """How contacts are simulated, and what of them is learnt.
+
+    Attributes
+    ----------
+    name : str
+        Of the run's folder.
+    says : str
+        What the study's table calls it.
+    contacts : str
+        Name of the set of contacts, which several twins may share.
+    randomisation : RandomisationSpec
+    across : int
+        Elements along each side of the skin's grid.
+    learns : bool
+        Whether it is told what its pins miss on the labelled frames.
+    share : float
+        Of the set's contacts, the first ones, that are learnt from.
+    """
+
+    name: str
+    says: str
+    contacts: str
+    sensor: SensorSpec
+    experiment: ExperimentSpec
+    randomisation: RandomisationSpec
+    across: int
+    learns: bool = True
+    share: float = 1.0
+
+    @property
+    def frictions(self) -> tuple:
+        """Of a labelled frame, tried one after another to see what is missed whatever its friction was."""
+        return FRICTIONS if self.randomisation.friction else (rig_of(self.sensor).friction,)
+
+    def config(self, touched: ObjectSpec, seed: int) -> GenerationConfig:
+        """Of its contacts, without pictures."""
+        return GenerationConfig(
+            sensor=self.sensor,
+            object=touched,
+            experiment=self.experiment,
+            randomisation=self.randomisation,
+            friction=rig_of(self.sensor).friction,
+            seed=seed,
+            images="none",
+            states="all",
+            across=self.across,
+        )
+
+    def part(self, contacts: Dataset) -> Dataset:
+        """The states of the contacts that are learnt from."""
+        if self.share == 1:
+            return contacts
+        numbers = np.unique(contacts.group)
+        return contacts.rows(np.flatnonzero(np.isin(contacts.group, numbers[: int(np.ceil(self.share * len(numbers)))])))
+
+
+def without_one_ingredient(full: Twin, uncalibrated: SensorSpec, every_tolerance: RandomisationSpec) -> list[Twin]:
+    """Twins that lack one thing each, or have one more.
+
+    Parameters
+    ----------
+    uncalibrated : SensorSpec
+        As it was before any labelled frame was looked at; see ``as_mounted``.
+    every_tolerance : RandomisationSpec
+        Draws skin and gel, too.
+    """
+
+    def but(name: str, says: str, *, shared: bool = False, **changes) -> Twin:
+        return replace(full, name=f"sim_{name}", says=says, contacts=full.contacts if shared else name, **changes)
+
+    still = full.experiment.model_copy(update={"move": MoveRanges()})
+    return [
+        but("bare", "simulated, bare", shared=True, learns=False),
+        but("few", f"simulated, {FEW:.0%} of the contacts", shared=True, share=FEW),
+        but("coarse", f"simulated, {COARSE} elements across", across=COARSE),
+        but("one_friction", "simulated, one friction", randomisation=full.randomisation.model_copy(update={"friction": None})),
+        but("taps", "simulated, without moves", experiment=still),
+        but("tolerances", f"simulated, randomised as '{every_tolerance.name}'", randomisation=every_tolerance),
+        but("uncalibrated", "simulated, uncalibrated", sensor=uncalibrated, learns=False),
+    ]
+
+
+def as_mounted(sensor: SensorSpec) -> SensorSpec:
+    """The sensor as somebody knows it who has put it on the arm and measured nothing: axes to a quarter turn, the rest as drawn."""
+    rig = rig_of(sensor)
+    quarter = QUARTER_DEG * round(rig.image_turn_deg / QUARTER_DEG)
+    plain = RigSpec(tcp_to_dome_mm=-sensor.skin.outer_radius_mm, turn_sign=rig.turn_sign, image_turn_deg=quarter)
+    return sensor.model_copy(update={"rig": plain})

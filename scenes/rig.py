@@ -31,6 +31,8 @@ class RigSpec(Section):
         Azimuth of the direction across in the sensor frame, from image x towards image y.
     friction : float
         One coefficient for all contacts.
+    compliance_mm_per_n : float
+        How far the arm and its mount give way along the sensor's axis; labels say where the arm was sent.
     """
 
     contact_offset_mm: float = 0.0
@@ -41,3 +43,4 @@ class RigSpec(Section):
     plate_tilt_deg: float = 0.0
     image_turn_deg: float = 0.0
     friction: NonNegative = 0.5
+    compliance_mm_per_n: NonNegative = 0.0

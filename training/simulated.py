@@ -65,8 +65,8 @@ def config_of(folder: Path) -> GenerationConfig:
 def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     """Depth and angle of the surface that was touched, whatever its shape, as labels: see ``twin.touch.surface_labels``.
 
-    Where the object stood is taken from the ground truth, with the rig's numbers that were drawn for each contact, so that the
-    flat plate's are the table's own, with moves that were not executed taken out.
+    Where the object stood is taken from the ground truth, with the rig's numbers that were drawn for each contact, less what the arm
+    gave way, so that the flat plate's are the table's own, with moves that were not executed taken out.
 
     Parameters
     ----------
@@ -89,12 +89,15 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
     rows = np.array([row_of.get(name, -1) for name in names.tolist()], int)
     T_sensor_object, contact = truth["T_sensor_object"][:][rows], np.where(rows < 0, -1, truth["path_id"][:][rows])
+    force_n = truth["force_n"][:][rows]
     surface = Surface(config.object)
     found: dict[str, np.ndarray] = {}
     for path_id in np.unique(contact[rows >= 0]):
         mine = contact == path_id
-        mounting = Mounting.of(_rigged(config.sensor, draws[int(path_id)]), config.experiment)
-        for label, values in surface_labels(config.experiment, mounting, surface, T_sensor_object[mine]).items():
+        sensor = _rigged(config.sensor, draws[int(path_id)])
+        sent = T_sensor_object[mine]
+        sent[:, 2, 3] -= rig_of(sensor).compliance_mm_per_n * force_n[mine, 2]
+        for label, values in surface_labels(config.experiment, Mounting.of(sensor, config.experiment), surface, sent).items():
             found.setdefault(label, np.full(len(rows), np.nan))[mine] = values
     return found
 

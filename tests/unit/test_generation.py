@@ -238,3 +238,15 @@ def test_pictures_are_those_of_the_states(tmp_path):
     moved = with_missing(data, arm_labels(data), SimpleNamespace(draw_px=lambda labels, moved_px, contact, seed: -moved_px), 0)
     assert moved.pins.nodes_px == pytest.approx(np.tile(data.pins.reference.pins_px, (1, 1, 1))), "pictures' pins, what is missing added"
     assert moved.pins.area_px2[0] == pytest.approx(data.pins.reference.area_px2)
+
+
+def test_labels_say_where_the_arm_was_sent_however_far_it_gives_way(tmp_path):
+    plain = small_config(tmp_path)
+    rig = rig_of(plain.sensor)
+    yields = plain.sensor.model_copy(update={"rig": rig.model_copy(update={"compliance_mm_per_n": 0.4})})
+    told, pressed = [], []
+    for name, sensor in (("stiff", plain.sensor), ("compliant", yields)):
+        generate(tmp_path / name, plain.model_copy(update={"sensor": sensor}), 3)
+        told.append(load_dataset(tmp_path / name, sensor, "surface-2d").targets.corrected)
+        pressed.append(zarr.open_group(tmp_path / name / "truth.zarr", mode="r")["force_n"][:, 2])
+    assert np.abs(told[0] - told[1]).max() < ARC_MM and (pressed[1] < 0.95 * pressed[0]).all()

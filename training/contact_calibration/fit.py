@@ -43,7 +43,7 @@ class ContactFit:
     ----------
     sensor : SensorSpec
     start, value, sd : (P,) float
-        Of the setup's parameters; logarithms where they are fitted so.
+        What is fitted of the setup's parameters (``Parameter.scale``).
     told : (P,) float
         Share of the prior's variance that the frames removed: 1 is told by the frames, 0 is the start as it was.
     correlation : (P, P) float

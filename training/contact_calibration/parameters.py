@@ -1,6 +1,7 @@
 """The numbers that contacts are calibrated by."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from scenes.experiment import ExperimentSpec
 from scenes.sensor import SensorSpec
 from twin.kinematics import rig_of
 
+LEAST = 1e-3  # of a number whose logarithm is fitted
 TURNING = {"x": 4, "y": 5, "z": 4}  # which of the turns lies in the plane of the approach and the direction across, from 0 in a pose
 
 
@@ -20,17 +22,36 @@ class Parameter:
     name : str
         Dotted key; ``rig.turn_offset_deg`` is the turn in the plane of approach and across.
     prior : float
-        Sd of what is plausible around the start; of the logarithm where ``log``.
+        Sd of what is plausible around the start, of what is fitted.
     step : float
         For differences.
-    log : bool
-        Fitted as its logarithm.
+    scale : {"plain", "log", "volume"}
+        What is fitted: the number, its logarithm, or of a Poisson's ratio log(1 - 2 nu), which is how much the volume yields.
+    least : float
+        Smallest number that makes sense; what is fitted may go below it.
     """
 
     name: str
     prior: float
     step: float
-    log: bool = False
+    scale: Literal["plain", "log", "volume"] = "plain"
+    least: float = -np.inf
+
+    def fitted(self, number: float) -> float:
+        """What is fitted of a number of the specification."""
+        if self.scale == "plain":
+            return number
+        return float(np.log(max(number if self.scale == "log" else 1 - 2 * number, LEAST)))
+
+    def number(self, fitted: float) -> float:
+        """The other way round."""
+        if self.scale == "plain":
+            return max(float(fitted), self.least)
+        return float(np.exp(fitted) if self.scale == "log" else (1 - np.exp(fitted)) / 2)
+
+    def slope(self, fitted: float) -> float:
+        """Absolute change of the number with what is fitted."""
+        return 1.0 if self.scale == "plain" else float(np.exp(fitted)) / (1 if self.scale == "log" else 2)
 
 
 PARAMETERS = (
@@ -40,23 +61,24 @@ PARAMETERS = (
     Parameter("rig.turn_offset_deg", 3.0, 0.3),
     Parameter("rig.plate_tilt_deg", 2.0, 0.3),
     Parameter("rig.image_turn_deg", 10.0, 1.0),
-    Parameter("rig.friction", 0.7, 0.15, log=True),
-    Parameter("gel.young_modulus_mpa", 0.7, 0.15, log=True),
+    Parameter("rig.friction", 0.7, 0.15, "log"),
+    Parameter("rig.compliance_mm_per_n", 0.1, 0.02, least=0.0),
+    Parameter("gel.young_modulus_mpa", 0.7, 0.15, "log"),
+    Parameter("gel.poisson_ratio", 0.7, 0.3, "volume"),
     Parameter("skin.thickness_mm", 0.2, 0.05),
-    Parameter("pins.length_mm", 0.3, 0.1, log=True),
+    Parameter("pins.length_mm", 0.3, 0.1, "log"),
 )
 
 
 def values_of(sensor: SensorSpec, experiment: ExperimentSpec, parameters: tuple = PARAMETERS) -> np.ndarray:
-    """(P,) what the specification says of the parameters, logarithms where they are fitted so."""
+    """(P,) what is fitted of what the specification says of the parameters."""
     plain = sensor.model_dump(include={"gel", "skin", "pins"}) | {"rig": rig_of(sensor).model_dump()}
     turning = TURNING[experiment.approach] - 3
     out = []
     for parameter in parameters:
         section, key = parameter.name.split(".")
         value = plain[section][key]
-        value = value[turning] if key == "turn_offset_deg" else value
-        out.append(np.log(max(value, 1e-3)) if parameter.log else value)
+        out.append(parameter.fitted(value[turning] if key == "turn_offset_deg" else value))
     return np.array(out)
 
 
@@ -74,7 +96,7 @@ def changed(
     plain["rig"]["turn_sign"] = int(turn_sign)
     for parameter, value in zip(parameters, values, strict=True):
         section, key = parameter.name.split(".")
-        number = float(np.exp(value)) if parameter.log else float(value)
+        number = parameter.number(value)
         if key == "turn_offset_deg":
             plain[section][key][TURNING[experiment.approach] - 3] = number
         else:

@@ -22,8 +22,8 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
     """All figures, as ``calibration.json`` holds them."""
     parameters = []
     for k, parameter in enumerate(setup.parameters):
-        start, value = (float(np.exp(v[k])) if parameter.log else float(v[k]) for v in (fit.start, fit.value))
-        sd = float(fit.sd[k] * (value if parameter.log else 1))
+        start, value = (parameter.number(v[k]) for v in (fit.start, fit.value))
+        sd = float(fit.sd[k] * parameter.slope(fit.value[k]))
         told = float(fit.told[k])
         parameters.append({"name": parameter.name, "start": start, "value": value, "sd": sd, "told": told, "known": told >= TOLD})
     pairs = [

@@ -76,8 +76,9 @@ def make_contact(text: str, index: int) -> Outcome:
 def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
     simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, keep=False)
     stimulus = build_stimulus(config.object)
-    way = arm_path(rig_of(draw.sensor), config.experiment, draw.sensor, stimulus, draw.label)
-    compliance = config.object.compliance_mm_per_n
+    rig = rig_of(draw.sensor)
+    way = arm_path(rig, config.experiment, draw.sensor, stimulus, draw.label)
+    compliance = config.object.compliance_mm_per_n + rig.compliance_mm_per_n
     found = list(simulator.solver.path(stimulus, way.path, friction=draw.friction, compliance_mm_per_n=compliance))
     labels = [way.label(fraction) for fraction, _ in found[:-1]] + [draw.label]
     kept = range(len(found)) if config.states == "all" else [len(found) - 1]

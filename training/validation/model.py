@@ -107,6 +107,7 @@ class ContactModel:
     def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
         self.spec, self.experiment, self.form = spec, experiment, form
         self.rig, self.stimulus = rig_of(spec), build_stimulus(touched)
+        self.compliance_mm_per_n = touched.compliance_mm_per_n + self.rig.compliance_mm_per_n
         self.solver = SkinSolver(spec, resolution=Resolution(across), keep=False)
         self.rest_px = self._pixels(self.solver.rest().caps_mm)
 
@@ -127,7 +128,9 @@ class ContactModel:
             return np.zeros_like(self.rest_px), np.zeros_like(self.rest_px)
         tap_ends = 1 / (len(way.labels) - 1) if way.touches else 0.0
         tapped_mm = self.solver.rest().caps_mm
-        for fraction, state in self.solver.path(self.stimulus, way.path, friction=self.rig.friction if friction is None else friction):
+        friction = self.rig.friction if friction is None else friction
+        path = self.solver.path(self.stimulus, way.path, friction=friction, compliance_mm_per_n=self.compliance_mm_per_n)
+        for fraction, state in path:
             if fraction <= tap_ends + _SAME:
                 tapped_mm = state.caps_mm
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px

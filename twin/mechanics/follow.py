@@ -37,7 +37,8 @@ class Follower:
     def __init__(self, solver: SkinSolver, stimulus: ObjectSpec, *, step_mm: float | None = None):
         self._solver, self._step_mm = solver, step_mm or _step_of(stimulus)
         self._field = build_stimulus(stimulus)
-        self._law, self._compliance = friction_of(stimulus), stimulus.compliance_mm_per_n
+        rig = solver.spec.rig
+        self._law, self._compliance = friction_of(stimulus), stimulus.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
         self._radius_mm = solver.spec.skin.outer_radius_mm
         self._dome_mm = self._radius_mm * dome_directions(solver.spec, _DIRECTIONS)
         self._rest = solver.rest()

@@ -33,6 +33,8 @@ class RigSpec(Section):
         One coefficient for all contacts.
     compliance_mm_per_n : float
         How far the arm and its mount give way along the sensor's axis; labels say where the arm was sent.
+    turn_compliance_deg_per_n : float
+        How far they turn, as the label in the plane of approach and across counts, for each N that the sensor pushes the object across.
     """
 
     contact_offset_mm: float = 0.0
@@ -44,3 +46,4 @@ class RigSpec(Section):
     image_turn_deg: float = 0.0
     friction: NonNegative = 0.5
     compliance_mm_per_n: NonNegative = 0.0
+    turn_compliance_deg_per_n: float = 0.0

@@ -11,7 +11,7 @@ from training.generation.config import GenerationConfig
 from training.generation.store import CONFIG, DRAWS
 from training.generation.truth_file import TRUTH
 from twin.errors import FrameError
-from twin.kinematics import rig_of
+from twin.kinematics import object_pose, rig_of
 from twin.mounting import Mounting
 from twin.preprocess.forms import frame_size
 from twin.recordings import Recording
@@ -65,7 +65,7 @@ def config_of(folder: Path) -> GenerationConfig:
 def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     """Depth and angle of the surface that was touched, whatever its shape, as labels: see ``twin.touch.surface_labels``.
 
-    Where the object stood is taken from the ground truth, with the rig's numbers that were drawn for each contact, less what the arm
+    Where the object stood is where the arm was sent, by the rig's numbers that were drawn for each contact, less what the object
     gave way, so that the flat plate's are the table's own, with moves that were not executed taken out.
 
     Parameters
@@ -88,15 +88,15 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     with (folder / DRAWS).open(newline="") as file:
         draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
     rows = np.array([row_of.get(name, -1) for name in names.tolist()], int)
-    T_sensor_object, contact = truth["T_sensor_object"][:][rows], np.where(rows < 0, -1, truth["path_id"][:][rows])
-    force_n = truth["force_n"][:][rows]
+    pose = truth["pose"][:] - truth["move"][:] * ~truth["executed"][:][:, None]
+    pose, force_n, contact = pose[rows], truth["force_n"][:][rows], np.where(rows < 0, -1, truth["path_id"][:][rows])
     surface = Surface(config.object)
     found: dict[str, np.ndarray] = {}
     for path_id in np.unique(contact[rows >= 0]):
         mine = contact == path_id
         sensor = _rigged(config.sensor, draws[int(path_id)])
-        sent = T_sensor_object[mine]
-        sent[:, 2, 3] -= rig_of(sensor).compliance_mm_per_n * force_n[mine, 2]
+        sent = np.stack([object_pose(rig_of(sensor), config.experiment, each, sensor.skin.outer_radius_mm) for each in pose[mine]])
+        sent[:, 2, 3] += config.object.compliance_mm_per_n * force_n[mine, 2]
         for label, values in surface_labels(config.experiment, Mounting.of(sensor, config.experiment), surface, sent).items():
             found.setdefault(label, np.full(len(rows), np.nan))[mine] = values
     return found

@@ -10,6 +10,7 @@ and the object, whose frame has z along the approach, leans by ``plate_tilt`` an
 robot's origin indents it by ``zero + contact_offset``. Arms tap along a0, then make the move in one straight line.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,7 @@ TOUCH_POINTS = 20_000  # on the sphere: the dome bulges by less than 2 um betwee
 MOST_MARCHES = 400
 CLEAR_MM = 10.0  # before the tap: recorded taps of 5 mm begin up to 0.4 mm inside the object
 
+TURNING = {"x": 5, "y": 5, "z": 4}  # which of a pose's labels turns the tool in the plane of the approach and the direction across
 _UNTURNED = {  # columns: the sensor's x (across), y and z (approach) in the work frame
     "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
     "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
@@ -96,6 +98,31 @@ def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, radi
     in_image = np.eye(4)
     in_image[:3, :3] = Rotation.from_euler("z", rig.image_turn_deg, degrees=True).as_matrix()
     return in_image @ T
+
+
+def arm_turning(rig: RigSpec, experiment: ExperimentSpec) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
+    """How an arm that gives way turns about its tool point; None for one that does not.
+
+    Returns
+    -------
+    callable
+        From ``T_sensor_object`` (4, 4) where the arm was sent, and the force on the object (3,), N, in the sensor frame, to the
+        pose where it then is.
+    """
+    if not rig.turn_compliance_deg_per_n:
+        return None
+    unturned, about = _UNTURNED[experiment.approach], np.eye(3)[TURNING[experiment.approach] - 3]
+    in_image = Rotation.from_euler("z", rig.image_turn_deg, degrees=True).as_matrix()
+    axis, tool_mm = in_image @ unturned.T @ about, -in_image @ [rig.tcp_lateral_mm, 0, rig.tcp_to_dome_mm]
+
+    def turned(T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
+        turn_deg = rig.turn_sign * rig.turn_compliance_deg_per_n * (T[:3, 0] @ force_n)
+        turn = Rotation.from_rotvec(-turn_deg * axis, degrees=True).as_matrix()
+        there = T.copy()
+        there[:3, :3], there[:3, 3] = turn @ T[:3, :3], tool_mm + turn @ (T[:3, 3] - tool_mm)
+        return there
+
+    return turned
 
 
 def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimulus, label: ArmLabel) -> ArmPath:

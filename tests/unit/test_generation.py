@@ -243,7 +243,7 @@ def test_pictures_are_those_of_the_states(tmp_path):
 def test_labels_say_where_the_arm_was_sent_however_far_it_gives_way(tmp_path):
     plain = small_config(tmp_path)
     rig = rig_of(plain.sensor)
-    yields = plain.sensor.model_copy(update={"rig": rig.model_copy(update={"compliance_mm_per_n": 0.4})})
+    yields = plain.sensor.model_copy(update={"rig": rig.model_copy(update={"compliance_mm_per_n": 0.4, "turn_compliance_deg_per_n": 3.0})})
     told, pressed = [], []
     for name, sensor in (("stiff", plain.sensor), ("compliant", yields)):
         generate(tmp_path / name, plain.model_copy(update={"sensor": sensor}), 3)

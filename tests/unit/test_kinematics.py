@@ -5,7 +5,7 @@ import pytest
 
 from scenes import RigSpec, load_experiment, load_sensor
 from twin.errors import ContactError
-from twin.kinematics import ArmLabel, arm_path, object_pose, rig_of
+from twin.kinematics import TURNING, ArmLabel, arm_path, arm_turning, object_pose, rig_of
 from twin.stimulus.analytic import Plane
 
 EXACT_MM = 1e-9
@@ -135,3 +135,17 @@ def test_every_label_of_the_recordings_leads_somewhere(name):
     for numbers in generator.uniform([-4, -20, -5, -5], [0, 20, 5, 5], (20, 4)):
         made = arm_path(rig_of(sensor), SURFACE, sensor, Plane(), label(*numbers))
         assert made.touches and 0.5 < indentation_mm(made.path.poses[1]) < 7.5
+
+
+@pytest.mark.parametrize(("approach", "sign"), [("x", 1), ("y", 1), ("y", -1), ("z", -1)])
+def test_an_arm_that_turns_under_a_force_is_where_a_larger_angle_would_have_sent_it(approach, sign):
+    plan = load_experiment("surface-2d").model_copy(update={"approach": approach})
+    rig = RigSpec(tcp_to_dome_mm=-17.0, tcp_lateral_mm=0.7, turn_sign=sign, image_turn_deg=80.0, plate_tilt_deg=-1.0)
+    pose, further = np.zeros(6), np.zeros(6)
+    pose[TURNING[approach]] = 12.0
+    further[TURNING[approach]] = 12.0 + 0.6
+    sent = object_pose(rig, plan, pose, 20.0)
+    assert arm_turning(rig, plan) is None
+    turned = arm_turning(rig.model_copy(update={"turn_compliance_deg_per_n": 0.3}), plan)
+    assert np.allclose(turned(sent, 2.0 * sent[:3, 0] + 5.0 * sent[:3, 2]), object_pose(rig, plan, further, 20.0), atol=1e-9)
+    assert np.allclose(turned(sent, 5.0 * sent[:3, 2]), sent)

@@ -7,10 +7,9 @@ import numpy as np
 
 from scenes.experiment import ExperimentSpec
 from scenes.sensor import SensorSpec
-from twin.kinematics import rig_of
+from twin.kinematics import TURNING, rig_of
 
 LEAST = 1e-3  # of a number whose logarithm is fitted
-TURNING = {"x": 4, "y": 5, "z": 4}  # which of the turns lies in the plane of the approach and the direction across, from 0 in a pose
 
 
 @dataclass(frozen=True)
@@ -63,6 +62,7 @@ PARAMETERS = (
     Parameter("rig.image_turn_deg", 10.0, 1.0),
     Parameter("rig.friction", 0.7, 0.15, "log"),
     Parameter("rig.compliance_mm_per_n", 0.1, 0.02, least=0.0),
+    Parameter("rig.turn_compliance_deg_per_n", 0.3, 0.1),
     Parameter("gel.young_modulus_mpa", 0.7, 0.15, "log"),
     Parameter("gel.poisson_ratio", 0.7, 0.3, "volume"),
     Parameter("skin.thickness_mm", 0.2, 0.05),

@@ -16,7 +16,7 @@ from scenes.sensor import SensorSpec
 from training.recorded_contact import read_arm_labels
 from twin.errors import FrameError
 from twin.geometry.solid import Resolution
-from twin.kinematics import ArmLabel, arm_path, rig_of
+from twin.kinematics import ArmLabel, arm_path, arm_turning, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline
 from twin.preprocess.batch import recording_reference
@@ -129,8 +129,8 @@ class ContactModel:
         tap_ends = 1 / (len(way.labels) - 1) if way.touches else 0.0
         tapped_mm = self.solver.rest().caps_mm
         friction = self.rig.friction if friction is None else friction
-        path = self.solver.path(self.stimulus, way.path, friction=friction, compliance_mm_per_n=self.compliance_mm_per_n)
-        for fraction, state in path:
+        yields = {"compliance_mm_per_n": self.compliance_mm_per_n, "given_way": arm_turning(self.rig, self.experiment)}
+        for fraction, state in self.solver.path(self.stimulus, way.path, friction=friction, **yields):
             if fraction <= tap_ends + _SAME:
                 tapped_mm = state.caps_mm
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px

@@ -70,9 +70,10 @@ def optics(
 CONTACT_HELP = """Fit the contact of a specification to labelled frames of the real sensor on its robot.
 
 From the no-contact frame (init_0.png) and N labelled frames: contact offset, tool point, angle offset and sign, tilt of the
-surface, direction of the robot's axes in the image, friction, how far the arm gives way, stiffness of the gel relative to the skin and
-how much its volume yields, thickness of the skin, length of the pins. Whether each frame's move had been executed when it was taken is found along with them, and
-frames that fit no story lose their weight. As many frames again, at most 20, are kept out of the fit to state the error.
+surface, direction of the robot's axes in the image, friction, how far the arm gives way and turns, stiffness of the gel relative to
+the skin and how much its volume yields, thickness of the skin, length of the pins. Whether each frame's move had been executed
+when it was taken is found along with them, and frames that fit no story lose their weight. As many frames again, at most 20, are
+kept out of the fit to state the error.
 
 \b
 Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/ with index.html (parameters with their
@@ -80,7 +81,7 @@ uncertainty and what the frames tell of them, frames with their probabilities, b
 contacts/: an interrupted run goes on where it was.
 
 \b
-It simulates about 50 + 55 N contacts, of 1 to 3 s each on one core; --workers divides that.
+It simulates about 50 + 60 N contacts, of 1 to 3 s each on one core; --workers divides that.
 
 \b
 Example:

@@ -78,6 +78,7 @@ class SkinSolver:
         *,
         friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
+        given_way: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
         release: bool = False,
         step_mm: float = _STEP_MM,
     ) -> Iterator[tuple[float, ContactState]]:
@@ -89,6 +90,9 @@ class SkinSolver:
             With a bare ``Stimulus``, friction and compliance default to 0.
         friction, compliance_mm_per_n : optional
             Override the object's.
+        given_way : callable, optional
+            What else the force does to the object's pose: from the path's ``T_sensor_object`` (4, 4) and the force on the object
+            (3,), N, after the load step before, to the pose that is taken.
         release : bool
             Afterwards lift the object off again, the way it came.
         step_mm : float
@@ -119,9 +123,15 @@ class SkinSolver:
         reached = self._reached(field, plan)
         contact = self.begin(field, law, compliance, reached, plan.at(0.0), focus=_focus(reached))
         stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
+        force_n = np.zeros(3)
+
+        def pose_at(progress: float) -> np.ndarray:
+            return plan.at(progress) if given_way is None else given_way(plan.at(progress), force_n)
+
         for number, (start, stop) in enumerate(pairwise(stops), 1):
             where = f"load step {number} of {len(stops) - 1} ({stop / stops[-1]:.0%} of the path)"
-            for at, state in contact.advance(plan.at, start, stop, plan.time_s, where):
+            for at, state in contact.advance(pose_at, start, stop, plan.time_s, where):
+                force_n = state.force_n
                 yield float(at / stops[-1]), state
 
     def begin(

@@ -133,9 +133,10 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     command += ("--epochs", 2, "--out", tmp_path / "study")
     said = twin(*command)
     rows = list(csv.DictReader((tmp_path / "study" / "study.csv").open()))
-    assert [(row["trained_on"], row["labelled_frames"]) for row in rows[:10]] == [
+    assert [(row["trained_on"], row["labelled_frames"]) for row in rows[:11]] == [
         *(("simulated", "0"), ("simulated and real", "12"), ("simulated, bare", "0"), ("simulated, 20% of the contacts", "0")),
-        *(("simulated, 12 elements across", "0"), ("simulated, one friction", "0"), ("simulated, without moves", "0")),
+        *(("simulated, 12 elements across", "0"), ("simulated, one friction", "0"), ("simulated, any friction", "0")),
+        ("simulated, without moves", "0"),
         *(("simulated, randomised as 'contact'", "0"), ("simulated, uncalibrated", "0"), ("real", "12")),
     ]
     assert all(np.isfinite(float(row["pose_2_corrected"])) for row in rows)

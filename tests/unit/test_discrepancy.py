@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.sim_to_real.discrepancy import Discrepancy, Residuals, label_axes
+from training.sim_to_real.discrepancy import FEWEST, FRICTIONS, Discrepancy, Residuals, _likeliest, label_axes
 from twin.kinematics import ArmLabel
 
 PINS = 30
@@ -39,7 +39,7 @@ def rng():
 def learnt(rng, scatter=0.0, count=40):
     labels = labels_of(rng, count)
     moved = moved_of(labels)
-    return Discrepancy(Residuals(label_axes(labels), moved, missed_by(labels, moved, scatter)))
+    return Discrepancy(Residuals(label_axes(labels), moved, missed_by(labels, moved, scatter), np.full(len(labels), np.nan)))
 
 
 def test_a_smooth_miss_is_recovered_on_other_labels(rng):
@@ -77,3 +77,28 @@ def test_it_grows_with_the_displacement(rng):
     found, labels = learnt(rng), labels_of(rng, 5)
     moved = 2 * moved_of(labels)
     assert found.mean_px(labels, moved / 2) == pytest.approx(found.mean_px(labels, moved) / 2)
+
+
+def test_a_frames_friction_is_found_between_those_that_were_tried():
+    rng = np.random.default_rng(3)
+    at = np.log(FRICTIONS)
+    fields = np.cumsum(rng.normal(size=(len(at), 1, 2, 30, 2)), axis=0) * np.ones((1, 9, 1, 1, 1))
+    true = rng.uniform(at[0], at[-1], 9)
+    real = np.stack([[np.interp(t, at, fields[:, 0, 1, n, c]) for n in range(30) for c in range(2)] for t in true]).reshape(9, 30, 2)
+    real[0, :4] = np.nan  # lost
+    fields[3, 1] = np.nan  # this friction's contact failed
+    moved, friction = _likeliest(fields, real, FRICTIONS)
+    sound = np.arange(9) != 1
+    assert np.allclose(np.log(friction[sound, 1]), true[sound]) and np.allclose(moved[2:, 1], real[2:])
+    assert np.isfinite(moved[1]).all(), "the frictions beside it stand for it"
+    fields[:, 5, 0] = np.nan
+    assert np.isnan(_likeliest(fields, real, FRICTIONS)[0][5, 0]).all()
+
+
+def test_friction_is_drawn_where_the_frames_had_it():
+    nothing = np.zeros((20, 5, 2))
+    frictions = np.exp(np.linspace(np.log(0.3), np.log(0.6), 20))
+    spread = Residuals(np.zeros((20, 12)), nothing, nothing, frictions).friction_spread()
+    assert 0.2 < spread.low < 0.3 and 0.6 < spread.high < 0.8 and spread.free_share == spread.stick_share == 0
+    few = np.where(np.arange(20) < FEWEST - 1, frictions, np.nan)
+    assert Residuals(np.zeros((20, 12)), nothing, nothing, few).friction_spread() is None

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
+from scenes.randomisation import FrictionSpread
 from training.sim_to_real.discrepancy import FRICTIONS
 from training.sim_to_real.twins import Twin, as_mounted, without_one_ingredient
 
@@ -11,8 +12,10 @@ from training.sim_to_real.twins import Twin, as_mounted, without_one_ingredient
 @pytest.fixture(scope="module")
 def twins():
     sensor = load_sensor("mg400-331")
-    full = Twin("sim_only", "simulated", "sim", sensor, load_experiment("surface-2d-wide"), load_randomisation("moves"), 20)
-    return full, {twin.name: twin for twin in without_one_ingredient(full, as_mounted(sensor), load_randomisation("contact"))}
+    moves, contact = load_randomisation("moves"), load_randomisation("contact")
+    seen = moves.model_copy(update={"friction": FrictionSpread(low=0.3, high=0.6)})
+    full = Twin("sim_only", "simulated", "sim", sensor, load_experiment("surface-2d-wide"), seen, 20)
+    return full, {twin.name: twin for twin in without_one_ingredient(full, as_mounted(sensor), moves, contact)}
 
 
 def test_each_lacks_one_thing_and_shares_contacts_only_where_they_are_the_same(twins):
@@ -22,7 +25,7 @@ def test_each_lacks_one_thing_and_shares_contacts_only_where_they_are_the_same(t
         assert (twin.config(plane, 0) == full.config(plane, 0)) == (twin.contacts == full.contacts)
         differ = [key for key in ("sensor", "experiment", "randomisation", "across", "share") if getattr(twin, key) != getattr(full, key)]
         assert len(differ) == (0 if twin.name == "sim_bare" else 1)
-    assert len({twin.contacts for twin in others.values()} - {full.contacts}) == 5
+    assert len({twin.contacts for twin in others.values()} - {full.contacts}) == 6
 
 
 def test_friction_that_is_never_drawn_is_not_tried_on_frames_either(twins):

@@ -19,6 +19,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
+from scenes.randomisation import FrictionSpread
 from training.contact_calibration.fit import expect, mean_squared, simulate
 from training.contact_calibration.parameters import PARAMETERS
 from training.contact_calibration.simulate import Setup
@@ -27,7 +28,8 @@ from training.validation.model import MeasuredFrames
 from twin.kinematics import ArmLabel, rig_of
 
 FRICTION = next(parameter for parameter in PARAMETERS if parameter.name == "rig.friction")
-FRICTIONS = (0.05, 0.15, 0.35, 0.7, 3.0)  # of a frame, tried one after another; the last is stick
+FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)  # of a frame, between which it is sought; the last is stick
+USUAL, WIDER = (0.05, 0.95), 1.25  # quantiles of the frames' frictions that are drawn between, and how far beyond
 FEWEST = 8  # frames that both stories could be simulated of
 LEAST_PX = 0.5  # of the rms displacement that residuals are divided by
 VARIES = 1e-6  # mm or deg: sd of a label's axis from which on it counts
@@ -50,16 +52,27 @@ class Residuals:
         Simulated displacements.
     missing_px : (K, N, 2) float
         Real less simulated; 0 for lost pins.
+    friction : (K,) float
+        The likeliest of each frame; NaN where no move was executed, which would show it.
     """
 
     axes: np.ndarray
     moved_px: np.ndarray
     missing_px: np.ndarray
+    friction: np.ndarray
 
     @property
     def error_px(self) -> float:
         """Mean distance of a real pin from its simulated place."""
         return float(np.linalg.norm(self.missing_px, axis=-1).mean())
+
+    def friction_spread(self) -> FrictionSpread | None:
+        """What friction to draw for simulated contacts; None where too few moves were executed to tell."""
+        shown = self.friction[np.isfinite(self.friction)]
+        if len(shown) < FEWEST:
+            return None
+        low, high = np.quantile(shown, USUAL)
+        return FrictionSpread(low=float(max(low / WIDER, FRICTIONS[0])), high=float(min(high * WIDER, FRICTIONS[-1])))
 
 
 def label_axes(labels: list[ArmLabel]) -> np.ndarray:
@@ -72,6 +85,8 @@ def measure_residuals(
 ) -> Residuals:
     """Simulate labelled frames after the tap and after the move, with several frictions; the likeliest story of each is compared.
 
+    Between two frictions pins are taken to move evenly with its logarithm.
+
     Friction differs from frame to frame, and simulated data sets draw it: what is left must not hold it once more.
 
     Raises
@@ -82,18 +97,38 @@ def measure_residuals(
     labels, real_px = measured.labels, measured.pins_px - measured.no_contact_px
     setup = replace(setup, parameters=(FRICTION,))
     moved = simulate(setup, measured, [[np.log(friction)] for friction in frictions], rig_of(setup.sensor).turn_sign, progress)
-    squared = np.stack([mean_squared(each, real_px) for each in moved])
-    best = np.where(np.isfinite(squared).all(axis=2), squared.min(axis=2), np.inf).argmin(axis=0)
-    rows = np.arange(len(labels))
-    moved = moved[best, rows]
-    weights = expect(squared[best, rows])
+    moved, friction = _likeliest(moved, real_px, frictions)
+    weights = expect(mean_squared(moved, real_px))
     good = np.flatnonzero(np.isfinite(moved).all(axis=(1, 2, 3)) & (weights.trust > TRUSTED))
     if len(good) < FEWEST:
         raise TrainingError(f"{len(good)} of {len(labels)} labelled frames fit the twin, {FEWEST} must; give more --labels, or --calibrate")
     executed = weights.executed[good] > 0.5
     told = [replace(labels[k], executed=bool(done)) for k, done in zip(good, executed, strict=True)]
     simulated = moved[good, executed.astype(int)]
-    return Residuals(label_axes(told), simulated, np.nan_to_num(real_px[good] - simulated))
+    friction = np.where(executed, friction[good, 1], np.nan)
+    return Residuals(label_axes(told), simulated, np.nan_to_num(real_px[good] - simulated), friction)
+
+
+def _likeliest(moved: np.ndarray, real_px: np.ndarray, frictions: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Of displacements (F, M, 2, N, 2) with F frictions those (M, 2, N, 2) nearest to real ones (M, N, 2), and their frictions (M, 2).
+
+    NaN where the contact failed with all frictions.
+    """
+    seen, target = np.isfinite(real_px)[:, None], np.nan_to_num(real_px)[:, None]
+    best, least = np.full(moved.shape[1:], np.nan), np.full(moved.shape[1:3], np.inf)
+    friction = np.full(moved.shape[1:3], np.nan)
+    log = np.log(frictions)
+    for k in range(len(frictions)):
+        start, way = moved[k], moved[min(k + 1, len(frictions) - 1)] - moved[k]
+        way = np.where(np.isfinite(way), way, 0.0)  # the next one failed: this one alone
+        along, length = ((part * way * seen).sum(axis=(-2, -1)) for part in (target - start, way))
+        share = np.clip(along / np.maximum(length, 1e-12), 0, 1)
+        there = start + share[..., None, None] * way
+        squared = (((target - there) * seen) ** 2).sum(axis=(-2, -1))
+        nearer = squared < least  # never where it failed
+        best[nearer], least[nearer] = there[nearer], squared[nearer]
+        friction[nearer] = np.exp(log[k] + share * (log[min(k + 1, len(log) - 1)] - log[k]))[nearer]
+    return best, friction
 
 
 class Discrepancy:

@@ -77,13 +77,17 @@ class Twin:
         return contacts.rows(np.flatnonzero(np.isin(contacts.group, numbers[: int(np.ceil(self.share * len(numbers)))])))
 
 
-def without_one_ingredient(full: Twin, uncalibrated: SensorSpec, every_tolerance: RandomisationSpec) -> list[Twin]:
+def without_one_ingredient(
+    full: Twin, uncalibrated: SensorSpec, any_friction: RandomisationSpec, every_tolerance: RandomisationSpec
+) -> list[Twin]:
     """Twins that lack one thing each, or have one more.
 
     Parameters
     ----------
     uncalibrated : SensorSpec
         As it was before any labelled frame was looked at; see ``as_mounted``.
+    any_friction : RandomisationSpec
+        Draws friction without having seen a frame.
     every_tolerance : RandomisationSpec
         Draws skin and gel, too.
     """
@@ -91,14 +95,16 @@ def without_one_ingredient(full: Twin, uncalibrated: SensorSpec, every_tolerance
     def but(name: str, says: str, *, shared: bool = False, **changes) -> Twin:
         return replace(full, name=f"sim_{name}", says=says, contacts=full.contacts if shared else name, **changes)
 
+    wide = every_tolerance.model_copy(update={"friction": full.randomisation.friction})
     still = full.experiment.model_copy(update={"move": MoveRanges()})
     return [
         but("bare", "simulated, bare", shared=True, learns=False),
         but("few", f"simulated, {FEW:.0%} of the contacts", shared=True, share=FEW),
         but("coarse", f"simulated, {COARSE} elements across", across=COARSE),
         but("one_friction", "simulated, one friction", randomisation=full.randomisation.model_copy(update={"friction": None})),
+        but("any_friction", "simulated, any friction", randomisation=any_friction),
         but("taps", "simulated, without moves", experiment=still),
-        but("tolerances", f"simulated, randomised as '{every_tolerance.name}'", randomisation=every_tolerance),
+        but("tolerances", f"simulated, randomised as '{every_tolerance.name}'", randomisation=wide),
         but("uncalibrated", "simulated, uncalibrated", sensor=uncalibrated, learns=False),
     ]
 

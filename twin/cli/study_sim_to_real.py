@@ -16,9 +16,10 @@ HELP = """Train in the twin, test on real frames, against training on real frame
 
 The recording's --experiment says how the arm went and what is learnt; --contacts is the experiment that is simulated.
 
---labels real frames are drawn by --seed from four fifths of the recording. What the twin's pins miss on them is learnt as a
-Gaussian process of the label, and drawn --draws times for every simulated contact; with --calibrate the specification is fitted to
-them first ('twin calibrate contact'; about an hour). Judged on the random fifth that is left:
+--labels real frames are drawn by --seed from four fifths of the recording. Friction is drawn as it was on them. What the twin's
+pins miss on them is learnt as a Gaussian process of the label, and drawn --draws times for every simulated contact; with
+--calibrate the specification is fitted to them first ('twin calibrate contact'; about an hour). Judged on the random fifth that
+is left:
 
 \b
   simulated            vgnn trained on simulated contacts alone; its 90 %
@@ -28,9 +29,9 @@ them first ('twin calibrate contact'; about an hour). Judged on the random fifth
   real                 vgnn and a quadratic regression trained on as many real
                        frames, on 500 and on all
   --ablate             simulated: without what the twin misses, with a fifth
-                       of the contacts, a coarse mesh, one friction, no
-                       moves, tolerances of skin and gel drawn as well, and
-                       uncalibrated; it simulates five more sets of contacts
+                       of the contacts, a coarse mesh, one friction, any
+                       friction, no moves, tolerances of skin and gel drawn as well, and
+                       uncalibrated; it simulates six more sets of contacts
 
 Contacts are simulated in --out/sim, without pictures, unless --sim (may be given several times: other objects) names finished data
 sets of 'twin dataset' or 'twin study objects'; of one with pictures the pins are those that the pipeline sees. The same command
@@ -102,8 +103,12 @@ def study_sim_to_real(
         setup = Setup(spec, plan, touched, measured.form, across, out / "calibration", workers)
         with rate_bar("calibration") as progress:
             spec = fit_contact(setup, measured, progress=progress).sensor
-    full = Twin("sim_only", "simulated", "sim", spec, simulated_plan, load_randomisation("moves"), across)
-    twins = [full, *(without_one_ingredient(full, uncalibrated, load_randomisation("contact")) if ablate else ())]
+    setup, moves = Setup(spec, plan, touched, measured.form, across, out / "labelled", workers, ()), load_randomisation("moves")
+    with rate_bar("labelled frames") as progress:
+        drawn_friction = measure_residuals(setup, measured, progress).friction_spread() or moves.friction
+    seen = moves.model_copy(update={"friction": drawn_friction})
+    full = Twin("sim_only", "simulated", "sim", spec, simulated_plan, seen, across)
+    twins = [full, *(without_one_ingredient(full, uncalibrated, moves, load_randomisation("contact")) if ablate else ())]
 
     sets, rows, about, left_out = {}, [], {}, np.empty(0)
     for twin in twins:
@@ -144,7 +149,7 @@ def study_sim_to_real(
             bare = states_touching(states, touched)
             left_out = put_beside(run, out / "sim_plus_real", bare.rows(states_like(bare, few)), few, seed=seed)
             about = {"error_px": residuals.error_px, "modes": missing.summary()[:4]}
-            about |= {"simulated": len(learnt[0]), "contacts": len(np.unique(learnt[0].group))}
+            about |= {"friction": drawn_friction, "simulated": len(learnt[0]), "contacts": len(np.unique(learnt[0].group))}
         rows.append(judged(twin.says, 0, run, real, chosen.test))
         if twin is full:
             rows.append(judged("simulated and real", labels, out / "sim_plus_real", real, chosen.test))

@@ -30,8 +30,9 @@ is left:
                        frames, on 500 and on all
   --ablate             simulated: without what the twin misses, with a fifth
                        of the contacts, a coarse mesh, one friction, any
-                       friction, no moves, tolerances of skin and gel drawn as well, and
-                       uncalibrated; it simulates six more sets of contacts
+                       friction, no moves, tolerances of skin and gel drawn
+                       as well, and uncalibrated; this simulates six more
+                       sets of contacts
 
 Contacts are simulated in --out/sim, without pictures, unless --sim (may be given several times: other objects) names finished data
 sets of 'twin dataset' or 'twin study objects'; of one with pictures the pins are those that the pipeline sees. The same command

@@ -39,7 +39,9 @@ def rng():
 def learnt(rng, scatter=0.0, count=40):
     labels = labels_of(rng, count)
     moved = moved_of(labels)
-    return Discrepancy(Residuals(label_axes(labels), moved, missed_by(labels, moved, scatter), np.full(len(labels), np.nan)))
+    return Discrepancy(
+        Residuals(label_axes(labels), moved, missed_by(labels, moved, scatter), np.full(len(labels), np.nan), np.ones(len(labels)))
+    )
 
 
 def test_a_smooth_miss_is_recovered_on_other_labels(rng):
@@ -87,8 +89,9 @@ def test_a_frames_friction_is_found_between_those_that_were_tried():
     real = np.stack([[np.interp(t, at, fields[:, 0, 1, n, c]) for n in range(30) for c in range(2)] for t in true]).reshape(9, 30, 2)
     real[0, :4] = np.nan  # lost
     fields[3, 1] = np.nan  # this friction's contact failed
-    moved, friction = _likeliest(fields, real, FRICTIONS)
+    moved, friction, told_px = _likeliest(fields, real, FRICTIONS)
     sound = np.arange(9) != 1
+    assert (told_px[sound, 1] > 0).all()
     assert np.allclose(np.log(friction[sound, 1]), true[sound]) and np.allclose(moved[2:, 1], real[2:])
     assert np.isfinite(moved[1]).all(), "the frictions beside it stand for it"
     fields[:, 5, 0] = np.nan
@@ -98,7 +101,9 @@ def test_a_frames_friction_is_found_between_those_that_were_tried():
 def test_friction_is_drawn_where_the_frames_had_it():
     nothing = np.zeros((20, 5, 2))
     frictions = np.exp(np.linspace(np.log(0.3), np.log(0.6), 20))
-    spread = Residuals(np.zeros((20, 12)), nothing, nothing, frictions).friction_spread()
+    spread = Residuals(np.zeros((20, 12)), nothing, nothing, frictions, np.ones(20)).friction_spread()
     assert 0.2 < spread.low < 0.3 and 0.6 < spread.high < 0.8 and spread.free_share == spread.stick_share == 0
     few = np.where(np.arange(20) < FEWEST - 1, frictions, np.nan)
-    assert Residuals(np.zeros((20, 12)), nothing, nothing, few).friction_spread() is None
+    assert Residuals(np.zeros((20, 12)), nothing, nothing, few, np.ones(20)).friction_spread() is None
+    sticking = np.append(frictions, [3.0, 3.0]), np.append(np.ones(20), [0.0, 0.01])
+    assert Residuals(np.zeros((22, 12)), nothing[:1], nothing[:1], *sticking).friction_spread().high == pytest.approx(spread.high, rel=0.05)

@@ -54,12 +54,15 @@ class Residuals:
         Real less simulated; 0 for lost pins.
     friction : (K,) float
         The likeliest of each frame; NaN where no move was executed, which would show it.
+    friction_px : (K,) float
+        How plainly each frame shows it: rms change of the pins' places with its logarithm.
     """
 
     axes: np.ndarray
     moved_px: np.ndarray
     missing_px: np.ndarray
     friction: np.ndarray
+    friction_px: np.ndarray
 
     @property
     def error_px(self) -> float:
@@ -67,11 +70,16 @@ class Residuals:
         return float(np.linalg.norm(self.missing_px, axis=-1).mean())
 
     def friction_spread(self) -> FrictionSpread | None:
-        """What friction to draw for simulated contacts; None where too few moves were executed to tell."""
-        shown = self.friction[np.isfinite(self.friction)]
-        if len(shown) < FEWEST:
+        """What friction to draw for simulated contacts; None where too few moves were executed to tell.
+
+        Frames count by how plainly they show it (squared): those that slide or stick whatever it is say nothing.
+        """
+        shown = np.isfinite(self.friction)
+        if shown.sum() < FEWEST:
             return None
-        low, high = np.quantile(shown, USUAL)
+        order = np.argsort(self.friction[shown])
+        friction, weight = self.friction[shown][order], self.friction_px[shown][order] ** 2
+        low, high = np.interp(USUAL, (np.cumsum(weight) - weight / 2) / weight.sum(), friction)
         return FrictionSpread(low=float(max(low / WIDER, FRICTIONS[0])), high=float(min(high * WIDER, FRICTIONS[-1])))
 
 
@@ -97,7 +105,7 @@ def measure_residuals(
     labels, real_px = measured.labels, measured.pins_px - measured.no_contact_px
     setup = replace(setup, parameters=(FRICTION,))
     moved = simulate(setup, measured, [[np.log(friction)] for friction in frictions], rig_of(setup.sensor).turn_sign, progress)
-    moved, friction = _likeliest(moved, real_px, frictions)
+    moved, friction, friction_px = _likeliest(moved, real_px, frictions)
     weights = expect(mean_squared(moved, real_px))
     good = np.flatnonzero(np.isfinite(moved).all(axis=(1, 2, 3)) & (weights.trust > TRUSTED))
     if len(good) < FEWEST:
@@ -106,20 +114,21 @@ def measure_residuals(
     told = [replace(labels[k], executed=bool(done)) for k, done in zip(good, executed, strict=True)]
     simulated = moved[good, executed.astype(int)]
     friction = np.where(executed, friction[good, 1], np.nan)
-    return Residuals(label_axes(told), simulated, np.nan_to_num(real_px[good] - simulated), friction)
+    return Residuals(label_axes(told), simulated, np.nan_to_num(real_px[good] - simulated), friction, friction_px[good, 1])
 
 
-def _likeliest(moved: np.ndarray, real_px: np.ndarray, frictions: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """Of displacements (F, M, 2, N, 2) with F frictions those (M, 2, N, 2) nearest to real ones (M, N, 2), and their frictions (M, 2).
+def _likeliest(moved: np.ndarray, real_px: np.ndarray, frictions: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of displacements (F, M, 2, N, 2) with F frictions those (M, 2, N, 2) nearest to real ones (M, N, 2).
 
-    NaN where the contact failed with all frictions.
+    Beside them their frictions (M, 2), and their rms change with its logarithm (M, 2), px. NaN where the contact failed with all frictions.
     """
     seen, target = np.isfinite(real_px)[:, None], np.nan_to_num(real_px)[:, None]
     best, least = np.full(moved.shape[1:], np.nan), np.full(moved.shape[1:3], np.inf)
-    friction = np.full(moved.shape[1:3], np.nan)
+    friction, told_px = np.full(moved.shape[1:3], np.nan), np.zeros(moved.shape[1:3])
     log = np.log(frictions)
     for k in range(len(frictions)):
-        start, way = moved[k], moved[min(k + 1, len(frictions) - 1)] - moved[k]
+        after = min(k + 1, len(frictions) - 1)
+        start, way, step = moved[k], moved[after] - moved[k], log[after] - log[k]
         way = np.where(np.isfinite(way), way, 0.0)  # the next one failed: this one alone
         along, length = ((part * way * seen).sum(axis=(-2, -1)) for part in (target - start, way))
         share = np.clip(along / np.maximum(length, 1e-12), 0, 1)
@@ -127,8 +136,9 @@ def _likeliest(moved: np.ndarray, real_px: np.ndarray, frictions: tuple) -> tupl
         squared = (((target - there) * seen) ** 2).sum(axis=(-2, -1))
         nearer = squared < least  # never where it failed
         best[nearer], least[nearer] = there[nearer], squared[nearer]
-        friction[nearer] = np.exp(log[k] + share * (log[min(k + 1, len(log) - 1)] - log[k]))[nearer]
-    return best, friction
+        friction[nearer] = np.exp(log[k] + share * step)[nearer]
+        told_px[nearer] = np.sqrt(length / way.shape[-2])[nearer] / max(step, 1e-12)
+    return best, friction, told_px
 
 
 class Discrepancy:

@@ -105,5 +105,6 @@ def test_friction_is_drawn_where_the_frames_had_it():
     assert 0.2 < spread.low < 0.3 and 0.6 < spread.high < 0.8 and spread.free_share == spread.stick_share == 0
     few = np.where(np.arange(20) < FEWEST - 1, frictions, np.nan)
     assert Residuals(np.zeros((20, 12)), nothing, nothing, few, np.ones(20)).friction_spread() is None
+    assert Residuals(np.zeros((20, 12)), nothing, nothing, frictions, np.zeros(20)).friction_spread() is None
     sticking = np.append(frictions, [3.0, 3.0]), np.append(np.ones(20), [0.0, 0.01])
     assert Residuals(np.zeros((22, 12)), nothing[:1], nothing[:1], *sticking).friction_spread().high == pytest.approx(spread.high, rel=0.05)

@@ -31,7 +31,7 @@ def test_pose_by_pose_it_is_what_the_path_gives(solver):
     follower = Follower(solver, plane)
     for k, stop in enumerate(stops):
         followed = follower.move(stop, float(k))
-    *_, (_, wanted) = solver.path(plane, ContactPath(np.stack(stops)))
+    *_, (_, wanted) = solver.path(plane, ContactPath(np.stack(stops)), compliance_mm_per_n=solver.spec.rig.compliance_mm_per_n)
     assert followed.force_n[2] > 0.1 and abs(followed.force_n[0]) > 0.02
     np.testing.assert_allclose(followed.force_n, wanted.force_n, atol=0.02 * np.linalg.norm(wanted.force_n))
     np.testing.assert_allclose(followed.caps_mm, wanted.caps_mm, atol=0.02)

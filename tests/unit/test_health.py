@@ -85,6 +85,6 @@ def test_a_contact_is_not_taken_for_a_nearer_camera(contact):
     reference = nominal_reference(spec, Form.RAW)
     seen = cap_truth(spec, rest_pins(spec), pins_under(spec, contact), Form.RAW).caps_px
     drift = drift_of(seen, reference.pins_px, reference.outmost)
-    assert drift.scale > 1.008 and abs(drift.scale_at_rest - 1) < 0.01
+    assert drift.scale > 1.008 and abs(drift.scale_at_rest - 1) < 0.015
     zoomed = drift_of(1.05 * seen, reference.pins_px, reference.outmost)
     assert zoomed.scale_at_rest == pytest.approx(1.05 * drift.scale_at_rest, rel=0.01)

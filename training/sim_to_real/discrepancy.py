@@ -75,7 +75,7 @@ class Residuals:
         Frames count by how plainly they show it (squared): those that slide or stick whatever it is say nothing.
         """
         shown = np.isfinite(self.friction)
-        if shown.sum() < FEWEST:
+        if shown.sum() < FEWEST or not self.friction_px[shown].any():
             return None
         order = np.argsort(self.friction[shown])
         friction, weight = self.friction[shown][order], self.friction_px[shown][order] ** 2

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
 from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError
@@ -123,6 +124,11 @@ def arm_turning(rig: RigSpec, experiment: ExperimentSpec) -> Callable[[np.ndarra
         return there
 
     return turned
+
+
+def giving_way(rig: RigSpec, experiment: ExperimentSpec, touched: ObjectSpec) -> dict:
+    """What ``SkinSolver.path`` is to know of how arm and object give way."""
+    return {"compliance_mm_per_n": touched.compliance_mm_per_n + rig.compliance_mm_per_n, "given_way": arm_turning(rig, experiment)}
 
 
 def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimulus, label: ArmLabel) -> ArmPath:

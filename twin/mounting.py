@@ -6,7 +6,7 @@ import numpy as np
 
 from scenes.experiment import ExperimentSpec
 from scenes.sensor import SensorSpec
-from twin.kinematics import rig_of
+from twin.kinematics import TURNING, rig_of
 
 _DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # approach, and across it
 
@@ -62,7 +62,7 @@ class Mounting:
         rig = rig_of(sensor)
         axis, across = (np.array(direction, float) for direction in _DIRECTIONS[experiment.approach])
         turn = np.cross(across, axis)
-        about = int(np.abs(turn).argmax())
+        about = TURNING[experiment.approach] - 3
         sign = int(np.sign(turn[about])) * rig.turn_sign
         return cls(
             axis,

@@ -7,7 +7,7 @@ import pytest
 from small_generation import small_config
 
 from training.validation.model import ContactModel
-from twin.kinematics import ArmLabel, arm_path, arm_turning
+from twin.kinematics import ArmLabel, arm_path
 from twin.types import Form
 
 ACROSS = 8
@@ -26,8 +26,7 @@ def model_of(config, **rig):
 
 def force_across_n(model, label):
     way = arm_path(model.rig, model.experiment, model.spec, model.stimulus, label)
-    yields = {"compliance_mm_per_n": model.compliance_mm_per_n, "given_way": arm_turning(model.rig, model.experiment)}
-    state = list(model.solver.path(model.stimulus, way.path, friction=model.rig.friction, **yields))[-1][1]
+    state = list(model.solver.path(model.stimulus, way.path, friction=model.rig.friction, **model.yields))[-1][1]
     return float(state.T_sensor_object[:3, 0] @ state.force_n), float(state.force_n[2])
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from training.generation.config import DatasetError, Draw, GenerationConfig, draw_contact
 from twin.errors import ContactError, MeshError
 from twin.geometry.solid import Resolution
-from twin.kinematics import ArmLabel, arm_path, arm_turning, rig_of
+from twin.kinematics import ArmLabel, arm_path, giving_way, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.optics.variant import one_thread
 from twin.preprocess.forms import gray_levels
@@ -78,8 +78,7 @@ def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, fail
     stimulus = build_stimulus(config.object)
     rig = rig_of(draw.sensor)
     way = arm_path(rig, config.experiment, draw.sensor, stimulus, draw.label)
-    compliance = config.object.compliance_mm_per_n + rig.compliance_mm_per_n
-    yields = {"compliance_mm_per_n": compliance, "given_way": arm_turning(rig, config.experiment)}
+    yields = giving_way(rig, config.experiment, config.object)
     found = list(simulator.solver.path(stimulus, way.path, friction=draw.friction, **yields))
     labels = [way.label(fraction) for fraction, _ in found[:-1]] + [draw.label]
     kept = range(len(found)) if config.states == "all" else [len(found) - 1]

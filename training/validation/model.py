@@ -16,7 +16,7 @@ from scenes.sensor import SensorSpec
 from training.recorded_contact import read_arm_labels
 from twin.errors import FrameError
 from twin.geometry.solid import Resolution
-from twin.kinematics import ArmLabel, arm_path, arm_turning, rig_of
+from twin.kinematics import ArmLabel, arm_path, giving_way, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline
 from twin.preprocess.batch import recording_reference
@@ -107,7 +107,7 @@ class ContactModel:
     def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
         self.spec, self.experiment, self.form = spec, experiment, form
         self.rig, self.stimulus = rig_of(spec), build_stimulus(touched)
-        self.compliance_mm_per_n = touched.compliance_mm_per_n + self.rig.compliance_mm_per_n
+        self.yields = giving_way(self.rig, experiment, touched)
         self.solver = SkinSolver(spec, resolution=Resolution(across), keep=False)
         self.rest_px = self._pixels(self.solver.rest().caps_mm)
 
@@ -129,8 +129,7 @@ class ContactModel:
         tap_ends = 1 / (len(way.labels) - 1) if way.touches else 0.0
         tapped_mm = self.solver.rest().caps_mm
         friction = self.rig.friction if friction is None else friction
-        yields = {"compliance_mm_per_n": self.compliance_mm_per_n, "given_way": arm_turning(self.rig, self.experiment)}
-        for fraction, state in self.solver.path(self.stimulus, way.path, friction=friction, **yields):
+        for fraction, state in self.solver.path(self.stimulus, way.path, friction=friction, **self.yields):
             if fraction <= tap_ends + _SAME:
                 tapped_mm = state.caps_mm
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px

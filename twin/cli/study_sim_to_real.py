@@ -66,6 +66,8 @@ def study_sim_to_real(
     workers: Workers = CORES,
     across: Across = FINE,
 ) -> None:
+    from dataclasses import replace
+
     import numpy as np
 
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
@@ -106,19 +108,20 @@ def study_sim_to_real(
             spec = fit_contact(setup, measured, progress=progress).sensor
     setup, moves = Setup(spec, plan, touched, measured.form, across, out / "labelled", workers, ()), load_randomisation("moves")
     with rate_bar("labelled frames") as progress:
-        drawn_friction = measure_residuals(setup, measured, progress).friction_spread() or moves.friction
-    seen = moves.model_copy(update={"friction": drawn_friction})
+        residuals = measure_residuals(setup, measured, progress)
+    seen = moves.model_copy(update={"friction": residuals.friction_spread() or moves.friction})
     full = Twin("sim_only", "simulated", "sim", spec, simulated_plan, seen, across)
     twins = [full, *(without_one_ingredient(full, uncalibrated, moves, load_randomisation("contact")) if ablate else ())]
 
+    known = {(full.across, full.frictions): Discrepancy(residuals)}
     sets, rows, about, left_out = {}, [], {}, np.empty(0)
     for twin in twins:
-        missing = None
-        if twin.learns:
-            setup = Setup(twin.sensor, plan, touched, measured.form, twin.across, out / "labelled", workers, ())
+        tried = twin.across, twin.frictions
+        if twin.learns and tried not in known:
             with rate_bar(f"{twin.name}: labelled frames") as progress:
-                residuals = measure_residuals(setup, measured, progress, frictions=twin.frictions)
-            missing = Discrepancy(residuals)
+                part = measure_residuals(replace(setup, across=twin.across), measured, progress, frictions=twin.frictions)
+            known[tried] = Discrepancy(part)
+        missing = known[tried] if twin.learns else None
         if twin.contacts not in sets:
             folders = sim if sim and twin is full else [out / twin.contacts]
             if folders is not sim:
@@ -150,7 +153,7 @@ def study_sim_to_real(
             bare = states_touching(states, touched)
             left_out = put_beside(run, out / "sim_plus_real", bare.rows(states_like(bare, few)), few, seed=seed)
             about = {"error_px": residuals.error_px, "modes": missing.summary()[:4]}
-            about |= {"friction": drawn_friction, "simulated": len(learnt[0]), "contacts": len(np.unique(learnt[0].group))}
+            about |= {"friction": seen.friction, "simulated": len(learnt[0]), "contacts": len(np.unique(learnt[0].group))}
         rows.append(judged(twin.says, 0, run, real, chosen.test))
         if twin is full:
             rows.append(judged("simulated and real", labels, out / "sim_plus_real", real, chosen.test))

@@ -33,16 +33,18 @@ class SessionWriter:
     Parameters
     ----------
     folder : path
-        New or empty.
+        New or empty, or of a session that ended before its first step: that one is begun anew.
     about : dict
         What JSON can hold: sensor, camera, model, arm.
     """
 
     def __init__(self, folder: str | Path, about: dict) -> None:
         self.folder = Path(folder)
-        if self.folder.exists() and any(self.folder.iterdir()):
+        begun_only = is_session(self.folder) and not (self.folder / STEPS).stat().st_size
+        if self.folder.exists() and any(self.folder.iterdir()) and not begun_only:
             raise DeviceError(f"{self.folder}: not empty; give a new folder for the session")
         (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
+        (self.folder / REST).unlink(missing_ok=True)
         (self.folder / ABOUT).write_text(json.dumps({"version": VERSION, **about}, indent=2) + "\n")
         self._lines = (self.folder / STEPS).open("a", encoding="utf-8")
         self._written: dict[int, str] = {}  # the newest picture by its number: a frame may serve several steps

@@ -46,6 +46,13 @@ class MjpegCamera(LiveSource):
         self._parts, self._connection, self._stream, self._last = parts, None, None, None
 
     def _open(self) -> None:
+        try:
+            self._request()
+        except OSError as error:
+            raise DeviceError(f"{self.name}: {error}; start the stream or check the address") from error
+
+    def _request(self) -> None:
+        """Ask for the stream; ``OSError`` says why there is none."""
         kind = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
         connection = kind(self._parts.hostname, self._parts.port, timeout=SILENT_S)
         try:
@@ -53,11 +60,11 @@ class MjpegCamera(LiveSource):
             answer = connection.getresponse()
         except (OSError, http.client.HTTPException) as error:
             connection.close()
-            raise DeviceError(f"{self.name}: no answer ({error}); start the stream or check the address") from error
+            raise OSError(f"no answer ({error})") from error
         kind = answer.getheader("Content-Type", "")
         if answer.status != 200 or "multipart" not in kind:
             connection.close()
-            raise DeviceError(f"{self.name}: answers {answer.status} {kind or 'without a type'}; expected a multipart stream of JPEGs")
+            raise OSError(f"answers {answer.status} {kind or 'without a type'}, no multipart stream of JPEGs")
         self._connection, self._stream = connection, answer
 
     def _close(self) -> None:
@@ -69,8 +76,8 @@ class MjpegCamera(LiveSource):
     def _grab(self) -> Picture:
         if self._stream is None:
             try:
-                self._open()
-            except DeviceError as error:
+                self._request()
+            except OSError as error:
                 self._pause()
                 raise ReadFailed(str(error)) from error
         try:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hardware.errors import DeviceError
-from hardware.session import FRAMES, STEPS, SessionSource, SessionWriter, is_session, read_steps
+from hardware.session import FRAMES, REST, STEPS, SessionSource, SessionWriter, is_session, read_steps
 from twin.errors import FrameError
 from twin.types import Form, Frame
 
@@ -47,6 +47,17 @@ def test_killed_at_any_moment_it_is_whole_up_to_the_last_line(tmp_path, after_s)
             assert int(source.read().image.astype(int).sum()) == step["sum"]
         with pytest.raises(EOFError):
             source.read()
+
+
+def test_a_session_that_ended_before_its_first_step_is_begun_anew_and_no_other(tmp_path):
+    with SessionWriter(tmp_path / "s", {"try": 1}) as session:
+        session.keep_rest(frame(9))
+    with SessionWriter(tmp_path / "s", {"try": 2}) as session:
+        session.append(frame(0), {"k": 0})
+    assert [step["k"] for step in read_steps(tmp_path / "s")] == [0]
+    assert not (tmp_path / "s" / REST).exists()
+    with pytest.raises(DeviceError, match="not empty"):
+        SessionWriter(tmp_path / "s", {})
 
 
 def test_a_torn_last_line_is_left_out(tmp_path):

@@ -106,5 +106,7 @@ def test_friction_is_drawn_where_the_frames_had_it():
     few = np.where(np.arange(20) < FEWEST - 1, frictions, np.nan)
     assert Residuals(np.zeros((20, 12)), nothing, nothing, few, np.ones(20)).friction_spread() is None
     assert Residuals(np.zeros((20, 12)), nothing, nothing, frictions, np.zeros(20)).friction_spread() is None
+    sliding = np.append(frictions, [0.1] * 3), np.append(np.full(20, 5.0), [0.6] * 3)
+    assert Residuals(np.zeros((23, 12)), nothing[:1], nothing[:1], *sliding).friction_spread().low == pytest.approx(0.1 / 1.25, rel=0.1)
     sticking = np.append(frictions, [3.0, 3.0]), np.append(np.ones(20), [0.0, 0.01])
     assert Residuals(np.zeros((22, 12)), nothing[:1], nothing[:1], *sticking).friction_spread().high == pytest.approx(spread.high, rel=0.05)

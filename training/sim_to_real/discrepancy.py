@@ -29,6 +29,7 @@ from twin.kinematics import ArmLabel, rig_of
 
 FRICTION = next(parameter for parameter in PARAMETERS if parameter.name == "rig.friction")
 FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)  # of a frame, between which it is sought; the last is stick
+PLAIN_PX = 0.5  # from which on a frame shows its friction
 USUAL, WIDER = (0.05, 0.95), 1.25  # quantiles of the frames' frictions that are drawn between, and how far beyond
 FEWEST = 8  # frames that both stories could be simulated of
 LEAST_PX = 0.5  # of the rms displacement that residuals are divided by
@@ -72,14 +73,13 @@ class Residuals:
     def friction_spread(self) -> FrictionSpread | None:
         """What friction to draw for simulated contacts; None where too few moves were executed to tell.
 
-        Frames count by how plainly they show it (squared): those that slide or stick whatever it is say nothing.
+        Frames that slide or stick whatever it is say nothing. One that slides for want of friction says so, be it not as plainly
+        as others: all that show it count alike.
         """
-        shown = np.isfinite(self.friction)
-        if shown.sum() < FEWEST or not self.friction_px[shown].any():
+        shown = self.friction[np.isfinite(self.friction) & (self.friction_px >= PLAIN_PX)]
+        if len(shown) < FEWEST:
             return None
-        order = np.argsort(self.friction[shown])
-        friction, weight = self.friction[shown][order], self.friction_px[shown][order] ** 2
-        low, high = np.interp(USUAL, (np.cumsum(weight) - weight / 2) / weight.sum(), friction)
+        low, high = np.quantile(shown, USUAL)
         return FrictionSpread(low=float(max(low / WIDER, FRICTIONS[0])), high=float(min(high * WIDER, FRICTIONS[-1])))
 
 

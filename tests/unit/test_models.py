@@ -12,7 +12,7 @@ from training.kernel import fit_kernel
 from training.loop import row_loss
 from training.models.cnn import Cnn
 from training.models.gcn import CHANNELS, Gcn, graph_rows
-from training.models.vgnn import Vgnn, VgnnSize
+from training.models.vgnn import Vgnn, VgnnSize, mode_components
 from training.registration import fit_registration
 
 PINS, FRAMES = 40, 6
@@ -253,3 +253,13 @@ def test_frames_of_one_camera_tell_its_displacement_together():
     assert (alone[:, 2] == 0).mean() > 0.8
     assert abs(np.median(together[:, 2]) / (4 * registration.usual[2]) - 1) < 0.3
     assert (registration(frames[300:], np.ones((100, 60)), together=True)[2] == 0).all(axis=1).mean() > 0.9
+
+
+@pytest.mark.parametrize("rows", [4, 8, 32])
+def test_modes_of_few_rows_are_only_directions_that_they_span(rows):
+    torch.manual_seed(0)
+    seen, others = (torch.randn(count, 6) @ torch.randn(6, 300) + 0.01 * torch.randn(count, 300) for count in (rows, 50))
+    components = mode_components(seen - seen.mean(dim=0), 40)
+    spanned = components.norm(dim=0) > 0
+    assert spanned.sum() == rows - 1
+    assert ((others - seen.mean(dim=0)) @ components).abs().max() < 500, "a rounding error, taken for a direction, is thousands long"

@@ -20,6 +20,7 @@ from torch import nn
 
 FEATURES = 3  # dx, dy, log area ratio
 FILL_RIDGE = 1e-3
+LEAST_SIZE = 1e-5  # of a mode, relative to the largest: of few rows the last mode is single precision's rounding, no direction
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ def mode_components(centred: torch.Tensor, count: int) -> torch.Tensor:
     The square root keeps small modes, which carry the finer facts, within a network's reach. Missing modes are 0.
     """
     _, sizes, directions = torch.linalg.svd(centred.double(), full_matrices=False)
-    keep = min(count, int((sizes > 1e-9 * sizes[0]).sum()))
+    keep = min(count, int((sizes > LEAST_SIZE * sizes[0]).sum()))
     deviation = sizes[:keep] / len(centred) ** 0.5
     found = torch.zeros(centred.shape[1], count)
     found[:, :keep] = (directions[:keep].T * (3 * (sizes[:keep] / sizes[0]).sqrt() / deviation)).float()

@@ -29,7 +29,7 @@ from twin.kinematics import ArmLabel, rig_of
 
 FRICTION = next(parameter for parameter in PARAMETERS if parameter.name == "rig.friction")
 FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)  # of a frame, between which it is sought; the last is stick
-PLAIN_PX = 0.5  # from which on a frame shows its friction
+PLAIN_PX = 0.5  # of the pins' change with the logarithm of friction, from which on a frame shows it
 USUAL, WIDER = (0.05, 0.95), 1.25  # quantiles of the frames' frictions that are drawn between, and how far beyond
 FEWEST = 8  # frames that both stories could be simulated of
 LEAST_PX = 0.5  # of the rms displacement that residuals are divided by

@@ -2,12 +2,13 @@
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
+from hardware.arms.kinematics import Kinematics
 from hardware.errors import DeviceError, StaleDataError
 from hardware.let_go import try_each
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
@@ -50,16 +51,22 @@ class SafeArm:
     """
 
     def __init__(
-        self, arm: Arm, limits: SafetyLimits, *, normal=(0.0, 0.0, 1.0), log: Callable[[LoggedDecision], None] | None = None
+        self,
+        arm: Arm,
+        limits: SafetyLimits,
+        *,
+        normal: Sequence[float] = (0.0, 0.0, 1.0),
+        log: Callable[[LoggedDecision], None] | None = None,
     ) -> None:
         if limits.joints_deg is not None and len(limits.joints_deg) != arm.axes:
             raise DeviceError(f"{arm.name} has {arm.axes} joints, the limits are for {len(limits.joints_deg)}; give those of this arm")
         self.arm, self.limits = arm, limits
         self.name, self.axes = arm.name, arm.axes
-        self.kinematics = getattr(arm, "kinematics", None)
+        self.kinematics: Kinematics | None = getattr(arm, "kinematics", None)
         self.normal = np.asarray(normal, float)
         self.decisions: deque[LoggedDecision] = deque(maxlen=KEPT_DECISIONS)
-        self._log, self._sensed = log, None
+        self._log = log
+        self._sensed: Sensed | None = None
 
     def sense(self, *, depth_mm: float, frame_time_s: float) -> None:
         """What the sensor tells; from the first call on, a move needs a frame that is new enough. NaN: depth not known."""
@@ -131,10 +138,12 @@ class SafeArm:
         state = self._newest_state("move_linear")
         decision = decide(pose, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
         self._obey("move_linear", decision)
-        return self.arm.move_linear(decision.pose, wait=wait, timeout_s=timeout_s)
+        return self.arm.move_linear(decision.allowed, wait=wait, timeout_s=timeout_s)
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         """As ``Arm.move_joints``; see ``move_linear``."""
+        if self.kinematics is None:
+            raise DeviceError(f"{self.name}: its kinematics are not known, so a move of its joints can't be checked; use move_linear")
         state = self._newest_state("move_joints")
         decision = decide_joints(joints_deg, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
         self._obey("move_joints", decision)
@@ -151,7 +160,7 @@ class SafeArm:
             decision = decide(target, state, free, now_s=time.monotonic(), kinematics=self.kinematics)
             self._note("retreat", decision)
             if decision.action is Action.MOVE:
-                return self.arm.move_linear(decision.pose)
+                return self.arm.move_linear(decision.allowed)
         return None
 
     def shutdown(self, why: str) -> None:

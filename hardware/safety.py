@@ -106,6 +106,13 @@ class Decision:
     reason: str
     pose: np.ndarray | None = None
 
+    @property
+    def allowed(self) -> np.ndarray:
+        """The pose (6,) that may be sent; ``ValueError`` where the decision allows none."""
+        if self.pose is None:
+            raise ValueError(f"nothing may be sent: {self.reason}")
+        return self.pose
+
 
 @dataclass(frozen=True)
 class Sensed:
@@ -145,8 +152,12 @@ def decide(
     if target.shape != (6,) or not np.isfinite(target).all():
         return Decision(Action.REFUSE, Code.NOT_A_NUMBER, f"the target {target} is not six numbers")
     unwrapped = kinematics is not None and kinematics.axes == 4
-    pose, shortened = shorten(state.pose, kinematics.nearest_pose(target) if unwrapped else target, limits, unwrapped=unwrapped)
-    if refused := _place(pose, state.pose, limits) or (kinematics and _joints(pose, state.pose, limits, kinematics)):
+    if kinematics is not None and unwrapped:
+        target = kinematics.nearest_pose(target)
+    pose, shortened = shorten(state.pose, target, limits, unwrapped=unwrapped)
+    if refused := _place(pose, state.pose, limits):
+        return refused
+    if kinematics is not None and (refused := _joints(pose, state.pose, limits, kinematics)):
         return refused
     if shortened:
         return Decision(Action.MOVE, Code.STEP_SHORTENED, f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg", pose)
@@ -154,7 +165,7 @@ def decide(
 
 
 def decide_joints(
-    joints_deg: np.ndarray, state: ArmState, limits: SafetyLimits, *, now_s: float, kinematics: Kinematics, sensed=None
+    joints_deg: np.ndarray, state: ArmState, limits: SafetyLimits, *, now_s: float, kinematics: Kinematics, sensed: Sensed | None = None
 ) -> Decision:
     """Whether the joints may go there: as ``decide``, checked at every degree of the way. Such a move is not shortened but refused."""
     if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
@@ -236,7 +247,7 @@ def _joints(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematic
     if broken := _broken_joints(joints, limits, kinematics):
         return broken
     blocked = check_line(kinematics, kinematics.nearest_pose(start), pose)
-    return blocked and Decision(Action.REFUSE, Code.LINE_BLOCKED, blocked.text)
+    return Decision(Action.REFUSE, Code.LINE_BLOCKED, blocked.text) if blocked else None
 
 
 def _broken_joints(joints: np.ndarray, limits: SafetyLimits, kinematics: Kinematics) -> Decision | None:

@@ -108,7 +108,7 @@ def servo_step(
     turn_deg = spec.kp_angle * error_deg + spec.ki_angle * memory.angle_deg
     turn_deg = float(np.clip(turn_deg, -spec.largest_turn_deg, spec.largest_turn_deg))
     step_mm = spec.feed_mm * mounting.across + press_mm * axis
-    step_mm *= min(1.0, spec.largest_move_mm / max(np.linalg.norm(step_mm), 1e-9))
+    step_mm *= min(1.0, spec.largest_move_mm / max(float(np.linalg.norm(step_mm)), 1e-9))
     T = matrix_of(pose)
     T[:3, :3] = T_base_surface[:3, :3] @ Rotation.from_rotvec(np.radians(now.angle_deg + turn_deg) * out_of_plane).as_matrix()
     T[:3, 3] += T_base_surface[:3, :3] @ step_mm

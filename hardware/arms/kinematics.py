@@ -27,7 +27,9 @@ class OutOfReachError(ValueError):
 class Kinematics(Protocol):
     """Joints to pose and back, and what the joints may be."""
 
-    axes: int
+    @property
+    def axes(self) -> int:
+        """Number of joints."""
 
     def forward(self, joints_deg: np.ndarray) -> np.ndarray:
         """Pose (6,) at the joints (J,)."""

@@ -27,7 +27,7 @@ class LeRobotArm:
 
     @property
     def observation_features(self) -> dict[str, type]:
-        joints = {f"joint_{n}.pos": float for n in range(1, self.arm.axes + 1)}
+        joints: dict[str, type] = {f"joint_{n}.pos": float for n in range(1, self.arm.axes + 1)}
         return {key: float for key in self._keys} | joints
 
     @property

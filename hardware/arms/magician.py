@@ -190,12 +190,12 @@ class Magician(BaseArm):
         sent = Message(id, ctrl, params).to_bytes()
         with self._lock:
             for _ in range(TRIES):
-                self._require_connected()
+                port = self._port()
                 try:
-                    self._serial.reset_input_buffer()
+                    port.reset_input_buffer()
                     self._buffer = b""
-                    self._serial.write(sent)
-                    if (reply := self._reply(id, ctrl)) is not None:
+                    port.write(sent)
+                    if (reply := self._reply(port, id, ctrl)) is not None:
                         return reply.params
                 except PORT_ERRORS as error:
                     self._close()
@@ -208,10 +208,16 @@ class Magician(BaseArm):
             "check that the port is a Magician's and the cable is sound"
         )
 
-    def _reply(self, id: Id, ctrl: int) -> Message | None:
+    def _port(self) -> serial.Serial:
+        """The open port; ``DeviceNotConnectedError`` where there is none."""
+        if self._serial is None:
+            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+        return self._serial
+
+    def _reply(self, port: serial.Serial, id: Id, ctrl: int) -> Message | None:
         deadline = time.monotonic() + REPLY_TIMEOUT_S
         while time.monotonic() < deadline:
-            self._buffer += self._serial.read(max(1, self._serial.in_waiting))
+            self._buffer += port.read(max(1, port.in_waiting))
             message, self._buffer = take_message(self._buffer)
             while message is not None:
                 if (message.id, message.ctrl) == (id, ctrl):

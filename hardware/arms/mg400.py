@@ -3,6 +3,7 @@
 import contextlib
 import re
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -262,7 +263,7 @@ class MG400(BaseArm):
     def _await_joints(self, joints: np.ndarray, timeout_s: float) -> None:
         self.wait_settled(self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s)  # the lengths are not exactly this arm's
 
-    def _await_mode(self, reached, otherwise: str) -> None:
+    def _await_mode(self, reached: Callable[[int], bool], otherwise: str) -> None:
         """Wait for feedback in such a mode that came after now."""
         asked_s = time.monotonic()
         while True:

@@ -163,7 +163,7 @@ class Feedback:
         with self._arrived:
             newest = self._newest
         age_s = np.inf if newest is None else time.monotonic() - newest[1]
-        if age_s > max_age_s:
+        if newest is None or age_s > max_age_s:
             raise StaleDataError(
                 f"{self._name}: no feedback for {age_s:.1f} s (allowed {max_age_s:g} s); the reader keeps trying to reconnect. "
                 "Don't trust the last pose: stop, check the cable, then go on"

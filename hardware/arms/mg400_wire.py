@@ -174,7 +174,7 @@ def newest_packet(buffer: bytes) -> tuple[np.void | None, bytes, int]:
     skipped : int
         Bytes before it that were no packet.
     """
-    newest, begin, used = None, None, 0
+    newest, begin, used = None, 0, 0
     at = buffer.find(TEST_BYTES)
     while at >= 0:
         start, following = at - TEST_OFFSET, buffer.find(TEST_BYTES, at + 1)

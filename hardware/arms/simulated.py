@@ -1,6 +1,7 @@
 """A simulated arm behind the same protocol as the real ones: moves take time, and it can misbehave on purpose."""
 
 import time
+from collections.abc import Sequence
 from enum import StrEnum
 
 import numpy as np
@@ -45,7 +46,7 @@ class SimulatedArm(BaseArm):
         self,
         *,
         axes: int = 6,
-        pose: np.ndarray = (300.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        pose: Sequence[float] | np.ndarray = (300.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         speeds: Speeds = Speeds(100.0, 100.0, 1000.0, 1000.0),  # noqa: B008  (frozen)
         time_scale: float = 1.0,
         faults: tuple[SimulatedFault, ...] = (),

@@ -28,4 +28,4 @@ def capture(image: np.ndarray, spec: SensorSpec | None, form: Form, name: str) -
         )
     if spec.camera.channels == "mono":
         image = gray_levels(image)
-    return record(image, spec.recording) if form is Form.RECORDING else image
+    return record(image, spec.recording) if form is Form.RECORDING and spec.recording is not None else image

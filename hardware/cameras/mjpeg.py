@@ -2,6 +2,7 @@
 
 import http.client
 import time
+from typing import Protocol
 from urllib.parse import urlsplit
 
 import cv2
@@ -19,6 +20,14 @@ LARGEST_PART = 32_000_000  # bytes
 TIME_HEADERS = ("x-timestamp",)  # Unix seconds of the exposure, as mjpg-streamer sends it
 CLOCK_SLACK_S = 60.0  # a stamp farther from now is from another clock
 START, END = b"\xff\xd8", b"\xff\xd9"
+
+
+class Readable(Protocol):
+    """A stream of bytes."""
+
+    def readline(self, limit: int, /) -> bytes: ...
+
+    def read(self, amount: int, /) -> bytes: ...
 
 
 class MjpegCamera(LiveSource):
@@ -43,7 +52,10 @@ class MjpegCamera(LiveSource):
             usable = False
         if not usable:
             raise DeviceError(f"{url}: not the address of a stream; expected http://host:port/path")
-        self._parts, self._connection, self._stream, self._last = parts, None, None, None
+        self._parts = parts
+        self._connection: http.client.HTTPConnection | None = None
+        self._stream: http.client.HTTPResponse | None = None
+        self._last: int | None = None
 
     def _open(self) -> None:
         try:
@@ -53,8 +65,8 @@ class MjpegCamera(LiveSource):
 
     def _request(self) -> None:
         """Ask for the stream; ``OSError`` says why there is none."""
-        kind = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
-        connection = kind(self._parts.hostname, self._parts.port, timeout=SILENT_S)
+        protocol = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
+        connection = protocol(self._parts.hostname or "", self._parts.port, timeout=SILENT_S)
         try:
             connection.request("GET", (self._parts.path or "/") + (f"?{self._parts.query}" if self._parts.query else ""))
             answer = connection.getresponse()
@@ -68,10 +80,10 @@ class MjpegCamera(LiveSource):
         self._connection, self._stream = connection, answer
 
     def _close(self) -> None:
-        if self._connection is not None:
-            self._stream.close()
-            self._connection.close()
-            self._connection = self._stream = None
+        for opened in (self._stream, self._connection):
+            if opened is not None:
+                opened.close()
+        self._connection = self._stream = None
 
     def _grab(self) -> Picture:
         if self._stream is None:
@@ -80,8 +92,11 @@ class MjpegCamera(LiveSource):
             except OSError as error:
                 self._pause()
                 raise ReadFailed(str(error)) from error
+        stream = self._stream
+        if stream is None:  # another thread closed it
+            raise ReadFailed("the stream was closed")
         try:
-            headers, data = next_part(self._stream)
+            headers, data = next_part(stream)
         except (OSError, EOFError, http.client.HTTPException) as error:
             self._close()  # to be opened anew
             raise ReadFailed(str(error) or type(error).__name__) from error
@@ -92,11 +107,11 @@ class MjpegCamera(LiveSource):
             self._last = number
         return Picture(image, stamped_s(headers), lost)
 
-    def _finish(self, image):
+    def _finish(self, image: np.ndarray) -> np.ndarray:
         return capture(image, self._spec, self.form, self.name)
 
 
-def next_part(stream) -> tuple[dict, bytes]:
+def next_part(stream: Readable) -> tuple[dict, bytes]:
     """Headers (lower case) and body of the next part of a multipart stream; ``EOFError`` at its end."""
     headers: dict[str, str] = {}
     while True:  # up to the next part's headers, past its boundary

@@ -2,7 +2,8 @@
 
 import threading
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +43,7 @@ class ReadFailed(Exception):  # noqa: N818  (no error until it happens too often
     """One picture could not be had; the reader tries again."""
 
 
-class LiveSource(Connection, ABC):
+class LiveSource(Connection):
     """Base of the live sources; see ``hardware.cameras.source.FrameSource`` for what each method promises.
 
     Parameters
@@ -54,6 +55,10 @@ class LiveSource(Connection, ABC):
 
     is_live = True
     notices_still = True  # whether a picture that doesn't change is a fault
+    _read_last: int  # sequence number of the frame that was read last
+    _sequence: int
+    _dropped: int
+    _delivered: int
     fps = 5.0  # of the frames; where the device does not tell, the slowest that is of use
 
     def __init__(self, name: str, form: Form) -> None:
@@ -139,7 +144,7 @@ class LiveSource(Connection, ABC):
             raise StaleDataError(f"{self.name}: the newest frame is {age_s:.2f} s old (allowed {max_age_s:g} s); check camera and cable")
         return frame
 
-    def _take(self, wanted, timeout_s: float, missing: str) -> Frame:
+    def _take(self, wanted: Callable[[Frame], bool], timeout_s: float, missing: str) -> Frame:
         deadline = time.monotonic() + timeout_s
         with self._new:
             while True:

@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
 
 from hardware.cameras.capture import capture
 from hardware.cameras.reader import LiveSource, Picture, ReadFailed
@@ -82,13 +83,16 @@ class UvcCamera(LiveSource):
             except DeviceError as error:
                 self._pause()
                 raise ReadFailed(str(error)) from error
-        good, image = self._device.read()
+        device = self._device
+        if device is None:  # another thread closed it
+            raise ReadFailed("the camera was closed")
+        good, image = device.read()
         if not good or image is None or not image.size:
             self._close()  # pulled out: it has to be opened anew
             raise ReadFailed("no picture")
-        return Picture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(self._device.get(cv2.CAP_PROP_POS_MSEC)))
+        return Picture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(device.get(cv2.CAP_PROP_POS_MSEC)))
 
-    def _finish(self, image):
+    def _finish(self, image: np.ndarray) -> np.ndarray:
         return capture(image, self._spec, self.form, self.name)
 
 
@@ -98,7 +102,7 @@ def exposed_s(position_ms: float) -> float:
     return position_ms / 1e3 if 0 <= now_s - position_ms / 1e3 < CLOCK_SLACK_S else now_s
 
 
-def apply_settings(device, settings: UvcSettings) -> list[tuple[str, float, float]]:
+def apply_settings(device: cv2.VideoCapture, settings: UvcSettings) -> list[tuple[str, float, float]]:
     """Ask for the settings in the order in which cameras take them; name, asked and read back of each."""
     asked = [
         ("fourcc", cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),

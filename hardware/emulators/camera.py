@@ -69,8 +69,9 @@ class CameraEmulator:
     @property
     def url(self) -> str:
         """Where the stream is."""
-        host, port = self._server.server_address[:2]
-        return f"http://{host}:{port}/stream.mjpg"
+        if self._server is None:
+            raise DeviceError("camera emulator: not started; call start() first")
+        return f"http://{self._address[0]}:{self._server.server_port}/stream.mjpg"
 
     def start(self) -> None:
         try:

@@ -8,6 +8,7 @@ import select
 import termios
 import time
 import tty
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Event, Lock, Thread, Timer
 
@@ -58,7 +59,7 @@ class MagicianEmulator:
         *,
         link: Path | None = None,
         faults: tuple[str, ...] = (),
-        joints_deg=START_JOINTS_DEG,
+        joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
         self.faults = Faults(FAULTS, faults)
@@ -152,7 +153,7 @@ class MagicianEmulator:
         pause_s = self.faults.value("split-frames")
         pieces = [frame] if pause_s is None else [frame[:SPLIT_AT], frame[SPLIT_AT:]]
         for n, piece in enumerate(pieces):
-            if n:
+            if n and pause_s is not None:
                 time.sleep(pause_s)
             with self._lock, contextlib.suppress(OSError):
                 if self._ends is not None:

@@ -2,6 +2,7 @@
 
 import struct
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from threading import RLock
 
@@ -17,7 +18,7 @@ NOT_UNDERSTOOD, LOST_STEPS = 1, 80
 START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
 HOME_SPEED_DEG_S = 30.0
 JOG_MM, JOG_DEG = 400.0, 300.0  # a jog's far end, beyond any limit
-PARAMETERS = {  # what is stored as it comes: number of bytes, what they are to begin with
+PARAMETERS: dict[int, bytes] = {  # what is stored as it comes: number of bytes, what they are to begin with
     Id.HOME_PARAMS: struct.pack("<4f", 200.0, 0.0, 0.0, 0.0),
     Id.END_EFFECTOR: struct.pack("<3f", 0.0, 0.0, 0.0),
     Id.LASER: bytes(2),
@@ -33,7 +34,15 @@ PARAMETERS = {  # what is stored as it comes: number of bytes, what they are to 
     Id.PTP_COMMON_PARAMS: struct.pack("<2f", 50.0, 50.0),
     Id.CP_PARAMS: struct.pack("<3fB", 100.0, 50.0, 10.0, 0),
 }
-SIZES = {Id.RESET_POSE: (9,), Id.HOME: (4, 0), Id.JOG: (2,), Id.PTP: (17,), Id.CP: (17, 14), Id.WAIT: (4,)}  # 14: pydobot's CP
+# Bytes of parameters that a command may have. pydobot sends CP without its last number: 14 bytes.
+SIZES: dict[int, tuple[int, ...]] = {
+    Id.RESET_POSE: (9,),
+    Id.HOME: (4, 0),
+    Id.JOG: (2,),
+    Id.PTP: (17,),
+    Id.CP: (17, 14),
+    Id.WAIT: (4,),
+}
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,7 @@ class Queued:
 class MagicianController:
     """What the arm does with its commands. Every method may be called from any thread."""
 
-    def __init__(self, faults: Faults, *, joints_deg=START_JOINTS_DEG, time_scale: float = 1.0) -> None:
+    def __init__(self, faults: Faults, *, joints_deg: Sequence[float] = START_JOINTS_DEG, time_scale: float = 1.0) -> None:
         self.faults, self._time_scale = faults, time_scale
         self.kinematics = MAGICIAN
         self.track = MotionTrack(MAGICIAN, np.asarray(joints_deg, float))
@@ -158,7 +167,8 @@ class MagicianController:
         elif message.id == Id.WAIT:
             return begins_s + struct.unpack("<I", params)[0] / 1000.0
         elif message.id == Id.JOG:
-            self._jog(*params, begins_s)
+            joints, command = params
+            self._jog(joints, command, begins_s)
         return begins_s  # ResetPose: nothing, the emulated arm always knows where it stands
 
     def _ptp(self, mode: int, numbers: np.ndarray, begins_s: float) -> float:

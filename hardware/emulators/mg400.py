@@ -5,6 +5,7 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Callable, Sequence
 from threading import Event, Lock, Thread, Timer
 
 import numpy as np
@@ -77,7 +78,7 @@ class Mg400Emulator:
         port_offset: int | None = 0,
         faults: tuple[str, ...] = (),
         firmware: str = NEW_FIRMWARE,
-        joints_deg=START_JOINTS_DEG,
+        joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
         try:
@@ -168,7 +169,7 @@ class Mg400Emulator:
                 bound.close()
             self._clients.clear()
 
-    def _run(self, target, *arguments) -> None:
+    def _run(self, target: Callable[..., None], *arguments: object) -> None:
         thread = Thread(target=target, args=arguments, daemon=True, name="mg400-emulator")
         self._threads = [*(one for one in self._threads if one.is_alive()), thread]
         thread.start()

@@ -2,11 +2,12 @@
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from hardware.arms.mg400_wire import ErrorId
+from hardware.arms.motion import Speeds
 from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame
 from hardware.emulators.mg400_grammar import Parameter, RefusedError, Request, keyword_number, read_numbers
 
@@ -80,7 +81,8 @@ class Mg400Commands:
     def _enable(self, request: Request) -> str:
         load = read_numbers(request, (LOAD_KG, NUMBER, NUMBER, NUMBER), (0, 1, 4))
         self.arm.enable()
-        self.arm.load = tuple(load + [0.0] * (4 - len(load)))
+        kg, x_mm, y_mm, z_mm = load + [0.0] * (4 - len(load))
+        self.arm.load = kg, x_mm, y_mm, z_mm
         return ""
 
     def _percentage(self, request: Request) -> str:
@@ -107,7 +109,8 @@ class Mg400Commands:
         whole = len(values) in (4, 6) and all(map(math.isfinite, values))
         if not 1 <= index <= 9 or not whole:  # frame 0 is the arm's own
             raise RefusedError(ErrorId.PARAMETER_RANGE - (1 if whole else 2))
-        frames[index] = PlanarFrame(*values[:3], values[3] if len(values) == 4 else values[5])
+        x, y, z = values[:3]
+        frames[index] = PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
         return ""
 
     def _output(self, request: Request) -> str:
@@ -194,7 +197,7 @@ class Mg400Commands:
         self.arm.jog(axis, user=self._frames(request)[0])
         return ""
 
-    def _speeds(self, request: Request, kind: str):
+    def _speeds(self, request: Request, kind: str) -> Speeds:
         speed = keyword_number(request, f"speed{kind}", PERCENT, self.arm.percent[f"speed{kind}"])
         acceleration = keyword_number(request, f"acc{kind}", PERCENT, self.arm.percent[f"acc{kind}"])
         keyword_number(request, "cp", RATIO, self.arm.percent["cp"])  # checked only: the emulator does not blend moves
@@ -220,7 +223,7 @@ class Mg400Commands:
         return list((user.inverse() @ flange @ tool).pose[[0, 1, 2, 5]])
 
 
-def _text(values) -> str:
+def _text(values: Iterable[float]) -> str:
     return ",".join(f"{value:.6f}" for value in values)
 
 

@@ -1,6 +1,7 @@
 """The emulated MG400's controller: modes, alarms, frames and the queue of moves. Knows no sockets."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import RLock
 
@@ -68,7 +69,7 @@ class Mg400Controller:
         How much faster than the real arm it moves.
     """
 
-    def __init__(self, faults: Faults, *, joints_deg=START_JOINTS_DEG, time_scale: float = 1.0) -> None:
+    def __init__(self, faults: Faults, *, joints_deg: Sequence[float] = START_JOINTS_DEG, time_scale: float = 1.0) -> None:
         self.faults, self.kinematics, self._time_scale = faults, MG400, time_scale
         self.track = MotionTrack(MG400, np.asarray(joints_deg, float))
         self.lock = RLock()

@@ -24,9 +24,11 @@ class BrowserView:
     """
 
     def __init__(self, title: str, *, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._host = host
         self._page = render_page("hardware.view", title=title).encode()
         self._new = threading.Condition()
-        self._jpeg, self._number, self._stats, self._ended = b"", 0, {}, False
+        self._jpeg, self._number, self._ended = b"", 0, False
+        self._stats: dict[str, object] = {}
         try:
             self._server = ThreadingHTTPServer((host, port), self._handler())
         except OSError as error:
@@ -37,10 +39,9 @@ class BrowserView:
     @property
     def url(self) -> str:
         """Address of the page."""
-        host, port = self._server.server_address[:2]
-        return f"http://{host}:{port}/"
+        return f"http://{self._host}:{self._server.server_port}/"
 
-    def show(self, picture: np.ndarray, stats: dict) -> bool:
+    def show(self, picture: np.ndarray, stats: dict[str, object]) -> bool:
         """Show a picture (H, W, 3) RGB and figures by name; False once the user closed the view (never, in a browser)."""
         jpeg = jpeg_of(picture)
         with self._new:

@@ -1,7 +1,7 @@
-"""The servo law: from the surface that a frame showed and where the arm is, to where it goes next. Pure.
+"""The servo law, a pure function: from the surface that a frame showed and the present pose of the arm to its next pose.
 
 An estimate of depth and angle, together with the arm's pose when the frame was exposed, puts the surface's tangent into the
-base frame. The law acts on where the arm is now against that tangent: so a frame may be older than the last move.
+base frame. The law compares the present pose of the arm with that tangent, so a frame may be older than the last move.
 Depth d and angle w of the tool against the tangent, reference r, sums S of the errors (bounded),
 
     e = r - (d, w),   S' = clip(S + e),   (d, w)' = (d, w) + kp e + ki S',   along' = along + feed
@@ -37,7 +37,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Step:
-    """What the law decided.
+    """The result of one step of the law.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Step:
 
 
 def tangent_of(mounting: Mounting, pose: np.ndarray, reading: Reading) -> np.ndarray:
-    """``T_base_surface`` (4, 4): a tool there, turned alike, would just touch, normal to the surface.
+    """``T_base_surface`` (4, 4), the pose of a tool that just touches the surface and stands normal to it.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def servo_step(
         Where the arm is now, or was last sent.
     memory : Memory
     fresh : bool
-        Whether the tangent is from a new frame; an old one adds nothing to the sums.
+        Whether the tangent comes from a new frame; an old frame does not change the sums.
     """
     axis, out_of_plane = mounting.axis, mounting.out_of_plane
     now = reading_at(mounting, T_base_surface, pose)

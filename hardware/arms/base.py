@@ -1,4 +1,4 @@
-"""What every arm of ours shares: refusals when not connected, waiting until it is at rest."""
+"""What all drivers share: errors when the arm is not connected, and waiting until the arm is at rest."""
 
 import time
 from abc import abstractmethod
@@ -12,8 +12,8 @@ from hardware.arms.motion import turn_between_deg
 from hardware.connection import Connection
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
 
-POLL_S = 0.005  # below the 8 ms of the fastest feedback
-BELIEVE_REST_S = 0.15  # a move shows in feedback sooner: an arm at rest elsewhere for so long will not execute it
+POLL_S = 0.005  # shorter than the 8 ms period of the fastest feedback
+BELIEVE_REST_S = 0.15  # a move shows in feedback sooner than this; an arm that rests elsewhere for longer does not execute it
 
 
 class BaseArm(Connection):

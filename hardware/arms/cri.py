@@ -24,7 +24,9 @@ EULER_AXES = tuple(
 
 
 class Controller:
-    """An arm as ``cri`` has it: connected and enabled as soon as it is made, poses (4, 4) of the flange in the base frame.
+    """An arm with the interface of ``cri``. It is connected and enabled when it is made.
+
+    Poses (4, 4) are those of the flange in the base frame.
 
     Parameters
     ----------
@@ -36,7 +38,7 @@ class Controller:
         self.arm = open_arm(arm) if isinstance(arm, str) else arm
         self._linear, self._angular = 20.0, 20.0
         self._overall: float | None = None
-        self._tilt_deg = np.zeros(2)  # last commanded; an arm of four axes drops it, reading gives it back
+        self._tilt_deg = np.zeros(2)  # the tilt last commanded: an arm of four axes does not report it, so reading a pose returns this one
         self.commanded_pose: np.ndarray | None = None
         self.commanded_joint_angles: np.ndarray | None = None
         self.arm.connect()

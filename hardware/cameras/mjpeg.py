@@ -15,10 +15,10 @@ from scenes.sensor import SensorSpec
 from twin.recordings.quiet import quiet
 from twin.types import Form
 
-SILENT_S = 2.0  # no byte for so long: the read failed
+SILENT_S = 2.0  # without a byte for so long the read has failed
 LARGEST_PART = 32_000_000  # bytes
 TIME_HEADERS = ("x-timestamp",)  # Unix seconds of the exposure, as mjpg-streamer sends it
-CLOCK_SLACK_S = 60.0  # a stamp farther from now is from another clock
+CLOCK_SLACK_S = 60.0  # a time stamp farther from now comes from another clock and is not used
 START, END = b"\xff\xd8", b"\xff\xd9"
 
 
@@ -33,7 +33,8 @@ class Readable(Protocol):
 class MjpegCamera(LiveSource):
     """A stream of JPEG pictures.
 
-    A part's ``X-Timestamp`` (Unix seconds) is taken as the time of exposure, else its arrival; ``X-Sequence`` tells lost ones.
+    The time of exposure is a part's ``X-Timestamp`` (Unix seconds), or its arrival if there is none. Gaps in
+    ``X-Sequence`` are lost pictures.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ class MjpegCamera(LiveSource):
         try:
             parts = urlsplit(url)
             usable = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
-        except ValueError:  # a port that is none
+        except ValueError:  # the port is not a number
             usable = False
         if not usable:
             raise DeviceError(f"{url}: not the address of a stream; expected http://host:port/path")
@@ -64,7 +65,7 @@ class MjpegCamera(LiveSource):
             raise DeviceError(f"{self.name}: {error}; start the stream or check the address") from error
 
     def _request(self) -> None:
-        """Ask for the stream; ``OSError`` says why there is none."""
+        """Request the stream; an ``OSError`` says why there is none."""
         protocol = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
         connection = protocol(self._parts.hostname or "", self._parts.port, timeout=SILENT_S)
         try:
@@ -133,7 +134,7 @@ def next_part(stream: Readable) -> tuple[dict, bytes]:
 
 
 def decode_jpeg(data: bytes) -> np.ndarray:
-    """A whole JPEG as gray (H, W) or RGB (H, W, 3) uint8; ``ReadFailed`` for a torn one, which decoders fill up with gray."""
+    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8. An incomplete one raises ``ReadFailed``: decoders would fill the rest with gray."""
     if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
         raise ReadFailed(f"a torn JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
     with quiet():
@@ -144,7 +145,7 @@ def decode_jpeg(data: bytes) -> np.ndarray:
 
 
 def stamped_s(headers: dict) -> float:
-    """Time of exposure on the monotonic clock, from a part's headers; now where they don't tell."""
+    """Time of exposure on the monotonic clock, from a part's headers; the present time if they do not hold it."""
     now_s, unix_s = time.monotonic(), time.time()
     for name in TIME_HEADERS:
         try:

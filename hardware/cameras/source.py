@@ -21,7 +21,7 @@ class FrameSource(Protocol):
 
     @property
     def first_frame_s(self) -> float:
-        """The first frame may take so long after ``connect``."""
+        """Longest time from ``connect`` to the first frame."""
 
     @property
     def is_connected(self) -> bool: ...

@@ -66,7 +66,7 @@ class MagicianEmulator:
         self.arm = MagicianController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self.device = ""
         self._link = link
-        self._ends: tuple[int, int] | None = None  # ours, the client's
+        self._ends: tuple[int, int] | None = None  # file descriptors: our end, the client's end
         self._lock, self._ended = Lock(), Event()
         self._thread: Thread | None = None
         self._noise, self._replies = random.Random(0), 0
@@ -133,7 +133,7 @@ class MagicianEmulator:
                 ready, _, _ = select.select([self._ends[0]], [], [], 0.0)
                 data = os.read(self._ends[0], 4096) if ready else b""
                 if data and termios.tcgetattr(self._ends[1])[4] != termios.B115200:
-                    data = b""  # at another speed it is noise
+                    data = b""  # at a wrong baud rate only noise arrives
             if not data:
                 time.sleep(0.001)
                 continue

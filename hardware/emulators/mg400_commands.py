@@ -1,4 +1,4 @@
-"""The emulated MG400's commands, by port: what each wants and answers."""
+"""The emulated MG400's commands, by port, with their parameters and replies."""
 
 import math
 import re
@@ -107,7 +107,7 @@ class Mg400Commands:
         except ValueError as error:
             raise RefusedError(ErrorId.PARAMETER_TYPE - 2) from error
         whole = len(values) in (4, 6) and all(map(math.isfinite, values))
-        if not 1 <= index <= 9 or not whole:  # frame 0 is the arm's own
+        if not 1 <= index <= 9 or not whole:  # frame 0 cannot be changed
             raise RefusedError(ErrorId.PARAMETER_RANGE - (1 if whole else 2))
         x, y, z = values[:3]
         frames[index] = PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
@@ -142,7 +142,7 @@ class Mg400Commands:
         return _text(self._seen(flange, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
 
     def _inverse(self, request: Request) -> str:
-        if len(request.values) not in (6, 7, 8):  # two more say near which joints: there is but one solution
+        if len(request.values) not in (6, 7, 8):  # two optional parameters select a solution near given joints; this arm has only one
             raise RefusedError(ErrorId.PARAMETER_COUNT)
         *pose, user, tool = read_numbers(Request(request.name, request.values[:6], {}, request.text), (NUMBER,) * 4 + (INDEX,) * 2, (6,))
         joints = self.arm.joints_at(self._flange(pose, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
@@ -178,7 +178,7 @@ class Mg400Commands:
         try:
             self.arm.order(Order(self.arm.joints_at(flange), False, speeds))
         except RefusedError:
-            self.arm.order(Order(flange.pose, True, speeds))  # planning it raises the alarm of a target out of reach
+            self.arm.order(Order(flange.pose, True, speeds))  # planning raises the alarm if the target is out of reach
 
     def _to_joints(self, request: Request, *, relative: bool) -> str:
         joints = np.array(read_numbers(request, (NUMBER,) * 4, (4,)))
@@ -200,7 +200,7 @@ class Mg400Commands:
     def _speeds(self, request: Request, kind: str) -> Speeds:
         speed = keyword_number(request, f"speed{kind}", PERCENT, self.arm.percent[f"speed{kind}"])
         acceleration = keyword_number(request, f"acc{kind}", PERCENT, self.arm.percent[f"acc{kind}"])
-        keyword_number(request, "cp", RATIO, self.arm.percent["cp"])  # checked only: the emulator does not blend moves
+        keyword_number(request, "cp", RATIO, self.arm.percent["cp"])  # only the value is checked: the emulator does not blend moves
         return self.arm.speeds(speed, acceleration)
 
     def _frames(self, request: Request) -> tuple[PlanarFrame, PlanarFrame]:

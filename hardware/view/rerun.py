@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import rerun
 
 VIEWER, SUFFIX = "viewer", ".rrd"
-ANSWER_S = 8.0  # for so long a viewer is waited for, at the start and at the end; a new one takes a second or two
+ANSWER_S = 8.0  # longest wait for a viewer, at the start and at the end; a new viewer takes a second or two
 
 
 class RerunView:
@@ -62,12 +62,12 @@ class RerunView:
             if self._target == VIEWER:
                 stream.spawn()
             elif "://" in self._target:
-                with create_connection(_address(self._target), timeout=ANSWER_S):  # a refusal is told at once, and in few words
+                with create_connection(_address(self._target), timeout=ANSWER_S):  # this reports a refusal at once and in few words
                     stream.connect_grpc(self._target)
             else:
                 Path(self._target).parent.mkdir(parents=True, exist_ok=True)
                 stream.save(self._target)
-            stream.flush(timeout_sec=ANSWER_S)  # connecting tells nothing, this does
+            stream.flush(timeout_sec=ANSWER_S)  # connecting reports no error, flushing does
         except (RuntimeError, OSError, ValueError) as error:
             remedy = "start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file"
             raise DeviceError(f"--rerun {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error

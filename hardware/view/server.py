@@ -14,13 +14,13 @@ WAIT_S = 0.5
 
 
 class BrowserView:
-    """Serves what ``show`` was given last. A context manager.
+    """Serves the last picture and figures given to ``show``. A context manager.
 
     Parameters
     ----------
     title : str
     host, port : str, int
-        Port 0: a free one, see ``url``.
+        Port 0 selects a free port, see ``url``.
     """
 
     def __init__(self, title: str, *, host: str = "127.0.0.1", port: int = 0) -> None:
@@ -104,6 +104,6 @@ class BrowserView:
                         return
 
             def log_message(self, *_: object) -> None:
-                """Keep still."""
+                """Write no log."""
 
         return Handler

@@ -1,1 +1,1 @@
-"""Cameras, arms and what of them is attached to this machine."""
+"""Cameras, arms, their emulators, and the loop that joins them."""

@@ -1,4 +1,4 @@
-"""Where an arm was, from the states that it told."""
+"""Where an arm was at a given time, from the states that it reported."""
 
 import threading
 from collections import deque
@@ -14,7 +14,7 @@ WATCH_S = 0.02
 
 
 class ArmTrack:
-    """The newest states of an arm.
+    """Keeps the newest states of an arm.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class ArmTrack:
         self._states.append(state)
 
     def pose_at(self, time_s: float) -> np.ndarray:
-        """Where (6,) the arm was at a ``time.monotonic()``, between the states that are known (its turn about z unwrapped)."""
+        """Pose (6,) of the arm at a ``time.monotonic()``, interpolated between known states. Its turn about z is unwrapped."""
         states = sorted(self._states.copy(), key=lambda state: state.time_s)
         times = np.array([state.time_s for state in states])
         poses = np.array([state.pose for state in states])
@@ -39,12 +39,12 @@ class ArmTrack:
 
     @contextmanager
     def watched(self):
-        """While the arm moves as frames are exposed: ask it for its state many times a step."""
+        """Context in which a thread asks the arm for its state many times a step: frames are exposed while the arm moves."""
         end = threading.Event()
 
         def watch() -> None:
             while not end.wait(WATCH_S):
-                with suppress(TwinError):  # whoever moves the arm will meet it
+                with suppress(TwinError):  # the caller that moves the arm gets the same error
                     self.add(self._arm.state())
 
         thread = threading.Thread(target=watch, name="arm watch", daemon=True)

@@ -1,10 +1,19 @@
-"""Devices as context managers: connected on the way in, let go of on the way out."""
+"""Devices as context managers: connected when entered, disconnected when left."""
+
+from abc import ABC, abstractmethod
+from typing import Self
 
 
-class Connection:
-    """Mixin for whatever has ``connect()`` and ``disconnect()``."""
+class Connection(ABC):
+    """Base of whatever has ``connect()`` and ``disconnect()``."""
 
-    def __enter__(self):
+    @abstractmethod
+    def connect(self) -> None: ...
+
+    @abstractmethod
+    def disconnect(self) -> None: ...
+
+    def __enter__(self) -> Self:
         self.connect()
         return self
 

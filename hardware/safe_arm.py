@@ -1,19 +1,20 @@
-"""An arm that may only do what ``hardware.safety`` allows."""
+"""An arm whose every move is checked by ``hardware.safety``."""
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
+from hardware.arms.kinematics import Kinematics
 from hardware.errors import DeviceError, StaleDataError
 from hardware.let_go import try_each
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
 
 KEPT_DECISIONS = 10_000
-RETREAT_SHARES = (1.0, 0.75, 0.5, 0.25)  # as far as the limits allow
+RETREAT_SHARES = (1.0, 0.75, 0.5, 0.25)  # shares of the retreat, tried in turn until the limits allow one
 
 
 class RefusedMoveError(DeviceError):
@@ -34,10 +35,10 @@ class LoggedDecision:
 
 
 class SafeArm:
-    """Wraps an arm: every move is decided on first, and every decision is logged.
+    """Wraps an arm. Every move is checked before it is sent, and every decision is logged.
 
-    Used as a context manager, it leaves by stopping; after any exception (Ctrl-C too) it stops, retreats along
-    the object's normal and disables. ``stop``, ``emergency_stop``, ``disable``, ``clear_error`` and ``disconnect`` are never refused.
+    As a context manager it disconnects at the end. After any exception, Ctrl-C included, it stops the arm, retreats along the
+    object's normal and disables the arm. ``stop``, ``emergency_stop``, ``disable``, ``clear_error`` and ``disconnect`` are never refused.
 
     Parameters
     ----------
@@ -50,19 +51,25 @@ class SafeArm:
     """
 
     def __init__(
-        self, arm: Arm, limits: SafetyLimits, *, normal=(0.0, 0.0, 1.0), log: Callable[[LoggedDecision], None] | None = None
+        self,
+        arm: Arm,
+        limits: SafetyLimits,
+        *,
+        normal: Sequence[float] = (0.0, 0.0, 1.0),
+        log: Callable[[LoggedDecision], None] | None = None,
     ) -> None:
         if limits.joints_deg is not None and len(limits.joints_deg) != arm.axes:
             raise DeviceError(f"{arm.name} has {arm.axes} joints, the limits are for {len(limits.joints_deg)}; give those of this arm")
         self.arm, self.limits = arm, limits
         self.name, self.axes = arm.name, arm.axes
-        self.kinematics = getattr(arm, "kinematics", None)
+        self.kinematics: Kinematics | None = getattr(arm, "kinematics", None)
         self.normal = np.asarray(normal, float)
         self.decisions: deque[LoggedDecision] = deque(maxlen=KEPT_DECISIONS)
-        self._log, self._sensed = log, None
+        self._log = log
+        self._sensed: Sensed | None = None
 
     def sense(self, *, depth_mm: float, frame_time_s: float) -> None:
-        """What the sensor tells; from the first call on, a move needs a frame that is new enough. NaN: depth not known."""
+        """Report what the sensor shows. After the first call a move needs a frame that is new enough. A depth of NaN is not known."""
         self._sensed = Sensed(depth_mm, frame_time_s)
 
     @property
@@ -114,7 +121,7 @@ class SafeArm:
         return self.arm.wait_settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s)
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        """Faster than allowed becomes what is allowed."""
+        """Set the speed; a speed above the limits is reduced to them."""
         linear, angular = min(linear_mm_s, self.limits.linear_mm_s), min(angular_deg_s, self.limits.angular_deg_s)
         if (linear, angular) != (linear_mm_s, angular_deg_s):
             self._note("set_speed", Decision(Action.MOVE, Code.SPEED_CAPPED, f"to {linear:g} mm/s and {angular:g} deg/s"))
@@ -126,22 +133,24 @@ class SafeArm:
         Raises
         ------
         RefusedMoveError
-            It was not allowed. Depending on why, the arm was stopped, or stopped and retreated.
+            The move was not allowed. Depending on the reason the arm was stopped, or stopped and retreated.
         """
         state = self._newest_state("move_linear")
         decision = decide(pose, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
         self._obey("move_linear", decision)
-        return self.arm.move_linear(decision.pose, wait=wait, timeout_s=timeout_s)
+        return self.arm.move_linear(decision.allowed, wait=wait, timeout_s=timeout_s)
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         """As ``Arm.move_joints``; see ``move_linear``."""
+        if self.kinematics is None:
+            raise DeviceError(f"{self.name}: its kinematics are not known, so a move of its joints can't be checked; use move_linear")
         state = self._newest_state("move_joints")
         decision = decide_joints(joints_deg, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
         self._obey("move_joints", decision)
         return self.arm.move_joints(joints_deg, wait=wait, timeout_s=timeout_s)
 
     def retreat(self) -> np.ndarray | None:
-        """Leave the object along its normal, as far as the limits allow; the pose reached, None if none is allowed."""
+        """Leave the object along its normal as far as the limits allow. Returns the pose reached, or None if no retreat is allowed."""
         state = self.arm.state(max_age_s=self.limits.feedback_age_s)
         free = self.limits.model_copy(update={"step_mm": None, "step_deg": None})
         self.arm.set_speed(min(self.limits.retreat_mm_s, self.limits.linear_mm_s), self.limits.angular_deg_s)
@@ -151,7 +160,7 @@ class SafeArm:
             decision = decide(target, state, free, now_s=time.monotonic(), kinematics=self.kinematics)
             self._note("retreat", decision)
             if decision.action is Action.MOVE:
-                return self.arm.move_linear(decision.pose)
+                return self.arm.move_linear(decision.allowed)
         return None
 
     def shutdown(self, why: str) -> None:

@@ -28,20 +28,20 @@ Range = Annotated[tuple[float, float], AfterValidator(_rising)]
 
 
 class SafetyLimits(Section):
-    """What a loop may do with an arm. What is None is not limited."""
+    """What a loop may do with an arm. None means no limit."""
 
-    box_mm: tuple[Range, Range, Range]  # of x, y, z of the tool in the base frame
+    box_mm: tuple[Range, Range, Range]  # range of the tool's x, y and z in the base frame
     annulus_mm: tuple[NonNegative, Positive] | None = None  # distance from the base's axis
     joints_deg: tuple[Range, ...] | None = None
     linkage_deg: Positive | None = None  # largest J3 - J2
-    step_mm: Positive | None = None  # of one move; longer ones are shortened
+    step_mm: Positive | None = None  # longest move; a longer one is shortened
     step_deg: Positive | None = None
     linear_mm_s: Positive = 100.0
     angular_deg_s: Positive = 90.0
-    contact_mm: Positive = 6.0  # deepest indentation that the sensor may tell
+    contact_mm: Positive = 6.0  # deepest contact that the sensor may report
     frame_age_s: Positive = 0.5
     feedback_age_s: Positive = 1.0
-    retreat_mm: Positive = 50.0  # at the end and after a failure the tool goes so far from the object
+    retreat_mm: Positive = 50.0  # distance of the tool from the object at the end and after a failure
     retreat_mm_s: Positive = 50.0
 
 
@@ -66,7 +66,7 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
 
 
 class Code(StrEnum):
-    """Why it was decided so."""
+    """Reason of a decision."""
 
     OK = "ok"
     STEP_SHORTENED = "step-shortened"
@@ -89,10 +89,10 @@ class Code(StrEnum):
 
 
 class Action(StrEnum):
-    """What to do about it."""
+    """What follows from a decision."""
 
     MOVE = "move"
-    REFUSE = "refuse"  # don't send it; what goes on may go on
+    REFUSE = "refuse"  # do not send it; a move in progress may go on
     HOLD = "hold"  # stop and stand still
     RETRACT = "retract"  # stop, and leave the object along its normal
 
@@ -105,6 +105,13 @@ class Decision:
     code: Code
     reason: str
     pose: np.ndarray | None = None
+
+    @property
+    def allowed(self) -> np.ndarray:
+        """The pose (6,) that may be sent; ``ValueError`` where the decision allows none."""
+        if self.pose is None:
+            raise ValueError(f"nothing may be sent: {self.reason}")
+        return self.pose
 
 
 @dataclass(frozen=True)
@@ -145,8 +152,12 @@ def decide(
     if target.shape != (6,) or not np.isfinite(target).all():
         return Decision(Action.REFUSE, Code.NOT_A_NUMBER, f"the target {target} is not six numbers")
     unwrapped = kinematics is not None and kinematics.axes == 4
-    pose, shortened = shorten(state.pose, kinematics.nearest_pose(target) if unwrapped else target, limits, unwrapped=unwrapped)
-    if refused := _place(pose, state.pose, limits) or (kinematics and _joints(pose, state.pose, limits, kinematics)):
+    if kinematics is not None and unwrapped:
+        target = kinematics.nearest_pose(target)
+    pose, shortened = shorten(state.pose, target, limits, unwrapped=unwrapped)
+    if refused := _place(pose, state.pose, limits):
+        return refused
+    if kinematics is not None and (refused := _joints(pose, state.pose, limits, kinematics)):
         return refused
     if shortened:
         return Decision(Action.MOVE, Code.STEP_SHORTENED, f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg", pose)
@@ -154,9 +165,9 @@ def decide(
 
 
 def decide_joints(
-    joints_deg: np.ndarray, state: ArmState, limits: SafetyLimits, *, now_s: float, kinematics: Kinematics, sensed=None
+    joints_deg: np.ndarray, state: ArmState, limits: SafetyLimits, *, now_s: float, kinematics: Kinematics, sensed: Sensed | None = None
 ) -> Decision:
-    """Whether the joints may go there: as ``decide``, checked at every degree of the way. Such a move is not shortened but refused."""
+    """Whether the joints may move there, checked at every degree of the way. A move that is too long is refused, not shortened."""
     if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
         return halted
     end = np.asarray(joints_deg, float)
@@ -178,7 +189,7 @@ def decide_joints(
 def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwrapped: bool = False) -> tuple[np.ndarray, bool]:
     """The target, or a point as far on the way to it as a step may be; and whether it was shortened.
 
-    Turns go the shorter way, but as told where they are ``unwrapped`` (R of an arm of four axes).
+    A turn takes the shorter way, unless it is ``unwrapped`` (R of an arm of four axes): then it is executed as given.
     """
     way = target - start
     if not unwrapped:
@@ -236,7 +247,7 @@ def _joints(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematic
     if broken := _broken_joints(joints, limits, kinematics):
         return broken
     blocked = check_line(kinematics, kinematics.nearest_pose(start), pose)
-    return blocked and Decision(Action.REFUSE, Code.LINE_BLOCKED, blocked.text)
+    return Decision(Action.REFUSE, Code.LINE_BLOCKED, blocked.text) if blocked else None
 
 
 def _broken_joints(joints: np.ndarray, limits: SafetyLimits, kinematics: Kinematics) -> Decision | None:

@@ -1,7 +1,7 @@
-"""The servo law: from the surface that a frame showed and where the arm is, to where it goes next. Pure.
+"""The servo law, a pure function: from the surface that a frame showed and the present pose of the arm to its next pose.
 
 An estimate of depth and angle, together with the arm's pose when the frame was exposed, puts the surface's tangent into the
-base frame. The law acts on where the arm is now against that tangent: so a frame may be older than the last move.
+base frame. The law compares the present pose of the arm with that tangent, so a frame may be older than the last move.
 Depth d and angle w of the tool against the tangent, reference r, sums S of the errors (bounded),
 
     e = r - (d, w),   S' = clip(S + e),   (d, w)' = (d, w) + kp e + ki S',   along' = along + feed
@@ -37,7 +37,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Step:
-    """What the law decided.
+    """The result of one step of the law.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Step:
 
 
 def tangent_of(mounting: Mounting, pose: np.ndarray, reading: Reading) -> np.ndarray:
-    """``T_base_surface`` (4, 4): a tool there, turned alike, would just touch, normal to the surface.
+    """``T_base_surface`` (4, 4), the pose of a tool that just touches the surface and stands normal to it.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def servo_step(
         Where the arm is now, or was last sent.
     memory : Memory
     fresh : bool
-        Whether the tangent is from a new frame; an old one adds nothing to the sums.
+        Whether the tangent comes from a new frame; an old frame does not change the sums.
     """
     axis, out_of_plane = mounting.axis, mounting.out_of_plane
     now = reading_at(mounting, T_base_surface, pose)
@@ -108,7 +108,7 @@ def servo_step(
     turn_deg = spec.kp_angle * error_deg + spec.ki_angle * memory.angle_deg
     turn_deg = float(np.clip(turn_deg, -spec.largest_turn_deg, spec.largest_turn_deg))
     step_mm = spec.feed_mm * mounting.across + press_mm * axis
-    step_mm *= min(1.0, spec.largest_move_mm / max(np.linalg.norm(step_mm), 1e-9))
+    step_mm *= min(1.0, spec.largest_move_mm / max(float(np.linalg.norm(step_mm)), 1e-9))
     T = matrix_of(pose)
     T[:3, :3] = T_base_surface[:3, :3] @ Rotation.from_rotvec(np.radians(now.angle_deg + turn_deg) * out_of_plane).as_matrix()
     T[:3, 3] += T_base_surface[:3, :3] @ step_mm

@@ -1,6 +1,6 @@
 """JPEG pictures over HTTP as multipart/x-mixed-replace: what a server of such a stream writes."""
 
-from typing import BinaryIO
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -16,7 +16,13 @@ def jpeg_of(image: np.ndarray) -> bytes:
     return coded.tobytes()
 
 
-def write_part(out: BinaryIO, jpeg: bytes, headers: dict | None = None) -> None:
+class Writable(Protocol):
+    """What bytes can be written to."""
+
+    def write(self, data: bytes, /) -> int | None: ...
+
+
+def write_part(out: Writable, jpeg: bytes, headers: dict[str, object] | None = None) -> None:
     """Write one picture of a stream; ``OSError`` where the client has gone."""
     more = "".join(f"{name}: {value}\r\n" for name, value in (headers or {}).items())
     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n{more}\r\n"

@@ -8,7 +8,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ArmState:
-    """What the arm says of itself.
+    """One report of an arm about itself.
 
     Attributes
     ----------
@@ -17,10 +17,10 @@ class ArmState:
         An arm of four axes has ``rx = ry = 0`` and its turn R as ``rz``.
     joints_deg : (J,) float
     time_s : float
-        ``time.monotonic()`` when the arm said so.
+        ``time.monotonic()`` when the state arrived.
     enabled, moving : bool
     error : str
-        "" where there is none.
+        The arm's error in words; "" if there is none.
     """
 
     pose: np.ndarray
@@ -47,7 +47,7 @@ class Arm(Protocol):
     def connect(self) -> None: ...
 
     def disconnect(self) -> None:
-        """Stop and let go; without effect when not connected."""
+        """Stop the arm and close the connection. It has no effect when the arm is not connected."""
 
     def __enter__(self) -> "Arm": ...
 

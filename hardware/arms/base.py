@@ -1,7 +1,8 @@
-"""What every arm of ours shares: refusals when not connected, waiting until it is at rest."""
+"""What all drivers share: errors when the arm is not connected, and waiting until the arm is at rest."""
 
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 import numpy as np
@@ -11,11 +12,11 @@ from hardware.arms.motion import turn_between_deg
 from hardware.connection import Connection
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
 
-POLL_S = 0.005  # below the 8 ms of the fastest feedback
-BELIEVE_REST_S = 0.15  # at rest elsewhere for this long: the move won't come (a move shows in feedback sooner)
+POLL_S = 0.005  # shorter than the 8 ms period of the fastest feedback
+BELIEVE_REST_S = 0.15  # a move shows in feedback sooner than this; an arm that rests elsewhere for longer does not execute it
 
 
-class BaseArm(Connection, ABC):
+class BaseArm(Connection):
     """Base of the arms; see ``hardware.arms.arm.Arm`` for what each method promises."""
 
     name: str
@@ -24,12 +25,6 @@ class BaseArm(Connection, ABC):
     @property
     @abstractmethod
     def is_connected(self) -> bool: ...
-
-    @abstractmethod
-    def connect(self) -> None: ...
-
-    @abstractmethod
-    def disconnect(self) -> None: ...
 
     @abstractmethod
     def stop(self) -> None: ...
@@ -74,8 +69,8 @@ class BaseArm(Connection, ABC):
             time.sleep(POLL_S)
 
     @contextmanager
-    def _watched(self):
-        """What a move is waited for in: after any error (Ctrl-C too) the arm is stopped, for what was begun must not go on unwatched."""
+    def _watched(self) -> Iterator[None]:
+        """Context in which a move is waited for. After any error, Ctrl-C included, the arm is stopped: no move goes on unwatched."""
         try:
             yield
         except BaseException:

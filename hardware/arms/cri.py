@@ -7,6 +7,8 @@ with SyncRobot(Controller()) as robot:
     robot.move_linear((0, 0, 0, 0, 0, 0))
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hardware.arms.arm import Arm
@@ -22,7 +24,9 @@ EULER_AXES = tuple(
 
 
 class Controller:
-    """An arm as ``cri`` has it: connected and enabled as soon as it is made, poses (4, 4) of the flange in the base frame.
+    """An arm with the interface of ``cri``. It is connected and enabled when it is made.
+
+    Poses (4, 4) are those of the flange in the base frame.
 
     Parameters
     ----------
@@ -32,8 +36,9 @@ class Controller:
 
     def __init__(self, arm: str | Arm = "simulated") -> None:
         self.arm = open_arm(arm) if isinstance(arm, str) else arm
-        self._linear, self._angular, self._overall = 20.0, 20.0, None
-        self._tilt_deg = np.zeros(2)  # last commanded; an arm of four axes drops it, reading gives it back
+        self._linear, self._angular = 20.0, 20.0
+        self._overall: float | None = None
+        self._tilt_deg = np.zeros(2)  # the tilt last commanded: an arm of four axes does not report it, so reading a pose returns this one
         self.commanded_pose: np.ndarray | None = None
         self.commanded_joint_angles: np.ndarray | None = None
         self.arm.connect()
@@ -154,7 +159,7 @@ class SyncRobot:
         return matrix_pose(self._T_tip_flange, self._axes)
 
     @tcp.setter
-    def tcp(self, tcp) -> None:
+    def tcp(self, tcp: Sequence[float]) -> None:
         self._T_tip_flange = self._matrix(tcp)
 
     @property
@@ -162,7 +167,7 @@ class SyncRobot:
         return matrix_pose(self._T_base_work, self._axes)
 
     @coord_frame.setter
-    def coord_frame(self, frame) -> None:
+    def coord_frame(self, frame: Sequence[float]) -> None:
         self._T_base_work = self._matrix(frame)
 
     @property
@@ -207,16 +212,16 @@ class SyncRobot:
     def target_joint_angles(self) -> np.ndarray | None:
         return self.controller.commanded_joint_angles
 
-    def move_linear(self, pose) -> None:
+    def move_linear(self, pose: Sequence[float]) -> None:
         self.controller.move_linear(self._T_base_work @ self._matrix(pose) @ self._T_tip_flange)
 
-    def move_joints(self, joint_angles) -> None:
+    def move_joints(self, joint_angles: np.ndarray) -> None:
         self.controller.move_joints(joint_angles)
 
     def close(self) -> None:
         self.controller.close()
 
-    def _matrix(self, pose) -> np.ndarray:
+    def _matrix(self, pose: Sequence[float]) -> np.ndarray:
         if len(pose) != 6:
             raise DeviceError(f"a pose has 6 numbers (x, y, z in mm and three angles in deg), got {len(pose)}")
         return pose_matrix(np.asarray(pose, float), self._axes)

@@ -14,7 +14,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Violation:
-    """Why joints or a pose can't be had; ``code`` is the alarm by which the Dobots tell it."""
+    """Why joints or a pose are not allowed. ``code`` is the number of the Dobots' alarm."""
 
     code: int
     text: str
@@ -25,9 +25,11 @@ class OutOfReachError(ValueError):
 
 
 class Kinematics(Protocol):
-    """Joints to pose and back, and what the joints may be."""
+    """From joints to pose and back, and the limits of the joints."""
 
-    axes: int
+    @property
+    def axes(self) -> int:
+        """Number of joints."""
 
     def forward(self, joints_deg: np.ndarray) -> np.ndarray:
         """Pose (6,) at the joints (J,)."""
@@ -42,10 +44,10 @@ class Kinematics(Protocol):
         """The pose (6,) without the turns that the arm does not have."""
 
 
-NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23  # alarms of planning
+NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23  # numbers of the alarms that planning raises
 FIRST_JOINT_ALARM = 64  # J1 above, J1 below, J2 above, ... up to 71
 LINKAGE_ABOVE, LINKAGE_BELOW = 72, 73
-LIMIT_TOLERANCE_DEG = 1e-6  # rounding of an inverse at a limit is no violation of it
+LIMIT_TOLERANCE_DEG = 1e-6  # rounding errors of the inverse kinematics at a limit do not violate it
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class LinkageKinematics:
         return None
 
     def nearest_pose(self, pose: np.ndarray) -> np.ndarray:
-        """``rx = ry = 0``, and R by full turns to where J4 is within its range and closest to its middle."""
+        """The pose with ``rx = ry = 0`` and R changed by full turns, so that J4 is as close as possible to the middle of its range."""
         x, y, z, _, _, turn = np.asarray(pose, float)
         j1 = np.degrees(np.arctan2(y, x))
         return np.array([x, y, z, 0.0, 0.0, turn - 360.0 * np.round((turn - j1) / 360.0)])
@@ -125,11 +127,11 @@ class LinkageKinematics:
 
 
 _MG400_LIMITS_DEG = ((-160.0, 160.0), (-25.0, 85.0), (-25.0, 105.0), (-180.0, 180.0))
-# The linkage's limit is in no manual; a real arm alarms at exactly 60 deg.
+# The manual does not give the linkage's limit. A real arm raised an alarm at exactly 60 deg.
 MG400_NOMINAL = LinkageKinematics(175.0, 175.0, 109.5, -53.8, _MG400_LIMITS_DEG, 60.0)
-MG400 = LinkageKinematics(174.207, 175.070, 109.500, -53.000, _MG400_LIMITS_DEG, 60.0)  # fitted to a real arm
+MG400 = LinkageKinematics(174.207, 175.070, 109.500, -53.000, _MG400_LIMITS_DEG, 60.0)  # fitted to ten joint/pose pairs of a real arm
 MG400_REACH_MM = 440.0
-_MAGICIAN_LIMITS_DEG = ((-125.0, 125.0), (-5.0, 90.0), (-15.0, 70.0), (-150.0, 150.0))  # those in use
+_MAGICIAN_LIMITS_DEG = ((-125.0, 125.0), (-5.0, 90.0), (-15.0, 70.0), (-150.0, 150.0))  # as public clients of the Magician use them
 MAGICIAN = LinkageKinematics(135.0, 147.0, 0.0, 0.0, _MAGICIAN_LIMITS_DEG)
 
 

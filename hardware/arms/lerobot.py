@@ -1,4 +1,4 @@
-"""An arm in the shape of a LeRobot robot (matched by shape; nothing of LeRobot is needed)."""
+"""An arm with the interface of a LeRobot robot. LeRobot itself is not needed."""
 
 from functools import cached_property
 
@@ -10,7 +10,7 @@ _POSE = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class LeRobotArm:
-    """An arm as LeRobot's scripts have it: observations and actions are dicts of floats, in mm and deg.
+    """An arm for LeRobot's scripts: observations and actions are dicts of floats, in mm and deg.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class LeRobotArm:
 
     @property
     def observation_features(self) -> dict[str, type]:
-        joints = {f"joint_{n}.pos": float for n in range(1, self.arm.axes + 1)}
+        joints: dict[str, type] = {f"joint_{n}.pos": float for n in range(1, self.arm.axes + 1)}
         return {key: float for key in self._keys} | joints
 
     @property
@@ -58,7 +58,7 @@ class LeRobotArm:
         return {key: pose[key] for key in self._keys} | {f"joint_{n}.pos": float(q) for n, q in enumerate(state.joints_deg, start=1)}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
-        """Begin a move towards the pose and don't wait for it; keys left out stay. Returns what was really sent."""
+        """Begin a move to the pose and do not wait for its end. A missing key keeps its present value. Returns what was really sent."""
         unknown = set(action) - set(_POSE)
         if unknown:
             raise KeyError(f"an action has the keys {', '.join(self._keys)}, not {', '.join(sorted(unknown))}")

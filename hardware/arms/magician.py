@@ -19,8 +19,8 @@ from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Me
 from hardware.arms.targets import joint_target, linear_target, require_possible
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
-REPLY_TIMEOUT_S = 0.3  # a reply takes some 10 ms
-TRIES = 4  # what is sent may be sent again: moves are absolute, a second one moves nothing
+REPLY_TIMEOUT_S = 0.3  # a reply usually takes about 10 ms
+TRIES = 4  # a command may be sent again: moves are absolute, so a repeated move does not move the arm
 HOME_TIMEOUT_S = 60.0
 PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)  # what pyserial raises when a port vanishes
 ACCELERATION = 4.0  # mm/s2 and deg/s2 for each mm/s and deg/s: full speed within a quarter of a second
@@ -29,7 +29,7 @@ ACCELERATION = 4.0  # mm/s2 and deg/s2 for each mm/s and deg/s: full speed withi
 class Magician(BaseArm):
     """A Dobot Magician.
 
-    It has no switch for its motors: ``enable`` lets us move it, ``disable`` stops it and no longer does.
+    The arm has no command that switches its motors. ``enable`` allows moves; ``disable`` stops the arm and refuses further moves.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Magician(BaseArm):
         self._serial: serial.Serial | None = None
         self._lock, self._buffer = RLock(), b""
         self._enabled = False
-        self._last_index: int | None = None  # of the newest move, None if none is to come
+        self._last_index: int | None = None  # queue index of the newest move; None when no move is pending
 
     @property
     def is_connected(self) -> bool:
@@ -98,7 +98,7 @@ class Magician(BaseArm):
 
     def stop(self) -> None:
         self._forget_queue()
-        self._request(Id.QUEUE_START, ctrl=WRITE)  # empty now; without this the next move would wait for ever
+        self._request(Id.QUEUE_START, ctrl=WRITE)  # the queue is empty now; it must run, or the next move would never begin
 
     def home(self, *, timeout_s: float = HOME_TIMEOUT_S) -> None:
         """Find the joints' zeros. The arm moves through its whole range: keep clear of it."""
@@ -186,16 +186,16 @@ class Magician(BaseArm):
             raise DeviceError(f"{self.name}: not enabled; call enable() first")
 
     def _request(self, id: Id, params: bytes = b"", *, ctrl: int = 0) -> bytes:
-        """Send a command and wait for the reply with the same id and ctrl; send again if none comes or it is damaged."""
+        """Send a command and wait for the reply with the same id and ctrl. The command is sent again if the reply is missing or damaged."""
         sent = Message(id, ctrl, params).to_bytes()
         with self._lock:
             for _ in range(TRIES):
-                self._require_connected()
+                port = self._port()
                 try:
-                    self._serial.reset_input_buffer()
+                    port.reset_input_buffer()
                     self._buffer = b""
-                    self._serial.write(sent)
-                    if (reply := self._reply(id, ctrl)) is not None:
+                    port.write(sent)
+                    if (reply := self._reply(port, id, ctrl)) is not None:
                         return reply.params
                 except PORT_ERRORS as error:
                     self._close()
@@ -208,10 +208,16 @@ class Magician(BaseArm):
             "check that the port is a Magician's and the cable is sound"
         )
 
-    def _reply(self, id: Id, ctrl: int) -> Message | None:
+    def _port(self) -> serial.Serial:
+        """The open port; ``DeviceNotConnectedError`` where there is none."""
+        if self._serial is None:
+            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+        return self._serial
+
+    def _reply(self, port: serial.Serial, id: Id, ctrl: int) -> Message | None:
         deadline = time.monotonic() + REPLY_TIMEOUT_S
         while time.monotonic() < deadline:
-            self._buffer += self._serial.read(max(1, self._serial.in_waiting))
+            self._buffer += port.read(max(1, port.in_waiting))
             message, self._buffer = take_message(self._buffer)
             while message is not None:
                 if (message.id, message.ctrl) == (id, ctrl):

@@ -6,8 +6,8 @@ from enum import IntEnum
 BAUD = 115200  # 8N1
 USB_VENDORS = {4292: "CP210x", 6790: "CH340"}
 HEADER = b"\xaa\xaa"
-LENGTH_LIMIT = 0xAA  # a length is below; so AA AA AA never begins a frame at its first byte
-WRITE, QUEUED = 1, 2  # bits of ctrl
+LENGTH_LIMIT = 0xAA  # every length is below 0xAA, so AA AA AA is never a header followed by a length
+WRITE, QUEUED = 1, 2  # bits of the ctrl byte
 
 
 class Id(IntEnum):
@@ -60,7 +60,7 @@ class Ptp(IntEnum):
 
 @dataclass(frozen=True)
 class Message:
-    """One frame without its wrapping."""
+    """The content of one frame."""
 
     id: int
     ctrl: int = 0
@@ -91,8 +91,8 @@ def checksum(body: bytes) -> int:
 def take_message(buffer: bytes) -> tuple[Message | None, bytes]:
     """The first valid frame in what has arrived, and what is left.
 
-    Noise and frames with a wrong checksum are skipped; AA within the parameters is legal, so a frame is only
-    believed as a whole. Bytes that may still become a frame are kept.
+    Noise and frames with a wrong checksum are skipped. AA may occur within the parameters, so only a whole frame
+    with a correct checksum counts. Bytes that may be the beginning of a frame are kept.
     """
     start, unfinished = buffer.find(HEADER), None
     while start >= 0:

@@ -3,6 +3,7 @@
 import contextlib
 import re
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,10 +30,10 @@ from hardware.arms.targets import joint_target, linear_target, require_possible
 from hardware.errors import DeviceError, DeviceNotConnectedError
 
 ENABLE_TIMEOUT_S = 5.0
-SETTLE_S = 0.5  # at least, for feedback to confirm a move: two periods of the slow port
+SETTLE_S = 0.5  # feedback gets at least this long to confirm a move: two periods of the slowest port
 PAUSED = "paused by another client; stop() drops what is queued, its Continue() would go on"
-SHORT_MM = 5.0  # a move whose turn may set its speed
-RESTED_S = 0.05  # without replies (old firmware), at rest for this long counts as done
+SHORT_MM = 5.0  # in a move shorter than this the turn may determine the speed
+RESTED_S = 0.05  # old firmware sends no replies: a move counts as done after the arm rested for so long
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Mg400Ports:
     feedback: tuple[int, ...] = tuple(FEEDBACK_PERIOD_S)[:2]
 
     def shifted(self, offset: int) -> "Mg400Ports":
-        """All of them, so much higher."""
+        """The same ports, shifted by an offset."""
         require_ports(offset)
         return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
 
@@ -59,7 +60,7 @@ class MG400(BaseArm):
     host : str
     ports : Mg400Ports
     kinematics : LinkageKinematics
-        Checks targets before they are sent, so that the arm need not alarm.
+        Used to check targets before they are sent, so that the arm does not raise an alarm.
     """
 
     axes = 4
@@ -75,11 +76,11 @@ class MG400(BaseArm):
         self._dashboard = CommandPort(self.name, host, ports.dashboard)
         self._motion = CommandPort(self.name, host, ports.motion)
         self._feedback = Feedback(self.name, host, ports.feedback)
-        self._in_use = False  # between connect and disconnect, connections lost or not
+        self._in_use = False  # true from connect to disconnect, even while a connection is lost
         self._bare = False  # old firmware: echoes on the dashboard, nothing on the motion port
         self._alarm_text: str | None = None
-        self._speed: tuple[float, float] | None = None  # mm/s and deg/s, unless percents were asked for
-        self._sent: np.ndarray | None = None  # pose where the queue ends, while it may still be going there
+        self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after percents were set
+        self._sent: np.ndarray | None = None  # end of the queue, as long as the arm may still move there
 
     @property
     def is_connected(self) -> bool:
@@ -128,7 +129,7 @@ class MG400(BaseArm):
         self._alarm_text = None
 
     def stop(self) -> None:
-        """Stop and drop the queue; an arm that refuses to is switched off, which is an error."""
+        """Stop and drop the queue. If the arm refuses to stop it is switched off, and a ``DeviceError`` says so."""
         self._sent = None
         try:
             self._tell_in_any_case("ResetRobot()", "stopped")
@@ -161,9 +162,9 @@ class MG400(BaseArm):
         )
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        """The arm takes whole percents of its fastest, at least 1; lower speeds become that.
+        """The arm takes whole percents of its largest speed. A speed below 1 % becomes 1 %.
 
-        A move in a line may turn as fast as told, too, which the percents of its own length would not let it.
+        In a linear move the turn may also reach the given angular speed, even if the move is short.
         """
         self._require_connected()
         if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
@@ -185,9 +186,10 @@ class MG400(BaseArm):
         return sent
 
     def _turning_option(self, pose: np.ndarray) -> str:
-        """``SpeedL`` of a short move that turns more than it goes, taken to scale line and turn alike: what takes longer sets the pace.
+        """``SpeedL`` of a short move that mainly turns. The part that takes longer, line or turn, sets the speed.
 
-        The manual gives no more than its syntax. Should an arm go the line that fast, it is over within ``SHORT_MM``.
+        The manual gives the syntax of ``SpeedL`` only; we assume that it scales line and turn alike. If an arm applied it to the
+        line alone, the fast part would be shorter than ``SHORT_MM``.
         """
         if self._speed is None:
             return ""
@@ -209,7 +211,7 @@ class MG400(BaseArm):
     ) -> None:
         self._require_connected()
         require_possible(self.name, self.kinematics, numbers, joints)
-        packet, _ = self._feedback.newest(SILENCE_S)  # old firmware would not tell
+        packet, _ = self._feedback.newest(SILENCE_S)  # old firmware does not report a refusal
         if int(packet["mode"]) == Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if not packet["enabled"]:
@@ -234,7 +236,7 @@ class MG400(BaseArm):
             self._check(text, self._motion.request(text))
 
     def _await_queue(self, deadline: float, timeout_s: float) -> None:
-        """Wait for ``Sync``, raced against an alarm, silence and the time limit. A move may never show as RUNNING."""
+        """Wait for the reply to ``Sync``; an alarm, silence or the time limit ends the wait. A short move may never show as RUNNING."""
         if not self._bare:
             self._motion.send("Sync()")
         rest_since, asked_s = None, time.monotonic()
@@ -255,15 +257,17 @@ class MG400(BaseArm):
                 time.sleep(POLL_S)
 
     def _forget_sync(self) -> None:
-        """A ``Sync`` without its reply would confuse the next one: begin the connection anew."""
+        """Open the connection again: the late reply to an old ``Sync`` would be taken for the reply to the next one."""
         with contextlib.suppress(DeviceError):
             self._motion.open()
 
     def _await_joints(self, joints: np.ndarray, timeout_s: float) -> None:
-        self.wait_settled(self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s)  # the lengths are not exactly this arm's
+        self.wait_settled(
+            self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s
+        )  # our link lengths are not exactly those of this arm
 
-    def _await_mode(self, reached, otherwise: str) -> None:
-        """Wait for feedback in such a mode that came after now."""
+    def _await_mode(self, reached: Callable[[int], bool], otherwise: str) -> None:
+        """Wait for feedback newer than now whose mode is one of those wanted."""
         asked_s = time.monotonic()
         while True:
             packet, time_s = self._feedback.newest(SILENCE_S)
@@ -277,7 +281,7 @@ class MG400(BaseArm):
         return int(self._feedback.newest(SILENCE_S)[0]["mode"])
 
     def _alarm(self) -> str:
-        """The alarms, asked for once."""
+        """The alarms in words; the arm is asked once for each error."""
         if self._alarm_text is None:
             ids: list[int] = []
             with contextlib.suppress(DeviceError):
@@ -287,7 +291,7 @@ class MG400(BaseArm):
         return self._alarm_text
 
     def _tell_in_any_case(self, request: str, what: str) -> None:
-        """Needs the dashboard alone; lost, it is tried once more to reach it, for the arm may still move."""
+        """Needs only the dashboard connection. If that is lost it is opened once more, because the arm may still move."""
         if not self._in_use:
             self._require_connected()
         try:

@@ -12,9 +12,9 @@ from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 CONNECT_TIMEOUT_S = 2.0
 REPLY_TIMEOUT_S = 2.0
-SILENCE_S = 1.0  # feedback older than this counts for nothing, and its connection is given up
-RECONNECT_S = 0.5  # the arm's users wait 5 s; a servo that holds still wants to know sooner
-BACKLOG_BYTES = 64 * PACKET_BYTES  # read at once: more than comes in half a second
+SILENCE_S = 1.0  # older feedback is not used, and its connection is closed
+RECONNECT_S = 0.5  # public clients wait 5 s; a servo that stands still needs feedback sooner
+BACKLOG_BYTES = 64 * PACKET_BYTES  # bytes in one read: more than half a second of feedback
 
 
 class CommandPort:
@@ -113,12 +113,12 @@ class CommandPort:
 
 
 class Feedback:
-    """The newest feedback packet, kept by a thread that reads everything there is and reconnects after silence.
+    """Keeps the newest feedback packet. A thread reads all that arrives and reconnects after silence.
 
     Attributes
     ----------
     skipped_bytes : int
-        That were no whole, valid packet.
+        Bytes that did not belong to a whole, valid packet.
     reconnects : int
     """
 
@@ -130,15 +130,15 @@ class Feedback:
         self.skipped_bytes = self.reconnects = 0
 
     def open(self) -> None:
-        """Connect, to the first port that lets us, and wait for a packet.
+        """Connect to the first port that accepts and wait for a packet.
 
         Raises
         ------
         DeviceNotConnectedError
-            No port lets us, or nothing comes.
+            No port accepts, or no packet arrives.
         """
         connection = self._connect()
-        self._ended = Event()  # a new one: a reader before that has not ended yet still will
+        self._ended = Event()  # a new event: an earlier reader that still runs must keep its own and end
         self._thread = Thread(target=self._read, args=(connection, self._ended), daemon=True, name="mg400-feedback")
         self._thread.start()
         with self._arrived:
@@ -163,7 +163,7 @@ class Feedback:
         with self._arrived:
             newest = self._newest
         age_s = np.inf if newest is None else time.monotonic() - newest[1]
-        if age_s > max_age_s:
+        if newest is None or age_s > max_age_s:
             raise StaleDataError(
                 f"{self._name}: no feedback for {age_s:.1f} s (allowed {max_age_s:g} s); the reader keeps trying to reconnect. "
                 "Don't trust the last pose: stop, check the cable, then go on"
@@ -206,7 +206,7 @@ class Feedback:
                 return
             packet, buffer, skipped = newest_packet(buffer + data)
             self.skipped_bytes += skipped
-            if packet is not None and len(data) < BACKLOG_BYTES:  # else older ones still wait to be read
+            if packet is not None and len(data) < BACKLOG_BYTES:  # otherwise newer packets are still waiting to be read
                 valid_s = time.monotonic()
                 with self._arrived:
                     self._newest = (packet, valid_s)

@@ -13,13 +13,13 @@ FEEDBACK_PERIOD_S = {30004: 0.008, 30005: 0.2, 30006: 0.05}
 LARGEST_PORT = 65535
 DEFAULT_HOSTS = {"LAN1": "192.168.1.6", "LAN2": "192.168.2.6", "Wi-Fi": "192.168.9.1"}
 
-# Speed at SpeedL and SpeedJ of 100 %. The vendor's figures have not been verified on an arm: taken high, so
-# that an arm never moves faster than it was asked to.
+# Speeds at SpeedL and SpeedJ of 100 %. The vendor's figures are not verified on an arm. They are assumed high, so that an arm
+# never moves faster than requested.
 MAX_LINEAR_MM_S, MAX_JOINT_DEG_S = 1000.0, 300.0
 
 
 def require_ports(offset: int) -> None:
-    """``DeviceError`` if the arm's ports, so much higher, are no ports."""
+    """``DeviceError`` if the arm's ports plus the offset are not valid ports."""
     lowest, highest = DASHBOARD_PORT + offset, max(FEEDBACK_PERIOD_S) + offset
     if lowest < 1 or highest > LARGEST_PORT:
         raise DeviceError(
@@ -28,7 +28,7 @@ def require_ports(offset: int) -> None:
 
 
 class ErrorId(IntEnum):
-    """First number of a reply; of the last two n is added, the number of the parameter (from 1)."""
+    """First number of a reply. The last two become -3000n and -4000n, where n is the number of the parameter, from 1."""
 
     ACCEPTED = 0
     FAILED = -1
@@ -83,7 +83,7 @@ def take_reply(buffer: str) -> tuple[Reply | None, str]:
             return Reply(int(numbered[1]), numbered[2], numbered[3]), buffer[end + 1 :]
         if not numbered:
             return Reply(None, "", text), buffer[end + 1 :]
-        end = buffer.find(";", end + 1)  # the echo is still to come
+        end = buffer.find(";", end + 1)  # the echo follows in the second fragment
     return None, buffer
 
 
@@ -163,18 +163,18 @@ PACKET = np.dtype(
 def newest_packet(buffer: bytes) -> tuple[np.void | None, bytes, int]:
     """The newest whole packet in what has arrived.
 
-    A packet counts if its length is 1440, its test value stands where it must, no other packet begins inside it and
-    another, or nothing yet, follows it (else it was cut short).
+    A packet counts if its length is 1440, its test value is at its place, no other packet begins inside it, and it is
+    followed by another packet or by nothing yet. Otherwise it was cut short.
 
     Returns
     -------
     packet : record of ``PACKET`` or None
     rest : bytes
-        What came after it.
+        The bytes after it.
     skipped : int
-        Bytes before it that were no packet.
+        Number of bytes before it that are not part of a packet.
     """
-    newest, begin, used = None, None, 0
+    newest, begin, used = None, 0, 0
     at = buffer.find(TEST_BYTES)
     while at >= 0:
         start, following = at - TEST_OFFSET, buffer.find(TEST_BYTES, at + 1)

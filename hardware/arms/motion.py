@@ -1,4 +1,4 @@
-"""Motion of a simulated or emulated arm: pieces one after another, each with a trapezoidal (or constant) speed."""
+"""Motion of a simulated or emulated arm: a sequence of moves, each with a trapezoidal or constant speed."""
 
 from collections import deque
 from dataclasses import dataclass, replace
@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hardware.arms.kinematics import LINE_LEAVES_WORKSPACE, NO_INVERSE, TARGET_LIMIT, Kinematics, OutOfReachError, Violation
 
-LINE_STEP_MM = 5.0  # a line is checked for limits at places this far apart
-HISTORY_N = 512  # pieces kept, so that a camera can ask where the arm was
+LINE_STEP_MM = 5.0  # distance between the places of a line at which limits are checked
+HISTORY_N = 512  # moves that are remembered, so that a camera can ask where the arm was
 
 
 @dataclass(frozen=True)
 class Speeds:
-    """Speed and acceleration along a line (mm), in turning and of joints (deg). No acceleration (inf): constant speed."""
+    """Speed and acceleration along a line (mm) and of turns and joints (deg). Infinite acceleration means constant speed."""
 
     linear_mm_s: float
     angular_deg_s: float
@@ -39,7 +39,7 @@ def travel_time_s(length: float, speed: float, acceleration: float) -> float:
 
 
 def travelled(fraction: float, ramp: float) -> float:
-    """Share of the way at a share of the time, when speeding up and slowing down take ``ramp`` of the time each."""
+    """Share of the way after a share of the time; acceleration and braking each take the share ``ramp`` of the time."""
     t = min(max(fraction, 0.0), 1.0)
     if ramp > 0:
         if t < ramp:
@@ -53,7 +53,7 @@ def travelled(fraction: float, ramp: float) -> float:
 class Piece:
     """One move: from pose to pose in a straight line, or from joints to joints.
 
-    ``cut_s`` is where a stop ended it (inf: not at all).
+    ``cut_s`` is the time at which a stop ended it (inf: it was not stopped).
     """
 
     kinematics: Kinematics
@@ -84,9 +84,9 @@ class Piece:
 
 
 def between(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, share: float, linear: bool) -> np.ndarray:
-    """The pose or joints at a share of the way; exactly the ends at 0 and 1.
+    """The pose or joints at a share of the way; at 0 and 1 exactly the ends.
 
-    An arm of six axes turns the shortest way; one of four by as many degrees as R differs, which is not wrapped.
+    An arm of six axes turns the shortest way. An arm of four axes turns by the difference of R, which is not wrapped.
     """
     if share <= 0 or share >= 1:
         return (start if share <= 0 else end).copy()
@@ -98,7 +98,7 @@ def between(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, share: f
 
 
 def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Violation | None:
-    """What a straight line would break: its end first, then the way there."""
+    """The first limit that a straight move would violate: its end is checked first, then its way."""
     steps = max(1, int(np.ceil(np.linalg.norm(end[:3] - start[:3]) / LINE_STEP_MM)))
     for n in (steps, *range(1, steps)):
         try:
@@ -113,7 +113,7 @@ def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Vi
 
 
 class MotionTrack:
-    """Where an arm is, was and (as planned) will be. Safe to use from several threads.
+    """Where an arm is, was, and according to plan will be. Safe to use from several threads.
 
     Parameters
     ----------

@@ -20,8 +20,8 @@ def open_arm(spec: str) -> Arm:
     Parameters
     ----------
     spec : str
-        See ``ARM_SPECS``. Without an address the MG400 is looked for at its first network port's (192.168.1.6), without
-        a port the Magician at the one USB adapter of its kind.
+        See ``ARM_SPECS``. Without an address the MG400 is expected at that of its first network port (192.168.1.6). Without a
+        port the Magician is expected at the only USB adapter of its kind.
 
     Raises
     ------

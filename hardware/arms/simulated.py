@@ -1,6 +1,7 @@
-"""A simulated arm behind the same protocol as the real ones: moves take time, and it can misbehave on purpose."""
+"""A simulated arm with the same protocol as real arms. Its moves take time, and faults can be switched on."""
 
 import time
+from collections.abc import Sequence
 from enum import StrEnum
 
 import numpy as np
@@ -34,18 +35,18 @@ class SimulatedArm(BaseArm):
     pose : (6,) float
         Where it stands to begin with.
     speeds : Speeds
-        Of moves until ``set_speed``; without acceleration the speed is constant.
+        Speeds until ``set_speed`` is called; without acceleration the speed is constant.
     time_scale : float
         How much faster than real it moves (``inf``: at once).
     faults : iterable of SimulatedFault
-        ``faults`` is a set that may be changed at any time; it counts for moves begun afterwards (SILENT at once).
+        ``faults`` is a set that may be changed at any time. A change holds for later moves; SILENT holds at once.
     """
 
     def __init__(
         self,
         *,
         axes: int = 6,
-        pose: np.ndarray = (300.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        pose: Sequence[float] | np.ndarray = (300.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         speeds: Speeds = Speeds(100.0, 100.0, 1000.0, 1000.0),  # noqa: B008  (frozen)
         time_scale: float = 1.0,
         faults: tuple[SimulatedFault, ...] = (),
@@ -160,7 +161,7 @@ class SimulatedArm(BaseArm):
         return next((text for since, text in self._errors if since <= time_s), "")
 
     def _told_s(self, now_s: float) -> float:
-        """When the newest feedback was sent: now, unless the arm fell silent."""
+        """Time of the newest feedback: now, unless the fault SILENT is on."""
         if SimulatedFault.SILENT not in self.faults:
             self._silent_since = None
         elif self._silent_since is None:

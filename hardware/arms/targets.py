@@ -7,7 +7,7 @@ from hardware.errors import DeviceError
 
 
 def linear_target(name: str, kinematics: LinkageKinematics, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pose (6,) that the arm can hold nearest to one asked for, and its joints (4,), NaN where it is not a number.
+    """The pose (6,) nearest to the requested one that the arm can take, and its joints (4,); NaN where a number is missing.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def joint_target(name: str, joints_deg: np.ndarray) -> np.ndarray:
 
 
 def require_possible(name: str, kinematics: LinkageKinematics, numbers: np.ndarray, joints_deg: np.ndarray) -> None:
-    """``DeviceError`` unless the joints (4,) are numbers within the limits; ``numbers`` are what would be sent."""
+    """Raise ``DeviceError`` unless the joints (4,) are numbers within the limits. ``numbers`` are those that would be sent."""
     if not np.isfinite(joints_deg).all():
         raise DeviceError(f"{name}: the target {numbers} is not a number; nothing was sent")
     if violation := kinematics.violation(joints_deg):

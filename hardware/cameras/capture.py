@@ -1,4 +1,4 @@
-"""From a camera's picture to a sensor's frame: the size checked, gray where the sensor's camera is, thresholded where recordings are."""
+"""From a camera's picture to a sensor's frame: check the size, make it gray for a mono camera, threshold it for the recordings' form."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from twin.types import Form
 
 
 def capture(image: np.ndarray, spec: SensorSpec | None, form: Form, name: str) -> np.ndarray:
-    """A picture (H, W) or (H, W, 3) uint8 RGB as the sensor's frame of a form; as it is without a sensor.
+    """A picture (H, W) or (H, W, 3) uint8 RGB as the sensor's frame of a form. Without a sensor the picture is returned unchanged.
 
     Raises
     ------
     DeviceError
-        It has not the size of the sensor's camera.
+        Its size is not that of the sensor's camera.
     """
     if spec is None:
         return image
@@ -28,4 +28,4 @@ def capture(image: np.ndarray, spec: SensorSpec | None, form: Form, name: str) -
         )
     if spec.camera.channels == "mono":
         image = gray_levels(image)
-    return record(image, spec.recording) if form is Form.RECORDING else image
+    return record(image, spec.recording) if form is Form.RECORDING and spec.recording is not None else image

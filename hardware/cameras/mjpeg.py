@@ -2,6 +2,7 @@
 
 import http.client
 import time
+from typing import Protocol
 from urllib.parse import urlsplit
 
 import cv2
@@ -14,17 +15,26 @@ from scenes.sensor import SensorSpec
 from twin.recordings.quiet import quiet
 from twin.types import Form
 
-SILENT_S = 2.0  # no byte for so long: the read failed
+SILENT_S = 2.0  # without a byte for so long the read has failed
 LARGEST_PART = 32_000_000  # bytes
 TIME_HEADERS = ("x-timestamp",)  # Unix seconds of the exposure, as mjpg-streamer sends it
-CLOCK_SLACK_S = 60.0  # a stamp farther from now is from another clock
+CLOCK_SLACK_S = 60.0  # a time stamp farther from now comes from another clock and is not used
 START, END = b"\xff\xd8", b"\xff\xd9"
+
+
+class Readable(Protocol):
+    """A stream of bytes."""
+
+    def readline(self, limit: int, /) -> bytes: ...
+
+    def read(self, amount: int, /) -> bytes: ...
 
 
 class MjpegCamera(LiveSource):
     """A stream of JPEG pictures.
 
-    A part's ``X-Timestamp`` (Unix seconds) is taken as the time of exposure, else its arrival; ``X-Sequence`` tells lost ones.
+    The time of exposure is a part's ``X-Timestamp`` (Unix seconds), or its arrival if there is none. Gaps in
+    ``X-Sequence`` are lost pictures.
 
     Parameters
     ----------
@@ -39,11 +49,14 @@ class MjpegCamera(LiveSource):
         try:
             parts = urlsplit(url)
             usable = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
-        except ValueError:  # a port that is none
+        except ValueError:  # the port is not a number
             usable = False
         if not usable:
             raise DeviceError(f"{url}: not the address of a stream; expected http://host:port/path")
-        self._parts, self._connection, self._stream, self._last = parts, None, None, None
+        self._parts = parts
+        self._connection: http.client.HTTPConnection | None = None
+        self._stream: http.client.HTTPResponse | None = None
+        self._last: int | None = None
 
     def _open(self) -> None:
         try:
@@ -52,9 +65,9 @@ class MjpegCamera(LiveSource):
             raise DeviceError(f"{self.name}: {error}; start the stream or check the address") from error
 
     def _request(self) -> None:
-        """Ask for the stream; ``OSError`` says why there is none."""
-        kind = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
-        connection = kind(self._parts.hostname, self._parts.port, timeout=SILENT_S)
+        """Request the stream; an ``OSError`` says why there is none."""
+        protocol = http.client.HTTPSConnection if self._parts.scheme == "https" else http.client.HTTPConnection
+        connection = protocol(self._parts.hostname or "", self._parts.port, timeout=SILENT_S)
         try:
             connection.request("GET", (self._parts.path or "/") + (f"?{self._parts.query}" if self._parts.query else ""))
             answer = connection.getresponse()
@@ -68,10 +81,10 @@ class MjpegCamera(LiveSource):
         self._connection, self._stream = connection, answer
 
     def _close(self) -> None:
-        if self._connection is not None:
-            self._stream.close()
-            self._connection.close()
-            self._connection = self._stream = None
+        for opened in (self._stream, self._connection):
+            if opened is not None:
+                opened.close()
+        self._connection = self._stream = None
 
     def _grab(self) -> Picture:
         if self._stream is None:
@@ -80,8 +93,11 @@ class MjpegCamera(LiveSource):
             except OSError as error:
                 self._pause()
                 raise ReadFailed(str(error)) from error
+        stream = self._stream
+        if stream is None:  # another thread closed it
+            raise ReadFailed("the stream was closed")
         try:
-            headers, data = next_part(self._stream)
+            headers, data = next_part(stream)
         except (OSError, EOFError, http.client.HTTPException) as error:
             self._close()  # to be opened anew
             raise ReadFailed(str(error) or type(error).__name__) from error
@@ -92,11 +108,11 @@ class MjpegCamera(LiveSource):
             self._last = number
         return Picture(image, stamped_s(headers), lost)
 
-    def _finish(self, image):
+    def _finish(self, image: np.ndarray) -> np.ndarray:
         return capture(image, self._spec, self.form, self.name)
 
 
-def next_part(stream) -> tuple[dict, bytes]:
+def next_part(stream: Readable) -> tuple[dict, bytes]:
     """Headers (lower case) and body of the next part of a multipart stream; ``EOFError`` at its end."""
     headers: dict[str, str] = {}
     while True:  # up to the next part's headers, past its boundary
@@ -118,7 +134,7 @@ def next_part(stream) -> tuple[dict, bytes]:
 
 
 def decode_jpeg(data: bytes) -> np.ndarray:
-    """A whole JPEG as gray (H, W) or RGB (H, W, 3) uint8; ``ReadFailed`` for a torn one, which decoders fill up with gray."""
+    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8. An incomplete one raises ``ReadFailed``: decoders would fill the rest with gray."""
     if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
         raise ReadFailed(f"a torn JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
     with quiet():
@@ -129,7 +145,7 @@ def decode_jpeg(data: bytes) -> np.ndarray:
 
 
 def stamped_s(headers: dict) -> float:
-    """Time of exposure on the monotonic clock, from a part's headers; now where they don't tell."""
+    """Time of exposure on the monotonic clock, from a part's headers; the present time if they do not hold it."""
     now_s, unix_s = time.monotonic(), time.time()
     for name in TIME_HEADERS:
         try:

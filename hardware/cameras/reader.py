@@ -1,8 +1,9 @@
-"""What every live source shares: a background reader that keeps the newest frame and says what is wrong."""
+"""What all live sources share: a background reader that keeps the newest frame and reports faults."""
 
 import threading
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +12,14 @@ from hardware.connection import Connection
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.types import Form, Frame
 
-MOST_FAILED_READS = 10  # in a row; one more ends the reader
-FAILED_PAUSE_S = 0.2  # before the device is tried again
-FROZEN_S, FROZEN_N = 0.5, 5  # the same picture for so long, and so often: no live sensor does that, for its noise
-BLACK_LEVEL = 16  # nothing brighter: the lamps are off, or nothing is seen
-START_S = 4.0  # of a real camera, from opening it to its first picture ...
-FIRST_PERIODS = 5  # ... and so many periods of its frames
+MOST_FAILED_READS = 10  # the reader ends after more failed reads in a row
+FAILED_PAUSE_S = 0.2  # pause before the next attempt
+# An identical picture for this time, and this number of times, means a frozen stream: a live sensor has noise.
+FROZEN_S, FROZEN_N = 0.5, 5
+BLACK_LEVEL = 16  # gray level; a picture without a brighter pixel is black: the lamps are off
+# The first picture of a real camera may take START_S after opening, plus FIRST_PERIODS periods of its frames.
+START_S = 4.0
+FIRST_PERIODS = 5
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class ReadFailed(Exception):  # noqa: N818  (no error until it happens too often
     """One picture could not be had; the reader tries again."""
 
 
-class LiveSource(Connection, ABC):
+class LiveSource(Connection):
     """Base of the live sources; see ``hardware.cameras.source.FrameSource`` for what each method promises.
 
     Parameters
@@ -54,7 +57,11 @@ class LiveSource(Connection, ABC):
 
     is_live = True
     notices_still = True  # whether a picture that doesn't change is a fault
-    fps = 5.0  # of the frames; where the device does not tell, the slowest that is of use
+    _read_last: int  # sequence number of the frame that was read last
+    _sequence: int
+    _dropped: int
+    _delivered: int
+    fps = 5.0  # frame rate; if the device does not report one, the slowest useful rate
 
     def __init__(self, name: str, form: Form) -> None:
         self.name, self.form = name, Form(form)
@@ -66,7 +73,7 @@ class LiveSource(Connection, ABC):
 
     @property
     def first_frame_s(self) -> float:
-        """So long after it was connected its first frame may take."""
+        """Longest time from ``connect`` to the first frame."""
         return START_S + FIRST_PERIODS / self.fps
 
     @abstractmethod
@@ -91,17 +98,17 @@ class LiveSource(Connection, ABC):
 
     @property
     def dropped(self) -> int:
-        """Frames that arrived, or that the device lost, and nobody read."""
+        """Number of frames that nobody read, those lost by the device included."""
         return self._dropped
 
     @property
     def delivered(self) -> int:
-        """Frames that somebody read."""
+        """Number of frames that were read."""
         return self._delivered
 
     @property
     def arrived(self) -> int:
-        """Frames of the device so far, lost ones included."""
+        """Number of frames from the device so far, lost ones included."""
         return self._sequence
 
     @property
@@ -139,7 +146,7 @@ class LiveSource(Connection, ABC):
             raise StaleDataError(f"{self.name}: the newest frame is {age_s:.2f} s old (allowed {max_age_s:g} s); check camera and cable")
         return frame
 
-    def _take(self, wanted, timeout_s: float, missing: str) -> Frame:
+    def _take(self, wanted: Callable[[Frame], bool], timeout_s: float, missing: str) -> Frame:
         deadline = time.monotonic() + timeout_s
         with self._new:
             while True:

@@ -1,6 +1,6 @@
 """Frames from disk behind the live sources' protocol: they wait for their reader, and end."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from twin.recordings import Recording, open_recording
 from twin.types import Form, Frame
 
 
-class SequentialSource(Connection, ABC):
+class SequentialSource(Connection):
     """Frames that wait for their reader, and end: what folders, videos and sessions share.
 
     Parameters

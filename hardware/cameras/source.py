@@ -18,7 +18,10 @@ class FrameSource(Protocol):
     name: str
     form: Form
     is_live: bool  # a recording waits for its reader, a live source does not
-    first_frame_s: float  # so long after it was connected its first frame may take
+
+    @property
+    def first_frame_s(self) -> float:
+        """Longest time from ``connect`` to the first frame."""
 
     @property
     def is_connected(self) -> bool: ...

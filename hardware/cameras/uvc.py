@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
 
 from hardware.cameras.capture import capture
 from hardware.cameras.reader import LiveSource, Picture, ReadFailed
@@ -13,13 +14,13 @@ from twin.recordings.quiet import quiet
 from twin.types import Form
 
 MANUAL_EXPOSURE = 1  # V4L2; 3 is automatic
-CLOCK_SLACK_S = 5.0  # a buffer's time farther from now is not on the monotonic clock
+CLOCK_SLACK_S = 5.0  # a buffer time farther from now is not on the monotonic clock and is not used
 BUFFERS = 1
 
 
 @dataclass(frozen=True)
 class UvcSettings:
-    """What is asked of the camera; None leaves it alone.
+    """Requested settings of the camera; None leaves a setting unchanged.
 
     Attributes
     ----------
@@ -82,24 +83,27 @@ class UvcCamera(LiveSource):
             except DeviceError as error:
                 self._pause()
                 raise ReadFailed(str(error)) from error
-        good, image = self._device.read()
+        device = self._device
+        if device is None:  # another thread closed it
+            raise ReadFailed("the camera was closed")
+        good, image = device.read()
         if not good or image is None or not image.size:
-            self._close()  # pulled out: it has to be opened anew
+            self._close()  # the camera may be unplugged: it must be opened again
             raise ReadFailed("no picture")
-        return Picture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(self._device.get(cv2.CAP_PROP_POS_MSEC)))
+        return Picture(image if image.ndim == 2 else image[..., ::-1].copy(), exposed_s(device.get(cv2.CAP_PROP_POS_MSEC)))
 
-    def _finish(self, image):
+    def _finish(self, image: np.ndarray) -> np.ndarray:
         return capture(image, self._spec, self.form, self.name)
 
 
 def exposed_s(position_ms: float) -> float:
-    """The kernel's buffer time (ms on the monotonic clock) if that is what it is, else now: ``time.monotonic()`` seconds."""
+    """Time of exposure in ``time.monotonic()`` seconds: the kernel's buffer time (ms) if it is on that clock, else the present time."""
     now_s = time.monotonic()
     return position_ms / 1e3 if 0 <= now_s - position_ms / 1e3 < CLOCK_SLACK_S else now_s
 
 
-def apply_settings(device, settings: UvcSettings) -> list[tuple[str, float, float]]:
-    """Ask for the settings in the order in which cameras take them; name, asked and read back of each."""
+def apply_settings(device: cv2.VideoCapture, settings: UvcSettings) -> list[tuple[str, float, float]]:
+    """Set the settings in the order that cameras need. Returns the name, the requested value and the value read back of each."""
     asked = [
         ("fourcc", cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG")),
         ("width", cv2.CAP_PROP_FRAME_WIDTH, settings.width_px),
@@ -115,6 +119,6 @@ def apply_settings(device, settings: UvcSettings) -> list[tuple[str, float, floa
     if settings.white_balance_k is not None:
         asked.append(("white balance", cv2.CAP_PROP_WB_TEMPERATURE, settings.white_balance_k))
     asked.append(("autofocus", cv2.CAP_PROP_AUTOFOCUS, 0))
-    for _, key, value in asked:  # set() may fail without a word
+    for _, key, value in asked:  # set() does not report failures
         device.set(key, value)
     return [(name, float(value), float(device.get(key))) for name, key, value in asked]

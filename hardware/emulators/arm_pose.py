@@ -1,4 +1,4 @@
-"""Where an MG400 is, from its feedback port alone: what an emulated camera needs of an arm in another process."""
+"""The pose of an MG400 from its feedback port alone. An emulated camera needs it when the arm runs in another process."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ MAX_AGE_S = 1.0
 
 
 class FeedbackPose:
-    """The newest state that the feedback ports tell; takes no command connection, so a driver may be connected beside it.
+    """Reads the newest state from the feedback ports. It opens no command connection, so a driver may be connected at the same time.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class FeedbackPose:
 
     @classmethod
     def of(cls, spec: str) -> "FeedbackPose":
-        """From ``mg400:ADDRESS[:DASHBOARD_PORT]``; a shifted dashboard shifts the feedback alike."""
+        """From ``mg400:ADDRESS[:DASHBOARD_PORT]``. The feedback ports have the same offset as the dashboard port."""
         kind, _, rest = spec.partition(":")
         host, _, port = rest.partition(":")
         if kind != "mg400" or not host or (port and not port.isdecimal()):

@@ -69,8 +69,9 @@ class CameraEmulator:
     @property
     def url(self) -> str:
         """Where the stream is."""
-        host, port = self._server.server_address[:2]
-        return f"http://{host}:{port}/stream.mjpg"
+        if self._server is None:
+            raise DeviceError("camera emulator: not started; call start() first")
+        return f"http://{self._address[0]}:{self._server.server_port}/stream.mjpg"
 
     def start(self) -> None:
         try:
@@ -82,7 +83,7 @@ class CameraEmulator:
         self._end.clear()
         self._source.connect()
         try:
-            await_frame(self._source)  # who finds it listening is not made to wait for kernels to be compiled
+            await_frame(self._source)  # the first frame compiles kernels: this happens before a client can connect
         except BaseException:
             self._server.server_close()
             self._source.disconnect()
@@ -110,7 +111,7 @@ class CameraEmulator:
 
     @property
     def pulled_out(self) -> bool:
-        """Whether the plug is out just now."""
+        """Whether the fault has unplugged the camera at present."""
         span_s = self.faults.value("unplugged")
         if span_s is None:
             self._pulled_s = None
@@ -119,7 +120,7 @@ class CameraEmulator:
         return time.monotonic() - self._pulled_s < span_s
 
     def next_part(self, after: int) -> _Part | None:
-        """The newest part with a higher number, when it is due; None if there is none for a while."""
+        """The newest part with a higher number, as soon as it may be sent; None if none comes for a while."""
         with self._new:
             self._new.wait_for(lambda: self._part is not None and self._part.number > after, CLIENT_WAIT_S)
             part = self._part
@@ -189,6 +190,6 @@ def _handler_of(camera: CameraEmulator) -> type[BaseHTTPRequestHandler]:
                 camera.sent += 1
 
         def log_message(self, *_: object) -> None:
-            """Keep still."""
+            """Write no log."""
 
     return Handler

@@ -8,6 +8,7 @@ import select
 import termios
 import time
 import tty
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Event, Lock, Thread, Timer
 
@@ -58,14 +59,14 @@ class MagicianEmulator:
         *,
         link: Path | None = None,
         faults: tuple[str, ...] = (),
-        joints_deg=START_JOINTS_DEG,
+        joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
         self.faults = Faults(FAULTS, faults)
         self.arm = MagicianController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self.device = ""
         self._link = link
-        self._ends: tuple[int, int] | None = None  # ours, the client's
+        self._ends: tuple[int, int] | None = None  # file descriptors: our end, the client's end
         self._lock, self._ended = Lock(), Event()
         self._thread: Thread | None = None
         self._noise, self._replies = random.Random(0), 0
@@ -132,7 +133,7 @@ class MagicianEmulator:
                 ready, _, _ = select.select([self._ends[0]], [], [], 0.0)
                 data = os.read(self._ends[0], 4096) if ready else b""
                 if data and termios.tcgetattr(self._ends[1])[4] != termios.B115200:
-                    data = b""  # at another speed it is noise
+                    data = b""  # at a wrong baud rate only noise arrives
             if not data:
                 time.sleep(0.001)
                 continue
@@ -152,7 +153,7 @@ class MagicianEmulator:
         pause_s = self.faults.value("split-frames")
         pieces = [frame] if pause_s is None else [frame[:SPLIT_AT], frame[SPLIT_AT:]]
         for n, piece in enumerate(pieces):
-            if n:
+            if n and pause_s is not None:
                 time.sleep(pause_s)
             with self._lock, contextlib.suppress(OSError):
                 if self._ends is not None:

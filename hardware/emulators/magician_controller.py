@@ -1,7 +1,8 @@
-"""The emulated Magician's controller: its commands, its queue and its alarms. Knows no serial port."""
+"""The emulated Magician's controller: commands, queue and alarms. It does not use a serial port."""
 
 import struct
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from threading import RLock
 
@@ -16,8 +17,9 @@ QUEUE_N = 32
 NOT_UNDERSTOOD, LOST_STEPS = 1, 80
 START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
 HOME_SPEED_DEG_S = 30.0
-JOG_MM, JOG_DEG = 400.0, 300.0  # a jog's far end, beyond any limit
-PARAMETERS = {  # what is stored as it comes: number of bytes, what they are to begin with
+JOG_MM, JOG_DEG = 400.0, 300.0  # a jog's target, beyond any limit: mm, deg
+# Parameters that are stored as received, with their initial bytes. The number of bytes must agree.
+PARAMETERS: dict[int, bytes] = {
     Id.HOME_PARAMS: struct.pack("<4f", 200.0, 0.0, 0.0, 0.0),
     Id.END_EFFECTOR: struct.pack("<3f", 0.0, 0.0, 0.0),
     Id.LASER: bytes(2),
@@ -33,7 +35,15 @@ PARAMETERS = {  # what is stored as it comes: number of bytes, what they are to 
     Id.PTP_COMMON_PARAMS: struct.pack("<2f", 50.0, 50.0),
     Id.CP_PARAMS: struct.pack("<3fB", 100.0, 50.0, 10.0, 0),
 }
-SIZES = {Id.RESET_POSE: (9,), Id.HOME: (4, 0), Id.JOG: (2,), Id.PTP: (17,), Id.CP: (17, 14), Id.WAIT: (4,)}  # 14: pydobot's CP
+# Bytes of parameters that a command may have. pydobot sends CP without its last number: 14 bytes.
+SIZES: dict[int, tuple[int, ...]] = {
+    Id.RESET_POSE: (9,),
+    Id.HOME: (4, 0),
+    Id.JOG: (2,),
+    Id.PTP: (17,),
+    Id.CP: (17, 14),
+    Id.WAIT: (4,),
+}
 
 
 @dataclass(frozen=True)
@@ -46,9 +56,9 @@ class Queued:
 
 
 class MagicianController:
-    """What the arm does with its commands. Every method may be called from any thread."""
+    """Executes the commands of the arm. Every method may be called from any thread."""
 
-    def __init__(self, faults: Faults, *, joints_deg=START_JOINTS_DEG, time_scale: float = 1.0) -> None:
+    def __init__(self, faults: Faults, *, joints_deg: Sequence[float] = START_JOINTS_DEG, time_scale: float = 1.0) -> None:
         self.faults, self._time_scale = faults, time_scale
         self.kinematics = MAGICIAN
         self.track = MotionTrack(MAGICIAN, np.asarray(joints_deg, float))
@@ -57,7 +67,7 @@ class MagicianController:
         self._params = dict(PARAMETERS)
         self._queue: list[Queued] = []
         self._running = False
-        self._since_s = self._ends_s = -np.inf  # the head can't begin before; the head is done (inf: not begun)
+        self._since_s = self._ends_s = -np.inf  # when the first command may begin, and when it ends (inf: not begun)
         self._begun, self._lost_at_s = False, np.inf
         self._issued = self._current = 0
 
@@ -67,7 +77,7 @@ class MagicianController:
             return self.track.pose(now_s if time_s is None else time_s)
 
     def answer(self, message: Message) -> Message:
-        """Do a command, or queue it; the reply has its id and ctrl."""
+        """Execute a command or queue it. The reply has the same id and ctrl."""
         with self.lock:
             now_s = self.advance()
             if not self._understood(message):
@@ -81,7 +91,7 @@ class MagicianController:
             return Message(message.id, message.ctrl, self._write(message, now_s) if message.is_write else self._read(message, now_s))
 
     def advance(self) -> float:
-        """Do what the queue has to do until now; the time now."""
+        """Execute the queue up to the present time, which is returned."""
         now_s = time.monotonic()
         with self.lock:
             if self._lost_at_s <= now_s:
@@ -123,7 +133,7 @@ class MagicianController:
             self.alarms.clear()
         elif message.id == Id.QUEUE_START:
             self._since_s, self._running = now_s, True
-        elif message.id == Id.QUEUE_STOP:  # what is being done is done to its end
+        elif message.id == Id.QUEUE_STOP:  # the command in execution is finished
             self._running = False
         elif message.id == Id.QUEUE_FORCE_STOP:
             self.track.stop(now_s)
@@ -136,7 +146,7 @@ class MagicianController:
         return b""
 
     def _do(self, message: Message, begins_s: float) -> float:
-        """Begin a command; when it will be done."""
+        """Begin a command; returns the time at which it ends."""
         params = message.params
         if message.id in PARAMETERS:
             self._params[message.id] = params
@@ -158,8 +168,9 @@ class MagicianController:
         elif message.id == Id.WAIT:
             return begins_s + struct.unpack("<I", params)[0] / 1000.0
         elif message.id == Id.JOG:
-            self._jog(*params, begins_s)
-        return begins_s  # ResetPose: nothing, the emulated arm always knows where it stands
+            joints, command = params
+            self._jog(joints, command, begins_s)
+        return begins_s  # ResetPose needs no action: the emulated arm always knows its pose
 
     def _ptp(self, mode: int, numbers: np.ndarray, begins_s: float) -> float:
         here, joints = self._target_pose(), self._target_joints()
@@ -194,7 +205,7 @@ class MagicianController:
         speed *= self._floats(Id.JOG_COMMON_PARAMS, "<2f")[0] / 100.0 * self._time_scale
         start = self.track.joints_deg(begins_s) if joints else self.track.pose(begins_s)
         at, length = (axis if joints or axis < 3 else 5), JOG_DEG if joints or axis == 3 else JOG_MM
-        while length > 0.5 and speed > 0:  # the far end is where the arm still can be
+        while length > 0.5 and speed > 0:  # the target is the last place within the limits
             end = start.copy()
             end[at] += sign * length
             moved = self.track.move(end, Speeds(speed, speed), linear=not joints, now_s=begins_s)

@@ -5,6 +5,7 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Callable, Sequence
 from threading import Event, Lock, Thread, Timer
 
 import numpy as np
@@ -53,7 +54,7 @@ class Mg400Emulator:
     host : str
         Address to listen on.
     port_offset : int or None
-        Added to the arm's ports; None: free ports, see ``ports``.
+        Added to the arm's port numbers. None: free ports are used, see ``ports``.
     faults : iterable of str
         ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` may be changed while it runs.
     firmware : str
@@ -77,7 +78,7 @@ class Mg400Emulator:
         port_offset: int | None = 0,
         faults: tuple[str, ...] = (),
         firmware: str = NEW_FIRMWARE,
-        joints_deg=START_JOINTS_DEG,
+        joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
         try:
@@ -143,13 +144,13 @@ class Mg400Emulator:
                 timer.start()
 
     def stop(self) -> None:
-        """Hang up and no longer listen."""
+        """Close all connections and stop listening."""
         self._close(abruptly=False)
         for thread in self._threads:
             thread.join(timeout=2.0)
 
     def kill(self) -> None:
-        """Go dead: every connection is reset, nobody listens any more."""
+        """Emulate a power loss: every connection is reset and no port listens."""
         self._close(abruptly=True)
 
     def _close(self, *, abruptly: bool) -> None:
@@ -164,11 +165,11 @@ class Mg400Emulator:
                         client.shutdown(socket.SHUT_RDWR)
             for bound in self._sockets:
                 with contextlib.suppress(OSError):
-                    bound.shutdown(socket.SHUT_RDWR)  # a thread that waits for it would keep it listening
+                    bound.shutdown(socket.SHUT_RDWR)  # wakes the thread that waits on it; otherwise the port would stay open
                 bound.close()
             self._clients.clear()
 
-    def _run(self, target, *arguments) -> None:
+    def _run(self, target: Callable[..., None], *arguments: object) -> None:
         thread = Thread(target=target, args=arguments, daemon=True, name="mg400-emulator")
         self._threads = [*(one for one in self._threads if one.is_alive()), thread]
         thread.start()
@@ -239,7 +240,7 @@ class Mg400Emulator:
         except RefusedError as refusal:
             if "split-refusals" in self.faults and not self._bare:
                 client.sendall(f"{refusal.error_id},{{}},;".encode())
-                time.sleep(0.02)  # so that they come in two pieces
+                time.sleep(0.02)  # the client receives two pieces
                 reply = f"{request.text};"
             else:
                 reply = f"{refusal.error_id},{{}},{request.text};"
@@ -262,7 +263,7 @@ class Mg400Emulator:
             return commands[request.name](request)
 
     def _wait_until_done(self, client: socket.socket) -> bool:
-        """Wait until the queue is empty; False if the client went away or no answer is to come."""
+        """Wait until the queue is empty. False if the client has gone or no reply will be sent."""
         while self.arm.busy() or "no-sync-reply" in self.faults:
             readable, _, _ = select.select([client], [], [], POLL_S)
             if self._ended.is_set() or (readable and not client.recv(1, socket.MSG_PEEK)):

@@ -1,12 +1,13 @@
-"""The emulated MG400's commands, by port: what each wants and answers."""
+"""The emulated MG400's commands, by port, with their parameters and replies."""
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from hardware.arms.mg400_wire import ErrorId
+from hardware.arms.motion import Speeds
 from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame
 from hardware.emulators.mg400_grammar import Parameter, RefusedError, Request, keyword_number, read_numbers
 
@@ -80,7 +81,8 @@ class Mg400Commands:
     def _enable(self, request: Request) -> str:
         load = read_numbers(request, (LOAD_KG, NUMBER, NUMBER, NUMBER), (0, 1, 4))
         self.arm.enable()
-        self.arm.load = tuple(load + [0.0] * (4 - len(load)))
+        kg, x_mm, y_mm, z_mm = load + [0.0] * (4 - len(load))
+        self.arm.load = kg, x_mm, y_mm, z_mm
         return ""
 
     def _percentage(self, request: Request) -> str:
@@ -105,9 +107,10 @@ class Mg400Commands:
         except ValueError as error:
             raise RefusedError(ErrorId.PARAMETER_TYPE - 2) from error
         whole = len(values) in (4, 6) and all(map(math.isfinite, values))
-        if not 1 <= index <= 9 or not whole:  # frame 0 is the arm's own
+        if not 1 <= index <= 9 or not whole:  # frame 0 cannot be changed
             raise RefusedError(ErrorId.PARAMETER_RANGE - (1 if whole else 2))
-        frames[index] = PlanarFrame(*values[:3], values[3] if len(values) == 4 else values[5])
+        x, y, z = values[:3]
+        frames[index] = PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
         return ""
 
     def _output(self, request: Request) -> str:
@@ -139,7 +142,7 @@ class Mg400Commands:
         return _text(self._seen(flange, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
 
     def _inverse(self, request: Request) -> str:
-        if len(request.values) not in (6, 7, 8):  # two more say near which joints: there is but one solution
+        if len(request.values) not in (6, 7, 8):  # two optional parameters select a solution near given joints; this arm has only one
             raise RefusedError(ErrorId.PARAMETER_COUNT)
         *pose, user, tool = read_numbers(Request(request.name, request.values[:6], {}, request.text), (NUMBER,) * 4 + (INDEX,) * 2, (6,))
         joints = self.arm.joints_at(self._flange(pose, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
@@ -175,7 +178,7 @@ class Mg400Commands:
         try:
             self.arm.order(Order(self.arm.joints_at(flange), False, speeds))
         except RefusedError:
-            self.arm.order(Order(flange.pose, True, speeds))  # planning it raises the alarm of a target out of reach
+            self.arm.order(Order(flange.pose, True, speeds))  # planning raises the alarm if the target is out of reach
 
     def _to_joints(self, request: Request, *, relative: bool) -> str:
         joints = np.array(read_numbers(request, (NUMBER,) * 4, (4,)))
@@ -194,10 +197,10 @@ class Mg400Commands:
         self.arm.jog(axis, user=self._frames(request)[0])
         return ""
 
-    def _speeds(self, request: Request, kind: str):
+    def _speeds(self, request: Request, kind: str) -> Speeds:
         speed = keyword_number(request, f"speed{kind}", PERCENT, self.arm.percent[f"speed{kind}"])
         acceleration = keyword_number(request, f"acc{kind}", PERCENT, self.arm.percent[f"acc{kind}"])
-        keyword_number(request, "cp", RATIO, self.arm.percent["cp"])  # checked only: the emulator does not blend moves
+        keyword_number(request, "cp", RATIO, self.arm.percent["cp"])  # only the value is checked: the emulator does not blend moves
         return self.arm.speeds(speed, acceleration)
 
     def _frames(self, request: Request) -> tuple[PlanarFrame, PlanarFrame]:
@@ -220,7 +223,7 @@ class Mg400Commands:
         return list((user.inverse() @ flange @ tool).pose[[0, 1, 2, 5]])
 
 
-def _text(values) -> str:
+def _text(values: Iterable[float]) -> str:
     return ",".join(f"{value:.6f}" for value in values)
 
 

@@ -1,6 +1,7 @@
-"""The emulated MG400's controller: modes, alarms, frames and the queue of moves. Knows no sockets."""
+"""The emulated MG400's controller: modes, alarms, frames and the queue of moves. It does not use sockets."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import RLock
 
@@ -12,10 +13,10 @@ from hardware.arms.motion import MotionTrack, Speeds, check_line
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400_grammar import RefusedError
 
-MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0  # of the emulator: those of the arm are not known
+MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0  # chosen for the emulator; those of a real arm are not known
 EMERGENCY_STOP, COLLISIONS = 85, (112, -2)
-START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)  # wherever it was left; here far from all limits
-JOG_STEP = 1.0  # mm or deg, in which the end of a jog is looked for
+START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)  # far from all limits
+JOG_STEP = 1.0  # mm or deg; step of the search for the end of a jog
 JOG_REACH = 1000.0
 
 
@@ -57,7 +58,7 @@ class Order:
 
 
 class Mg400Controller:
-    """What the arm does with its commands. Every method may be called from any thread.
+    """Executes the commands of the arm. Every method may be called from any thread.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class Mg400Controller:
         How much faster than the real arm it moves.
     """
 
-    def __init__(self, faults: Faults, *, joints_deg=START_JOINTS_DEG, time_scale: float = 1.0) -> None:
+    def __init__(self, faults: Faults, *, joints_deg: Sequence[float] = START_JOINTS_DEG, time_scale: float = 1.0) -> None:
         self.faults, self.kinematics, self._time_scale = faults, MG400, time_scale
         self.track = MotionTrack(MG400, np.asarray(joints_deg, float))
         self.lock = RLock()
@@ -84,7 +85,7 @@ class Mg400Controller:
         self._due: list[tuple[float, tuple[int, ...]]] = []  # alarms that will come
 
     def update(self) -> float:
-        """Let alarms that are due come; the time now."""
+        """Raise the alarms that are due. Returns the present time."""
         now_s = time.monotonic()
         with self.lock:
             for due_s, alarms in sorted(self._due):
@@ -146,7 +147,7 @@ class Mg400Controller:
     def reset(self) -> None:
         """Stop and forget the queue."""
         with self.lock:
-            self.update()  # an alarm that has come stays
+            self.update()  # an alarm that was raised stays
             self._hold(time.monotonic())
             self._held.clear()
             self.paused = False
@@ -186,7 +187,7 @@ class Mg400Controller:
                 self._plan(order)
 
     def last_target(self) -> PlanarFrame:
-        """Flange where the queue will leave it."""
+        """Flange frame at the end of the queue."""
         with self.lock:
             last = self._held[-1] if self._held else None
             if last is None:
@@ -194,7 +195,7 @@ class Mg400Controller:
             return PlanarFrame.of_pose(last.end if last.linear else self.kinematics.forward(last.end))
 
     def last_joints_deg(self) -> np.ndarray:
-        """Joints where the queue will leave it."""
+        """Joints at the end of the queue."""
         return self.joints_at(self.last_target())
 
     def joints_at(self, flange: PlanarFrame) -> np.ndarray:
@@ -211,7 +212,7 @@ class Mg400Controller:
             raise RefusedError(ErrorId.FAILED) from error
 
     def speeds(self, percent: float, acceleration: float) -> Speeds:
-        """At the given percentages."""
+        """Speeds at the given percentages."""
         factor = self._time_scale * percent / 100.0 * self.percent["speedfactor"] / 100.0
         if (slow := self.faults.value("slow")) is not None:
             factor *= slow
@@ -219,7 +220,7 @@ class Mg400Controller:
         return Speeds(MAX_LINEAR_MM_S * factor, MAX_JOINT_DEG_S * factor, MAX_LINEAR_MM_S2 * ramp, MAX_JOINT_DEG_S2 * ramp)
 
     def jog(self, axis: str, *, user: PlanarFrame) -> None:
-        """Move along an axis (``J1+``, ``X-``, ...) until the arm can't, or until ``MoveJog()``; the limit is an alarm."""
+        """Move along an axis (``J1+``, ``X-``, ...) until a limit, which raises an alarm, or until ``MoveJog()``."""
         sign = {"+": 1.0, "-": -1.0}[axis[-1]]
         with self.lock:
             self.update()
@@ -259,7 +260,7 @@ class Mg400Controller:
             self.track.stop(planned.start_s + share * planned.duration_s)
 
     def _hold(self, time_s: float) -> None:
-        """Stand still and keep what is still to be done."""
+        """Stop and keep the moves that are not finished."""
         self._held = [order for order in self._orders if order.end_s > time_s and not order.jog] + self._held
         self._orders, self._due = [order for order in self._orders if order.end_s <= time_s], []
         self.track.stop(time_s)

@@ -7,11 +7,11 @@ import numpy as np
 from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, ROBOT_TYPE_MG400, TEST_VALUE, Mode
 from hardware.emulators.mg400_controller import Mg400Controller, PlanarFrame
 
-DIFFERENCE_S = 0.008  # over which speeds are taken
+DIFFERENCE_S = 0.008  # interval of the finite differences that give speeds
 
 
 def feedback_packet(arm: Mg400Controller) -> np.ndarray:
-    """What the arm says of itself now, a record of ``PACKET``. It follows its targets exactly; currents and forces are not emulated."""
+    """The present state as a record of ``PACKET``. The arm follows its targets exactly. Currents and forces are not emulated."""
     mode, now_s = arm.mode(), arm.update()
     user, tool = arm.users[arm.user], arm.tools[arm.tool]
     joints, before = arm.track.joints_deg(now_s), arm.track.joints_deg(now_s - DIFFERENCE_S)

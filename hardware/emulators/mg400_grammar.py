@@ -1,4 +1,4 @@
-"""The MG400's requests: ``Name(p1,p2,Key=v)``. Taken from a stream, and checked against what a command wants."""
+"""The MG400's requests, ``Name(p1,p2,Key=v)``: found in a stream and checked against the parameters of their command."""
 
 import math
 import re
@@ -18,7 +18,7 @@ class Request:
 
 
 class RefusedError(Exception):
-    """A request is answered by an error id."""
+    """The request is refused with an error id."""
 
     def __init__(self, error_id: int) -> None:
         super().__init__(f"refused: {error_id}")
@@ -42,14 +42,14 @@ def _parse(text: str) -> Request:
         key, equals, value = part.partition("=")
         if equals:
             keywords[key.strip().lower()] = value.strip()
-        elif part.strip():  # clients leave commas at the end
+        elif part.strip():  # some clients send a comma at the end
             values.append(part.strip())
     return Request(name.strip().lower(), tuple(values), keywords, text)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """What a parameter may be."""
+    """Type and range of a parameter."""
 
     integer: bool = False
     low: float = float("-inf")
@@ -70,7 +70,7 @@ def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tu
 
 
 def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:
-    """A keyword's number; its place n counts on after the values."""
+    """The value of a keyword. In error ids the keywords are numbered after the values."""
     if key not in request.keywords:
         return default
     return _number(request.keywords[key], parameter, len(request.values) + 1 + list(request.keywords).index(key))

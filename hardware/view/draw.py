@@ -7,7 +7,7 @@ from twin.preprocess.overlay import draw_overlay
 from twin.types import Frame, Observation
 
 TEXT_PX, MARGIN_PX = 18, 8
-FULL_CHANGE = 0.3  # relative change of a cell's area at the ends of the colours
+FULL_CHANGE = 0.3  # relative change of a cell's area at both ends of the colour scale
 WHITE, GRAY = (255, 255, 255), (28, 32, 38)
 
 

@@ -1,8 +1,11 @@
 """A view in Rerun (``rerun-sdk``, an optional package): frame, pins, graph and estimates over time, in its viewer or in a file."""
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 from socket import create_connection
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -11,8 +14,11 @@ from hardware.errors import DeviceError
 from hardware.step import Estimate
 from twin.types import Frame, Observation
 
+if TYPE_CHECKING:
+    import rerun
+
 VIEWER, SUFFIX = "viewer", ".rrd"
-ANSWER_S = 8.0  # for so long a viewer is waited for, at the start and at the end; a new one takes a second or two
+ANSWER_S = 8.0  # longest wait for a viewer, at the start and at the end; a new viewer takes a second or two
 
 
 class RerunView:
@@ -40,10 +46,10 @@ class RerunView:
         except ImportError as error:
             raise DeviceError("--rerun needs the package rerun-sdk; install it: pip install 'tactip-twin[rerun]'") from error
         self._rerun, self._title, self._target = rerun, title, target
-        self._stream = None
+        self._stream: rerun.RecordingStream | None = None
         self.url = "Rerun's viewer" if target == VIEWER else target
 
-    def __enter__(self) -> "RerunView":
+    def __enter__(self) -> RerunView:
         """Open the target.
 
         Raises
@@ -51,47 +57,53 @@ class RerunView:
         DeviceError
             No viewer answers there, or the file can't be written.
         """
-        self._stream = self._rerun.RecordingStream(re.sub(r"\W+", "-", self._title))
+        stream = self._stream = self._rerun.RecordingStream(re.sub(r"\W+", "-", self._title))
         try:
             if self._target == VIEWER:
-                self._stream.spawn()
+                stream.spawn()
             elif "://" in self._target:
-                with create_connection(_address(self._target), timeout=ANSWER_S):  # a refusal is told at once, and in few words
-                    self._stream.connect_grpc(self._target)
+                with create_connection(_address(self._target), timeout=ANSWER_S):  # this reports a refusal at once and in few words
+                    stream.connect_grpc(self._target)
             else:
                 Path(self._target).parent.mkdir(parents=True, exist_ok=True)
-                self._stream.save(self._target)
-            self._stream.flush(timeout_sec=ANSWER_S)  # connecting tells nothing, this does
+                stream.save(self._target)
+            stream.flush(timeout_sec=ANSWER_S)  # connecting reports no error, flushing does
         except (RuntimeError, OSError, ValueError) as error:
             remedy = "start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file"
             raise DeviceError(f"--rerun {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error
         return self
 
     def __exit__(self, *_: object) -> None:
+        stream = self._opened()
         try:
-            self._stream.flush(timeout_sec=ANSWER_S)
+            stream.flush(timeout_sec=ANSWER_S)
         except RuntimeError as error:
             raise DeviceError(f"--rerun {self._target}: gone before the end ({error}); the last that was shown is missing there") from error
         finally:
-            self._stream.disconnect()
+            stream.disconnect()
+
+    def _opened(self) -> rerun.RecordingStream:
+        if self._stream is None:
+            raise DeviceError(f"--rerun {self._target}: not open; use the view as a context manager")
+        return self._stream
 
     def log(self, frame: Frame, seen: Observation, estimate: Estimate) -> None:
         """A frame with its pins and graph, and the estimate's values with their intervals, on the timelines ``frame`` and ``time``."""
-        rerun, stream = self._rerun, self._stream
+        rerun, stream = self._rerun, self._opened()
         stream.set_time("frame", sequence=frame.sequence)
         stream.set_time("time", duration=frame.time_s)
         stream.log("camera", rerun.Image(frame.image))
-        if seen.valid:
+        if seen.valid and seen.graph is not None:
             nodes = seen.graph.nodes_px
             stream.log("camera/edges", rerun.LineStrips2D(nodes[np.asarray(seen.graph.edges)]))
             stream.log("camera/pins", rerun.Points2D(nodes))
         for name, value, low, high in zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True):
             stream.log(f"pose/{name}", rerun.Scalars([value, low, high]))
 
-    def show(self, picture: np.ndarray, stats: dict) -> bool:
+    def show(self, picture: np.ndarray, stats: dict[str, object]) -> bool:
         """Show a picture (H, W, 3) RGB and figures by name; False once the user closed the view (never, in Rerun)."""
-        self._stream.log("view", self._rerun.Image(picture))
-        self._stream.log("figures", self._rerun.TextDocument("\n".join(stats.values())))
+        self._opened().log("view", self._rerun.Image(picture))
+        self._opened().log("figures", self._rerun.TextDocument("\n".join(map(str, stats.values()))))
         return True
 
 

@@ -14,19 +14,21 @@ WAIT_S = 0.5
 
 
 class BrowserView:
-    """Serves what ``show`` was given last. A context manager.
+    """Serves the last picture and figures given to ``show``. A context manager.
 
     Parameters
     ----------
     title : str
     host, port : str, int
-        Port 0: a free one, see ``url``.
+        Port 0 selects a free port, see ``url``.
     """
 
     def __init__(self, title: str, *, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._host = host
         self._page = render_page("hardware.view", title=title).encode()
         self._new = threading.Condition()
-        self._jpeg, self._number, self._stats, self._ended = b"", 0, {}, False
+        self._jpeg, self._number, self._ended = b"", 0, False
+        self._stats: dict[str, object] = {}
         try:
             self._server = ThreadingHTTPServer((host, port), self._handler())
         except OSError as error:
@@ -37,10 +39,9 @@ class BrowserView:
     @property
     def url(self) -> str:
         """Address of the page."""
-        host, port = self._server.server_address[:2]
-        return f"http://{host}:{port}/"
+        return f"http://{self._host}:{self._server.server_port}/"
 
-    def show(self, picture: np.ndarray, stats: dict) -> bool:
+    def show(self, picture: np.ndarray, stats: dict[str, object]) -> bool:
         """Show a picture (H, W, 3) RGB and figures by name; False once the user closed the view (never, in a browser)."""
         jpeg = jpeg_of(picture)
         with self._new:
@@ -103,6 +104,6 @@ class BrowserView:
                         return
 
             def log_message(self, *_: object) -> None:
-                """Keep still."""
+                """Write no log."""
 
         return Handler

@@ -18,8 +18,9 @@ from training.dataset import Dataset, split_rows
 from training.loop import Loop, Rows
 from training.networks import build_network, parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
-from training.run_files import write_curves, write_tensors, write_text
+from training.run_files import write_curves, write_tensors
 from twin.preprocess.forms import blob_spec
+from twin.store import write_text
 
 FOLDS = 10  # each network of an ensemble watches another tenth of the training rows
 KEEP_EVERY_S = 20.0

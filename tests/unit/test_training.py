@@ -182,6 +182,6 @@ def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkey
         content[-1] ^= 1
         file.write_bytes(content)
         found.append(digest_of(copy))
-    monkeypatch.setattr("training.estimator.code_digest", lambda *packages: "of another version")
+    monkeypatch.setattr("training.estimator.fingerprint", lambda *makers: "of another version")
     found.append(digest_of(copy))
     assert len(set(found)) == 4

@@ -1,5 +1,7 @@
 """A sensor's specification as TOML that a person can read and edit."""
 
+from typing import Any
+
 import tomlkit
 
 from scenes.sensor import SensorSpec
@@ -26,7 +28,7 @@ def sensor_text(spec: SensorSpec, comment: str = "") -> str:
     return tomlkit.dumps(document)
 
 
-def _item(value):
+def _item(value: Any) -> Any:
     if isinstance(value, dict):
         table = tomlkit.table()
         for key, part in value.items():
@@ -55,6 +57,6 @@ def _item(value):
     return value
 
 
-def _numbers(value) -> int:
+def _numbers(value: object) -> int:
     """How many numbers a value holds."""
     return sum(map(_numbers, value)) if isinstance(value, list | tuple) else 1

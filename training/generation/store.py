@@ -95,7 +95,7 @@ class Store:
 
     def finish(self, count: int) -> int:
         """Write tables and truth of the contacts 0 to ``count`` - 1; how many frames there are."""
-        tables = {"targets.csv": [], "move_executed.csv": [], DRAWS: [], "failures.csv": []}
+        tables: dict[str, list[dict]] = {"targets.csv": [], "move_executed.csv": [], DRAWS: [], "failures.csv": []}
         truth = TruthFile(self.folder / f".{TRUTH}.part")
         try:
             for index in range(count):

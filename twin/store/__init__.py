@@ -1,6 +1,6 @@
 """Keeping results: files written whole or not at all, a cache, work that can be gone on with, and what code made it all."""
 
-from twin.store.atomic import remove_parts, replace_folder, unwritten, write_bytes, write_json, write_npz, write_text, write_with
+from twin.store.atomic import remove_parts, replace_folder, text_file, unwritten, write_bytes, write_json, write_npz, write_text, write_with
 from twin.store.cache import cache_folder, cached_arrays
 from twin.store.fingerprint import code_of, fingerprint
 from twin.store.inputs import inputs_digest
@@ -26,6 +26,7 @@ __all__ = [
     "remove_parts",
     "replace_folder",
     "require_same_code",
+    "text_file",
     "unwritten",
     "write_bytes",
     "write_json",

@@ -5,12 +5,13 @@ process that is killed meanwhile leaves the old file as it was, and beside it a 
 """
 
 import errno
+import io
 import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -67,6 +68,14 @@ def write_text(path: Path, text: str) -> Path:
     return write_bytes(path, text.encode())
 
 
+@contextmanager
+def text_file(path: Path) -> Iterator[io.StringIO]:
+    """A text to be filled within ``with``, and written when that ends without an error; errors as of ``write_with``."""
+    text = io.StringIO(newline="")
+    yield text
+    write_text(path, text.getvalue())
+
+
 def write_json(path: Path, content: object, *, default: Callable[[object], object] | None = None) -> Path:
     """Write JSON with indented lines; ``default`` as of ``json.dumps``, errors as of ``write_with``."""
     return write_text(path, json.dumps(content, indent=1, default=default) + "\n")
@@ -74,7 +83,7 @@ def write_json(path: Path, content: object, *, default: Callable[[object], objec
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = False) -> Path:
     """Write arrays by name as ``np.load`` reads them; errors as of ``write_with``."""
-    save = np.savez_compressed if compressed else np.savez
+    save: Callable[..., None] = np.savez_compressed if compressed else np.savez
     return write_with(path, lambda file: save(file, **arrays))
 
 

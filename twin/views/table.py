@@ -1,29 +1,28 @@
 """Tables as files."""
 
 import csv
-import io
 from pathlib import Path
 
-from twin.store import write_text
+from twin.store import text_file
 
 
 def write_rows(path: Path, rows: list[dict]) -> Path:
     """Rows of the same keys as CSV, numbers in full; the path."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0].keys())
-    writer.writeheader()
-    writer.writerows(rows)
-    return write_text(path, text.getvalue())
+    with text_file(path) as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
 
 
 def write_table(path: Path, rows: list[dict]) -> Path:
     """Rows as CSV for reading, numbers to six digits; a column of any row is a column of the table."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=columns, restval="")
-    writer.writeheader()
-    writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
-    return write_text(path, text.getvalue())
+    with text_file(path) as file:
+        writer = csv.DictWriter(file, fieldnames=columns, restval="")
+        writer.writeheader()
+        writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
+    return path
 
 
 def _cell(value: object) -> str:

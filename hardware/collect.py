@@ -9,6 +9,7 @@ import csv
 import json
 import os
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from hardware.let_go import try_each
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 from scenes.experiment import LABELS, ExperimentSpec
 from twin.recordings.images import write_image
+from twin.store import locked, made_by, write_json, write_text
 from twin.types import Form, Frame
 
 CLEAR_MM, LIFT_MM, NEAR_MM = 50.0, 10.0, 0.5
@@ -73,14 +75,14 @@ class Collection:
         elif any(self.folder.iterdir()):
             raise DeviceError(f"{self.folder}: holds something else; give an empty or a new folder")
         else:
-            meta.write_text(json.dumps(about, indent=1) + "\n")
+            write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
         self.pictures.mkdir(exist_ok=True)
         table, log = self.folder / TABLE, self.folder / LOG
         for lines in (table, log):
             if lines.is_file():
                 self._drop_torn_line(lines)
         if not table.is_file() or not table.read_text():
-            table.write_text(",".join(COLUMNS) + "\n")
+            write_text(table, ",".join(COLUMNS) + "\n")
 
     @property
     def count(self) -> int:
@@ -118,7 +120,7 @@ class Collection:
     def _drop_torn_line(lines: Path) -> None:
         text = lines.read_text()
         if not text.endswith("\n"):
-            lines.write_text(text[: text.rfind("\n") + 1])
+            write_text(lines, text[: text.rfind("\n") + 1])
 
 
 def draw_contact(experiment: ExperimentSpec, seed: int, index: int) -> Contact:
@@ -196,6 +198,8 @@ def collect(
     DeviceError
         The source is not live, no way leads to the object, the arm did not come to stand where it was sent or could not be let go
         of, or no frame came.
+    StoreError
+        Another run collects into the folder, or it can't be written to.
     """
     if not source.is_live:
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
@@ -233,7 +237,8 @@ def collect(
         frame_after(state)
         return state
 
-    here, at_object = np.zeros(6), False
+    here, at_object, held = np.zeros(6), False, ExitStack()
+    held.enter_context(locked(collection.folder))
     try:
         arm.enable()
         arm.set_speed(*speed)
@@ -270,6 +275,7 @@ def collect(
     finally:
         back = {"retreat": lambda: go(here, CLEAR_MM)} if at_object else {}
         failed = try_each(stop=arm.stop, **back, disable=arm.disable)
+        held.close()
     if failed:
         raise DeviceError("; ".join(failed))
     return collection.count

@@ -16,6 +16,7 @@ from hardware.cameras.recorded import SequentialSource
 from hardware.errors import DeviceError
 from twin.errors import FrameError
 from twin.recordings.images import read_image, write_image
+from twin.store import write_json
 from twin.types import Form, Frame
 
 ABOUT, STEPS, FRAMES, REST = "session.json", "steps.jsonl", "frames", "rest.png"
@@ -45,7 +46,7 @@ class SessionWriter:
             raise DeviceError(f"{self.folder}: not empty; give a new folder for the session")
         (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
         (self.folder / REST).unlink(missing_ok=True)
-        (self.folder / ABOUT).write_text(json.dumps({"version": VERSION, **about}, indent=2) + "\n")
+        write_json(self.folder / ABOUT, {"version": VERSION, **about})
         self._lines = (self.folder / STEPS).open("a", encoding="utf-8")
         self._written: dict[int, str] = {}  # the newest picture by its number: a frame may serve several steps
         self.count = 0

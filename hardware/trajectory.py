@@ -10,6 +10,7 @@ from hardware.rig_geometry import PlacedObject, matrix_of
 from hardware.servo import Reading, tangent_of
 from hardware.step import StepRecord
 from twin.mounting import Mounting
+from twin.store import text_file
 
 LOCAL_N = 9  # points in a window of the local smoothness
 SETTLING_N = 5  # steps after the start that the errors leave out
@@ -204,7 +205,7 @@ def write_csv(path: Path, trajectory: Trajectory) -> Path:
             columns |= {f"{stem}_x_mm": values[:, 0], f"{stem}_y_mm": values[:, 1]}
         else:
             columns[name] = values
-    with path.open("w", newline="") as file:
+    with text_file(path) as file:
         writer = csv.writer(file)
         writer.writerow(["step", *columns])
         writer.writerows([k, *(f"{value:.6g}" for value in row)] for k, row in enumerate(zip(*columns.values(), strict=True)))

@@ -1,6 +1,6 @@
-"""Writing a sensor's specification as a TOML file that a person can read and edit."""
+"""A sensor's specification as TOML that a person can read and edit."""
 
-from pathlib import Path
+from typing import Any
 
 import tomlkit
 
@@ -10,12 +10,11 @@ DIGITS = 6  # significant ones of a number
 ROW = 12  # numbers in a line of a long list
 
 
-def write_sensor(path: Path, spec: SensorSpec, comment: str = "") -> None:
-    """Write a specification; values that are the defaults are left out, the name is the file's.
+def sensor_text(spec: SensorSpec, comment: str = "") -> str:
+    """The text of a specification's file; values that are the defaults are left out, the name is the file's.
 
     Parameters
     ----------
-    path : Path
     spec : SensorSpec
     comment : str
         Lines that stand above everything.
@@ -26,12 +25,10 @@ def write_sensor(path: Path, spec: SensorSpec, comment: str = "") -> None:
     plain = {key: value for key, value in spec.model_dump(exclude_defaults=True).items() if key != "name" and value is not None}
     for key in sorted(plain, key=lambda k: isinstance(plain[k], dict)):  # tables come last
         document.add(key, _item(plain[key]))
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(tomlkit.dumps(document))
-    partial.replace(path)
+    return tomlkit.dumps(document)
 
 
-def _item(value):
+def _item(value: Any) -> Any:
     if isinstance(value, dict):
         table = tomlkit.table()
         for key, part in value.items():
@@ -60,6 +57,6 @@ def _item(value):
     return value
 
 
-def _numbers(value) -> int:
+def _numbers(value: object) -> int:
     """How many numbers a value holds."""
     return sum(map(_numbers, value)) if isinstance(value, list | tuple) else 1

@@ -10,6 +10,7 @@ import numpy as np
 from training.audit import STORIES, Audit
 from training.dataset import Dataset
 from training.targets import corrected
+from twin.store import made_by, text_file, write_json, write_text
 from twin.views.plots import new_figure
 
 NAMES = ("pose_2", "pose_6", "move_1", "move_6")
@@ -46,7 +47,7 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
     """``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``."""
     labels = corrected(NAMES, data.targets.raw, audit.executed.round(), data.targets.raw[:, 2:], audit.depth_per_move)
     table = out / "labels_corrected.csv"
-    with table.open("w", newline="") as file:
+    with text_file(table) as file:
         writer = csv.writer(file)
         writer.writerow(["image_name", "executed", *NAMES, *(f"chi2_{story.replace(' ', '_')}" for story in STORIES), "findings"])
         for k, name in enumerate(data.pins.image_name):
@@ -56,9 +57,9 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
                 said.append(f"same pins as {data.pins.image_name[audit.twins[k]]}")
             numbers = [f"{v:.6g}" for v in (*labels[k], *audit.chi2[k])]
             writer.writerow([name, f"{audit.executed[k]:.4g}", *numbers, "; ".join(said)])
-    (out / "audit.json").write_text(json.dumps(summary, indent=1) + "\n")
+    write_json(out / "audit.json", summary | {"made_by": made_by("training.audit")})
     _draw(out / "audit.png", audit, data, labels)
-    (out / "audit.html").write_text(_page(summary, data))
+    write_text(out / "audit.html", _page(summary, data))
     return [table, out / "audit.json", out / "audit.png", out / "audit.html"]
 
 

@@ -7,17 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-import twin.preprocess
 from scenes.sensor import SensorSpec
 from training.simulated import is_pins_only, is_simulated, open_simulated, touched_labels
 from training.targets import DEPTH_PER_MOVE, Targets, choose_targets
-from twin.cache import cached_arrays
 from twin.errors import FrameError
 from twin.kinematics import rig_of
 from twin.preprocess import Pipeline, make_graph, make_reference, nominal_reference
 from twin.preprocess.batch import UNMEASURED, recording_reference
 from twin.preprocess.reference import Reference
 from twin.recordings import Recording, open_recording
+from twin.store import cached_arrays
 from twin.types import Form
 
 HELD_OUT = 5  # one row in five is the validation part
@@ -307,24 +306,22 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progres
         about = {"rest_px": reference.pins_px, "measured": np.array(named != UNMEASURED), "notes": np.array(notes, str)}
         return {"image_name": np.array(names, str)} | about | arrays
 
-    found = cached_arrays("recorded-pins-2", _key(recording, spec), compute)
+    found = cached_arrays("recorded-pins", _key(recording, spec), compute)
     problems += found.pop("notes").tolist()
     reference = make_reference(found.pop("rest_px"), spec.pins.rings)
     return PinTable(spec, recording.form, reference, measured=bool(found.pop("measured")), **found)
 
 
 def _key(recording: Recording, spec: SensorSpec) -> dict:
-    """All that the pins depend on: files, the specification, and the pipeline's own text."""
+    """All that the pins depend on beside the code: files and the specification."""
     root = recording.path if recording.path.is_dir() else recording.path.parent
     states = sorted((str(file.relative_to(root)), *_state(file)) for file in root.rglob("*") if file.is_file())
-    sources = sorted(Path(twin.preprocess.__file__).parent.glob("*.py"))
     return {
         "path": str(recording.path.resolve()),
         "names": recording.names,
         "files": json.dumps(states),
         "form": str(recording.form),
         "sensor": spec.model_dump(mode="json"),
-        "pipeline": b"".join(source.read_bytes() for source in sources),
     }
 
 

@@ -18,9 +18,9 @@ from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features, 
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.recipes import TrainingError
 from training.registration import Registration
-from twin.cache import code_digest
 from twin.errors import FrameError
 from twin.preprocess import Pipeline, make_reference, measure_reference
+from twin.store import fingerprint
 from twin.types import Form, Frame
 
 
@@ -213,7 +213,7 @@ def folder_of(run: str | Path) -> Path:
 
 def digest_of(run: str | Path) -> str:
     """Digest of all that a model's answers depend on: its weights, its configuration, and the code that runs it."""
-    folder, digest = folder_of(run), hashlib.sha256(code_digest("scenes", "twin", "training").encode())
+    folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
     for name in ("config.json", WEIGHTS, "weights.pt"):
         if (folder / name).is_file():
             digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())

@@ -1,7 +1,6 @@
 """How good a trained model is on a recording: errors, intervals, leaks, as numbers, a table and pictures."""
 
 import csv
-import json
 from pathlib import Path
 from time import perf_counter
 
@@ -15,6 +14,7 @@ from training.inputs import image_inputs
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
 from twin.recordings import open_recording
+from twin.store import made_by, text_file, write_json
 from twin.views.plots import new_figure
 
 DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)
@@ -139,7 +139,7 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
     truth = getattr(targets, labels)
     half_width = made.half_width_raw if labels == "raw" else made.half_width
     path = out / "predictions.csv"
-    with path.open("w", newline="") as file:
+    with text_file(path) as file:
         writer = csv.writer(file)
         parts = [f"{name}_{part}" for name in targets.names for part in ("true", "pred", "lo90", "hi90")]
         writer.writerow(["image_name", *parts, "executed_probability", "valid"])
@@ -150,7 +150,7 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
                 for v in (truth[m, k], made.mean[m, k], made.mean[m, k] - half_width[m, k], made.mean[m, k] + half_width[m, k])
             ]
             writer.writerow([data.pins.image_name[row], *cells, f"{made.executed[m]:.4g}", int(np.isfinite(made.mean[m]).all())])
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    write_json(out / "metrics.json", metrics | {"made_by": made_by(__name__)})
     return [path, out / "metrics.json", _draw(out / "errors.png", made, truth, targets, labels)]
 
 

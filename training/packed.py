@@ -17,6 +17,7 @@ from scenes.sensor import SensorSpec
 from training.networks import build_network
 from training.recipes import TrainingError
 from twin.preprocess import make_reference
+from twin.store import write_bytes, write_text
 
 WEIGHTS = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "weights"
@@ -57,7 +58,7 @@ def pack(run: Path, out: Path) -> int:
     out.mkdir(parents=True, exist_ok=True)
     write_arrays(out / WEIGHTS, small)
     kept = {key: value for key, value in config.items() if key not in ("data", "problems")}
-    (out / "config.json").write_text(json.dumps(kept) + "\n")
+    write_text(out / "config.json", json.dumps(kept) + "\n")
     return (out / WEIGHTS).stat().st_size
 
 
@@ -91,7 +92,8 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
         start += array.nbytes
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
-    path.write_bytes(struct.pack("<Q", len(text)) + text + b"".join(np.ascontiguousarray(arrays[key]).tobytes() for key in sorted(arrays)))
+    data = b"".join(np.ascontiguousarray(arrays[key]).tobytes() for key in sorted(arrays))
+    write_bytes(path, struct.pack("<Q", len(text)) + text + data)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:

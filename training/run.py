@@ -18,8 +18,9 @@ from training.dataset import Dataset, split_rows
 from training.loop import Loop, Rows
 from training.networks import build_network, parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
-from training.run_files import write_curves, write_tensors, write_text
+from training.run_files import write_curves, write_tensors
 from twin.preprocess.forms import blob_spec
+from twin.store import fingerprint, write_text
 
 FOLDS = 10  # each network of an ensemble watches another tenth of the training rows
 KEEP_EVERY_S = 20.0
@@ -136,7 +137,9 @@ def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
     wanted = json.loads(json.dumps(resolve(config, data, train)))
     found = json.loads((out / "config.json").read_text())
     if _identity(wanted) != _identity({key: found.get(key) for key in wanted}):
-        raise TrainingError(f"{out}: holds a finished run with other settings or data; give another --out")
+        raise TrainingError(
+            f"{out}: holds a finished run with other settings or data, or of another version of the program; give another --out"
+        )
     return True
 
 
@@ -158,6 +161,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
         "pipeline": {"form": str(pins.form), "graph": "voronoi", "detection": blob_spec(pins.sensor, pins.form).model_dump(mode="json")},
         "data": ", ".join(map(str, data.folders)),
         "problems": data.problems,
+        "code": fingerprint(__name__),
     } | ({"labelled": list(config.labelled)} if config.labelled else {})
 
 
@@ -235,7 +239,8 @@ def _opened(out: Path, resolved: dict) -> dict | None:
     state = torch.load(path, weights_only=True, map_location="cpu")
     if state["identity"] != _identity(resolved):
         raise TrainingError(
-            f"{out}: holds a run with other settings or data, begun and not finished; give another --out, or the same settings"
+            f"{out}: holds a run with other settings or data, or of another version of the program, begun and not finished; "
+            "give another --out, or the same settings"
         )
     return state
 

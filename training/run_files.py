@@ -2,34 +2,26 @@
 
 import csv
 import io
-import os
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from twin.store import write_text, write_with
+
 
 def write_tensors(path: Path, content: dict) -> None:
     """A dict of numbers, text, lists, arrays and tensors, as ``torch.load`` reads it with ``weights_only``."""
-    part = path.with_name(f".{path.name}.part")
-    torch.save(_as_tensors(content), part)
-    os.replace(part, path)
+    write_with(path, lambda file: torch.save(_as_tensors(content), file))
 
 
-def _as_tensors(value):
+def _as_tensors(value: object) -> object:
     """The same with arrays as tensors, which are read back without running anything that a file may hold."""
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value)
     if isinstance(value, dict):
         return {key: _as_tensors(part) for key, part in value.items()}
     return [_as_tensors(part) for part in value] if isinstance(value, list) else value
-
-
-def write_text(path: Path, text: str) -> None:
-    """Text, whole or not at all."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
-    os.replace(part, path)
 
 
 def write_curves(out: Path, curves: list) -> None:

@@ -1,6 +1,5 @@
 """The files of one rendered contact: frame, truth, skin, panel."""
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from twin.preprocess.pipeline import Pipeline
 from twin.recordings.images import write_image
 from twin.simulator import Shot, Simulator
 from twin.stimulus import build_stimulus
+from twin.store import made_by, write_json, write_npz
 from twin.types import ContactState
 from twin.views.panel import Look, contact_panel
 from twin.views.skin3d import displaced_skin, draw_contact_skin
@@ -29,8 +29,9 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     spec = simulator.spec
     write_image(out / "frame.png", shot.frame.image)
     write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
-    np.savez_compressed(out / "truth.npz", **asdict(shot.truth), **contact_arrays(state))
-    (out / "truth.json").write_text(json.dumps(contact_record(simulator, stimulus, pose, state, shot), indent=1) + "\n")
+    write_npz(out / "truth.npz", asdict(shot.truth) | contact_arrays(state), compressed=True)
+    record = contact_record(simulator, stimulus, pose, state, shot)
+    write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, stimulus, pose])})
 
     mesh = simulator.solver.mesh
     displaced_skin(mesh, state).save(out / "skin.vtp")

@@ -19,3 +19,7 @@ class MeshError(TwinError):
 
 class RenderError(TwinError):
     """Nothing can be rendered on this machine as asked."""
+
+
+class StoreError(TwinError):
+    """A result can't be written, or what lies in a folder was made otherwise, or another run is at work there."""

@@ -16,6 +16,7 @@ from twin.preprocess.legacy import LegacyPipeline
 from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import open_recording
+from twin.store import write_npz
 from twin.types import Form, PinGraph
 from twin.views.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes, new_figure
 
@@ -63,16 +64,14 @@ def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) ->
     Arrays: ``image_name (M,)``, ``nodes_px (M, N, 2)``, ``area_px2 (M, N)``, and the directed edges of all graphs one after
     the other, ``edges (E, 2)``, those of graph k being ``edges[edge_start[k]:edge_start[k + 1]]``.
     """
-    path = out / "graph.npz"
-    np.savez_compressed(
-        path,
-        image_name=np.asarray(names, dtype=np.str_),
-        nodes_px=np.stack([graph.nodes_px for graph in graphs]),
-        area_px2=np.stack([graph.area_px2 for graph in graphs]),
-        edges=np.concatenate([graph.edges for graph in graphs]),
-        edge_start=np.concatenate([[0], np.cumsum([len(graph.edges) for graph in graphs])]),
-    )
-    return path
+    arrays = {
+        "image_name": np.asarray(names, dtype=np.str_),
+        "nodes_px": np.stack([graph.nodes_px for graph in graphs]),
+        "area_px2": np.stack([graph.area_px2 for graph in graphs]),
+        "edges": np.concatenate([graph.edges for graph in graphs]),
+        "edge_start": np.concatenate([[0], np.cumsum([len(graph.edges) for graph in graphs])]),
+    }
+    return write_npz(out / "graph.npz", arrays, compressed=True)
 
 
 def draw_graph_pictures(

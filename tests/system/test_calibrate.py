@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from scenes import load_object, load_sensor
-from scenes.write import write_sensor
 from twin.calibration import run as calibration
 from twin.calibration.aligned import revised
 from twin.calibration.run import calibrate
 from twin.mechanics import ContactPose
+from twin.sensor_file import write_sensor
 from twin.simulator import Simulator
 
 SENSOR = "ur5-331"

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ from training.recorded_contact import read_arm_labels
 from training.run import fold_rows
 from training.sim_to_real.study import arm_labels, with_missing
 from training.targets import corrected, read_executed
-from twin.errors import ContactError, RenderError
+from twin.errors import ContactError, RenderError, StoreError
 from twin.geometry.solid import Resolution
 from twin.kinematics import arm_path, rig_of
 from twin.mechanics.solver import SkinSolver
@@ -26,6 +27,7 @@ from twin.preprocess import nominal_reference
 from twin.preprocess.forms import raw_to_recording
 from twin.projection import project
 from twin.stimulus import build_stimulus
+from twin.store import atomic, locked
 from twin.types import Form
 
 COUNT = 4
@@ -140,8 +142,6 @@ def test_pins_alone_are_read_like_frames_and_split_by_contact(made):
 def test_a_broken_off_run_ends_with_the_same_bytes(made, tmp_path, monkeypatch):
     """Broken off between contacts, while a record is written, and while the tables are."""
     folder, config, _ = made
-    import training.generation.store as store
-
     calls = []
 
     def broken_at(limit):
@@ -151,11 +151,11 @@ def test_a_broken_off_run_ends_with_the_same_bytes(made, tmp_path, monkeypatch):
                 raise KeyboardInterrupt
             os.replace(source, target)
 
-        return SimpleNamespace(replace=replace, fsync=os.fsync)  # for this module alone
+        return SimpleNamespace(replace=replace, fsync=os.fsync, getpid=os.getpid)  # for this module alone
 
-    for limit in (3, 4, 6):  # in the second record, in the first table, in the last step of all
+    for limit in (4, 4, 6):  # in the second record, in the first table, in the last step of all
         calls.clear()
-        monkeypatch.setattr(store, "os", broken_at(limit))
+        monkeypatch.setattr(atomic, "os", broken_at(limit))
         with pytest.raises(KeyboardInterrupt):
             generate(tmp_path / "set", config, COUNT)
         monkeypatch.undo()
@@ -205,9 +205,31 @@ def test_other_options_and_foreign_folders_are_refused(made, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["photo.txt"], "and left as they were"
 
 
-def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):
-    import training.generation.store as store
+def test_a_data_set_made_by_other_code_is_refused_and_left_as_it_was(made, tmp_path):
+    folder, config, _ = made
+    shutil.copytree(folder, tmp_path / "set")
+    record = tmp_path / "set" / "made_by.json"
+    told = json.loads(record.read_text())
+    solver = "twin.mechanics.solver"
+    assert solver in told["modules"] and "numpy" in told["libraries"]
+    record.write_text(json.dumps(told | {"modules": told["modules"] | {solver: "0" * 16}}))
+    before = contents(tmp_path / "set")
+    with pytest.raises(StoreError, match=rf"made by another version of the program \({solver} changed\); give another --out, or remove"):
+        generate(tmp_path / "set", config, COUNT + 1)
+    assert contents(tmp_path / "set") == before
+    record.unlink()
+    with pytest.raises(StoreError, match="does not say what version of the program made it"):
+        generate(tmp_path / "set", config, COUNT + 1)
 
+
+def test_two_runs_at_once_in_one_folder_are_refused(made):
+    folder, config, _ = made
+    with locked(folder), pytest.raises(StoreError, match="another run is at work there"):
+        generate(folder, config, COUNT)
+    assert generate(folder, config, COUNT).before == COUNT
+
+
+def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):
     folder, config, _ = made
 
     def full(number):
@@ -215,8 +237,8 @@ def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):
             raise OSError(28, "No space left on device")
         os.fsync(number)
 
-    monkeypatch.setattr(store, "os", SimpleNamespace(replace=os.replace, fsync=full))
-    with pytest.raises(DatasetError, match=r"No space left on device\); 2 contacts are kept"):
+    monkeypatch.setattr(atomic, "os", SimpleNamespace(replace=os.replace, fsync=full, getpid=os.getpid))
+    with pytest.raises(DatasetError, match=r"No space left on device\); free some space .*; 2 contacts are kept"):
         generate(tmp_path / "set", config, COUNT)
     assert not list(tmp_path.rglob("*.part"))
     monkeypatch.undo()

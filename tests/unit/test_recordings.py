@@ -11,7 +11,7 @@ import pytest
 from drawn_frames import drawn_frame, smooth_warp
 
 from scenes import load_sensor
-from twin.errors import FrameError
+from twin.errors import FrameError, StoreError
 from twin.preprocess import nominal_reference
 from twin.preprocess.batch import preprocess_recording
 from twin.preprocess.overlay import overlay_name
@@ -423,9 +423,9 @@ def test_frames_without_pins_are_one_error_with_the_files_written(tmp_path, spec
 
 
 def test_a_picture_that_can_not_be_written_is_an_error_and_leaves_no_half_of_it(tmp_path, pictures):
-    with pytest.raises(FrameError, match="can't be written"):
+    with pytest.raises(StoreError, match="can't be written"):
         write_image(tmp_path / "missing" / "frame.png", pictures[0])
     (tmp_path / "frame.png").mkdir()
-    with pytest.raises(FrameError, match="can't be written"):
+    with pytest.raises(StoreError, match="can't be written"):
         write_image(tmp_path / "frame.png", pictures[0])
     assert [path.name for path in tmp_path.iterdir()] == ["frame.png"]

@@ -201,7 +201,7 @@ def test_cells_are_those_of_their_weights_specification_and_code(spec, frames, m
     assert names.isdisjoint(cell.file for cell in cells_of(retrained))
     softer = replace(plan.source, spec=changed(spec, gel={"poisson_ratio": spec.gel.poisson_ratio - 0.001}))
     assert names.isdisjoint(cell.file for cell in cells_of(replace(plan, source=softer)))
-    monkeypatch.setattr("twin.robustness.sweep.code_digest", lambda *packages: "of another version")
+    monkeypatch.setattr("twin.store.resume.fingerprint", lambda *makers: "of another version")
     assert names.isdisjoint(cell.file for cell in cells_of(plan))
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from scenes import load_sensor
 from scenes.sensor import SensorSpec
-from scenes.write import write_sensor
+from twin.sensor_file import write_sensor
 
 
 def rounded(value):
@@ -20,7 +20,7 @@ def test_a_sensor_round_trips(sensor, tmp_path):
     write_sensor(path, sensor, "first line\nsecond line")
     assert path.read_text().startswith("# first line\n# second line\n")
     assert rounded(load_sensor(path).model_dump()) == rounded(sensor.model_dump())
-    assert not list(tmp_path.glob("*.partial"))
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_what_was_measured_of_each_cap_round_trips(tmp_path):

@@ -90,6 +90,13 @@ def test_another_run_in_the_same_folder_is_refused(data, trained, tmp_path):
         train_run(config_of("vgnn", epochs=4), data, tmp_path)
 
 
+def test_a_run_begun_by_other_code_is_not_gone_on_with(data, tmp_path, monkeypatch):
+    train_run(config_of("vgnn", epochs=3), data, tmp_path, max_minutes=0)
+    monkeypatch.setattr("training.run.fingerprint", lambda *makers: "of another version")
+    with pytest.raises(TrainingError, match="another version of the program"):
+        train_run(config_of("vgnn", epochs=3), data, tmp_path)
+
+
 def test_a_run_keeps_all_that_made_it(trained):
     config = json.loads((trained / "config.json").read_text())
     assert config["recipe"]["epochs"] == 30 and config["sensor"]["name"] == "mg400-127" and config["pipeline"]["detection"]
@@ -182,6 +189,6 @@ def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkey
         content[-1] ^= 1
         file.write_bytes(content)
         found.append(digest_of(copy))
-    monkeypatch.setattr("training.estimator.code_digest", lambda *packages: "of another version")
+    monkeypatch.setattr("training.estimator.fingerprint", lambda *makers: "of another version")
     found.append(digest_of(copy))
     assert len(set(found)) == 4

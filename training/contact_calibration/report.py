@@ -1,6 +1,5 @@
 """Page, figures and table of a contact calibration."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from training.contact_calibration.fit import INDEPENDENT, ContactFit
 from training.contact_calibration.simulate import Setup
 from training.validation.model import MeasuredFrames
 from twin.kinematics import rig_of
+from twin.store import made_by, write_json, write_text
 from twin.views.page import render_page
 from twin.views.plots import draw_displacement, new_figure
 
@@ -60,7 +60,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
     moved : (2, 2, M, N, 2) float
         Simulated displacements before and after the calibration; of each, after the tap and after the move.
     """
-    (folder / "calibration.json").write_text(json.dumps(summary, indent=1) + "\n")
+    write_json(folder / "calibration.json", summary | {"made_by": made_by("training.contact_calibration.fit")})
     solved = np.flatnonzero(np.isfinite(fit.after_px) & np.isfinite(fit.before_px) & (fit.trust >= TRUSTED))
     chosen = solved[np.argsort(fit.before_px[solved])[[len(solved) // 2, -1]]] if len(solved) else solved
     pictures = []
@@ -74,7 +74,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
         figure.savefig(folder / name, dpi=DPI)
         pictures.append(name)
     page = folder / "index.html"
-    page.write_text(render_page("training.contact_calibration", summary=summary, pictures=pictures))
+    write_text(page, render_page("training.contact_calibration", summary=summary, pictures=pictures))
     return page
 
 

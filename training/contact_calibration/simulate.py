@@ -1,9 +1,6 @@
 """Simulated displacements of many contacts under many parameter values, each kept on disk as soon as it is there."""
 
-import hashlib
-import io
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,6 +17,7 @@ from training.generation.work import outcomes
 from training.validation.model import ContactModel
 from twin.errors import ContactError
 from twin.kinematics import ArmLabel
+from twin.store import Item, find_arrays, inputs_digest, keep_arrays
 from twin.types import Form
 
 
@@ -50,20 +48,17 @@ class Setup:
             "across": self.across,
             "parameters": [parameter.name for parameter in self.parameters],
         }
-        head = json.dumps(fixed, sort_keys=True)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        files = [self.folder / f"{hashlib.sha256((head + json.dumps(plan, sort_keys=True)).encode()).hexdigest()}.npy" for plan in plans]
-        todo = [k for k, file in enumerate(files) if not file.is_file()]
+        shared = inputs_digest(fixed)
+        items = [Item("contact", (__name__,), [shared, plan]) for plan in plans]
+        found = {k: kept["displacements_px"] for k, item in enumerate(items) if (kept := find_arrays(self.folder, item)) is not None}
+        todo = [k for k in range(len(items)) if k not in found]
         text = json.dumps({"fixed": fixed, "plans": plans})
-        for done, (k, both) in enumerate(outcomes(_contact, text, todo, workers=self.workers, scheduler="")):
-            data = io.BytesIO()
-            np.save(data, both)
-            part = files[k].with_suffix(".part")
-            part.write_bytes(data.getvalue())
-            os.replace(part, files[k])
+        for k, both in outcomes(_contact, text, todo, workers=self.workers, scheduler=""):
+            keep_arrays(self.folder, items[k], {"displacements_px": both})
+            found[k] = both
             if progress:
-                progress(len(files) - len(todo) + done + 1, len(files))
-        return np.stack([np.load(file) for file in files])
+                progress(len(found), len(items))
+        return np.stack([found[k] for k in range(len(items))])
 
 
 def _contact(text: str, index: int) -> tuple[int, np.ndarray]:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from training.generation.config import GenerationConfig
 from training.generation.make import REST, make_contact
-from training.generation.store import Store
+from training.generation.store import Store, refuse_foreign
 from training.generation.work import outcomes
+from twin.store import locked
 
 
 @dataclass(frozen=True)
@@ -43,19 +44,23 @@ def generate(
         contact can't be made.
     RenderError
         Nothing can be rendered there.
+    StoreError
+        Another run is at work in the folder, or another version of the program made what it holds.
     """
-    store = Store(folder, config)
-    done = store.finished()
-    before = len(done - {REST})
-    store.check_count(count)
-    todo = [index for index in range(REST, count) if index not in done]
-    made, failed = before, 0
-    if progress:
-        progress(made, count)
-    for outcome in outcomes(make_contact, config.text(), todo, workers=workers, scheduler=scheduler):
-        store.add(outcome)
-        failed += len(outcome.failures)
-        made += outcome.index != REST
+    refuse_foreign(folder)
+    with locked(folder):
+        store = Store(folder, config)
+        done = store.finished()
+        before = len(done - {REST})
+        store.check_count(count)
+        todo = [index for index in range(REST, count) if index not in done]
+        made, failed = before, 0
         if progress:
             progress(made, count)
-    return Summary(count, store.finish(count), before, failed)
+        for outcome in outcomes(make_contact, config.text(), todo, workers=workers, scheduler=scheduler):
+            store.add(outcome)
+            failed += len(outcome.failures)
+            made += outcome.index != REST
+            if progress:
+                progress(made, count)
+        return Summary(count, store.finish(count), before, failed)

@@ -8,34 +8,39 @@ order, so that a data set does not show in which order, by how many workers and 
 import csv
 import io
 import json
-import os
-import shutil
 from pathlib import Path
 
 import numpy as np
 
 from scenes.experiment import LABELS
 from training.generation.config import DatasetError, GenerationConfig
-from training.generation.make import REST, Outcome
+from training.generation.make import REST, Outcome, make_contact
 from training.generation.truth_file import TRUTH, TruthFile
+from twin.errors import StoreError
+from twin.store import remove_parts, replace_folder, require_same_code, unwritten, write_bytes, write_npz, write_text
+from twin.store.atomic import PART
+from twin.store.lock import LOCK
+from twin.store.resume import MADE_BY
 
 CONFIG, RECORDS, DRAWS = "generation.json", "records", "draws.csv"
 FAILURE_COLUMNS = ("path_id", "attempt", "reason")
 
 
 class Store:
-    """A data set's folder.
+    """A data set's folder, of which the run that opens it holds the lock.
 
     Parameters
     ----------
     folder : Path
-        Made if missing.
+        That is there, and holds a data set or nothing: see ``refuse_foreign``.
     config : GenerationConfig
 
     Raises
     ------
     DatasetError
-        The folder holds another data set or other files, or can't be written to.
+        The folder holds another data set, or can't be written to.
+    StoreError
+        Another version of the program made it: its contacts would not be of one kind with the new ones.
     """
 
     def __init__(self, folder: Path, config: GenerationConfig) -> None:
@@ -43,8 +48,8 @@ class Store:
         self.pictures = folder / config.image_folder
         self._check_config()
         try:
-            for part in (*folder.glob(".*.part"), *(folder / RECORDS).glob(".*.part"), *self.pictures.glob(".*.part")):
-                shutil.rmtree(part) if part.is_dir() else part.unlink()
+            for place in (folder, folder / RECORDS, self.pictures):
+                remove_parts(place)
             (folder / RECORDS).mkdir(exist_ok=True)
             if config.images != "none":
                 self.pictures.mkdir(exist_ok=True)
@@ -74,19 +79,23 @@ class Store:
         DatasetError
             It can't be written: disk full, folder gone.
         """
+        try:
+            self._keep(outcome)
+        except StoreError as error:
+            raise self._unfinished(error) from error
+
+    def _keep(self, outcome: Outcome) -> None:
         if outcome.index == REST:
-            self._write(self.folder / "init_0.png", outcome.images[0])
+            write_bytes(self.folder / "init_0.png", outcome.images[0])
             return
         for state, image in enumerate(outcome.images):
-            self._write(self.pictures / image_name(outcome.index, state), image)
-        record = io.BytesIO()
+            write_bytes(self.pictures / image_name(outcome.index, state), image)
         notes = json.dumps({"draw": outcome.draw, "failures": outcome.failures})
-        np.savez(record, notes=np.array(notes), **outcome.arrays)
-        self._write(self.folder / RECORDS / f"{outcome.index:06d}.npz", record.getvalue())
+        write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", {"notes": np.array(notes), **outcome.arrays})
 
     def finish(self, count: int) -> int:
         """Write tables and truth of the contacts 0 to ``count`` - 1; how many frames there are."""
-        tables = {"targets.csv": [], "move_executed.csv": [], DRAWS: [], "failures.csv": []}
+        tables: dict[str, list[dict]] = {"targets.csv": [], "move_executed.csv": [], DRAWS: [], "failures.csv": []}
         truth = TruthFile(self.folder / f".{TRUTH}.part")
         try:
             for index in range(count):
@@ -96,13 +105,14 @@ class Store:
                 truth.append(arrays)
                 self._add_rows(tables, index, arrays, notes)
             truth.close({"sensor": self.config.sensor.name, "form": str(self.config.form)})
-            self._write(self.folder / "meta.json", json.dumps(self._meta(count)).encode())
+            write_text(self.folder / "meta.json", json.dumps(self._meta(count)))
             for name, rows in tables.items():
-                self._write(self.folder / name, _csv(rows, FAILURE_COLUMNS if name == "failures.csv" else None))
-            shutil.rmtree(self.folder / TRUTH, ignore_errors=True)
-            os.replace(truth.path, self.folder / TRUTH)
+                write_text(self.folder / name, _csv(rows, FAILURE_COLUMNS if name == "failures.csv" else None))
+            replace_folder(truth.path, self.folder / TRUTH)
+        except StoreError as error:
+            raise self._unfinished(error) from error
         except OSError as error:
-            raise self._unwritten(self.folder / TRUTH, error) from error
+            raise self._unfinished(unwritten(self.folder / TRUTH, error)) from error
         return len(tables["targets.csv"])
 
     def _add_rows(self, tables: dict, index: int, arrays: dict, notes: dict) -> None:
@@ -147,33 +157,26 @@ class Store:
             if before != now:
                 other = ", ".join(key for key in now if before.get(key) != now[key])
                 raise DatasetError(f"{self.folder}: holds a data set made otherwise ({other}); repeat its options, or give another --out")
+            require_same_code(self.folder, make_contact, begun=True)
             return
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            strange = [p.name for p in self.folder.iterdir() if p.name != f".{CONFIG}.part"]
-        except OSError as error:
-            raise DatasetError(f"{self.folder}: can't be written to ({error.strerror}); give another folder with --out") from error
-        if strange:
-            raise DatasetError(f"{self.folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with --out")
-        self._write(path, text.encode())
+        require_same_code(self.folder, make_contact, begun=False)
+        write_text(path, text)  # last: a folder with a configuration says what code made it
 
-    def _write(self, path: Path, data: bytes) -> None:
-        part = path.with_name(f".{path.name}.part")
-        try:
-            with part.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, path)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise self._unwritten(path, error) from error
-
-    def _unwritten(self, path: Path, error: OSError) -> DatasetError:
+    def _unfinished(self, error: StoreError) -> DatasetError:
         done = len(self.finished() - {REST})
-        return DatasetError(
-            f"{path}: can't be written ({error.strerror}); {done} contacts are kept: free some space and give the same command again"
-        )
+        return DatasetError(f"{error}; {done} contacts are kept, and the same command goes on from there")
+
+
+def refuse_foreign(folder: Path) -> None:
+    """DatasetError where a folder holds files, and none of them is a data set's configuration."""
+    if not folder.exists() or (folder / CONFIG).is_file():
+        return
+    try:
+        strange = [p.name for p in folder.iterdir() if p.name not in (LOCK, MADE_BY) and not p.name.endswith(PART)]
+    except OSError as error:
+        raise DatasetError(f"{folder}: can't be read ({error.strerror}); give another folder with --out") from error
+    if strange:
+        raise DatasetError(f"{folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with --out")
 
 
 def image_name(index: int, state: int) -> str:
@@ -181,9 +184,9 @@ def image_name(index: int, state: int) -> str:
     return f"frame_{index}_{state}.png"
 
 
-def _csv(rows: list[dict], columns: tuple | None = None) -> bytes:
+def _csv(rows: list[dict], columns: tuple | None = None) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, columns or list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    return text.getvalue().encode()
+    return text.getvalue()

@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from training.generation.config import DatasetError
-from twin.cache import code_digest
 from twin.errors import TwinError
+from twin.store import fingerprint
 
 AHEAD = 2  # tasks for each worker on the way: a free one need not wait, and little is lost when all ends
 LOOK_S = 1.0
 JOIN_S = 60.0  # for the scheduler's first worker
-PACKAGES = ("scenes", "twin", "training")  # workers of another version of them would make other frames
+LOOPBACK = "127.0.0.1"
 AGAIN = "what is done is kept, and the same command goes on from there"
 
 
@@ -49,9 +49,19 @@ def _client(workers: int, scheduler: str) -> Iterator:
             finally:
                 client.close(timeout=2)
             return
-        options = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None, "silence_logs": 60}
-        options["scheduler_kwargs"] = {"dashboard_address": ":0"}  # any free port: other clusters may run
-        with LocalCluster(**options) as cluster, Client(cluster) as client:
+        # Dask serves HTTP even without its dashboard, and asks nobody who they are: nothing may listen beyond this machine.
+        nobody = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}  # any free port: other clusters may run
+        with (
+            LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                host=LOOPBACK,
+                silence_logs=logging.CRITICAL + 10,
+                scheduler_kwargs=nobody,
+            ) as cluster,
+            Client(cluster) as client,
+        ):
             yield client
 
 
@@ -77,7 +87,7 @@ def _by_cluster(client, make: Callable, text: str, todo: list[int], scheduler: s
         client.wait_for_workers(1, timeout=JOIN_S)
     except TimeoutError as error:
         raise DatasetError(f"{where}: no worker has come within {JOIN_S:g} s; start some with 'dask worker {scheduler}'") from error
-    waiting, flying, own = list(reversed(todo)), {}, code_digest(*PACKAGES)
+    waiting, flying, own = list(reversed(todo)), {}, fingerprint(make)
     while waiting or flying:
         try:
             room = AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])) - len(flying)
@@ -112,6 +122,6 @@ def _result(future, index: int, where: str):
 
 
 def _checked(make: Callable, text: str, index: int, expected: str):
-    if code_digest(*PACKAGES) != expected:
+    if fingerprint(make) != expected:
         raise DatasetError("a worker runs another version of this program, its frames would differ; install the same one there")
     return make(text, index)

@@ -1,7 +1,6 @@
 """Page, table and figures of a comparison with real frames."""
 
 import csv
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from matplotlib.figure import Figure
 
 from scenes.sensor import SensorSpec
 from training.validation.compare import MEASURES, Comparison, table_of
+from twin.store import made_by, text_file, write_json, write_text
 from twin.views.page import render_page
 from twin.views.plots import draw_displacement, new_figure
 
@@ -42,7 +42,7 @@ def summary_of(found: Comparison, spec: SensorSpec) -> dict:
 def write_validation(out: Path, found: Comparison, spec: SensorSpec, summary: dict) -> list[Path]:
     """Write ``index.html`` with its pictures, ``frames.csv`` and ``validation.json``; the paths."""
     table = out / "frames.csv"
-    with table.open("w", newline="") as file:
+    with text_file(table) as file:
         writer = csv.writer(file)
         writer.writerow(["image_name", "executed", *MEASURES, "error_px", "own_friction", "error_own_friction_px", "failure"])
         for k, name in enumerate(found.measured.names):
@@ -51,11 +51,11 @@ def write_validation(out: Path, found: Comparison, spec: SensorSpec, summary: di
             numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*values, *own)]
             writer.writerow([name, int(found.executed[k]), *numbers, found.failures.get(name, "")])
     figures = out / "validation.json"
-    figures.write_text(json.dumps(summary, indent=1) + "\n")
+    write_json(figures, summary | {"made_by": made_by("training.validation.compare")})
     _draw_errors(found).savefig(out / "errors.png", dpi=DPI)
     _draw_worst(found).savefig(out / "frames.png", dpi=DPI)
     page = out / "index.html"
-    page.write_text(render_page("training.validation", spec=spec, summary=summary, measures=MEASURES))
+    write_text(page, render_page("training.validation", spec=spec, summary=summary, measures=MEASURES))
     return [page, table, figures]
 
 

@@ -1,7 +1,5 @@
 """The calibration's stages in their order; each one's result is kept, so that an interrupted run goes on where it was."""
 
-import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -25,6 +23,7 @@ from twin.preprocess.pipeline import Pipeline
 from twin.realism.disc import lens_disc
 from twin.realism.images import compare_images
 from twin.recordings.images import read_image
+from twin.store import Item, inputs_digest, kept_arrays, kept_json
 from twin.types import Form, Frame
 
 FRAMES = 6  # that are fitted, evenly spread over the folder
@@ -97,7 +96,7 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
     spec : SensorSpec
         Where it starts: geometry and camera of the same kind of sensor.
     work : Path
-        Folder for what each stage has found; a second run with the same frames and start goes on from there.
+        Folder for what each stage has found; a second run with the same frames, start and code goes on from there.
     bar : callable
     limit : int
         Frames to fit.
@@ -170,42 +169,22 @@ def _pins_at_rest(path: Path, spec: SensorSpec) -> np.ndarray:
 
 
 class _Log:
-    """Results of the stages on disk, under a name made of the start and the frames."""
+    """Results of the stages on disk, each under the digest of what it was made of."""
 
-    def __init__(self, work: Path, spec: SensorSpec, raw: list):
-        digest = hashlib.sha256(spec.model_dump_json().encode())
-        for name, image, _ in raw:
-            digest.update(name.encode() + image.tobytes())
-        self._folder = work / digest.hexdigest()[:16]
-        self._folder.mkdir(parents=True, exist_ok=True)
+    def __init__(self, work: Path, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
+        self._folder, self._inputs = work, inputs_digest(spec, raw)
 
-    def aligned(self, spec: SensorSpec, raw: list, progress) -> list[Aligned]:
+    def aligned(self, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]], progress: Callable) -> list[Aligned]:
         """Frames with their fitted skin, from disk where they are there."""
         fit, frames = cache(lambda: SkinFit(spec)), []
         for done, (name, image, pins_px) in enumerate(raw):
-            path = self._folder / f"{Path(name).stem}.npz"
-            if path.exists():
-                with np.load(path) as kept:
-                    state = FittedPins(**kept)
-            else:
-                state = fit()(pins_px)
-                _write(path, lambda file, state=state: np.savez(file, **vars(state)))
-            frames.append(Aligned(name, image, pins_px, state))
+            item = Item(f"skin-{Path(name).stem}", (SkinFit,), [spec, pins_px])
+            found = kept_arrays(self._folder, item, lambda pins_px=pins_px: vars(fit()(pins_px)))
+            frames.append(Aligned(name, image, pins_px, FittedPins(**found)))
             progress(done + 1, len(raw))
         return frames
 
-    def stage(self, name: str, run: Callable, spec: SensorSpec) -> SensorSpec:
+    def stage(self, name: str, run: Callable[[SensorSpec], SensorSpec], spec: SensorSpec) -> SensorSpec:
         """The stage's result, from disk where it is there."""
-        path = self._folder / f"{name}.json"
-        if path.exists():
-            return SensorSpec.model_validate(json.loads(path.read_text()))
-        found = run(spec)
-        _write(path, lambda file: file.write(found.model_dump_json().encode()))
-        return found
-
-
-def _write(path: Path, fill: Callable) -> None:
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        fill(file)
-    partial.replace(path)
+        item = Item(name, (__name__,), [self._inputs, spec])
+        return SensorSpec.model_validate(kept_json(self._folder, item, lambda: run(spec).model_dump(mode="json")))

@@ -46,11 +46,11 @@ def optics(
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
 ) -> None:
     from scenes import load_sensor
-    from scenes.write import write_sensor
     from twin.calibration.report import write_page
     from twin.calibration.run import calibrate
     from twin.cli.progress import count_bar
     from twin.errors import FrameError
+    from twin.sensor_file import write_sensor
 
     if out.suffix != ".toml":
         raise FrameError(f"--out {out}: give the name of a .toml file")
@@ -108,11 +108,11 @@ def contact(
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor
-    from scenes.write import write_sensor
     from training.contact_calibration import PARAMETERS
     from training.contact_calibration.run import calibrate_contact
     from twin.cli.progress import rate_bar
     from twin.errors import FrameError
+    from twin.sensor_file import write_sensor
 
     if out.suffix != ".toml":
         raise FrameError(f"--out {out}: give the name of a .toml file")

@@ -35,6 +35,8 @@ Writes:
                       and sliding, the object's pose: one row a frame
   draws.csv           what was drawn for each contact; failures.csv: draws that failed
   generation.json     everything resolved
+  made_by.json        the code that makes it; a version whose code for contacts differs
+                      does not go on with it, as its frames would differ
   records/            one for each finished contact; with them the same command goes on
                       after any end, or to a larger --count
 

@@ -19,11 +19,11 @@ from hardware.safety import SHIPPED_LIMITS, load_limits
 from hardware.step import Estimator, LoopSettings
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
-from twin.cache import cached_arrays
 from twin.errors import RenderError
 from twin.mounting import Mounting
 from twin.optics.preview import Preview, Shading
 from twin.optics.render import Renderer
+from twin.store import cached_arrays
 from twin.types import Form, Frame
 
 TWIN = "twin"
@@ -150,7 +150,7 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
 
     key = {"sensor": sensor.model_dump(mode="json"), "window_px": list(preview.window_px), "quality": SHADING_QUALITY}
     try:
-        preview.shading = Shading(**cached_arrays("shading", key, trace))
+        preview.shading = Shading(**cached_arrays("shading", key, trace, code=(Preview, Renderer)))
     except RenderError as error:
         raise RenderError(f"{error}; or draw with --plain-light, which needs no path tracing") from error
     return preview

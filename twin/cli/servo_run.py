@@ -1,6 +1,5 @@
 """One run of surface following, from its options to its results on disk."""
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
 from twin.cli.at_rest import FIRST, counting_from_first, given_frame
 from twin.cli.rig import build_rig, servo_loop, steps_round
 from twin.errors import TwinError
+from twin.store import made_by, write_json
 from twin.types import Form
 
 GIVE_UP_S = 5.0
@@ -188,5 +188,5 @@ def _write(out: Path, run: ServoRun, followed: Followed, told: dict) -> list[Pat
         "notes": followed.notes,
     }
     measures = out / "measures.json"
-    measures.write_text(json.dumps(plain(content), indent=1) + "\n")
+    write_json(measures, plain(content) | {"made_by": made_by(ServoLoop, measure)})
     return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]

@@ -10,6 +10,7 @@ from scenes import load_object, load_servo
 from twin.cli.progress import count_bar
 from twin.cli.servo_run import Followed, ServoRun, follow
 from twin.errors import TwinError
+from twin.store import text_file
 
 COLUMNS = ("smoothness", "local_smoothness", "path_error_mm", "depth_error_mm", "angle_error_deg", "completed", "lost_contacts")
 HEADS = ("S", "local S", "path mm", "depth mm", "angle deg", "way", "lost")
@@ -34,7 +35,7 @@ def run_study(
                     found[label, name] = str(error)
                 progress(len(found), len(estimators) * len(stimuli))
     followed = {key: value for key, value in found.items() if isinstance(value, Followed)}
-    with (out / "study.csv").open("w", newline="") as file:
+    with text_file(out / "study.csv") as file:
         writer = csv.writer(file)
         rows = [(*key, asdict(value.measures), value.failure) for key, value in followed.items()]
         names = list(rows[0][2]) if rows else []

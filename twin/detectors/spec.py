@@ -11,6 +11,7 @@ from scenes.base import Fraction, Positive, Section
 from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.preprocess.forms import blob_spec
+from twin.store import write_text
 from twin.types import Form
 
 Method = Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"]
@@ -105,7 +106,13 @@ def load_detector(path: Path) -> DetectorSpec:
 
 
 def write_detector(path: Path, detector: DetectorSpec, comment: str = "") -> None:
-    """Write a detector's parameters for `load_detector`."""
+    """Write a detector's parameters for `load_detector`.
+
+    Raises
+    ------
+    StoreError
+        They can't be written.
+    """
     document = tomlkit.document()
     for line in comment.splitlines():
         document.add(tomlkit.comment(line))
@@ -117,6 +124,4 @@ def write_detector(path: Path, detector: DetectorSpec, comment: str = "") -> Non
     data["pins_px"] = pins
     for key in sorted(data, key=lambda k: isinstance(data[k], dict)):  # tables come last
         document.add(key, data[key])
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(tomlkit.dumps(document), encoding="utf-8")
-    partial.replace(path)
+    write_text(path, tomlkit.dumps(document))

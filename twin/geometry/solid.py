@@ -13,12 +13,11 @@ from functools import cached_property, partial
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.cache import cached_arrays
 from twin.geometry.bspline import Basis
 from twin.geometry.chart import Chart, Focus, disc_points, dome_points
 from twin.geometry.pins import rest_pins
+from twin.store import cached_arrays
 
-_VERSION = 1  # raised whenever the arrays change for the same key
 _CELL_PARTS = ("controls", "gradients", "weights_mm3")
 _GEL_GRADING = 1.5  # power law of the depths between the gel's elements: thin below the skin
 
@@ -121,7 +120,7 @@ class Solid:
 def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus: Focus | None = None, keep: bool = True) -> Solid:
     """The body of a sensor, its grid fine around a focus (default: around the apex).
 
-    It depends on the sensor's geometry alone, and is kept on disk (see ``twin.cache``) if ``keep``.
+    It depends on the sensor's geometry alone, and is kept on disk (see ``twin.store``) if ``keep``.
     """
     resolution, focus = resolution or Resolution(), focus or Focus()
     inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
@@ -134,7 +133,6 @@ def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus
     }
     geometry = ("outer_radius_mm", "thickness_mm", "rim_z_mm")
     key = {
-        "version": _VERSION,
         "skin": {name: getattr(spec.skin, name) for name in geometry},
         "lens_mm": spec.lens.z_mm,
         "pins": spec.pins.model_dump(mode="json"),

@@ -1,8 +1,8 @@
 """Proofs, each in a process of its own, that a Dr.Jit backend runs here.
 
 A backend with an unsuitable LLVM or driver ends the process instead of raising, so it is
-tried in a child. Verdicts are kept in the user's cache directory, keyed by everything
-that could change them.
+tried in a child. Verdicts are kept in the cache folder (see ``twin.store``), keyed by everything
+that could change them; where the cache is off, every process probes for itself.
 """
 
 import importlib.metadata
@@ -11,10 +11,14 @@ import os
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 
+from twin.errors import StoreError
 from twin.optics.native import PRIVATE_FOLDER
+from twin.store import cache_folder, fingerprint, write_json
 
 PROBE_TIMEOUT_S = 60.0
 
@@ -40,19 +44,6 @@ class Verdict:
     reason: str
 
 
-def cache_dir() -> Path:
-    """Where this package keeps what can be found out again."""
-    if "TACTIP_CACHE" in os.environ:
-        return Path(os.environ["TACTIP_CACHE"])
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "tactip-twin"
-
-
 def probe(backend: str, library: Path, *, remember_failure: bool = True) -> Verdict:
     """Run a tiny kernel on ``backend`` ("llvm" or "cuda") with ``library``, or recall the last verdict."""
     key = "|".join(
@@ -61,10 +52,14 @@ def probe(backend: str, library: Path, *, remember_failure: bool = True) -> Verd
             str(library),
             str(library.stat().st_mtime_ns),
             importlib.metadata.version("drjit"),
+            fingerprint(__name__),
             os.environ.get("CUDA_VISIBLE_DEVICES", "") if backend == "cuda" else "",
         ]
     )
-    store = cache_dir() / "backend-probes.json"
+    folder = cache_folder()
+    if folder is None:
+        return _run_once(key, backend, library)
+    store = folder / "backend-probes.json"
     known = _read(store)
     if key in known:
         return Verdict(**known[key])
@@ -72,6 +67,11 @@ def probe(backend: str, library: Path, *, remember_failure: bool = True) -> Verd
     if verdict.ok or remember_failure:
         _write(store, _read(store) | {key: asdict(verdict)})
     return verdict
+
+
+@cache
+def _run_once(key: str, backend: str, library: Path) -> Verdict:
+    return _run(backend, library)
 
 
 def _run(backend: str, library: Path) -> Verdict:
@@ -114,10 +114,6 @@ def _read(store: Path) -> dict:
 
 def _write(store: Path, verdicts: dict) -> None:
     """Best effort: without a writable cache every start probes again."""
-    try:
+    with suppress(OSError, StoreError):
         store.parent.mkdir(parents=True, exist_ok=True)
-        partial = store.with_name(f"{store.name}.{os.getpid()}")
-        partial.write_text(json.dumps(verdicts, indent=1))
-        partial.replace(store)
-    except OSError:
-        return
+        write_json(store, verdicts)

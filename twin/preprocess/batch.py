@@ -1,7 +1,5 @@
 """The pipeline over a whole recording, written to a folder."""
 
-import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from twin.preprocess.overlay import draw_overlay, overlay_name
 from twin.preprocess.pipeline import Pipeline, measure_reference
 from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import Recording, open_recording
+from twin.store import made_by, unwritten, write_bytes, write_json, write_npz
 from twin.types import Form, Observation
 
 UNMEASURED = "specification"  # in place of a no-contact frame's name
@@ -31,18 +30,6 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
         except FrameError as error:
             problems.append(str(error))
     return nominal_reference(spec, recording.form), UNMEASURED
-
-
-def _write(path: Path, write: Callable) -> None:
-    """Write a file so that it is there whole or not at all."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
-            write(file)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise FrameError(f"{path}: can't be written ({error.strerror}); give another folder or free some space") from error
 
 
 def _timing(observations: list[Observation]) -> dict:
@@ -106,14 +93,16 @@ def preprocess_recording(
     Raises
     ------
     FrameError
-        No frame was readable, none was valid (the files are written all the same), or the folder can't be written to.
+        No frame was readable, or none was valid (the files are written all the same).
+    StoreError
+        The folder can't be written to.
     """
     recording = open_recording(path, spec, form)
     out_dir = Path(out_dir)
     try:
         (out_dir / "overlay" if overlay else out_dir).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FrameError(f"{out_dir}: can't be made ({error.strerror}); give another folder") from error
+        raise unwritten(out_dir, error) from error
     notes: list[str] = []
     reference, reference_name = recording_reference(spec, recording, notes)
     pipeline = Pipeline(spec, recording.form, reference)
@@ -128,7 +117,7 @@ def preprocess_recording(
         observations.append(observation)
         if overlay:
             picture = cv2.cvtColor(draw_overlay(frame, observation), cv2.COLOR_RGB2BGR)
-            _write(out_dir / "overlay" / overlay_name(frame.name, pictures), cv2.imencode(".png", picture)[1].tofile)
+            write_bytes(out_dir / "overlay" / overlay_name(frame.name, pictures), cv2.imencode(".png", picture)[1].tobytes())
         if progress:
             progress(frame.sequence + 1, len(recording))
     failed = recording.failed + failed
@@ -150,9 +139,10 @@ def preprocess_recording(
         "invalid": [{"image_name": name, "reason": o.reason} for name, o in zip(names, observations, strict=True) if not o.valid],
         "failed": failed,
         "problems": recording.problems + notes,
+        "made_by": made_by(preprocess_recording, inputs=[spec, recording.path.resolve(), recording.names]),
     }
-    _write(out_dir / "pins.npz", lambda file: np.savez_compressed(file, **arrays))
-    _write(out_dir / "summary.json", lambda file: file.write((json.dumps(summary, indent=1) + "\n").encode()))
+    write_npz(out_dir / "pins.npz", arrays, compressed=True)
+    write_json(out_dir / "summary.json", summary)
     if not arrays["valid"].any():
         raise FrameError(_nothing_found(path, summary, out_dir / "summary.json"))
     return summary

@@ -1,6 +1,5 @@
 """What the comparison leaves behind: metrics.json, tables, pictures and the page."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from twin.realism.compare import Pair, PoseAligned
 from twin.realism.images import difference_picture
 from twin.realism.statistics import RADIAL_MEASURES, TARGET, TARGET_MEASURES, Statistics
 from twin.recordings.images import write_image
+from twin.store import made_by, write_json, write_text
 from twin.views.page import render_page
 from twin.views.table import write_rows
 
@@ -130,13 +130,11 @@ def write_plots(folder: Path, found: Statistics) -> dict[str, str]:
 
 def write_metrics(path: Path, metrics: dict) -> Path:
     """metrics.json, numpy numbers and all."""
-    path.write_text(json.dumps(metrics, indent=2, default=lambda thing: thing.item()) + "\n", encoding="utf-8")
-    return path
+    return write_json(path, metrics | {"made_by": made_by(__name__)}, default=lambda thing: thing.item())
 
 
 def write_page(path: Path, spec: SensorSpec, metrics: dict, plots: dict, pairs: list[dict], poses: list[dict], found: Statistics) -> Path:
     """index.html; pictures lie beside it."""
     content = {"spec": spec, "metrics": metrics, "plots": plots, "pairs": pairs, "poses": poses, "radial": found.radial, "names": NAMES}
     page = render_page("twin.realism", **content, measures=RADIAL_MEASURES, target=TARGET, targets=TARGET_MEASURES)
-    path.write_text(page, encoding="utf-8")
-    return path
+    return write_text(path, page)

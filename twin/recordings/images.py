@@ -8,6 +8,7 @@ import numpy as np
 
 from twin.errors import FrameError
 from twin.recordings.quiet import quiet
+from twin.store import write_bytes
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 DEPTHS = (8, 10, 12, 14, 16)  # bits that cameras deliver in 16-bit files
@@ -37,17 +38,10 @@ def write_image(path: Path, image: np.ndarray) -> Path:
 
     Raises
     ------
-    FrameError
+    StoreError
         It can't be written.
     """
-    part = path.with_name(f"{path.name}.part")
-    try:
-        part.write_bytes(cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes())
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise FrameError(f"{path}: can't be written ({error.strerror}); make room, or give another folder") from error
-    return path
+    return write_bytes(path, cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes())
 
 
 def decode(path: Path) -> np.ndarray:

@@ -6,11 +6,10 @@ import numpy as np
 
 from scenes import load_object
 from scenes.sensor import SensorSpec
-from twin.cache import cached_arrays
 from twin.geometry.pins import rest_pins
-from twin.mechanics.newton import RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
+from twin.store import cached_arrays
 
 
 @dataclass(frozen=True)
@@ -59,5 +58,5 @@ def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
 
     optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px"}
     key = {part: getattr(spec, part).model_dump(mode="json", exclude=optical) for part in ("skin", "gel", "lens", "pins")}
-    key |= {"stimulus": load_object(contact.stimulus).model_dump(mode="json"), "pose": vars(contact.pose), "tolerance": RESIDUAL_TOLERANCE}
+    key |= {"stimulus": load_object(contact.stimulus).model_dump(mode="json"), "pose": vars(contact.pose)}
     return PinState(**cached_arrays("pins-under-contact", key, solve))

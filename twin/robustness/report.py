@@ -1,6 +1,5 @@
 """A sweep's page and tables."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from twin.robustness.judgement import Judgement
 from twin.robustness.measures import MEASURES, POSE_MEASURES
 from twin.robustness.plots import TITLES, plot_case, plot_shares
 from twin.robustness.sweep import Cell, Plan, cells_of
+from twin.store import made_by, write_json
 from twin.views.page import render_page
 from twin.views.table import write_rows
 
@@ -62,7 +62,7 @@ def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str],
     )
     summary = out / "envelope.json"
     content = {"comparisons": comparisons, "envelope": [_row(e) for e in envelopes], "shares": [_share_row(s) for s in shares]}
-    summary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_json(summary, content | {"made_by": made_by("twin.robustness.sweep")})
     written = [
         page,
         summary,

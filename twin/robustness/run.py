@@ -1,6 +1,6 @@
 """A whole robustness study into one folder."""
 
-import zlib
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.cache import code_digest
 from twin.detectors import METHODS, DetectorSpec, load_detector, shipped_detector, tune, write_detector
 from twin.errors import TwinError
 from twin.recordings import open_recording
@@ -20,6 +19,7 @@ from twin.robustness.real import consensus
 from twin.robustness.report import write_report
 from twin.robustness.shots import RenderedSource
 from twin.robustness.sweep import Models, Plan
+from twin.store import Item, inputs_digest
 from twin.types import Form, Frame
 
 
@@ -32,15 +32,18 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
         A file can't be read; `check_pipelines` tells so sooner.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    chosen, digest = [], zlib.crc32(code_digest("scenes", "twin").encode() + b"".join(frame.image.tobytes() for frame in frames))
+    chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
     for k, name in enumerate(names):
         progress(k, len(names))
-        kept = folder / f"{name}-{spec.name}-{digest:08x}.toml"
         if name == "twin":
             chosen.append(shipped_detector(spec, frames[0].form))
         elif name in METHODS:
+            item = Item(f"{name}-{spec.name}", (tune,), [name, inputs])
+            kept = folder / f"{item.file}.toml"
             if not kept.is_file():
-                write_detector(kept, tune(frames, spec, name).detector, "Tuned on undegraded frames.")
+                write_detector(
+                    kept, tune(frames, spec, name).detector, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}"
+                )
             chosen.append(load_detector(kept).model_copy(update={"name": name}))
         else:
             chosen.append(load_detector(Path(name)))

@@ -1,8 +1,5 @@
 """Every case at every severity: cells that are computed in parallel, kept one by one, and never computed twice."""
 
-import hashlib
-import json
-import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -13,14 +10,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from twin.cache import code_digest
+from scenes import load_object
 from twin.detectors import DetectorSpec, Found, make_detector
 from twin.errors import TwinError
-from twin.robustness.condition import Case
+from twin.robustness.condition import Case, Condition
 from twin.robustness.measures import judge
 from twin.robustness.shots import RealSource, RenderedSource, Shot
+from twin.store import Item, find_json, inputs_digest, keep_json, write_bytes
 
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+CELLS = "cells"  # folder of the finished ones
 Models = Callable[[], dict]  # gives {name: estimate}, estimate(frame) -> (values, units, valid)
 
 
@@ -56,19 +55,25 @@ class Cell:
 
     case: Case
     severity: float
-    file: str
+    item: Item
+
+    @property
+    def file(self) -> str:
+        """Name of its files, without suffix."""
+        return self.item.file
 
 
 def cells_of(plan: Plan) -> list[Cell]:
     """All cells; severity 0 is one cell that all cases share, its case the first one."""
-    base = hashlib.sha256(_source_key(plan).encode()).hexdigest()
+    base = inputs_digest(_inputs(plan))
     cells = []
     for case in plan.cases:
         for severity in plan.severities:
-            name = "nominal" if severity == 0 else case.name
-            values = [] if severity == 0 else [[c.name, c.value(severity)] for c in case.conditions]
-            digest = hashlib.sha256(json.dumps([base, values]).encode()).hexdigest()[:12]
-            cells.append(Cell(case, severity, f"{name}-{round(1000 * severity):04d}-{digest}"))
+            degrading = () if severity == 0 else case.conditions
+            name = case.name if degrading else "nominal"
+            values = [[c.name, c.value(severity)] for c in degrading]
+            item = Item(f"{name}-{round(1000 * severity):04d}", (__name__, *_hooks(degrading)), [base, values])
+            cells.append(Cell(case, severity, item))
     return cells
 
 
@@ -79,14 +84,15 @@ def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, i
     computed again.
     """
     cells = cells_of(plan)
-    (folder / "cells").mkdir(parents=True, exist_ok=True)
-    (folder / "pictures").mkdir(exist_ok=True)
-    open_cells = {cell.file: cell for cell in cells if _read(folder, cell) is None}
+    (folder / "pictures").mkdir(parents=True, exist_ok=True)
+    open_cells = {cell.file: cell for cell in cells if find_json(folder / CELLS, cell.item) is None}
     total = len({cell.file for cell in cells})
     progress(total - len(open_cells), total)
     if open_cells:
         _compute(plan, folder, list(open_cells.values()), jobs, lambda done: progress(total - len(open_cells) + done, total))
-    return [row | {"case": cell.case.name, "severity": cell.severity} for cell in cells for row in _read(folder, cell) or []]
+    return [
+        row | {"case": cell.case.name, "severity": cell.severity} for cell in cells for row in find_json(folder / CELLS, cell.item) or []
+    ]
 
 
 def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress) -> None:
@@ -129,11 +135,9 @@ def _run(cell: Cell) -> None:
                 worst = rows[-1]["recall"], shot, found
         rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in _WORK["models"].items()]
     if worst is not None:
-        cv2.imwrite(str(folder / "pictures" / f"{cell.file}.jpg"), overlay(worst[1], worst[2]))
-    path = folder / "cells" / f"{cell.file}.json"
-    part = path.with_suffix(f".{os.getpid()}.part")
-    part.write_text(json.dumps(rows, default=float), encoding="utf-8")
-    os.replace(part, path)
+        picture = cv2.imencode(".jpg", overlay(worst[1], worst[2]))[1].tobytes()
+        write_bytes(folder / "pictures" / f"{cell.file}.jpg", picture)
+    keep_json(folder / CELLS, cell.item, rows, default=float)
 
 
 def _pose(estimate, shot: Shot) -> dict:
@@ -155,19 +159,15 @@ def overlay(shot: Shot, found: Found) -> np.ndarray:
     return picture
 
 
-def _read(folder: Path, cell: Cell) -> list[dict] | None:
-    try:
-        return json.loads((folder / "cells" / f"{cell.file}.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
+def _hooks(conditions: tuple[Condition, ...]) -> list[Callable]:
+    """The functions by which conditions degrade: a cell depends on the code of its own conditions, not on that of all."""
+    return [hook for c in conditions for hook in (c.spec, c.light, c.frame, c.moves, c.hides, c.setting) if hook is not None]
 
 
-def _source_key(plan: Plan) -> str:
-    """Everything that all cells depend on, the code that computes them too."""
-    source, code = plan.source, code_digest("scenes", "twin")
-    content = [code, source.spec.model_dump(mode="json"), [d.model_dump(mode="json") for d in plan.detectors], plan.model_digests]
+def _inputs(plan: Plan) -> list[object]:
+    """Everything that all cells are made of."""
+    source = plan.source
+    shared = [source.spec, plan.detectors, plan.model_digests]
     if isinstance(source, RenderedSource):
-        content.append([[c.name, c.stimulus, vars(c.pose)] for c in source.contacts])
-    else:
-        content.append([[f.name, hashlib.sha256(f.image.tobytes()).hexdigest()] for f in source.frames])
-    return json.dumps(content)
+        return [*shared, [[c.name, load_object(c.stimulus), c.pose] for c in source.contacts]]
+    return [*shared, [[frame.name, frame.image] for frame in source.frames], source.caps_px]

@@ -10,19 +10,18 @@ import trimesh
 from scipy.ndimage import spline_filter
 
 from scenes.object import MeshShape
-from twin.cache import cached_arrays
 from twin.errors import MeshError
 from twin.stimulus.analytic import Probe, project_on_xy
 from twin.stimulus.level_set import Probed, rows, unit_normals
 from twin.stimulus.mesh_distance import signed_distance
 from twin.stimulus.mesh_file import place_mesh, read_mesh
 from twin.stimulus.spline import spline_probe, spline_value
+from twin.store import cached_arrays
 
 _REACH_MM = 40.0  # half width of the sampled region around the origin: the dome and its shear
 _MARGIN_MM = 4.0
 _NODES = 250_000  # of the sampled grid: about 1 s, 2 MB
 _FINEST_MM = 0.25
-_SAMPLING = 1  # raised whenever the same mesh would be read, placed or sampled differently
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,6 @@ def _sampled(file: str, digest: str, unit: str, rotation_deg: tuple) -> MeshFiel
         "file": [digest, Path(file).suffix.lower()],
         "placement": [unit, list(rotation_deg)],
         "grid": [_REACH_MM, _MARGIN_MM, _NODES, _FINEST_MM],
-        "version": _SAMPLING,
     }
 
     def sample():

@@ -10,8 +10,7 @@ import warnings
 import numpy as np
 import pytest
 
-from twin import cache
-from twin.cache import cached_arrays
+from twin.store import atomic, cache, cached_arrays
 
 KEY = {"size": 3, "bytes": b"abc"}
 
@@ -70,6 +69,23 @@ def test_the_keys_order_does_not_matter_but_the_kind_and_the_format_do(folder, m
     monkeypatch.setattr(cache, "_FORMAT", cache._FORMAT + 1)
     cached_arrays("field", KEY, work)
     assert work.times == 3
+
+
+def test_what_other_code_computed_is_not_taken(folder, monkeypatch):
+    work = Work()
+    cached_arrays("field", KEY, work)
+    monkeypatch.setattr(cache, "fingerprint", lambda *makers: "of another version")
+    cached_arrays("field", KEY, work)
+    assert work.times == 2 and len(entries(folder)) == 2
+
+
+def test_work_that_was_typed_in_is_not_kept(folder):
+    """The source of a function without a file can't be read, so nobody could say whether it is still the same."""
+    namespace = {"__name__": "typed_in", "np": np}
+    exec("def compute(): return {'values': np.arange(3)}", namespace)
+    with pytest.warns(RuntimeWarning, match="typed_in: its source can't be read"):
+        assert cached_arrays("field", KEY, namespace["compute"])["values"].tolist() == [0, 1, 2]
+    assert not folder.exists()
 
 
 def test_a_key_or_an_array_that_can_not_be_kept_is_the_callers_error(folder):
@@ -163,7 +179,7 @@ def test_a_full_or_read_only_disk_leaves_no_part_behind(folder, monkeypatch, ste
             args[0].write(b"half an entry")
         raise OSError(code, os.strerror(code))
 
-    owner = {"savez": cache.np, "replace": cache.os}.get(step, cache.Path)
+    owner = {"savez": atomic.np, "replace": atomic.os}.get(step, cache.Path)
     work = Work()
     with monkeypatch.context() as patch, pytest.warns(RuntimeWarning, match=os.strerror(code)):
         patch.setattr(owner, step, fail)
@@ -195,7 +211,7 @@ def test_the_longest_unused_entries_go_first_and_strangers_stay(folder, monkeypa
     stranger = folder / "holiday.npz"
     stranger.write_bytes(bytes(100_000))
     os.utime(stranger, (0, 0))
-    left_over = folder / f"{first.name}.x1.part"  # of a killed process
+    left_over = folder / f".{first.name}.x1.part"  # of a killed process
     left_over.write_bytes(b"half")
     os.utime(left_over, (1, 1))
     os.utime(first, (1_000, 1_000))
@@ -217,7 +233,7 @@ def test_the_longest_unused_entries_go_first_and_strangers_stay(folder, monkeypa
 WRITER = """
 import sys
 import numpy as np
-from twin.cache import cached_arrays
+from twin.store import cache_folder, cached_arrays
 
 seed = int(sys.argv[1])
 for turn in range(60):
@@ -225,35 +241,18 @@ for turn in range(60):
     found = cached_arrays("field", {"key": key}, lambda: {"values": np.full(50_000, float(key))})
     assert (found["values"] == key).all() and found["values"].shape == (50_000,)
     if turn % 7 == seed:
-        import twin.cache
-        for path in twin.cache.cache_folder().glob("*.npz"):
+        for path in cache_folder().glob("*.npz"):
             path.unlink(missing_ok=True)
 """
 
 
-def test_processes_share_a_folder(folder):
+def test_processes_share_a_folder(folder, tmp_path):
     """Two processes write, read and remove the same entries: each always reads whole arrays, without a warning."""
-    run = [sys.executable, "-W", "error", "-c", WRITER]
+    script = tmp_path / "writer.py"
+    script.write_text(WRITER)
+    run = [sys.executable, "-W", "error", str(script)]
     workers = [subprocess.Popen([*run, str(seed)], stderr=subprocess.PIPE, text=True) for seed in (1, 4)]
     for worker in workers:
         _, said = worker.communicate(timeout=120)
         assert worker.returncode == 0, said
-    assert not list(folder.glob("*.part"))
-
-
-def test_the_codes_digest_is_that_of_its_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "__file__", str(tmp_path / "twin" / "cache.py"))
-    (tmp_path / "twin" / "inner").mkdir(parents=True)
-    file = tmp_path / "twin" / "inner" / "a.py"
-    found = []
-    for change in (
-        lambda: file.write_text("a = 1\n"),
-        lambda: file.write_text("a = 2\n"),
-        lambda: file.rename(file.with_name("b.py")),
-        lambda: (tmp_path / "twin" / "c.toml").write_text("c = 1\n"),
-    ):
-        change()
-        found.append(cache.code_digest.__wrapped__("twin"))
-    assert len(set(found)) == 4
-    (tmp_path / "twin" / "inner" / "b.cpython-311.pyc").write_bytes(b"compiled")
-    assert cache.code_digest.__wrapped__("twin") == found[-1] == cache.code_digest.__wrapped__("twin", "none")
+    assert not list(folder.glob(".*.part"))

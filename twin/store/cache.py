@@ -1,15 +1,12 @@
 """Arrays that are slow to compute, kept on disk between processes.
 
-Each entry is one file whose name is its key's hash. A cache may fail, the work may not: whatever is wrong with the
-folder or a file, the arrays are computed, and one warning names the path. ``TACTIP_CACHE`` names another folder, or
-``off`` for none.
+Each entry is one file whose name is the hash of its key and of the code that computes it. A cache may fail, the work may not:
+whatever is wrong with the folder or a file, the arrays are computed, and one warning names the path. ``TACTIP_CACHE`` names
+another folder, or ``off`` for none.
 """
 
-import hashlib
-import json
 import os
 import re
-import tempfile
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,13 +16,21 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 
+from twin.errors import StoreError
+from twin.store.atomic import write_npz
+from twin.store.fingerprint import Maker, UnknownCodeError, fingerprint
+from twin.store.inputs import inputs_digest
+
 _VARIABLE = "TACTIP_CACHE"
-_FORMAT = 1  # raised whenever older files must not be read
+_FORMAT = 2  # raised whenever older files must not be read
 _LIMIT_BYTES = 1_000_000_000  # of all entries together; the longest unused go first
-_OURS = re.compile(r"[\w-]+-[0-9a-f]{64}\.npz(\.\w+\.part)?")  # the folder may hold other things, which are left alone
+_ENTRY = r"[\w-]+-[0-9a-f]{64}\.npz"
+_OURS = re.compile(rf"{_ENTRY}|\.{_ENTRY}\.\w+\.part")  # the folder may hold other things, which are left alone
 
 
-def cached_arrays(kind: str, key: dict, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def cached_arrays(
+    kind: str, key: dict, compute: Callable[[], dict[str, np.ndarray]], *, code: tuple[Maker, ...] | None = None
+) -> dict[str, np.ndarray]:
     """The arrays of ``compute()``, from disk where they are kept.
 
     Parameters
@@ -33,33 +38,35 @@ def cached_arrays(kind: str, key: dict, compute: Callable[[], dict[str, np.ndarr
     kind : str
         What the arrays are, in letters, digits and hyphens: a part of the file's name and of the key.
     key : dict
-        Everything the arrays depend on: what JSON can hold, and bytes.
+        Every input that the arrays depend on, as ``inputs_digest`` takes it.
     compute : callable
         Gives arrays by name; no array of objects. Its errors are the caller's, and nothing is kept then.
+    code : tuple of functions, classes or names of modules, optional
+        The code that the arrays depend on: ``compute`` itself by default. Give it where ``compute`` lies in a module that imports
+        much more than it computes with.
 
     Returns
     -------
     dict of str to array
+
+    Notes
+    -----
+    Arrays that other code computed are not taken. Where the code of ``compute`` can't be read, nothing is kept.
     """
+    digest = inputs_digest(_FORMAT, kind, key)
     folder = cache_folder()
     if folder is None:
         return _arrays(compute)
-    path = folder / f"{kind}-{_digest(kind, key)}.npz"
+    try:
+        path = folder / f"{kind}-{inputs_digest(digest, fingerprint(*(code or (compute,))))}.npz"
+    except UnknownCodeError as error:
+        _warn(str(error))
+        return _arrays(compute)
     found = _read(path)
     if found is None:
         found = _arrays(compute)
         _write(path, found)
     return found
-
-
-@cache
-def code_digest(*packages: str) -> str:
-    """Digest of the Python and TOML files of packages beside this one: whatever is computed by them may be another where it changes."""
-    digest, root = hashlib.sha256(), Path(__file__).parents[1]
-    for path in sorted(path for package in packages for path in (root / package).rglob("*") if path.suffix in (".py", ".toml")):
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
-    return digest.hexdigest()
 
 
 def cache_folder() -> Path | None:
@@ -70,21 +77,11 @@ def cache_folder() -> Path | None:
     return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("tactip-twin"))
 
 
-def _arrays(compute) -> dict[str, np.ndarray]:
+def _arrays(compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     found = {name: np.asarray(value) for name, value in compute().items()}
     if any(value.dtype.hasobject for value in found.values()):
         raise TypeError("arrays of objects can't be kept; give arrays of numbers")
     return found
-
-
-def _digest(kind: str, key: dict) -> str:
-    def plain(value):
-        if isinstance(value, bytes):
-            return {"sha256": hashlib.sha256(value).hexdigest()}
-        raise TypeError(f"a cache key holds JSON and bytes, not {type(value).__name__}")
-
-    text = json.dumps([_FORMAT, kind, key], sort_keys=True, default=plain)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
@@ -103,19 +100,14 @@ def _read(path: Path) -> dict[str, np.ndarray] | None:
 
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Keep arrays; other processes see the whole file or none."""
-    part = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f"{path.name}.", suffix=".part", delete=False) as file:
-            part = Path(file.name)
-            np.savez(file, **arrays)
-        os.replace(part, path)
+        write_npz(path, arrays)
         _make_room(path.parent)
-    except OSError as error:
-        _warn(f"{path.parent}: results can't be kept ({error.strerror or error}); set {_VARIABLE} to a writable folder, or to off")
-        if part is not None:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
+    except (OSError, StoreError) as error:
+        reason = error.__cause__ if isinstance(error, StoreError) else error
+        why = getattr(reason, "strerror", None) or reason
+        _warn(f"{path.parent}: results can't be kept ({why}); set {_VARIABLE} to a writable folder, or to off")
 
 
 def _make_room(folder: Path) -> None:

@@ -1,0 +1,124 @@
+"""The one place that writes results: a file is there whole, or as it was before.
+
+The content goes to a temporary file in the same folder, is flushed to the disk, and takes the file's name in one step. A
+process that is killed meanwhile leaves the old file as it was, and beside it a temporary file that ``remove_parts`` removes.
+"""
+
+import errno
+import io
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from twin.errors import StoreError
+
+PART = ".part"  # ends the name of a temporary file, which begins with a dot
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space and give the same command again",
+    errno.EDQUOT: "free some space and give the same command again",
+    errno.EROFS: "give a folder that may be written to",
+    errno.EACCES: "give a folder that may be written to",
+    errno.EPERM: "give a folder that may be written to",
+    errno.ENOENT: "make its folder first, or give another one",
+    errno.ENOTDIR: "give another folder: a file is in the way",
+    errno.EISDIR: "give another name: a folder is in the way",
+}
+_ANY_REMEDY = "give another folder or free some space"
+
+
+def write_with(path: Path, fill: Callable[[BinaryIO], object]) -> Path:
+    """Write what ``fill`` puts into an open binary file; the path.
+
+    Raises
+    ------
+    StoreError
+        It can't be written: disk full, folder read-only or missing. What was there before is still there.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}{secrets.token_hex(4)}{PART}")
+    try:
+        with part.open("xb") as file:
+            fill(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except BaseException as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise unwritten(path, error) from error
+        raise
+    return path
+
+
+def write_bytes(path: Path, data: bytes) -> Path:
+    """Write bytes; errors as of ``write_with``."""
+    return write_with(path, lambda file: file.write(data))
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write text as UTF-8, its line ends as they are; errors as of ``write_with``."""
+    return write_bytes(path, text.encode())
+
+
+@contextmanager
+def text_file(path: Path) -> Iterator[io.StringIO]:
+    """A text to be filled within ``with``, and written when that ends without an error; errors as of ``write_with``."""
+    text = io.StringIO(newline="")
+    yield text
+    write_text(path, text.getvalue())
+
+
+def write_json(path: Path, content: object, *, default: Callable[[object], object] | None = None) -> Path:
+    """Write JSON with indented lines; ``default`` as of ``json.dumps``, errors as of ``write_with``."""
+    return write_text(path, json.dumps(content, indent=1, default=default) + "\n")
+
+
+def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = False) -> Path:
+    """Write arrays by name as ``np.load`` reads them; errors as of ``write_with``."""
+    save: Callable[..., None] = np.savez_compressed if compressed else np.savez
+    return write_with(path, lambda file: save(file, **arrays))
+
+
+def replace_folder(part: Path, path: Path) -> Path:
+    """Give a finished folder its name, in place of the folder that has it; the path.
+
+    Raises
+    ------
+    StoreError
+        It can't be moved.
+    """
+    try:
+        shutil.rmtree(path, ignore_errors=True)
+        os.replace(part, path)
+    except OSError as error:
+        raise unwritten(path, error) from error
+    return path
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove the temporary files and folders that killed processes left in a folder which nobody else writes to now.
+
+    Raises
+    ------
+    StoreError
+        One can't be removed.
+    """
+    try:
+        for part in folder.glob(f".*{PART}"):
+            shutil.rmtree(part) if part.is_dir() else part.unlink()
+    except OSError as error:
+        raise unwritten(folder, error) from error
+
+
+def unwritten(path: Path, error: OSError) -> StoreError:
+    """The error to raise where a path can't be written: names the path, the reason and the remedy."""
+    remedy = _REMEDIES.get(error.errno or 0, _ANY_REMEDY)
+    return StoreError(f"{path}: can't be written ({error.strerror or error}); {remedy}")

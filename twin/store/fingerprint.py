@@ -1,0 +1,270 @@
+"""What code made a result: the modules that a function imports, directly and through others, and the versions of its libraries.
+
+The modules are followed from file to file by their import statements, also those within functions. A name that a package
+only passes on is followed to the module that defines it, so the package's other modules don't count. Of each module the
+syntax tree counts without docstrings; comments and formatting are not in it. So a changed formula is other code, and a
+changed explanation is not. The texts of the command line lie in ``twin.cli``, which nothing that computes imports.
+"""
+
+import ast
+import gc
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from twin.errors import StoreError
+
+PACKAGES = ("scenes", "twin", "training", "hardware")
+ROOT = Path(__file__).parents[2]  # the folder that the packages lie in
+KEEPER = "twin.store"  # keeps results and has no part in making them
+LIBRARIES = {  # import name -> distribution, of those whose version may change a number
+    "cv2": "opencv-python-headless",
+    "drjit": "drjit",
+    "mitsuba": "mitsuba",
+    "numba": "numba",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "torch": "torch",
+    "trimesh": "trimesh",
+}
+
+_From = tuple[str, str | None]  # a module, and the name that is taken from it (None: the module itself)
+Maker = Callable[..., Any] | str  # a function, a class, or the name of a module
+
+
+class UnknownCodeError(StoreError):
+    """The source of a function can't be read: it was typed in, not written to a file."""
+
+
+@dataclass(frozen=True)
+class Code:
+    """The code behind a result.
+
+    Attributes
+    ----------
+    modules : dict of str to str
+        Digest of each module, by its name.
+    libraries : dict of str to str
+        Version of each library, by its distribution's name.
+    """
+
+    modules: Mapping[str, str]
+    libraries: Mapping[str, str]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """One digest of all, 64 hexadecimal digits."""
+        lines = [f"{name} {of}\n" for part in (self.modules, self.libraries) for name, of in sorted(part.items())]
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+    def record(self) -> dict[str, dict[str, str]]:
+        """As JSON holds it."""
+        return {"modules": dict(sorted(self.modules.items())), "libraries": dict(sorted(self.libraries.items()))}
+
+    def changes(self, record: Mapping[str, Mapping[str, str]]) -> list[str]:
+        """What differs from the code of a record, each in a few words; nothing where they are the same."""
+        before, now = record.get("modules", {}), self.modules
+        found = [f"{name} changed" for name in sorted(now) if name in before and before[name] != now[name]]
+        found += [f"{name} is new" for name in sorted(now) if name not in before]
+        found += [f"{name} is gone" for name in sorted(before) if name not in now]
+        had = record.get("libraries", {})
+        return found + [
+            f"{name} {self.libraries.get(name, 'not used')}, was {had.get(name, 'not used')}"
+            for name in sorted({*had, *self.libraries})
+            if had.get(name) != self.libraries.get(name)
+        ]
+
+
+def fingerprint(*makers: Maker) -> str:
+    """Digest of the code behind functions, as 64 hexadecimal digits; see ``code_of``."""
+    return code_of(*makers).fingerprint
+
+
+def code_of(*makers: Maker, root: Path = ROOT) -> Code:
+    """The code behind functions, read once in a process.
+
+    Parameters
+    ----------
+    makers : functions, classes or names of modules
+        Each stands for its module. ``functools.partial``, methods and callable instances stand for what they call.
+    root : Path
+        Folder that the packages lie in.
+
+    Raises
+    ------
+    UnknownCodeError
+        The source of one can't be read.
+    """
+    return _code(root, tuple(sorted({_module_of(maker) for maker in makers})))
+
+
+def name_of(maker: Maker) -> str:
+    """Name of a function or class with its module; of a module its own."""
+    maker = _called(maker)
+    return maker if isinstance(maker, str) else f"{maker.__module__}.{maker.__qualname__}"
+
+
+def _module_of(maker: Maker) -> str:
+    maker = _called(maker)
+    return maker if isinstance(maker, str) else maker.__module__
+
+
+def _called(maker: Maker) -> Maker:
+    """The function or class itself: what a partial or a decorated function calls, the class of a callable instance."""
+    while isinstance(maker, partial):
+        maker = maker.func
+    if isinstance(maker, str):
+        return maker
+    maker = inspect.unwrap(maker)
+    return maker if inspect.isroutine(maker) or inspect.isclass(maker) else type(maker)
+
+
+@cache
+def _code(root: Path, starts: tuple[str, ...]) -> Code:
+    modules, libraries, waiting = {}, set(), [(name, _file_of(root, name)) for name in starts]
+    while waiting:
+        name, file = waiting.pop()
+        if name in modules:
+            continue
+        if file is None:
+            raise UnknownCodeError(f"{name}: its source can't be read, so what it computes can't be kept; write it to a file")
+        found = _read(root, file, name)
+        modules[name] = found.digest
+        for imported, asked in found.imports:
+            top = imported.partition(".")[0]
+            if top in LIBRARIES:
+                libraries.add(LIBRARIES[top])
+            elif top in PACKAGES:
+                waiting += [(each, _source(root, each)) for each in _resolved(root, imported, asked)]
+    return Code(modules, {name: _version(name) for name in libraries})
+
+
+def _file_of(root: Path, name: str) -> Path | None:
+    """Source of a module where the search starts, which may lie outside of the packages."""
+    if name.partition(".")[0] in PACKAGES:
+        return _source(root, name)
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return Path(file) if file and Path(file).is_file() else None
+
+
+def _source(root: Path, name: str) -> Path | None:
+    """File of a module, or of a package's own code; None where there is none."""
+    place = root.joinpath(*name.split("."))
+    return next((file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()), None)
+
+
+def _resolved(root: Path, name: str, asked: str | None) -> list[str]:
+    """Modules that ``from name import asked`` (or ``import name``) takes code from."""
+    if name == KEEPER or name.startswith(f"{KEEPER}."):
+        return []
+    if asked is None or asked == "*":
+        return [name]
+    if _source(root, f"{name}.{asked}") is not None:
+        return _resolved(root, f"{name}.{asked}", None)
+    file = _source(root, name)
+    if file is None or file.name != "__init__.py":
+        return [name]
+    passed_on = _read(root, file, name).names.get(asked)
+    return [name] if passed_on is None else _resolved(root, *passed_on)
+
+
+@dataclass(frozen=True)
+class _Module:
+    """One file: digest, what it imports as (module, name or None), and the names that it has from other modules."""
+
+    digest: str
+    imports: tuple[_From, ...]
+    names: Mapping[str, _From]
+
+
+def source_text(file: Path) -> str:
+    """Text of a module's file."""
+    return file.read_text(encoding="utf-8")
+
+
+@cache
+def _read(root: Path, file: Path, name: str) -> _Module:
+    collecting = gc.isenabled()
+    gc.disable()  # a syntax tree is many small objects: collecting among them doubles the time
+    try:
+        tree = ast.parse(source_text(file))
+        lines: list[str] = []
+        _flatten(tree, lines)
+        imports, names = _imports(tree, name, file.name == "__init__.py")
+    except (OSError, SyntaxError, UnicodeDecodeError) as error:
+        raise UnknownCodeError(f"{file}: not readable ({error}); install the program again") from error
+    finally:
+        if collecting:
+            gc.enable()
+    return _Module(hashlib.sha256("".join(lines).encode()).hexdigest()[:16], imports, names)
+
+
+def _imports(tree: ast.Module, module: str, is_package: bool) -> tuple[tuple[_From, ...], dict[str, _From]]:
+    """Every import of a module, but those for a type checker alone; and its names that come from other modules."""
+    found: dict[_From, None] = {}
+    names: dict[str, _From] = {}
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            waiting += node.orelse
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                found[alias.name, None] = None
+                names[alias.asname or alias.name.partition(".")[0]] = (alias.name, None)
+        elif isinstance(node, ast.ImportFrom):
+            above = module.split(".")[: len(module.split(".")) - node.level + is_package] if node.level else []
+            source = ".".join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                found[source, alias.name] = None
+                names[alias.asname or alias.name] = (source, alias.name)
+        elif isinstance(node, ast.stmt | ast.Module | ast.ExceptHandler | ast.match_case):
+            waiting += ast.iter_child_nodes(node)
+    return tuple(found), names
+
+
+def _flatten(node: ast.AST, lines: list[str]) -> None:
+    """Append a syntax tree as text, without docstrings, places, and fields that are empty."""
+    lines.append(f"({type(node).__name__}")
+    body = getattr(node, "body", None)
+    docstring = body[0] if isinstance(node, _DOCUMENTED) and body and _is_text(body[0]) else None
+    for name in node._fields:
+        value = getattr(node, name, None)
+        if isinstance(value, list):
+            parts = [part for part in value if part is not docstring]
+            lines += [f" {name}["] if parts else []  # an empty list may be a field that only later versions of Python know
+            for part in parts:
+                if isinstance(part, ast.AST):
+                    _flatten(part, lines)
+                else:
+                    lines.append(repr(part))
+            lines += ["]"] if parts else []
+        elif isinstance(value, ast.AST):
+            lines.append(f" {name}")
+            _flatten(value, lines)
+        elif value is not None:
+            lines.append(f" {name}={value!r}")
+    lines.append(")")
+
+
+_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def _is_text(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant) and isinstance(statement.value.value, str)
+
+
+@cache
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "of another origin"

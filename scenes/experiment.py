@@ -5,7 +5,7 @@ the work frame. For each contact a pose and a move are drawn evenly from their r
 ``pose - move + clear``, taps by ``tap``, moves by ``move`` (the shear), and the frame is taken at ``pose + clear + tap``.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -90,7 +90,7 @@ class ExperimentSpec(Section):
         return self.ranges()[f"pose_{self.axis + 1}"][1] - self.ranges()[f"move_{self.axis + 1}"][0]
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         for label, (low, high) in self.ranges().items():
             if low > high:
                 raise ValueError(f"{label} = [{low:g}, {high:g}]: give the lower end first")

@@ -122,8 +122,8 @@ def _list(kind: str) -> dict[str, Path]:
 def _find(name_or_path: str | Path, kind: str) -> Path:
     path = Path(name_or_path)
     if path.suffix != ".toml" and path.is_file():
-        known = ", ".join((".toml", *MESH_SUFFIXES) if kind == "objects" else (".toml",))
-        raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {known}")
+        suffixes = ", ".join((".toml", *MESH_SUFFIXES) if kind == "objects" else (".toml",))
+        raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {suffixes}")
     if path.suffix == ".toml":
         if not path.is_file():
             raise SpecError(f"{path}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'")
@@ -165,7 +165,7 @@ def _explain(error: ValidationError, model: type[BaseModel]) -> str:
     return "; ".join(problems)
 
 
-def _keys_at(model: type[BaseModel], loc: tuple) -> list[str]:
+def _keys_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """Known keys of the section at ``loc`` (a tagged union's tag is one of its parts)."""
     candidates = [model]
     for part in loc:
@@ -175,12 +175,12 @@ def _keys_at(model: type[BaseModel], loc: tuple) -> list[str]:
     return sorted({key for c in candidates for key in c.model_fields})
 
 
-def _models_in(annotation) -> list[type[BaseModel]]:
+def _models_in(annotation: object) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [m for arg in getattr(annotation, "__args__", ()) for m in _models_in(arg)]
 
 
-def _tags(model: type[BaseModel]) -> tuple:
+def _tags(model: type[BaseModel]) -> tuple[str, ...]:
     kind = model.model_fields.get("kind")
     return getattr(kind.annotation, "__args__", ()) if kind else ()

@@ -7,7 +7,7 @@ with (0, 0) at the centre of the first pixel of the *raw* camera frame.
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -39,7 +39,7 @@ class MaterialSpec(Section):
     relaxation: tuple[RelaxationTerm, ...] = ()
 
     @model_validator(mode="after")
-    def _check_law(self):
+    def _check_law(self) -> Self:
         if self.law != "mooney-rivlin" and self.second_invariant_share:
             raise ValueError("second_invariant_share belongs to law = 'mooney-rivlin'")
         if self.law != "yeoh" and (self.c20_c10 or self.c30_c10):
@@ -148,7 +148,7 @@ class CameraSpec(Section):
     blue_shift_px: tuple[float, float] = (0.0, 0.0)
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.projection == "fisheye" and (self.p1 or self.p2):
             raise ValueError("p1 and p2 belong to projection = 'perspective'")
         return self
@@ -176,7 +176,7 @@ class LedRingSpec(Section):
     core_mm: Positive = 0.3
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.balance and len(self.balance) != len(self.azimuth_deg):
             raise ValueError("balance needs one number for each of azimuth_deg")
         return self
@@ -195,7 +195,7 @@ class RimSpec(Section):
     light: Annotated[tuple[tuple[tuple[int, int, int], ...], ...], Field(min_length=3)]
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.outer_mm <= self.inner_mm:
             raise ValueError("outer_mm must be larger than inner_mm")
         if len({len(row) for row in self.light}) > 1 or len(self.light[0]) < 2:
@@ -232,7 +232,7 @@ class HousingSpec(Section):
     rim: RimSpec | None = None
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.outer_radius_mm <= self.aperture_radius_mm:
             raise ValueError("outer_radius_mm must be larger than aperture_radius_mm")
         return self
@@ -320,7 +320,7 @@ class RecordingSpec(Section):
     threshold_offset: float
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         x0, y0, x1, y1 = self.crop_px
         if x1 <= x0 or y1 <= y0:
             raise ValueError("crop_px must be (x0, y0, x1, y1) with x1 > x0 and y1 > y0")
@@ -372,7 +372,7 @@ class SensorSpec(Section):
     rig: RigSpec | None = None
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         skin, pins = self.skin, self.pins
         inner_mm = skin.outer_radius_mm - skin.thickness_mm
         if inner_mm <= 0:

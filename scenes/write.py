@@ -31,7 +31,7 @@ def write_sensor(path: Path, spec: SensorSpec, comment: str = "") -> None:
     partial.replace(path)
 
 
-def _item(value):
+def _item(value: object) -> object:
     if isinstance(value, dict):
         table = tomlkit.table()
         for key, part in value.items():
@@ -60,6 +60,6 @@ def _item(value):
     return value
 
 
-def _numbers(value) -> int:
+def _numbers(value: object) -> int:
     """How many numbers a value holds."""
     return sum(map(_numbers, value)) if isinstance(value, list | tuple) else 1

@@ -13,7 +13,7 @@ from twin.preprocess.pipeline import Pipeline
 from twin.recordings.images import write_image
 from twin.simulator import Shot, Simulator
 from twin.stimulus import build_stimulus
-from twin.types import ContactState
+from twin.types import ContactState, FloatArray
 from twin.views.panel import Look, contact_panel
 from twin.views.skin3d import displaced_skin, draw_contact_skin
 
@@ -29,7 +29,7 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     spec = simulator.spec
     write_image(out / "frame.png", shot.frame.image)
     write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
-    np.savez_compressed(out / "truth.npz", **asdict(shot.truth), **contact_arrays(state))
+    np.savez_compressed(out / "truth.npz", allow_pickle=False, **asdict(shot.truth), **contact_arrays(state))
     (out / "truth.json").write_text(json.dumps(contact_record(simulator, stimulus, pose, state, shot), indent=1) + "\n")
 
     mesh = simulator.solver.mesh
@@ -42,7 +42,7 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     return [out / name for name in names]
 
 
-def contact_arrays(state: ContactState) -> dict[str, np.ndarray]:
+def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
     """The contact, place by place (see ``ContactState``)."""
     names = ("contact_mm", "point_area_mm2", "normal", "normal_n", "tangential_n", "slipping")
     return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}

@@ -17,13 +17,14 @@ or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 
 import numpy as np
 
 from scenes.sensor import CameraSpec, SensorSpec
+from twin.types import FloatArray
 
 NEWTON_STEPS = 12  # quadratic: the last ones only polish
 MOST_NEWTON_MOVE = 0.1  # per step, normalised: keeps far starts from jumping past the fold
 GRAZING = 1e6  # tangent beyond which a ray counts as parallel to the window
 
 
-def sensor_to_camera(camera: CameraSpec) -> np.ndarray:
+def sensor_to_camera(camera: CameraSpec) -> FloatArray:
     """``T_camera_sensor`` (4, 4): camera looks along +z with x right and y down.
 
     The entrance pupil is at (0, 0, -distance) of the sensor frame; the camera is turned about it
@@ -38,7 +39,7 @@ def sensor_to_camera(camera: CameraSpec) -> np.ndarray:
     return T_camera_sensor
 
 
-def distort(camera: CameraSpec, xy: np.ndarray) -> np.ndarray:
+def distort(camera: CameraSpec, xy: FloatArray) -> FloatArray:
     """Tangents (..., 2) of rays in the camera frame to normalised image coordinates."""
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -56,7 +57,7 @@ def distort(camera: CameraSpec, xy: np.ndarray) -> np.ndarray:
     )
 
 
-def undistort(camera: CameraSpec, seen: np.ndarray, *, guess: np.ndarray | None = None) -> np.ndarray:
+def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None = None) -> FloatArray:
     """Normalised image coordinates (..., 2) to tangents: Newton's method on ``distort(ideal) = seen``.
 
     Starts at ``guess`` (default: ``seen``). Meaningless where the distortion folds back, outside its valid field.
@@ -78,7 +79,7 @@ def undistort(camera: CameraSpec, seen: np.ndarray, *, guess: np.ndarray | None 
     return ideal
 
 
-def project(spec: SensorSpec, points_mm: np.ndarray) -> np.ndarray:
+def project(spec: SensorSpec, points_mm: FloatArray) -> FloatArray:
     """Sensor-frame points (..., 3) in front of the camera to raw-frame pixels (..., 2), pixel centres at integers.
 
     A point's height decides the layers its ray passes: points behind the window are seen straight.
@@ -92,7 +93,7 @@ def project(spec: SensorSpec, points_mm: np.ndarray) -> np.ndarray:
     return distort(camera, in_camera[..., :2] / in_camera[..., 2:]) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
 
 
-def window_tangent(spec: SensorSpec, rho_mm: np.ndarray, z_mm: np.ndarray, *, behind_mm: float | None = None) -> np.ndarray:
+def window_tangent(spec: SensorSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
     """Tangent u of the angle in air of the rays that join (0, z0) to (rho, z), z0 the pupil's or ``behind_mm``."""
     heights, indices = _layers(spec, z_mm, -spec.camera.distance_mm if behind_mm is None else behind_mm)
     u = rho_mm / sum(h / n for h, n in zip(heights, indices, strict=True))
@@ -106,7 +107,7 @@ def window_tangent(spec: SensorSpec, rho_mm: np.ndarray, z_mm: np.ndarray, *, be
     return u
 
 
-def pixel_rays(spec: SensorSpec, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pixel_rays(spec: SensorSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Where the rays of raw-frame pixels (..., 2) enter the gel, (..., 3) mm, and their unit directions (..., 3) in it."""
     camera = spec.camera
     ideal = undistort(camera, (np.asarray(pixels, float) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px])
@@ -127,7 +128,7 @@ def pixel_rays(spec: SensorSpec, pixels: np.ndarray) -> tuple[np.ndarray, np.nda
     return place, direction
 
 
-def _layers(spec: SensorSpec, z_mm: np.ndarray, from_mm: float) -> tuple[tuple, tuple]:
+def _layers(spec: SensorSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:
     """Heights of air, window and gel between the planes ``from_mm`` (in the air) and ``z_mm``, and their indices."""
     back, front = spec.lens.back_mm, spec.lens.z_mm
     z = np.asarray(z_mm, float)
@@ -135,9 +136,9 @@ def _layers(spec: SensorSpec, z_mm: np.ndarray, from_mm: float) -> tuple[tuple, 
     return heights, (1.0, spec.lens.refractive_index, spec.gel.refractive_index)
 
 
-def _fisheye(camera: CameraSpec, angle: np.ndarray) -> np.ndarray:
+def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:
     return angle * (1 + camera.k1 * angle**2 + camera.k2 * angle**4)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

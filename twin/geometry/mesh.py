@@ -11,6 +11,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.geometry.chart import Chart, Focus
 from twin.geometry.solid import body_points
+from twin.types import ComplexArray, FloatArray, IntArray
 
 SKIN, GEL = 0, 1
 _ACROSS, _SKIN_LAYERS, _GEL_LAYERS = 21, 1, 4
@@ -43,12 +44,12 @@ class SensorMesh:
     skin_layers : int
     """
 
-    nodes_mm: np.ndarray
-    hexes: np.ndarray
-    material: np.ndarray
-    outer_quads: np.ndarray
-    inner_quads: np.ndarray
-    disc: np.ndarray
+    nodes_mm: FloatArray
+    hexes: IntArray
+    material: IntArray
+    outer_quads: IntArray
+    inner_quads: IntArray
+    disc: ComplexArray
     grid: tuple[int, int, int]
     skin_layers: int
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.sensor import SensorSpec
+from twin.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -21,12 +22,12 @@ class PinRest:
         Centre of the cap's solid (mid-height), ``base + (length + cap_height / 2) axis``.
     """
 
-    base_mm: np.ndarray
-    axis: np.ndarray
-    caps_mm: np.ndarray
+    base_mm: FloatArray
+    axis: FloatArray
+    caps_mm: FloatArray
 
 
-def pin_lattice(layout: str, rings: int) -> np.ndarray:
+def pin_lattice(layout: str, rings: int) -> FloatArray:
     """Unit-disc lattice of a layout: (N, 2) of (radius / outermost radius, azimuth in rad).
 
     Order: the centre, then ring by ring, each from its first pin by increasing azimuth

@@ -23,6 +23,7 @@ from twin.geometry.soft_body import SoftBody
 from twin.geometry.solid import pin_pose, surface_operators
 from twin.mechanics.elements import PAIRS
 from twin.projection import pixel_rays, project
+from twin.types import BoolArray, FloatArray
 
 STEPS = 14  # of Gauss-Newton at most
 SETTLED_MM = 0.01  # largest move of a step that is the last
@@ -68,14 +69,14 @@ class FittedPins:
         Sum of the tractions found, on the skin.
     """
 
-    base_mm: np.ndarray
-    axis: np.ndarray
-    caps_mm: np.ndarray
-    remainder_px: np.ndarray
-    force_n: np.ndarray
+    base_mm: FloatArray
+    axis: FloatArray
+    caps_mm: FloatArray
+    remainder_px: FloatArray
+    force_n: FloatArray
 
 
-def fit_skin(spec: SensorSpec, pins_px: np.ndarray, *, prior: Prior | None = None, centroids: bool = True) -> FittedPins:
+def fit_skin(spec: SensorSpec, pins_px: FloatArray, *, prior: Prior | None = None, centroids: bool = True) -> FittedPins:
     """Pins in space from pins in the image; see ``SkinFit`` for many frames of one sensor.
 
     Raises
@@ -86,7 +87,7 @@ def fit_skin(spec: SensorSpec, pins_px: np.ndarray, *, prior: Prior | None = Non
     return SkinFit(spec, prior=prior)(pins_px, centroids=centroids)
 
 
-def centroid_offset_px(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def centroid_offset_px(spec: SensorSpec, caps_mm: FloatArray, axis: FloatArray) -> FloatArray:
     """(N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
     turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS + 1)[:, None, None]
     u = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
@@ -106,7 +107,7 @@ class SkinFit:
     prior : Prior, optional
     """
 
-    def __init__(self, spec: SensorSpec, *, prior: Prior | None = None):
+    def __init__(self, spec: SensorSpec, *, prior: Prior | None = None) -> None:
         self.spec, self.prior = spec, prior or Prior()
         self._blas = ThreadpoolController()
         self._body = SoftBody(spec)
@@ -122,7 +123,7 @@ class SkinFit:
         self._mass = (self._value.T @ (self._area_mm2[:, None] * self._value)).toarray()  # traction coefficients to forces
         self._loaded = self._body.unknown[self._outer][moving]  # (m, 3) unknowns that carry the traction
 
-    def __call__(self, pins_px: np.ndarray, *, centroids: bool = True) -> FittedPins:
+    def __call__(self, pins_px: FloatArray, *, centroids: bool = True) -> FittedPins:
         """Fit one frame.
 
         Parameters
@@ -141,7 +142,7 @@ class SkinFit:
         count = self.spec.pins.count
         if pins_px.shape != (count, 2):
             raise ValueError(f"expected pins_px of shape ({count}, 2) for {self.spec.name}, got {pins_px.shape}")
-        seen = np.isfinite(pins_px).all(axis=1)
+        seen: BoolArray = np.all(np.isfinite(pins_px), axis=1)
         if 2 * seen.sum() < count:
             raise ValueError(f"{seen.sum()} of {count} pins are too few to fit a skin to; at least half are needed")
         control, traction = self._solid.control_mm.copy(), np.zeros(self._area_mm2.shape + (3,))
@@ -156,11 +157,11 @@ class SkinFit:
             pins = self._on_rays(control, pins_px - self._offset_px(control) * centroids, seen)
         return replace(pins, force_n=self._area_mm2 @ traction)
 
-    def _offset_px(self, control: np.ndarray) -> np.ndarray:
+    def _offset_px(self, control: FloatArray) -> FloatArray:
         _, axis, cap = pin_pose(self._solid, control)
         return centroid_offset_px(self.spec, cap, axis)
 
-    def _on_rays(self, control: np.ndarray, target_px: np.ndarray, seen: np.ndarray) -> FittedPins:
+    def _on_rays(self, control: FloatArray, target_px: FloatArray, seen: BoolArray) -> FittedPins:
         """Pins of a shape, the seen ones shifted parallel to the image onto their rays."""
         base, axis, cap = pin_pose(self._solid, control)
         remainder = np.where(seen, np.linalg.norm(project(self.spec, cap) - target_px, axis=1), np.nan)
@@ -169,7 +170,9 @@ class SkinFit:
         shift = np.where(seen[:, None], on_ray - cap, 0.0)
         return FittedPins(base + shift, axis, cap + shift, remainder, np.zeros(3))
 
-    def _step(self, control, target_px, seen, traction, *, even: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _step(
+        self, control: FloatArray, target_px: FloatArray, seen: BoolArray, traction: FloatArray, *, even: bool
+    ) -> tuple[FloatArray, FloatArray]:
         """Move (f, 3) of the free controls, and the traction (q, 3) in MPa at the skin's points that goes with it."""
         factor, force = self._body.factor(control), self._body.forces(control)
         seen_px, per_control = self._pin_rows(control, seen)
@@ -183,7 +186,7 @@ class SkinFit:
         load[self._loaded] += self._mass @ coefficients
         return cho_solve(factor, load).reshape(-1, 3), self._value @ coefficients
 
-    def _cost(self, control: np.ndarray, traction: np.ndarray, *, even: bool) -> np.ndarray:
+    def _cost(self, control: FloatArray, traction: FloatArray, *, even: bool) -> FloatArray:
         """Quadratic form (3 m, 3 m) of the traction's coefficients, weighted by the traction (q, 3) of the step before."""
         prior = self.prior
         outward = np.cross(*(s @ control[self._outer] for s in self._slopes))
@@ -198,7 +201,7 @@ class SkinFit:
             form[:, i, :, j] = form[:, j, :, i] = (self._value.T @ (weight[:, None] * self._value)).toarray()
         return form.reshape(3 * count, 3 * count)
 
-    def _pin_rows(self, control: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _pin_rows(self, control: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Projections (s, 2) of the seen caps, and their derivative (2 s, unknowns) by the free controls."""
         solid, inner = self._solid, control[self._solid.inner]
         _, axis, cap = pin_pose(solid, control)

@@ -84,6 +84,7 @@ def _start(spec: SensorSpec, resolution: Resolution | None) -> None:
 
 
 def _work(number: int, job: ContactJob) -> ContactOutcome:
+    assert _solver is not None, "the process was not started by press_many"
     return _solve(_solver, number, job)
 
 

@@ -14,6 +14,8 @@ from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, 
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
+from twin.stimulus import Stimulus
+from twin.types import FloatArray, IntArray
 
 GAP_BOUND_MM = 0.01  # no contact point ends deeper inside the object
 RESIDUAL_TOLERANCE = 1e-6  # of the sum of the contact forces
@@ -29,7 +31,7 @@ _REACH_MM = 0.15  # contact points farther than this from the object are left ou
 class NoConvergence(Exception):
     """A load step was not solved; ``relative`` is the relative residual reached."""
 
-    def __init__(self, relative: float):
+    def __init__(self, relative: float) -> None:
         super().__init__(relative)
         self.relative = relative
 
@@ -47,7 +49,7 @@ class LoadStepper:
     compliance_mm_per_n : float
     """
 
-    def __init__(self, body: Body, frontal: FrontalSolver, stimulus, friction: Friction, compliance_mm_per_n: float):
+    def __init__(self, body: Body, frontal: FrontalSolver, stimulus: Stimulus, friction: Friction, compliance_mm_per_n: float) -> None:
         self._body, self._frontal, self._stimulus, self._friction = body, frontal, stimulus, friction
         self._compliance = compliance_mm_per_n
         shapes = [(len(kind.cells.controls), 6, *2 * kind.cells.controls.shape[1:]) for kind in body.kinds]
@@ -60,7 +62,7 @@ class LoadStepper:
         self._reachable = ((self._local >= 0) | ~body.free[body.points.controls]).all(axis=1)
         self._tangent: Tangent | None = None
         self._shift = 0.0
-        self._near: tuple | None = None
+        self._near: tuple[Tangent, IntArray, Near] | None = None
         self._last: LoadState | None = None
         self.iterations, self.inner_iterations, self.eliminations = 0, 0, 0
 
@@ -68,7 +70,7 @@ class LoadStepper:
         """Go on with changed elements (a relaxing material's law is scaled by the step's duration)."""
         self._body = body
 
-    def step(self, state: LoadState, T: np.ndarray, given: list[np.ndarray]) -> tuple[LoadState, Balance, np.ndarray]:
+    def step(self, state: LoadState, T: FloatArray, given: list[FloatArray]) -> tuple[LoadState, Balance, IntArray]:
         """The converged state with the object at ``T``, no contact point deeper than the bound.
 
         ``given``: stress left of the past, for each kind of elements (see ``Elements.add_forces``).
@@ -104,7 +106,7 @@ class LoadStepper:
                 return self._accepted(state, problem, control, border, balance), balance, looked
         raise NoConvergence(balance.relative)
 
-    def _extrapolate(self, state: LoadState, T: np.ndarray):
+    def _extrapolate(self, state: LoadState, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where the body will be if it goes on as in the last step; where it is if the object turns another way.
 
         If that leaves an element inside out, the step isn't solved, and a shorter one goes less far.
@@ -116,12 +118,12 @@ class LoadStepper:
             return state.control_mm, state.border
 
         before, now = carried(at, old.T, state.T).ravel(), carried(at, state.T, T).ravel()
-        ratio = (before @ now) / max(before @ before, 1e-300)
+        ratio = (before @ now) / max(float(before @ before), 1e-300)
         if before @ now < 0.95 * np.linalg.norm(before) * np.linalg.norm(now) or ratio > 2:
             return state.control_mm, state.border
         return state.control_mm + ratio * (state.control_mm - old.control_mm), state.border
 
-    def _accepted(self, state: LoadState, problem: Problem, control, border, balance: Balance) -> LoadState:
+    def _accepted(self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance) -> LoadState:
         contact, looked, count = balance.contact, problem.looked, len(state.held)
         self._last = state
         held, anchor, slid = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count)
@@ -132,18 +134,20 @@ class LoadStepper:
         lost = float((tangential * moved)[contact.slipping].sum())
         return LoadState(control, border, anchor, held, slid, problem.penalty, problem.T, balance.elastic_nmm, lost)
 
-    def _seen(self, control, border, T) -> np.ndarray:
+    def _seen(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
         """All contact points in the object's frame, (p, 3)."""
         return in_object(self._body.points.positions(control), T, border)
 
-    def _solve(self, problem: Problem, control, border, extrapolated: bool):
+    def _solve(
+        self, problem: Problem, control: FloatArray, border: FloatArray, extrapolated: bool
+    ) -> tuple[FloatArray, FloatArray, Balance]:
         balance = problem.balance(control, border)
+        if balance is None:
+            raise NoConvergence(np.inf)
         astray = False
         tangent, fresh, shift, last, accepted = self._tangent, False, 0.0, np.inf, 0
         most_inner = self.inner_iterations + _INNER_ITERATIONS
         for _ in range(_ITERATIONS):
-            if balance is None:
-                raise NoConvergence(np.inf)
             if balance.relative <= RESIDUAL_TOLERANCE:
                 return control, border, balance
             if self.inner_iterations > most_inner:
@@ -177,7 +181,7 @@ class LoadStepper:
             return control, border, balance
         raise NoConvergence(balance.relative)
 
-    def _linearise(self, problem: Problem, control, border, shift: float) -> Tangent:
+    def _linearise(self, problem: Problem, control: FloatArray, border: FloatArray, shift: float) -> Tangent:
         """The body's tangent at a state, plus a shift on the diagonal."""
         self.eliminations += 1
         self._tangent = None  # its room is used again
@@ -200,7 +204,9 @@ class LoadStepper:
         inner[eliminated.kept] = False
         return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]))
 
-    def _contact_move(self, problem: Problem, tangent: Tangent, control, border, balance: Balance, soften: bool):
+    def _contact_move(
+        self, problem: Problem, tangent: Tangent, control: FloatArray, border: FloatArray, balance: Balance, soften: bool
+    ) -> tuple[FloatArray, FloatArray]:
         """The move (unknowns,) and (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept

@@ -1,12 +1,14 @@
 """Where the object goes: a path of poses through which it is moved."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError
+from twin.stimulus import Stimulus
+from twin.types import FloatArray
 
 _LARGEST_TILT_DEG = 60.0
 _LARGEST_TWIST_DEG = 90.0
@@ -54,26 +56,26 @@ class ContactPath:
         ``T_sensor_object``, k >= 2.
     times_s : (k,) float, optional
         When each is reached, rising; only a viscoelastic sensor cares. Two equal poses hold the object still.
-        Default: one second each.
+        Empty, the default: one second each.
     """
 
-    poses: np.ndarray
-    times_s: np.ndarray | None = None
+    poses: FloatArray
+    times_s: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         poses = np.asarray(self.poses, float)
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2 or not np.isfinite(poses).all():
             raise ContactError(f"a path needs at least two finite 4x4 poses, got an array of shape {poses.shape}")
         turn = poses[:, :3, :3]
         if np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(turn) < 0).any():
             raise ContactError("a pose of the path is not a rigid motion; give rotations in its upper left 3x3")
-        times = np.arange(len(poses), dtype=float) if self.times_s is None else np.asarray(self.times_s, float)
+        times = np.asarray(self.times_s, float) if np.size(self.times_s) else np.arange(len(poses), dtype=float)
         if times.shape != (len(poses),) or not (np.diff(times) > 0).all():
             raise ContactError(f"times_s must rise, one for each of the {len(poses)} poses, got {times}")
         object.__setattr__(self, "poses", poses)
         object.__setattr__(self, "times_s", times)
 
-    def at(self, progress: float) -> np.ndarray:
+    def at(self, progress: float) -> FloatArray:
         """``T_sensor_object`` (4, 4) at a progress from 0 (first pose) to k - 1 (last)."""
         leg = int(np.clip(np.floor(progress), 0, len(self.poses) - 2))
         share = progress - leg
@@ -94,7 +96,7 @@ class ContactPath:
         return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([self.times_s, self.times_s[-1] + span[1:]]))
 
 
-def carried(points_mm: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+def carried(points_mm: FloatArray, start: FloatArray, stop: FloatArray) -> FloatArray:
     """How far points (k, 3) move with an object that goes from one pose (4, 4) to another."""
     return (points_mm - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - points_mm
 
@@ -104,7 +106,7 @@ def deepest_mm(spec: SensorSpec) -> float:
     return 0.5 * (spec.skin.outer_radius_mm - spec.skin.thickness_mm - spec.lens.z_mm)
 
 
-def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
+def plan_path(spec: SensorSpec, stimulus: Stimulus, pose: ContactPose) -> ContactPath:
     """Check a pose and find its first touch with the undeformed skin: poses at touch, pressed, and (if it moves further) sheared.
 
     The object comes down along z by its smallest distance to the dome, again and again, which never
@@ -146,7 +148,7 @@ def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
     return ContactPath(np.stack(poses))
 
 
-def dome_directions(spec: SensorSpec, count: int) -> np.ndarray:
+def dome_directions(spec: SensorSpec, count: int) -> FloatArray:
     """(k, 3) unit vectors evenly over the dome, about ``count`` on the whole sphere."""
     directions = _sphere_points(count)
     return directions[directions[:, 2] >= spec.skin.rim_z_mm / spec.skin.outer_radius_mm]
@@ -169,7 +171,7 @@ def _check(spec: SensorSpec, pose: ContactPose) -> None:
             raise ContactError(f"{name}: {value:g} is more than {limit:g} ({reason}); give a smaller value")
 
 
-def _bring_down(stimulus, T, points_mm, height_mm, depth_mm):
+def _bring_down(stimulus: Stimulus, T: FloatArray, points_mm: FloatArray, height_mm: float, depth_mm: float) -> tuple[float, int]:
     """Height above ``T`` (mm) where the object just touches the points, and the index of the touched one."""
     turn, shift = T[:3, :3], T[:3, 3]
     free_mm = None
@@ -190,7 +192,7 @@ def _bring_down(stimulus, T, points_mm, height_mm, depth_mm):
     raise ContactError("the object misses the dome; use a smaller offset or tilt")
 
 
-def _sphere_points(count: int) -> np.ndarray:
+def _sphere_points(count: int) -> FloatArray:
     """(count, 3) nearly even unit vectors (Fibonacci sphere)."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count

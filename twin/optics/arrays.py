@@ -5,12 +5,15 @@ beyond its last element. Where that is the end of a mapped page the process dies
 Embree asks for the same room behind vertices. So what is handed over gets room behind its end.
 """
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 ROOM_BYTES = 64  # the widest packet: 16 numbers of 4 bytes (AVX-512)
 
 
-def with_room(values, dtype) -> np.ndarray:
+def with_room(values: ArrayLike, dtype: DTypeLike) -> NDArray[Any]:
     """A contiguous copy of ``values``, of their shape, with ``ROOM_BYTES`` of its own memory behind its end."""
     values = np.asarray(values)
     room = np.zeros(values.size + -(-ROOM_BYTES // np.dtype(dtype).itemsize), dtype)

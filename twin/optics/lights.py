@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.sensor import SensorSpec
+from twin.types import FloatArray
 
 LED_FLUX = 640.0  # radiance times area (mm^2) of an LED of power 1: a white cap then sends about 1, the unit of the linear image
 
@@ -24,10 +25,10 @@ class Patch:
         Linear RGB.
     """
 
-    center_mm: np.ndarray
-    half_mm: np.ndarray
-    radii_mm: np.ndarray
-    radiance: np.ndarray
+    center_mm: FloatArray
+    half_mm: FloatArray
+    radii_mm: FloatArray
+    radiance: FloatArray
 
     @property
     def area_mm2(self) -> float:

@@ -5,6 +5,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.optics.surfaces import CAP_BEVEL, cap_outlines
 from twin.projection import project
+from twin.types import FloatArray
 
 SIDES = 16  # of an outline
 RIM_PLACES = 6  # a rim's image is smooth: these determine it
@@ -22,7 +23,7 @@ class PinOutlines:
     the rim's, ``centre + f(t) odd(t) + f(t)^2 even(t)``. Discs further along the axis are taken to be shifted images.
     """
 
-    def __init__(self, spec: SensorSpec):
+    def __init__(self, spec: SensorSpec) -> None:
         self._spec = spec
         shapes = cap_outlines(spec, SIDES)
         self._cap = EVENLY * (np.ones((1, SIDES)) if shapes is None else shapes)[..., None]
@@ -30,7 +31,7 @@ class PinOutlines:
         self._odd = np.cos(apart) * 2 / RIM_PLACES
         self._even = (0.5 + np.cos(2 * apart)) * 2 / RIM_PLACES
 
-    def __call__(self, base_mm: np.ndarray, axis: np.ndarray, caps_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, base_mm: FloatArray, axis: FloatArray, caps_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Feet (N, 2), and outlines (N, 3, SIDES, 2) of stem, side and face of each pin, given (N, 3) each."""
         pins = self._spec.pins
         radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
@@ -45,7 +46,7 @@ class PinOutlines:
         odd, even = (np.einsum("kj,jnc->nkc", series, from_centre) for series in (self._odd, self._even))
         along = (centre - foot) / np.linalg.norm(caps_mm - base_mm, axis=1)[:, None, None]  # px per mm of the axis
 
-        def disc(factor):
+        def disc(factor: float | FloatArray) -> FloatArray:
             return factor * odd + factor**2 * even
 
         stem = disc(EVENLY * 0.5 * pins.diameter_mm / radius)
@@ -54,7 +55,7 @@ class PinOutlines:
         return seen[-1], np.stack([_hull(foot + stem, centre - half * along + stem), _hull(bottom, edge, face), face], axis=1)
 
 
-def _hull(*discs: np.ndarray) -> np.ndarray:
+def _hull(*discs: FloatArray) -> FloatArray:
     """Outline (N, K, 2) about similar closed outlines (N, K, 2): of their points k the one furthest out."""
     tangent = np.roll(discs[0], -1, axis=1) - np.roll(discs[0], 1, axis=1)
     outward = np.stack([tangent[..., 1], -tangent[..., 0]], axis=-1)

@@ -5,13 +5,14 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.projection import project
+from twin.types import BoolArray, PinState
 
 SKIN_SAVING = 4  # samples on a pin for one on bare skin
 MARGIN_PX = 2.0  # what a pin's edge may be off
 SUBPIXEL_BITS = 4
 
 
-def near_pins(spec: SensorSpec, state, window_px: tuple[int, int, int, int]) -> np.ndarray:
+def near_pins(spec: SensorSpec, state: PinState, window_px: tuple[int, int, int, int]) -> BoolArray:
     """Pixels (H, W) bool of a window of the raw frame that may show a part of a pin, from its foot to its cap."""
     pins, (x0, y0, x1, y1) = spec.pins, window_px
     across = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis

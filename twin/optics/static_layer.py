@@ -9,9 +9,10 @@ from scipy.ndimage import map_coordinates
 
 from scenes.sensor import HousingSpec, SensorSpec
 from twin.optics.lens import ray_table, subpixel_rays
-from twin.optics.lights import led_patches, lights
+from twin.optics.lights import Patch, led_patches, lights
 from twin.optics.window import fresnel
 from twin.projection import sensor_to_camera
+from twin.types import FloatArray
 
 ACROSS = 4  # places in a pixel, each way, where its corners differ
 EVEN = 0.02  # relative difference of the corners below which their mean is the pixel
@@ -19,7 +20,7 @@ RIM_UNIT = 1000.0  # of the numbers in RimSpec.light
 SMALL = 1e-3  # light and cover below this need no relative precision
 
 
-def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:
     """Light and cover of a window of the raw frame.
 
     Returns
@@ -41,7 +42,7 @@ def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tupl
     return both[..., :3].astype(np.float32), both[..., 3].astype(np.float32)
 
 
-def _seen(spec: SensorSpec, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _seen(spec: SensorSpec, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Light (..., 3) and cover (...) along rays (..., 3) from the pupil, sensor frame, of any length."""
     camera, ring = spec.camera, spec.housing
     tangents = rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)
@@ -53,7 +54,7 @@ def _seen(spec: SensorSpec, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return light, np.where(wall, 1.0, hidden)
 
 
-def rim_light(ring: HousingSpec, at_mm: np.ndarray) -> np.ndarray:
+def rim_light(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
     """Light (..., 3) measured on top of the formulas at places (..., 2) of the housing's plane; linear in azimuth and radius."""
     if ring.rim is None:
         return np.zeros((*at_mm.shape[:-1], 3))
@@ -69,8 +70,8 @@ def rim_light(ring: HousingSpec, at_mm: np.ndarray) -> np.ndarray:
 
 
 def rim_places(
-    ring: HousingSpec, inner_mm: float, outer_mm: float, shape: tuple[int, int], at_mm: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    ring: HousingSpec, inner_mm: float, outer_mm: float, shape: tuple[int, int], at_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Row and column (...) in a rim's table, of ``shape`` azimuths and radii, of places (..., 2) of the housing's plane."""
     place = at_mm - ring.center_mm
     turn = np.arctan2(place[..., 1], place[..., 0]) % (2 * np.pi) / (2 * np.pi) * shape[0]
@@ -78,7 +79,7 @@ def rim_places(
     return turn, along
 
 
-def housing_light(spec: SensorSpec, at_mm: np.ndarray) -> np.ndarray:
+def housing_light(spec: SensorSpec, at_mm: FloatArray) -> FloatArray:
     """Radiance (..., 3) that the ring and wall send to the camera from places (..., 2) of their plane.
 
     ``albedo * power * (ambient * lit share of LEDs * exp(-(rho - aperture) / falloff)
@@ -98,7 +99,7 @@ def housing_light(spec: SensorSpec, at_mm: np.ndarray) -> np.ndarray:
     return light[..., None] * np.array(ring.albedo)
 
 
-def reflections(spec: SensorSpec, tangents: np.ndarray) -> np.ndarray:
+def reflections(spec: SensorSpec, tangents: FloatArray) -> FloatArray:
     """Radiance (..., 3) of the lights mirrored in both faces of the window, for tangents (..., 2) of rays in air."""
     lens, distance = spec.lens, spec.camera.distance_mm
     u2 = np.sum(tangents**2, axis=-1)
@@ -111,7 +112,7 @@ def reflections(spec: SensorSpec, tangents: np.ndarray) -> np.ndarray:
     from_front = (1 - outer) ** 2 * inner / (1 - outer * inner)
     # tan(window) / tan(air): the detour through the window and back
     detour = 2 * lens.thickness_mm * cos_air / (lens.refractive_index * cos_window)
-    total = 0.0
+    total: FloatArray = np.zeros((*u2.shape, 3))
     for patch in lights(spec):
         straight = (lens.back_mm + distance) + (lens.back_mm - patch.center_mm[2])
         for weight, reach in ((outer, straight), (from_front, straight + detour)):
@@ -120,7 +121,7 @@ def reflections(spec: SensorSpec, tangents: np.ndarray) -> np.ndarray:
     return total
 
 
-def _profile(spec: SensorSpec, patch, at_mm: np.ndarray) -> np.ndarray:
+def _profile(spec: SensorSpec, patch: Patch, at_mm: FloatArray) -> FloatArray:
     """A light's radiance at places (..., 2) about its centre, relative to its mean."""
     inner, outer = patch.radii_mm
     if outer > 0:
@@ -132,7 +133,7 @@ def _profile(spec: SensorSpec, patch, at_mm: np.ndarray) -> np.ndarray:
     return spec.leds.mirror_share * ((1 - share) * within + share * core)
 
 
-def _specks(spec: SensorSpec, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _specks(spec: SensorSpec, tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cover (...) and light (..., 3) of the specks on the window's gel side."""
     hidden, shine = np.zeros(tangents.shape[:-1]), np.zeros((*tangents.shape[:-1], 3))
     lens, u2 = spec.lens, np.sum(tangents**2, axis=-1, keepdims=True)

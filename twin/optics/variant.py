@@ -15,10 +15,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeAlias
 
 from twin.errors import RenderError
 from twin.optics.native import load_needed_libraries
 from twin.optics.probes import probe
+
+DrJit: TypeAlias = Any
+"""A value of Dr.Jit or an object of Mitsuba. Their classes belong to the variant, which is chosen while the program runs."""
 
 OLDEST_LLVM = 16  # 14 and 15 abort at the first kernel
 BACKENDS = ("cuda", "llvm", "scalar")
@@ -118,7 +123,7 @@ def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_s
     if backend not in (*BACKENDS, "auto"):
         names = ", ".join(v for v in available_variants() if v.endswith(("_rgb", "_mono")))
         raise RenderError(f"{source}={wish!r} is no variant: use auto, {', '.join(BACKENDS)}, or one of {names}")
-    failed = []
+    failed: list[str] = []
     for kind in BACKENDS if backend == "auto" else (backend,):
         choice, reason = _try(kind, exact or _name(kind, channels), llvm_search)
         if choice is not None:
@@ -128,7 +133,7 @@ def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_s
     raise RenderError(f"{source}={wish!r} does not work here: {failed[0]}; {REMEDY if backend == 'llvm' else 'use TACTIP_VARIANT=auto'}")
 
 
-def use_variant(choice: VariantChoice):
+def use_variant(choice: VariantChoice) -> ModuleType:
     """Make ``choice`` Mitsuba's current variant and return the ``mitsuba`` module."""
     if choice.llvm_path:
         os.environ[_LLVM_VARIABLE] = choice.llvm_path
@@ -202,7 +207,7 @@ def _name(backend: str, channels: str) -> str:
     return mono if channels == "mono" and mono in available_variants() else f"{prefix}_rgb"
 
 
-def _try(backend: str, variant: str, llvm_search) -> tuple[VariantChoice | None, str]:
+def _try(backend: str, variant: str, llvm_search: Sequence[Path] | None) -> tuple[VariantChoice | None, str]:
     if variant not in available_variants():
         return None, f"{variant} is not compiled into the installed Mitsuba"
     if missing := load_needed_libraries():

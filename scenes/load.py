@@ -14,6 +14,7 @@ from scenes.object import MeshShape, ObjectSpec
 from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
 from scenes.servo import ServoSpec
+from scenes.tables import fill_in_tables
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
@@ -143,6 +144,10 @@ def _read(path: Path, model: type[Spec]) -> Spec:
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SpecError(f"{path}: not readable as TOML: {error}") from error
     data.setdefault("name", path.stem)
+    try:
+        data = fill_in_tables(data, path.parent)
+    except ValueError as error:
+        raise SpecError(f"{path}: {error}") from error
     try:
         return model.model_validate(data)
     except ValidationError as error:

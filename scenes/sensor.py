@@ -352,6 +352,30 @@ class PipelineSpec(Section):
     recording: BlobSpec | None = None
 
 
+class GeometrySpec(Section):
+    """Where skin, window and pins are: what the meshes of a sensor are made from (``SensorSpec.geometry``)."""
+
+    skin: SkinSpec
+    lens: LensSpec
+    pins: PinsSpec
+
+
+class ViewSpec(Section):
+    """What decides where the camera sees a place in the gel: the camera, the window and the gel's index (``SensorSpec.view``)."""
+
+    camera: CameraSpec
+    lens: LensSpec
+    gel_index: Index
+
+
+class CaptureSpec(Section):
+    """What makes a frame from the light on the film: the gel's haze, the camera's optics and its response (``SensorSpec.capture``)."""
+
+    gel: GelSpec
+    camera: CameraSpec
+    response: ResponseSpec
+
+
 class SensorSpec(Section):
     """A TacTip, complete. ``name`` is the file's stem; ``rig`` is there where contacts of this sensor on a robot were calibrated."""
 
@@ -370,6 +394,21 @@ class SensorSpec(Section):
     recording: RecordingSpec | None = None
     pipeline: PipelineSpec
     rig: RigSpec | None = None
+
+    @property
+    def geometry(self) -> GeometrySpec:
+        """Skin, window and pins."""
+        return GeometrySpec.model_construct(skin=self.skin, lens=self.lens, pins=self.pins)
+
+    @property
+    def view(self) -> ViewSpec:
+        """Camera, window and the gel's index."""
+        return ViewSpec.model_construct(camera=self.camera, lens=self.lens, gel_index=self.gel.refractive_index)
+
+    @property
+    def capture(self) -> CaptureSpec:
+        """The gel's haze, the camera's optics and its response."""
+        return CaptureSpec.model_construct(gel=self.gel, camera=self.camera, response=self.response)
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from scenes.sensor import CameraSpec, GelSpec, RecordingSpec, ResponseSpec, SensorSpec
+from scenes.sensor import CameraSpec, CaptureSpec, GelSpec, RecordingSpec, ResponseSpec
 from twin.errors import FrameError
 from twin.types import FloatArray, ImageArray
 from twin.video import luma_weights, through_stream
@@ -13,7 +13,7 @@ MEDIAN_PX = 5  # the recorder's own despeckling before its threshold
 
 
 def expose(
-    linear: FloatArray, spec: SensorSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
+    linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
 ) -> ImageArray:
     """What gel, lens and camera make of the light: a raw frame.
 
@@ -25,7 +25,7 @@ def expose(
     ----------
     linear : (H, W, 3) or (H, W) float
         Chromatic aberration and white balance apply to colour only.
-    spec : SensorSpec
+    capture : CaptureSpec
     rng : numpy.random.Generator, optional
         Source of the frame's gain and noise; without it there is neither.
     origin_px : (x, y)
@@ -35,11 +35,11 @@ def expose(
     -------
     (H, W, 3) or (H, W) uint8
     """
-    response = spec.response
-    light = hazed(np.asarray(linear, np.float32), spec.gel)
-    light = dispersed(light, spec.camera, origin_px)
+    camera, response = capture.camera, capture.response
+    light = hazed(np.asarray(linear, np.float32), capture.gel)
+    light = dispersed(light, camera, origin_px)
     light = blurred(light, response.blur_sigma_px)
-    light = vignetted(light, spec.camera, origin_px)
+    light = vignetted(light, camera, origin_px)
     light = amplified(light, response, rng)
     gray = developed(light, noisy(light, response, rng), response, origin_px)
     frame = through_stream(gray, response.stream) if gray.ndim == 3 else np.clip(np.rint(gray), 0, 255).astype(np.uint8)

@@ -16,7 +16,7 @@ or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 
 
 import numpy as np
 
-from scenes.sensor import CameraSpec, SensorSpec
+from scenes.sensor import CameraSpec, ViewSpec
 from twin.types import FloatArray
 
 NEWTON_STEPS = 12  # quadratic: the last ones only polish
@@ -79,23 +79,23 @@ def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None 
     return ideal
 
 
-def project(spec: SensorSpec, points_mm: FloatArray) -> FloatArray:
+def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
     """Sensor-frame points (..., 3) in front of the camera to raw-frame pixels (..., 2), pixel centres at integers.
 
     A point's height decides the layers its ray passes: points behind the window are seen straight.
     """
-    camera = spec.camera
+    camera = view.camera
     rho = np.linalg.norm(points_mm[..., :2], axis=-1)
-    tangent = window_tangent(spec, rho, points_mm[..., 2])
+    tangent = window_tangent(view, rho, points_mm[..., 2])
     across = points_mm[..., :2] * (tangent / np.maximum(rho, 1e-12))[..., None]
     in_sensor = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
     in_camera = in_sensor @ sensor_to_camera(camera)[:3, :3].T
     return distort(camera, in_camera[..., :2] / in_camera[..., 2:]) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
 
 
-def window_tangent(spec: SensorSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
+def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
     """Tangent u of the angle in air of the rays that join (0, z0) to (rho, z), z0 the pupil's or ``behind_mm``."""
-    heights, indices = _layers(spec, z_mm, -spec.camera.distance_mm if behind_mm is None else behind_mm)
+    heights, indices = _layers(view, z_mm, -view.camera.distance_mm if behind_mm is None else behind_mm)
     u = rho_mm / sum(h / n for h, n in zip(heights, indices, strict=True))
     for _ in range(NEWTON_STEPS):
         reach, slope = 0.0, 0.0
@@ -107,9 +107,9 @@ def window_tangent(spec: SensorSpec, rho_mm: FloatArray, z_mm: FloatArray, *, be
     return u
 
 
-def pixel_rays(spec: SensorSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Where the rays of raw-frame pixels (..., 2) enter the gel, (..., 3) mm, and their unit directions (..., 3) in it."""
-    camera = spec.camera
+    camera = view.camera
     ideal = undistort(camera, (np.asarray(pixels, float) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px])
     in_camera = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
     direction = in_camera @ sensor_to_camera(camera)[:3, :3]
@@ -117,9 +117,9 @@ def pixel_rays(spec: SensorSpec, pixels: FloatArray) -> tuple[FloatArray, FloatA
     place = np.zeros_like(direction)
     place[..., 2] = -camera.distance_mm
     for index, before, height in (
-        (1.0, 1.0, spec.lens.back_mm + camera.distance_mm),
-        (spec.lens.refractive_index, 1.0, spec.lens.thickness_mm),
-        (spec.gel.refractive_index, spec.lens.refractive_index, 0.0),
+        (1.0, 1.0, view.lens.back_mm + camera.distance_mm),
+        (view.lens.refractive_index, 1.0, view.lens.thickness_mm),
+        (view.gel_index, view.lens.refractive_index, 0.0),
     ):
         across = direction[..., :2] * before / index
         up = np.sqrt(np.maximum(1 - np.sum(across**2, axis=-1, keepdims=True), 0))
@@ -128,12 +128,12 @@ def pixel_rays(spec: SensorSpec, pixels: FloatArray) -> tuple[FloatArray, FloatA
     return place, direction
 
 
-def _layers(spec: SensorSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:
+def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:
     """Heights of air, window and gel between the planes ``from_mm`` (in the air) and ``z_mm``, and their indices."""
-    back, front = spec.lens.back_mm, spec.lens.z_mm
+    back, front = view.lens.back_mm, view.lens.z_mm
     z = np.asarray(z_mm, float)
     heights = np.minimum(z, back) - from_mm, np.clip(z, back, front) - back, np.maximum(z - front, 0)
-    return heights, (1.0, spec.lens.refractive_index, spec.gel.refractive_index)
+    return heights, (1.0, view.lens.refractive_index, view.gel_index)
 
 
 def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:

@@ -90,7 +90,7 @@ class Simulator:
         self.check_form(form)
         start = perf_counter()
         linear = self.renderer.render(state, seed=seed)
-        image = expose(linear, self.spec, np.random.default_rng(seed))
+        image = expose(linear, self.spec.capture, np.random.default_rng(seed))
         seconds = perf_counter() - start
         raw = Shot(Frame(image, Form.RAW, name), linear, cap_truth(self.spec, self.rest, state, Form.RAW), seconds)
         return raw if form is Form.RAW else self.as_recorded(raw, state)

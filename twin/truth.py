@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import SensorSpec, ViewSpec
 from twin.preprocess.forms import frame_size, from_raw
 from twin.projection import pixel_rays, project
 from twin.types import BoolArray, ContactState, FloatArray, Form, PinState
@@ -33,19 +33,19 @@ class CapTruth:
 
 def cap_truth(spec: SensorSpec, rest: ContactState, state: ContactState, form: Form) -> CapTruth:
     """Ground truth of a contact for frames of the given form."""
-    caps_px = from_raw(spec, form, project(spec, state.caps_mm))
-    rest_px = from_raw(spec, form, project(spec, rest.caps_mm))
+    caps_px = from_raw(spec, form, project(spec.view, state.caps_mm))
+    rest_px = from_raw(spec, form, project(spec.view, rest.caps_mm))
     inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
-    return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec, state))
+    return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state))
 
 
-def occluded(spec: SensorSpec, state: PinState) -> BoolArray:
+def occluded(view: ViewSpec, cap_radius_mm: float, state: PinState) -> BoolArray:
     """(N,) bool: the ray in the gel from the window to the cap's centre passes through another pin.
 
     Pins count as capsules of the cap's radius around the axis from foot to cap.
     """
-    window_mm, _ = pixel_rays(spec, project(spec, state.caps_mm))
-    return _meets_another(window_mm, state.base_mm, state.caps_mm, spec.pins.cap_diameter_mm / 2)
+    window_mm, _ = pixel_rays(view, project(view, state.caps_mm))
+    return _meets_another(window_mm, state.base_mm, state.caps_mm, cap_radius_mm)
 
 
 @numba.njit(cache=True)

@@ -179,11 +179,11 @@ def test_friction_vanishes_without_friction_and_slides_at_its_coefficient(solver
 
 
 def test_more_friction_drags_the_pins_further_along_the_shear(solver, sensor):
-    rest = project(sensor, solver.rest().caps_mm)
+    rest = project(sensor.view, solver.rest().caps_mm)
     moved = []
     for mu in (0.0, 0.2, 1.0):
         state = solver.press(load_object("plane"), ContactPose(2.0, shear_mm=(1.2, 0.0)), friction=mu)
-        moved.append((project(sensor, state.caps_mm) - rest).mean(axis=0)[0])
+        moved.append((project(sensor.view, state.caps_mm) - rest).mean(axis=0)[0])
     assert abs(moved[0]) < 0.1 < moved[1] < moved[2]
 
 
@@ -196,10 +196,10 @@ def test_tilt_presses_the_side_that_comes_first(solver):
 
 
 def test_area_force_energy_and_mean_spread_grow_with_depth(solver, sensor):
-    rest = project(sensor, solver.rest().caps_mm)
+    rest = project(sensor.view, solver.rest().caps_mm)
     centre, path = rest[0], []
     for _, state in solver.path(load_object("plane"), ContactPose(4.5)):
-        radial = np.linalg.norm(project(sensor, state.caps_mm) - centre, axis=1) - np.linalg.norm(rest - centre, axis=1)
+        radial = np.linalg.norm(project(sensor.view, state.caps_mm) - centre, axis=1) - np.linalg.norm(rest - centre, axis=1)
         path.append((state.force_n[2], radial.mean(), state.area_mm2, state.elastic_nmm))
     force, spread, area, energy = np.array(path).T
     assert (np.diff(force) > 0).all() and (np.diff(energy) > 0).all()
@@ -232,7 +232,7 @@ def turned(plan, angle_rad):
 def test_a_scene_turned_by_steps_of_the_focus_gives_the_turned_answer(solver, friction, angle_deg):
     """Off the axis the grid turns with the contact, by steps of 15 deg: all is the same but rounding."""
     field = build_stimulus(load_object("cylinder"))
-    plan = plan_path(solver.spec, field, ContactPose(2.0, tilt_deg=(0.0, 20.0), shear_mm=(0.8, 0.3), offset_mm=(2.0, 0.0)))
+    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, tilt_deg=(0.0, 20.0), shear_mm=(0.8, 0.3), offset_mm=(2.0, 0.0)))
     state = solver.press(field, plan, friction=friction)
     control, at = solver.state.control_mm, state.T_sensor_object
     plan, turn = turned(plan, np.radians(angle_deg))
@@ -250,7 +250,7 @@ def test_a_scene_turned_by_steps_of_the_focus_gives_the_turned_answer(solver, fr
 def test_a_scene_turned_by_any_angle_gives_about_the_turned_answer(solver, name):
     """On the axis the grid stays, off the axis it turns by a rounded angle: the answers differ by the grid's error."""
     field = build_stimulus(load_object(name))
-    plan = plan_path(solver.spec, field, ContactPose(2.0, tilt_deg=(10.0, 0.0), shear_mm=(0.8, 0.3)))
+    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, tilt_deg=(10.0, 0.0), shear_mm=(0.8, 0.3)))
     state = solver.press(field, plan, friction=0.5)
     plan, turn = turned(plan, np.radians(37))
     other = solver.press(field, plan, friction=0.5)
@@ -261,7 +261,7 @@ def test_a_scene_turned_by_any_angle_gives_about_the_turned_answer(solver, name)
 
 def test_a_contact_on_the_axis_turned_by_a_quarter_turns_the_nodes(solver):
     field = build_stimulus(load_object("plane"))
-    plan = plan_path(solver.spec, field, ContactPose(2.0, shear_mm=(0.8, 0.3)))
+    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, shear_mm=(0.8, 0.3)))
     state = solver.press(field, plan, friction=0.5)
     plan, turn = turned(plan, np.pi / 2)
     other = solver.press(field, plan, friction=0.5)
@@ -324,7 +324,7 @@ def test_other_laws_press_alike_at_little_indentation_and_yeoh_stiffer_at_more(s
 
 
 def drags(solver, friction, shear_mm=3.0, step_mm=0.1):
-    plan = plan_path(solver.spec, build_stimulus(load_object("plane")), ContactPose(1.5, shear_mm=(shear_mm, 0.0)))
+    plan = plan_path(solver.spec.geometry, build_stimulus(load_object("plane")), ContactPose(1.5, shear_mm=(shear_mm, 0.0)))
     states = [(at, state) for at, state in solver.path(load_object("plane"), plan, friction=friction, step_mm=step_mm) if at > 0.5]
     return np.array([-state.force_n[0] / state.force_n[2] for _, state in states]), states
 

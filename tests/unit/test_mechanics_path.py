@@ -153,7 +153,7 @@ def test_every_state_s_progress_is_told_in_order(solver):
 @pytest.mark.parametrize("name, offset", [("plane", (0, 0)), ("sphere", (3, -4)), ("edge", (-2, 0)), ("mesh-can", (1, 1))])
 def test_path_starts_at_first_touch(sensor, name, offset):
     field = build_stimulus(load_object(name))
-    T = plan_path(sensor, field, ContactPose(1.0, tilt_deg=(10.0, 5.0), offset_mm=offset)).at(0.0)
+    T = plan_path(sensor.geometry, field, ContactPose(1.0, tilt_deg=(10.0, 5.0), offset_mm=offset)).at(0.0)
     angle = np.linspace(0, 2 * np.pi, 721)
     polar, azimuth = np.meshgrid(angle[:181], angle)
     dome = 20.0 * np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1).reshape(-1, 3)

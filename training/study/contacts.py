@@ -89,7 +89,7 @@ def twin_contacts(spec: SensorSpec, form: Form, *, depths_mm=DEPTHS_MM, names=tu
         stimulus, turn_deg, aside_mm = CONTACTS[name]
         thing = load_object(stimulus)
         for depth in depths_mm:
-            poses = plan_path(spec, build_stimulus(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
+            poses = plan_path(spec.geometry, build_stimulus(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
             state = [state for _, state in simulator.solver.path(thing, ContactPath(_turned(turn_deg) @ poses))][-1]
             seen = pipeline(simulator.shoot(state, form=form).frame)
             if not seen.valid:

@@ -135,4 +135,4 @@ class ContactModel:
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px
 
     def _pixels(self, caps_mm: np.ndarray) -> np.ndarray:
-        return from_raw(self.spec, self.form, project(self.spec, caps_mm))
+        return from_raw(self.spec, self.form, project(self.spec.view, caps_mm))

@@ -93,7 +93,7 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
     written = contact_pictures(pictures, result)
     touched = result.state.contact_mm
     contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
-    contact_px = from_raw(spec, result.look.frame.form, project(spec, contact_mm[None]))[0]
+    contact_px = from_raw(spec, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
     return {
         "title": f"{spec.name} against {result.stimulus}",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec
 from twin.geometry.chart import Chart, Focus
 from twin.geometry.solid import body_points
 from twin.types import ComplexArray, FloatArray, IntArray
@@ -54,11 +54,11 @@ class SensorMesh:
     skin_layers: int
 
 
-def build_mesh(spec: SensorSpec) -> SensorMesh:
+def build_mesh(geometry: GeometrySpec) -> SensorMesh:
     """Mesh a sensor at rest: 21x21 columns, one layer of skin, four of gel."""
     side, layers = _ACROSS, _SKIN_LAYERS + _GEL_LAYERS
     v, u = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side), indexing="ij")
-    largest = float(np.arccos(spec.skin.rim_z_mm / (spec.skin.outer_radius_mm - spec.skin.thickness_mm)))
+    largest = float(np.arccos(geometry.skin.rim_z_mm / (geometry.skin.outer_radius_mm - geometry.skin.thickness_mm)))
     disc = Chart(Focus(radius_rad=0.62 * largest), largest).disc(np.stack([u.ravel(), v.ravel()], axis=1))
     depths = np.concatenate([np.linspace(0, 1, _SKIN_LAYERS + 1), 1 + np.linspace(0, 1, _GEL_LAYERS + 1)[1:]])
     grid = (layers + 1, side, side)
@@ -66,7 +66,7 @@ def build_mesh(spec: SensorSpec) -> SensorMesh:
     cells = [index[c : layers + c, b : side - 1 + b, a : side - 1 + a] for a, b, c in _HEX_CORNERS]
     quads = np.stack([c[0] for c in cells[:4]], axis=-1).reshape(-1, 4)
     return SensorMesh(
-        nodes_mm=np.concatenate([body_points(spec, disc, depth) for depth in depths]),
+        nodes_mm=np.concatenate([body_points(geometry, disc, depth) for depth in depths]),
         # layers run inwards: swap the two faces, so that the first four corners are the inner ones
         hexes=np.stack(cells[4:] + cells[:4], axis=-1).reshape(-1, 8),
         material=np.repeat(np.where(np.arange(layers) < _SKIN_LAYERS, SKIN, GEL), (side - 1) ** 2),

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec
 from twin.types import FloatArray
 
 
@@ -47,9 +47,9 @@ def pin_lattice(layout: str, rings: int) -> FloatArray:
     return np.array(points)
 
 
-def rest_pins(spec: SensorSpec) -> PinRest:
-    """Pins at rest of a sensor: the lattice wrapped onto the inside of the dome (``spec.pins.spacing``)."""
-    pins, skin = spec.pins, spec.skin
+def rest_pins(geometry: GeometrySpec) -> PinRest:
+    """Pins at rest of a sensor: the lattice wrapped onto the inside of the dome as ``PinsSpec.spacing`` says."""
+    pins, skin = geometry.pins, geometry.skin
     lattice = pin_lattice(pins.layout, pins.rings)
     largest = np.radians(pins.max_polar_deg)
     polar = largest * lattice[:, 0] if pins.spacing == "polar" else np.arcsin(np.sin(largest) * lattice[:, 0])

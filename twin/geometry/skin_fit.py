@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 from threadpoolctl import ThreadpoolController
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import SensorSpec, ViewSpec
 from twin.geometry.soft_body import SoftBody
 from twin.geometry.solid import pin_pose, surface_operators
 from twin.mechanics.elements import PAIRS
@@ -87,13 +87,13 @@ def fit_skin(spec: SensorSpec, pins_px: FloatArray, *, prior: Prior | None = Non
     return SkinFit(spec, prior=prior)(pins_px, centroids=centroids)
 
 
-def centroid_offset_px(spec: SensorSpec, caps_mm: FloatArray, axis: FloatArray) -> FloatArray:
+def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArray, axis: FloatArray) -> FloatArray:
     """(N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
     turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS + 1)[:, None, None]
     u = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    rim = caps_mm + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
-    p = project(spec, rim) - project(spec, caps_mm)
+    rim = caps_mm + 0.5 * cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
+    p = project(view, rim) - project(view, caps_mm)
     twice = p[:-1, :, 0] * p[1:, :, 1] - p[1:, :, 0] * p[:-1, :, 1]
     return ((p[:-1] + p[1:]) * twice[..., None]).sum(axis=0) / (3 * twice.sum(axis=0))[:, None]
 
@@ -110,7 +110,8 @@ class SkinFit:
     def __init__(self, spec: SensorSpec, *, prior: Prior | None = None) -> None:
         self.spec, self.prior = spec, prior or Prior()
         self._blas = ThreadpoolController()
-        self._body = SoftBody(spec)
+        self._view = spec.view
+        self._body = SoftBody(spec.geometry, spec.gel)
         solid = self._solid = self._body.solid
         at, weights = (a.ravel() for a in solid.basis.gauss(2))
         v, u = (g.ravel() for g in np.meshgrid(at, at, indexing="ij"))
@@ -159,13 +160,13 @@ class SkinFit:
 
     def _offset_px(self, control: FloatArray) -> FloatArray:
         _, axis, cap = pin_pose(self._solid, control)
-        return centroid_offset_px(self.spec, cap, axis)
+        return centroid_offset_px(self._view, self.spec.pins.cap_diameter_mm, cap, axis)
 
     def _on_rays(self, control: FloatArray, target_px: FloatArray, seen: BoolArray) -> FittedPins:
         """Pins of a shape, the seen ones shifted parallel to the image onto their rays."""
         base, axis, cap = pin_pose(self._solid, control)
-        remainder = np.where(seen, np.linalg.norm(project(self.spec, cap) - target_px, axis=1), np.nan)
-        place, along = pixel_rays(self.spec, np.where(seen[:, None], target_px, 0.0))
+        remainder = np.where(seen, np.linalg.norm(project(self._view, cap) - target_px, axis=1), np.nan)
+        place, along = pixel_rays(self._view, np.where(seen[:, None], target_px, 0.0))
         on_ray = place + along * ((cap[:, 2] - place[:, 2]) / along[:, 2])[:, None]
         shift = np.where(seen[:, None], on_ray - cap, 0.0)
         return FittedPins(base + shift, axis, cap + shift, remainder, np.zeros(3))
@@ -208,8 +209,8 @@ class SkinFit:
         slopes = solid.pin_slope_u, solid.pin_slope_v
         t = np.stack([s @ inner for s in slopes], axis=1)
         dual = np.linalg.inv(t @ t.swapaxes(1, 2)) @ t
-        here = project(self.spec, cap)
-        per_mm = np.stack([(project(self.spec, cap + PROBE_MM * unit) - here) / PROBE_MM for unit in np.eye(3)], axis=2)
+        here = project(self._view, cap)
+        per_mm = np.stack([(project(self._view, cap + PROBE_MM * unit) - here) / PROBE_MM for unit in np.eye(3)], axis=2)
         rows = np.zeros((seen.sum(), 2, len(control), 3))
         part = solid.pin_value[seen, None, :, None] * per_mm[seen, :, None, :]
         for slope, toward in zip(slopes, dual.swapaxes(0, 1), strict=True):  # the axis turns as the normal: d a = -t^c (a . d t_c)

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GelSpec, GeometrySpec
 from twin.geometry.solid import build_solid
 from twin.mechanics.elements import PAIRS, Elements
 from twin.mechanics.material import law_coefficients
@@ -25,11 +25,11 @@ class SoftBody:
         Number of each control's unknowns, control by control; -1 where clamped.
     """
 
-    def __init__(self, spec: SensorSpec) -> None:
-        solid = self.solid = build_solid(spec)
-        gel = law_coefficients(spec.gel, layer=False)
-        skin = Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True)
-        self._kinds = skin, Elements(solid.gel_top, gel), Elements(solid.gel_deep, gel)
+    def __init__(self, geometry: GeometrySpec, gel: GelSpec) -> None:
+        solid = self.solid = build_solid(geometry)
+        soft = law_coefficients(gel, layer=False)
+        skin = Elements(solid.skin, law_coefficients(geometry.skin, layer=True), layer=True)
+        self._kinds = skin, Elements(solid.gel_top, soft), Elements(solid.gel_deep, soft)
         self.free = np.flatnonzero(~solid.fixed)
         self.unknown = np.full((len(solid.fixed), 3), -1)
         self.unknown[self.free] = np.arange(3 * len(self.free)).reshape(-1, 3)

@@ -12,7 +12,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec
 from twin.cache import cached_arrays
 from twin.geometry.bspline import Basis
 from twin.geometry.chart import Chart, Focus, disc_points, dome_points
@@ -119,27 +119,27 @@ class Solid:
         return foot, np.linalg.inv(frame)
 
 
-def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus: Focus | None = None, keep: bool = True) -> Solid:
+def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None, focus: Focus | None = None, keep: bool = True) -> Solid:
     """The body of a sensor, its grid fine around a focus (default: around the apex).
 
     It depends on the sensor's geometry alone, and is kept on disk (see ``twin.cache``) if ``keep``.
     """
     resolution, focus = resolution or Resolution(), focus or Focus()
-    inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
+    inner_mm = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm
     basis = Basis(np.linspace(-1, 1, resolution.across + 1))
-    chart = Chart(focus, float(np.arccos(spec.skin.rim_z_mm / inner_mm)))
+    chart = Chart(focus, float(np.arccos(geometry.skin.rim_z_mm / inner_mm)))
     coarse = Basis(basis.breaks[::2])
     through = Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING)
-    geometry = ("outer_radius_mm", "thickness_mm", "rim_z_mm")
+    shape_of_skin = ("outer_radius_mm", "thickness_mm", "rim_z_mm")
     key = {
         "version": _VERSION,
-        "skin": {name: getattr(spec.skin, name) for name in geometry},
-        "lens_mm": spec.lens.z_mm,
-        "pins": spec.pins.model_dump(mode="json"),
+        "skin": {name: getattr(geometry.skin, name) for name in shape_of_skin},
+        "lens_mm": geometry.lens.z_mm,
+        "pins": geometry.pins.model_dump(mode="json"),
         "resolution": asdict(resolution),
         "focus": asdict(focus),
     }
-    arrays = partial(_arrays, spec, resolution, chart, basis, coarse, through)
+    arrays = partial(_arrays, geometry, resolution, chart, basis, coarse, through)
     kept = cached_arrays("solid", key, arrays) if keep else arrays()
     upper = basis.count**2
     return Solid(
@@ -159,7 +159,7 @@ def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus
         pin_base_mm=kept["pin_base_mm"],
         pin_axis=kept["pin_axis"],
         inner=slice(resolution.skin_layers * upper, (resolution.skin_layers + 1) * upper),
-        pin_cap_length_mm=spec.pins.length_mm + spec.pins.cap_height_mm / 2,
+        pin_cap_length_mm=geometry.pins.length_mm + geometry.pins.cap_height_mm / 2,
     )
 
 
@@ -168,14 +168,16 @@ def _kept_cells(kept: dict[str, np.ndarray], name: str) -> Cells:
     return Cells(kept[f"{name}_controls"], kept[f"{name}_gradients"], kept[f"{name}_weights_mm3"])
 
 
-def _arrays(spec: SensorSpec, resolution: Resolution, chart: Chart, basis: Basis, coarse: Basis, through: Basis) -> dict[str, np.ndarray]:
+def _arrays(
+    geometry: GeometrySpec, resolution: Resolution, chart: Chart, basis: Basis, coarse: Basis, through: Basis
+) -> dict[str, np.ndarray]:
     """The arrays of a ``Solid``, by name."""
-    inner_mm, layers = spec.skin.outer_radius_mm - spec.skin.thickness_mm, resolution.skin_layers
+    inner_mm, layers = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm, resolution.skin_layers
     through_skin = Basis(np.linspace(0, 1, layers + 1), degree=1)
     side, coarse_side = basis.count, coarse.count
 
-    fine = [_fit(basis, chart, spec, depth) for depth in through_skin.greville]
-    deep = [_fit(coarse, chart, spec, depth) for depth in through.greville[1:]]
+    fine = [_fit(basis, chart, geometry, depth) for depth in through_skin.greville]
+    deep = [_fit(coarse, chart, geometry, depth) for depth in through.greville[1:]]
     control = np.concatenate(fine + deep)
     index = np.arange(len(fine) * side * side).reshape(-1, side, side)
     below = (len(fine) * side * side + np.arange(len(deep) * coarse_side**2)).reshape(-1, coarse_side, coarse_side)
@@ -192,8 +194,8 @@ def _arrays(spec: SensorSpec, resolution: Resolution, chart: Chart, basis: Basis
         "gel_top": spline_cells(basis, top, through, 0, control),
         "gel_deep": joined_cells([spline_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
     }
-    pins = rest_pins(spec)
-    value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, spec.skin.rim_z_mm)))
+    pins = rest_pins(geometry)
+    value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, geometry.skin.rim_z_mm)))
     return {
         **{f"{name}_{part}": getattr(kind, part) for name, kind in cells.items() for part in _CELL_PARTS},
         "boxes_0": np.tile(_boxes(resolution.across, 1), (layers, 1)),
@@ -246,23 +248,23 @@ def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
     return base, axis, base + solid.pin_cap_length_mm * axis
 
 
-def body_points(spec: SensorSpec, disc: ComplexArray, depth: float) -> FloatArray:
+def body_points(geometry: GeometrySpec, disc: ComplexArray, depth: float) -> FloatArray:
     """Places (k, 3) of the body at rest: depth 0 outside of the skin, 1 its inside, 2 the lens; straight lines between."""
-    skin = spec.skin
+    skin = geometry.skin
     inner_mm = skin.outer_radius_mm - skin.thickness_mm
     inner = dome_points(disc, inner_mm, skin.rim_z_mm)
     if depth <= 1:
         outer = dome_points(disc, skin.outer_radius_mm, skin.rim_z_mm)
         return outer + depth * (inner - outer)
     flat = np.sqrt(inner_mm**2 - skin.rim_z_mm**2) * disc
-    lens = np.column_stack([flat.real, flat.imag, np.full(len(disc), spec.lens.z_mm)])
+    lens = np.column_stack([flat.real, flat.imag, np.full(len(disc), geometry.lens.z_mm)])
     return inner + (depth - 1) * (lens - inner)
 
 
-def _fit(basis: Basis, chart: Chart, spec: SensorSpec, depth: float) -> FloatArray:
+def _fit(basis: Basis, chart: Chart, geometry: GeometrySpec, depth: float) -> FloatArray:
     """Controls (side^2, 3) of the spline surface through the body's places at one depth."""
     v, u = np.meshgrid(basis.greville, basis.greville, indexing="ij")
-    places = body_points(spec, chart.disc(np.column_stack([u.ravel(), v.ravel()])), depth)
+    places = body_points(geometry, chart.disc(np.column_stack([u.ravel(), v.ravel()])), depth)
     inverse = np.linalg.inv(basis.values(basis.greville))
     return np.einsum("ri,cj,ijx->rcx", inverse, inverse, places.reshape(basis.count, basis.count, 3), optimize=True).reshape(-1, 3)
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
 from twin.geometry.mesh import SensorMesh
 from twin.geometry.solid import Solid, surface_operators
 from twin.types import FloatArray
@@ -33,7 +32,7 @@ class NodeView:
     gel: FloatArray
 
     @classmethod
-    def of(cls, spec: SensorSpec, mesh: SensorMesh, solid: Solid) -> "NodeView":
+    def of(cls, mesh: SensorMesh, solid: Solid) -> "NodeView":
         """The map for one solid of a sensor."""
         at = solid.chart.square(mesh.disc)
         layers = np.linspace(0, 1, mesh.skin_layers + 1)

@@ -40,7 +40,7 @@ class Follower:
         rig = solver.spec.rig
         self._law, self._compliance = friction_of(stimulus), stimulus.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
         self._radius_mm = solver.spec.skin.outer_radius_mm
-        self._dome_mm = self._radius_mm * dome_directions(solver.spec, _DIRECTIONS)
+        self._dome_mm = self._radius_mm * dome_directions(solver.spec.skin, _DIRECTIONS)
         self._rest = solver.rest()
         self._contact: OngoingContact | None = None
         self._reached = np.zeros((0, 3))
@@ -93,7 +93,7 @@ class Follower:
         return ContactState.untouched(rest.nodes_mm, rest.base_mm, rest.axis, rest.caps_mm, T_sensor_object=T)
 
     def _press(self, T: np.ndarray, time_s: float) -> None:
-        limit = deepest_mm(self._solver.spec)
+        limit = deepest_mm(self._solver.spec.geometry)
         if (deep := -self.gap_mm(T)) > limit:
             raise ContactError(f"the object is {deep:.1f} mm inside the dome, more than {limit:.1f} (half the gel's depth); move away")
         near = self._T is not None and np.linalg.norm(carried(self._dome_mm, self._T, T), axis=1).max() < LARGEST_MOVE_MM

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import RelaxationTerm
 from twin.errors import ContactError
 from twin.geometry.solid import Solid, pin_pose
 from twin.geometry.view import NodeView
@@ -21,11 +21,21 @@ _SMALLEST_STRIDE = 1 / 64  # of a regular load step
 
 @dataclass(frozen=True)
 class Setting:
-    """A solid, and what is derived from it."""
+    """A solid, and what is derived from it.
+
+    Attributes
+    ----------
+    solid : Solid
+    body : Body
+    view : NodeView
+    relaxation : tuple of tuples of RelaxationTerm
+        For each kind of the body's elements; empty where it is elastic.
+    """
 
     solid: Solid
     body: Body
     view: NodeView
+    relaxation: tuple[tuple[RelaxationTerm, ...], ...]
 
 
 class OngoingContact:
@@ -33,7 +43,6 @@ class OngoingContact:
 
     Parameters
     ----------
-    spec : SensorSpec
     setting : Setting
     T : (4, 4) float
         The object's pose at the start, free of contact.
@@ -46,7 +55,7 @@ class OngoingContact:
         The last converged one, of all controls.
     """
 
-    def __init__(self, spec: SensorSpec, setting: Setting, T: FloatArray, one_thread: Callable[[], AbstractContextManager]) -> None:
+    def __init__(self, setting: Setting, T: FloatArray, one_thread: Callable[[], AbstractContextManager]) -> None:
         self.setting, self._one_thread = setting, one_thread
         self.stepper: LoadStepper | None = None  # set before the first step
         body = setting.body
@@ -60,7 +69,7 @@ class OngoingContact:
             penalty_mpa_mm=_PENALTY_MPA_MM,
             T=T,
         )
-        self._terms = [spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation]
+        self._terms = setting.relaxation
         self._past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, self._terms, strict=True)]
 
     def step(self, T: FloatArray, span_s: float) -> ContactState:

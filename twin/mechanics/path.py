@@ -1,11 +1,11 @@
 """Where the object goes: a path of poses through which it is moved."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec, SkinSpec
 from twin.errors import ContactError
 from twin.stimulus import Stimulus
 from twin.types import FloatArray
@@ -56,11 +56,11 @@ class ContactPath:
         ``T_sensor_object``, k >= 2.
     times_s : (k,) float, optional
         When each is reached, rising; only a viscoelastic sensor cares. Two equal poses hold the object still.
-        Empty, the default: one second each.
+        Default: one second each.
     """
 
     poses: FloatArray
-    times_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    times_s: FloatArray | None = None
 
     def __post_init__(self) -> None:
         poses = np.asarray(self.poses, float)
@@ -69,11 +69,17 @@ class ContactPath:
         turn = poses[:, :3, :3]
         if np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(turn) < 0).any():
             raise ContactError("a pose of the path is not a rigid motion; give rotations in its upper left 3x3")
-        times = np.asarray(self.times_s, float) if np.size(self.times_s) else np.arange(len(poses), dtype=float)
+        times = np.arange(len(poses), dtype=float) if self.times_s is None else np.asarray(self.times_s, float)
         if times.shape != (len(poses),) or not (np.diff(times) > 0).all():
             raise ContactError(f"times_s must rise, one for each of the {len(poses)} poses, got {times}")
         object.__setattr__(self, "poses", poses)
         object.__setattr__(self, "times_s", times)
+
+    @property
+    def _clock(self) -> FloatArray:
+        """``times_s``, which is there once the path is made."""
+        assert self.times_s is not None
+        return self.times_s
 
     def at(self, progress: float) -> FloatArray:
         """``T_sensor_object`` (4, 4) at a progress from 0 (first pose) to k - 1 (last)."""
@@ -88,12 +94,13 @@ class ContactPath:
 
     def time_s(self, progress: float) -> float:
         """Time at a progress."""
-        return float(np.interp(progress, np.arange(len(self.poses)), self.times_s))
+        return float(np.interp(progress, np.arange(len(self.poses)), self._clock))
 
     def there_and_back(self) -> "ContactPath":
         """The path, then the same way back."""
-        span = self.times_s[-1] - self.times_s[::-1]
-        return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([self.times_s, self.times_s[-1] + span[1:]]))
+        clock = self._clock
+        span = clock[-1] - clock[::-1]
+        return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([clock, clock[-1] + span[1:]]))
 
 
 def carried(points_mm: FloatArray, start: FloatArray, stop: FloatArray) -> FloatArray:
@@ -101,12 +108,12 @@ def carried(points_mm: FloatArray, start: FloatArray, stop: FloatArray) -> Float
     return (points_mm - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - points_mm
 
 
-def deepest_mm(spec: SensorSpec) -> float:
+def deepest_mm(geometry: GeometrySpec) -> float:
     """Half the gel's depth: no contact goes deeper."""
-    return 0.5 * (spec.skin.outer_radius_mm - spec.skin.thickness_mm - spec.lens.z_mm)
+    return 0.5 * (geometry.skin.outer_radius_mm - geometry.skin.thickness_mm - geometry.lens.z_mm)
 
 
-def plan_path(spec: SensorSpec, stimulus: Stimulus, pose: ContactPose) -> ContactPath:
+def plan_path(geometry: GeometrySpec, stimulus: Stimulus, pose: ContactPose) -> ContactPath:
     """Check a pose and find its first touch with the undeformed skin: poses at touch, pressed, and (if it moves further) sheared.
 
     The object comes down along z by its smallest distance to the dome, again and again, which never
@@ -118,23 +125,24 @@ def plan_path(spec: SensorSpec, stimulus: Stimulus, pose: ContactPose) -> Contac
     ContactError
         If a value is out of range, or the object misses the dome or starts inside it.
     """
-    _check(spec, pose)
+    _check(geometry, pose)
     rx, ry = np.radians(pose.tilt_deg)
     turn_x = np.array([[1, 0, 0], [0, np.cos(rx), -np.sin(rx)], [0, np.sin(rx), np.cos(rx)]])
     turn_y = np.array([[np.cos(ry), 0, np.sin(ry)], [0, 1, 0], [-np.sin(ry), 0, np.cos(ry)]])
-    radius = spec.skin.outer_radius_mm
+    skin = geometry.skin
+    radius = skin.outer_radius_mm
     T = np.eye(4)
     T[:3, :3] = turn_y @ turn_x
     T[:3, 3] = [*pose.offset_mm, radius]
-    lowest_z = spec.skin.rim_z_mm / radius
-    directions = dome_directions(spec, _DOME_POINTS)
-    height, nearest = _bring_down(stimulus, T, radius * directions, _START_MM, radius - spec.skin.rim_z_mm)
+    lowest_z = skin.rim_z_mm / radius
+    directions = dome_directions(skin, _DOME_POINTS)
+    height, nearest = _bring_down(stimulus, T, radius * directions, _START_MM, radius - skin.rim_z_mm)
     # around the nearest point the sampling is refined 30 times
     spread = 3 / np.sqrt(_DOME_POINTS)
     near = directions[nearest] + spread * _sphere_points(2000)
     near /= np.linalg.norm(near, axis=1, keepdims=True)
     near = near[near[:, 2] >= lowest_z]
-    height, _ = _bring_down(stimulus, T, radius * near, height + spread * radius, radius - spec.skin.rim_z_mm)
+    height, _ = _bring_down(stimulus, T, radius * near, height + spread * radius, radius - skin.rim_z_mm)
     T[2, 3] += height
     pressed = T.copy()
     pressed[2, 3] -= max(pose.indent_mm, 0.0)
@@ -148,19 +156,19 @@ def plan_path(spec: SensorSpec, stimulus: Stimulus, pose: ContactPose) -> Contac
     return ContactPath(np.stack(poses))
 
 
-def dome_directions(spec: SensorSpec, count: int) -> FloatArray:
+def dome_directions(skin: SkinSpec, count: int) -> FloatArray:
     """(k, 3) unit vectors evenly over the dome, about ``count`` on the whole sphere."""
     directions = _sphere_points(count)
-    return directions[directions[:, 2] >= spec.skin.rim_z_mm / spec.skin.outer_radius_mm]
+    return directions[directions[:, 2] >= skin.rim_z_mm / skin.outer_radius_mm]
 
 
-def _check(spec: SensorSpec, pose: ContactPose) -> None:
+def _check(geometry: GeometrySpec, pose: ContactPose) -> None:
     values = np.concatenate([[pose.indent_mm, pose.twist_deg], pose.tilt_deg, pose.shear_mm, pose.offset_mm])
     if values.shape != (8,) or not np.isfinite(values).all():
         raise ContactError(f"a contact pose needs finite numbers, got {values}; give numbers in mm and deg")
-    radius = spec.skin.outer_radius_mm
+    radius = geometry.skin.outer_radius_mm
     limits = [
-        ("indent_mm", pose.indent_mm, deepest_mm(spec), "half the gel's depth"),
+        ("indent_mm", pose.indent_mm, deepest_mm(geometry), "half the gel's depth"),
         ("tilt_deg", max(map(abs, pose.tilt_deg)), _LARGEST_TILT_DEG, "the dome's reach"),
         ("shear_mm", float(np.hypot(*pose.shear_mm)), radius / 2, "half the dome's radius"),
         ("twist_deg", abs(pose.twist_deg), _LARGEST_TWIST_DEG, "a quarter turn"),

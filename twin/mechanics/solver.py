@@ -46,7 +46,7 @@ class SkinSolver:
 
     def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None, keep: bool = True) -> None:
         self.spec, self.resolution, self._keep = spec, resolution or Resolution(), keep
-        self.mesh = build_mesh(spec)
+        self.mesh = build_mesh(spec.geometry)
         self._blas = ThreadpoolController()
         self._setting = lru_cache(maxsize=32)(self._set_up)
 
@@ -114,7 +114,7 @@ class SkinSolver:
         spec, field = (stimulus, build_stimulus(stimulus)) if isinstance(stimulus, ObjectSpec) else (None, stimulus)
         law = friction_of(spec, friction)
         compliance = compliance_mm_per_n if compliance_mm_per_n is not None else (spec.compliance_mm_per_n if spec else 0.0)
-        plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec, field, pose)
+        plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec.geometry, field, pose)
         if release:
             plan = plan.there_and_back()
         if isinstance(pose, ContactPose) and pose.indent_mm <= 0:
@@ -146,7 +146,7 @@ class SkinSolver:
         """
         with self._one_thread():
             setting = self._setting(focus)
-        contact = OngoingContact(self.spec, setting, T, self._one_thread)
+        contact = OngoingContact(setting, T, self._one_thread)
         self.reach(contact, field, law, compliance, reached)
         return contact
 
@@ -162,7 +162,7 @@ class SkinSolver:
 
     def _set_up(self, focus: Focus) -> Setting:
         spec = self.spec
-        solid = build_solid(spec, resolution=self.resolution, focus=focus, keep=self._keep)
+        solid = build_solid(spec.geometry, resolution=self.resolution, focus=focus, keep=self._keep)
         gel = law_coefficients(spec.gel, layer=False)
         kinds = (
             Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True),
@@ -170,7 +170,9 @@ class SkinSolver:
             Elements(solid.gel_deep, gel),
         )
         points = contact_points(solid, spec.skin.outer_radius_mm)
-        return Setting(solid, Body(kinds, points, ~solid.fixed, spec.gel.sealed), NodeView.of(spec, self.mesh, solid))
+        body = Body(kinds, points, ~solid.fixed, spec.gel.sealed)
+        relaxation = spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation
+        return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
 
     def _frontal(self, setting: Setting, reached: FloatArray) -> FrontalSolver:
         """Elimination of all but the outer controls that may be touched: those that carry points around the reached directions."""
@@ -185,9 +187,9 @@ class SkinSolver:
     def _reached(self, field: Stimulus, plan: ContactPath) -> FloatArray:
         """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""
         radius = self.spec.skin.outer_radius_mm
-        directions = dome_directions(self.spec, _FOCUS_POINTS)
+        directions = dome_directions(self.spec.skin, _FOCUS_POINTS)
         deepest = np.full(len(directions), np.inf)
-        limit = deepest_mm(self.spec)
+        limit = deepest_mm(self.spec.geometry)
         for at in _stops(plan, directions, radius, _LOOK_MM):
             T = plan.at(at)
             gap = field.distance((radius * directions - T[:3, 3]) @ T[:3, :3])

@@ -1,10 +1,12 @@
 """Light of the lamps behind the window at places in the gel: closed forms without shadows (the ray's equation: ``twin.projection``)."""
 
+from collections.abc import Sequence
+
 import numba
 import numpy as np
 
-from scenes.sensor import SensorSpec
-from twin.optics.lights import lights
+from scenes.sensor import GelSpec, LensSpec
+from twin.optics.lights import Patch
 from twin.optics.window import NEWTON_STEPS, fresnel
 from twin.types import FloatArray
 
@@ -19,16 +21,18 @@ class DirectLight:
 
     Parameters
     ----------
-    spec : SensorSpec
+    lens : LensSpec
+    gel : GelSpec
+    patches : sequence of Patch
+        What lights the gel (see ``twin.optics.lights.lights``).
     """
 
-    def __init__(self, spec: SensorSpec) -> None:
-        lens, gel = spec.lens, spec.gel
+    def __init__(self, lens: LensSpec, gel: GelSpec, patches: Sequence[Patch]) -> None:
         self._window = np.array([lens.back_mm, lens.z_mm, lens.refractive_index, gel.refractive_index])
         self._absorption = np.array(gel.absorption_per_mm, float)
         places, powers = [], []
         turn = np.arange(RING_PLACES) * 2 * np.pi / RING_PLACES
-        for patch in lights(spec):
+        for patch in patches:
             ring = 0 if patch.radii_mm[1] == 0 else np.sqrt(np.mean(patch.radii_mm**2))
             around = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1) if ring else np.zeros((1, 3))
             places.append(patch.center_mm + ring * around)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.optics.surfaces import CAP_BEVEL, cap_outlines
 from twin.projection import project
 from twin.types import FloatArray
@@ -23,9 +23,9 @@ class PinOutlines:
     the rim's, ``centre + f(t) odd(t) + f(t)^2 even(t)``. Discs further along the axis are taken to be shifted images.
     """
 
-    def __init__(self, spec: SensorSpec) -> None:
-        self._spec = spec
-        shapes = cap_outlines(spec, SIDES)
+    def __init__(self, view: ViewSpec, pins: PinsSpec, appearance: AppearanceSpec) -> None:
+        self._view, self._pins = view, pins
+        shapes = cap_outlines(appearance, SIDES)
         self._cap = EVENLY * (np.ones((1, SIDES)) if shapes is None else shapes)[..., None]
         apart = TURN[:, None] - np.arange(RIM_PLACES) * 2 * np.pi / RIM_PLACES
         self._odd = np.cos(apart) * 2 / RIM_PLACES
@@ -33,14 +33,14 @@ class PinOutlines:
 
     def __call__(self, base_mm: FloatArray, axis: FloatArray, caps_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Feet (N, 2), and outlines (N, 3, SIDES, 2) of stem, side and face of each pin, given (N, 3) each."""
-        pins = self._spec.pins
+        pins = self._pins
         radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
         bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
         u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis  # where an outline starts (`surfaces`)
         u /= np.linalg.norm(u, axis=1, keepdims=True)
         places = np.arange(RIM_PLACES) * 2 * np.pi / RIM_PLACES
         rim = caps_mm + radius * (np.cos(places)[:, None, None] * u + np.sin(places)[:, None, None] * np.cross(u, axis))
-        seen = project(self._spec, np.concatenate([rim, caps_mm[None], base_mm[None]]))
+        seen = project(self._view, np.concatenate([rim, caps_mm[None], base_mm[None]]))
         centre, foot = seen[-2, :, None], seen[-1, :, None]
         from_centre = seen[:-2] - seen[-2]
         odd, even = (np.einsum("kj,jnc->nkc", series, from_centre) for series in (self._odd, self._even))

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.projection import project
 from twin.types import BoolArray, PinState
 
@@ -12,16 +12,18 @@ MARGIN_PX = 2.0  # what a pin's edge may be off
 SUBPIXEL_BITS = 4
 
 
-def near_pins(spec: SensorSpec, state: PinState, window_px: tuple[int, int, int, int]) -> BoolArray:
+def near_pins(
+    view: ViewSpec, pins: PinsSpec, appearance: AppearanceSpec, state: PinState, window_px: tuple[int, int, int, int]
+) -> BoolArray:
     """Pixels (H, W) bool of a window of the raw frame that may show a part of a pin, from its foot to its cap."""
-    pins, (x0, y0, x1, y1) = spec.pins, window_px
+    x0, y0, x1, y1 = window_px
     across = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    middle = project(spec, state.caps_mm)
-    reach_mm = 0.5 * pins.cap_diameter_mm * _largest_outline(spec)
-    sides = [project(spec, state.caps_mm + reach_mm * way) for way in (across, np.cross(state.axis, across))]
+    middle = project(view, state.caps_mm)
+    reach_mm = 0.5 * pins.cap_diameter_mm * _largest_outline(appearance)
+    sides = [project(view, state.caps_mm + reach_mm * way) for way in (across, np.cross(state.axis, across))]
     radius = np.max([np.linalg.norm(side - middle, axis=1) for side in sides], axis=0) + MARGIN_PX
-    feet = project(spec, state.base_mm)
+    feet = project(view, state.base_mm)
     mask, ends = np.zeros((y1 - y0, x1 - x0), np.uint8), np.stack([feet, middle], axis=1) - [x0, y0]
     fine = np.rint(ends * (1 << SUBPIXEL_BITS)).astype(np.int32)
     width = np.ceil(2 * radius).astype(int)
@@ -30,7 +32,7 @@ def near_pins(spec: SensorSpec, state: PinState, window_px: tuple[int, int, int,
     return mask.astype(bool)
 
 
-def _largest_outline(spec: SensorSpec) -> float:
+def _largest_outline(appearance: AppearanceSpec) -> float:
     """Of the caps' outlines, relative to a circle."""
-    shapes = np.array(spec.appearance.cap_shapes or [[0.0]])
+    shapes = np.array(appearance.cap_shapes or [[0.0]])
     return float(1 + np.abs(shapes).sum(axis=1).max())

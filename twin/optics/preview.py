@@ -14,11 +14,12 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.spatial import Delaunay
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.optics.direct_light import DirectLight
 from twin.optics.lens import ray_table
+from twin.optics.lights import lights
 from twin.optics.outlines import PinOutlines
 from twin.optics.raster import draw_polygons, draw_triangles
 from twin.optics.render import Renderer
@@ -109,20 +110,25 @@ class Preview:
         self.spec, self.shading = spec, shading or Shading()
         self.window_px = window_px or (0, 0, spec.camera.width_px, spec.camera.height_px)
         self._color = spec.camera.channels == "color"
-        self._direct = DirectLight(spec)
+        self._direct = DirectLight(spec.lens, spec.gel, lights(spec.leds, spec.housing))
         self._light = light or self._direct
         shine, cover = static_layer(spec, self.window_px) if static is None else static
-        through = (1 - np.asarray(cover)) * _transmittance(spec, self.window_px)
+        through = (1 - np.asarray(cover)) * _transmittance(spec.view, self.window_px)
         self._through = through[..., None].astype(np.float32)
         self._shine = self._on_film(np.broadcast_to(shine, (*through.shape, 3)))
-        self._rest = rest_pins(spec)
-        self._outlines = PinOutlines(spec)
-        self._belt_mm, self._faces = _belt(spec, self._rest.base_mm)
-        self._belt_px = project(spec, self._belt_mm)
+        self._rest = rest_pins(spec.geometry)
+        self._outlines = PinOutlines(spec.view, spec.pins, spec.appearance)
+        self._belt_mm, self._faces = _belt(spec.geometry, self._rest.base_mm)
+        self._belt_px = project(spec.view, self._belt_mm)
         self._belt_light = self._light(self._belt_mm, -_unit(self._belt_mm))
         self._mean_light = self._cap_light(self._rest.caps_mm, self._rest.axis).mean()
         look = spec.appearance
-        self._albedo = np.array([look.skin_albedo]), np.array([look.pin_albedo]), cap_albedo(spec), cap_albedo(spec)
+        self._albedo = (
+            np.array([look.skin_albedo]),
+            np.array([look.pin_albedo]),
+            cap_albedo(look, spec.pins.count),
+            cap_albedo(look, spec.pins.count),
+        )
 
     def render(self, state: PinState | None = None) -> FloatArray:
         """Linear light on the film, as a `Renderer` gives it.
@@ -243,10 +249,11 @@ def _fit(parts: FloatArray, target: FloatArray) -> FloatArray:
     return nnls(np.concatenate([parts, trust * np.eye(8)]).astype(float), np.concatenate([target, trust * plain]).astype(float))[0]
 
 
-def _belt(spec: SensorSpec, feet_mm: FloatArray) -> tuple[FloatArray, IntArray]:
+def _belt(geometry: GeometrySpec, feet_mm: FloatArray) -> tuple[FloatArray, IntArray]:
     """Points (b, 3) of the skin at rest from the outermost pins to the rim, and triangles (t, 3) over the feet (N, 3) and them."""
-    inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
-    start, end = np.radians(spec.pins.max_polar_deg), np.arccos(np.clip(spec.skin.rim_z_mm / inner_mm, -1, 1))
+    skin = geometry.skin
+    inner_mm = skin.outer_radius_mm - skin.thickness_mm
+    start, end = np.radians(geometry.pins.max_polar_deg), np.arccos(np.clip(skin.rim_z_mm / inner_mm, -1, 1))
     steps = np.linspace(start, end, int(np.ceil((end - start) / BELT_STEP_RAD)) + 1)[1:]
     polar, turn = (g.ravel() for g in np.meshgrid(steps, np.arange(BELT_PLACES) * 2 * np.pi / BELT_PLACES, indexing="ij"))
     belt = inner_mm * np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
@@ -256,12 +263,12 @@ def _belt(spec: SensorSpec, feet_mm: FloatArray) -> tuple[FloatArray, IntArray]:
     return belt, Delaunay(chart).simplices
 
 
-def _transmittance(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> FloatArray:
+def _transmittance(view: ViewSpec, window_px: tuple[int, int, int, int]) -> FloatArray:
     """Share (H, W) of radiance that the window lets through to each pixel."""
-    corners = (ray_table(spec.camera, window_px) @ sensor_to_camera(spec.camera)[:3, :3])[..., 2]
+    corners = (ray_table(view.camera, window_px) @ sensor_to_camera(view.camera)[:3, :3])[..., 2]
     cos_air = np.clip(0.25 * (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]), 1e-6, 1)
-    cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (spec.lens.refractive_index, spec.gel.refractive_index))
-    return Window.of(spec).transmittance(np, cos_air, cos_window, cos_gel)
+    cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (view.lens.refractive_index, view.gel_index))
+    return Window.of(view).transmittance(np, cos_air, cos_window, cos_gel)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

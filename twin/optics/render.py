@@ -73,9 +73,9 @@ class Renderer:
         self.choice = variant if isinstance(variant, VariantChoice) else choose_variant(camera.channels, variant)
         self._scalar = self.choice.backend == "scalar"
         self.spp = spp or (SCALAR_SAMPLES if self._scalar else SAMPLES)[quality]
-        self._rest = rest_pins(spec)
+        self._rest = rest_pins(spec.geometry)
         self._inner = None if mesh is None else np.unique(mesh.inner_quads)
-        self._skin = SkinSurface(spec, self._rest.base_mm if mesh is None else mesh.nodes_mm[self._inner])
+        self._skin = SkinSurface(spec.skin, self._rest.base_mm if mesh is None else mesh.nodes_mm[self._inner])
         self._bounces = bounces
         self._view: GelView | ScalarView | None = None
 
@@ -127,8 +127,8 @@ class Renderer:
         control = state.base_mm if self._inner is None else (self._skin.control_mm if nodes is None else nodes[self._inner])
         return {
             "skin": Surface(self._skin.vertices(control), self._skin.faces),
-            "stems": stems(self.spec, state.base_mm, state.axis),
-            "caps": caps(self.spec, state.caps_mm, state.axis),
+            "stems": stems(self.spec.pins, state.base_mm, state.axis),
+            "caps": caps(self.spec.pins, self.spec.appearance, state.caps_mm, state.axis),
         }
 
 
@@ -152,10 +152,10 @@ class GelView:
         import drjit as dr
 
         self._mi, self._dr, self._spec, self._window_px = mi, dr, spec, window_px
-        scene = build_scene(mi, spec, surfaces)
+        scene = build_scene(mi, spec.appearance, spec.gel.refractive_index, surfaces)
         self.params = mi.traverse(scene)
         self.tracer = GelTracer.of(mi, spec, scene, bounces)
-        self.rays = CameraRays(mi, dr, spec.camera, Window.of(spec), window_px)
+        self.rays = CameraRays(mi, dr, spec.camera, Window.of(spec.view), window_px)
 
     def move(self, surfaces: dict[str, Surface]) -> None:
         """Move the meshes' vertices."""
@@ -164,7 +164,7 @@ class GelView:
     def gel_light(self, pixels: IntArray, spp: int, seed: int, state: PinState) -> FloatArray:
         """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row; fewer samples on bare skin."""
         mi, dr = self._mi, self._dr
-        pins = near_pins(self._spec, state, self._window_px).ravel()[pixels]
+        pins = near_pins(self._spec.view, self._spec.pins, self._spec.appearance, state, self._window_px).ravel()[pixels]
         passes, each, few = 1, spp, -(-spp // SKIN_SAVING)
         while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
             passes, each, few = 2 * passes, -(-each // 2), -(-few // 2)  # halves: nets of powers of two are even

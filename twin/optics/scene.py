@@ -5,7 +5,7 @@ from types import ModuleType
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import AppearanceSpec
 from twin.optics.arrays import with_room
 from twin.optics.surfaces import Surface
 from twin.optics.tracer import luminance
@@ -17,11 +17,15 @@ SKIN_INDEX = 1.52  # acrylate rubber
 PAINT = {"type": "mesh_attribute", "name": "vertex_paint"}
 
 
-def build_scene(mi: ModuleType, spec: SensorSpec, surfaces: Mapping[str, Surface], *, extra: dict[str, DrJit] | None = None) -> DrJit:
+def build_scene(
+    mi: ModuleType, look: AppearanceSpec, gel_index: float, surfaces: Mapping[str, Surface], *, extra: dict[str, DrJit] | None = None
+) -> DrJit:
     """A Mitsuba scene of what is in the gel, without camera or lights.
 
     Parameters
     ----------
+    look : AppearanceSpec
+    gel_index : float
     surfaces : mapping of str to Surface
         By the names ``skin``, ``stems`` and ``caps``.
     extra : dict, optional
@@ -32,14 +36,13 @@ def build_scene(mi: ModuleType, spec: SensorSpec, surfaces: Mapping[str, Surface
     mi.Scene
         Its updatable meshes have the ids ``skin``, ``stems`` and ``caps``.
     """
-    look, gel = spec.appearance, spec.gel.refractive_index
-    skin_bsdf = _rubber(mi, {"type": "rgb", "value": list(look.skin_albedo)}, look.skin_gloss, look.skin_roughness, gel)
-    cap_bsdf = _rubber(mi, PAINT, look.cap_gloss, look.cap_roughness, gel)
+    skin_bsdf = _rubber(mi, {"type": "rgb", "value": list(look.skin_albedo)}, look.skin_gloss, look.skin_roughness, gel_index)
+    cap_bsdf = _rubber(mi, PAINT, look.cap_gloss, look.cap_roughness, gel_index)
     description = {
         "type": "scene",
         "skin": mesh(mi, "skin", surfaces["skin"], skin_bsdf, smooth=True),
         "stems": mesh(
-            mi, "stems", surfaces["stems"], _rubber(mi, {"type": "rgb", "value": list(look.pin_albedo)}, 0.0, 1.0, gel), smooth=True
+            mi, "stems", surfaces["stems"], _rubber(mi, {"type": "rgb", "value": list(look.pin_albedo)}, 0.0, 1.0, gel_index), smooth=True
         ),
         "caps": mesh(mi, "caps", surfaces["caps"], cap_bsdf, smooth=False),
     }

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import AppearanceSpec, PinsSpec, SkinSpec
 from twin.types import FloatArray, IntArray
 
 SKIN_POLAR_STEPS = 40
@@ -39,14 +39,14 @@ class SkinSurface:
 
     Parameters
     ----------
-    spec : SensorSpec
+    skin : SkinSpec
     control_mm : (n, 3) float
         Rest positions, on the inside of the skin, at which displacements will be given.
     """
 
-    def __init__(self, spec: SensorSpec, control_mm: FloatArray) -> None:
-        inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
-        rim_rad = np.arccos(np.clip(spec.skin.rim_z_mm / inner_mm, -1, 1))
+    def __init__(self, skin: SkinSpec, control_mm: FloatArray) -> None:
+        inner_mm = skin.outer_radius_mm - skin.thickness_mm
+        rim_rad = np.arccos(np.clip(skin.rim_z_mm / inner_mm, -1, 1))
         polar = np.linspace(0, rim_rad, SKIN_POLAR_STEPS + 1)[1:]
         azimuth = np.arange(SKIN_AZIMUTH_STEPS) * 2 * np.pi / SKIN_AZIMUTH_STEPS
         theta, phi = (a.ravel() for a in np.meshgrid(polar, azimuth, indexing="ij"))
@@ -70,34 +70,34 @@ class SkinSurface:
         return self.rest_mm + self._weights @ moved.astype(np.float32)
 
 
-def stems(spec: SensorSpec, base_mm: FloatArray, axis: FloatArray) -> Surface:
+def stems(pins: PinsSpec, base_mm: FloatArray, axis: FloatArray) -> Surface:
     """All pin stems, one surface: cylinders from the skin to the cap."""
-    length = spec.pins.length_mm
-    profile = np.array([[0.5 * spec.pins.diameter_mm, -STEM_ROOT_MM], [0.5 * spec.pins.diameter_mm, length]])
+    length = pins.length_mm
+    profile = np.array([[0.5 * pins.diameter_mm, -STEM_ROOT_MM], [0.5 * pins.diameter_mm, length]])
     return _lathe(profile, base_mm, axis, STEM_SIDES)
 
 
-def caps(spec: SensorSpec, caps_mm: FloatArray, axis: FloatArray) -> Surface:
+def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: FloatArray) -> Surface:
     """All caps, one surface: bevelled discs, or of their own outlines, about their centres; open below, where nothing is seen of them."""
-    radius, half = 0.5 * spec.pins.cap_diameter_mm, 0.5 * spec.pins.cap_height_mm
-    bevel = min(CAP_BEVEL * spec.pins.cap_height_mm, 0.5 * radius)
+    radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
+    bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
     radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
     profile = np.array([[radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
-    body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(spec, CAP_SIDES))
-    return Surface(body.vertices_mm, body.faces, np.repeat(cap_albedo(spec), len(body.vertices_mm) // len(caps_mm), axis=0))
+    body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(appearance, CAP_SIDES))
+    return Surface(
+        body.vertices_mm, body.faces, np.repeat(cap_albedo(appearance, pins.count), len(body.vertices_mm) // len(caps_mm), axis=0)
+    )
 
 
-def cap_albedo(spec: SensorSpec) -> FloatArray:
+def cap_albedo(look: AppearanceSpec, count: int) -> FloatArray:
     """Reflectance (N, 3) of each cap: measured, or drawn."""
-    look, count = spec.appearance, spec.pins.count
     drawn = 1 + look.cap_variation * np.random.default_rng(look.cap_pattern).standard_normal(count)
     each = np.array(look.cap_levels) if look.cap_levels else drawn
     return np.clip(each[:, None] * np.array(look.cap_albedo), 0, 1)
 
 
-def cap_outlines(spec: SensorSpec, sides: int) -> FloatArray | None:
+def cap_outlines(look: AppearanceSpec, sides: int) -> FloatArray | None:
     """Radius (N, sides) of each cap's outline relative to its circle's, or None where all are round."""
-    look = spec.appearance
     if not look.cap_shapes and not look.cap_offsets:
         return None
     shapes, offsets = np.array(look.cap_shapes or [[0.0]]), np.array(look.cap_offsets or [[0.0, 0.0]])

@@ -61,10 +61,10 @@ class GelTracer:
     @classmethod
     def of(cls, mi: ModuleType, spec: SensorSpec, scene: DrJit, bounces: int) -> "GelTracer":
         """For a sensor, its gel-side scene and a number of bounces."""
-        patches = lights(spec)
+        patches = lights(spec.leds, spec.housing)
         emitters = Emitters(patches, [spectrum(mi, p.radiance) for p in patches])
         caps = next(mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == "caps")
-        return cls(scene, Window.of(spec), emitters, spec.gel.absorption_per_mm, bounces, spec.appearance.cap_bump, caps)
+        return cls(scene, Window.of(spec.view), emitters, spec.gel.absorption_per_mm, bounces, spec.appearance.cap_bump, caps)
 
     def radiance(self, mi: ModuleType, dr: ModuleType, place: DrJit, direction: DrJit, random: PixelSamples) -> DrJit:
         """Radiance in the gel, divided by n^2, along rays that start at the window's gel side.

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from types import ModuleType
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import ViewSpec
 from twin.optics.variant import DrJit
 
 NEWTON_STEPS = 5  # from the paraxial start; the sixth changes a direction by less than 1e-5
@@ -20,9 +20,10 @@ class Window:
     radius: float
 
     @classmethod
-    def of(cls, spec: SensorSpec) -> "Window":
+    def of(cls, view: ViewSpec) -> "Window":
         """The window of a sensor."""
-        return cls(spec.lens.back_mm, spec.lens.z_mm, spec.lens.refractive_index, spec.gel.refractive_index, spec.lens.radius_mm)
+        lens = view.lens
+        return cls(lens.back_mm, lens.z_mm, lens.refractive_index, view.gel_index, lens.radius_mm)
 
     def enter(self, dr: ModuleType, mi: ModuleType, origin: DrJit, direction: DrJit) -> tuple[DrJit, DrJit, DrJit]:
         """A ray in the air, ``direction.z > 0``, followed to the window's gel side.

@@ -8,8 +8,10 @@ from twin.errors import FrameError
 from twin.types import FloatArray, ImageArray
 from twin.video import luma_weights, through_stream
 
-JPEG_BLOCK_PX = 16  # the unit of a JPEG with halved chroma
-MEDIAN_PX = 5  # the recorder's own despeckling before its threshold
+JPEG_BLOCK_PX = 16
+"""Side of the blocks of a JPEG whose chroma has half the resolution."""
+MEDIAN_PX = 5
+"""Width of the median filter with which the recorder removes specks before its threshold."""
 
 
 def expose(
@@ -54,7 +56,7 @@ def hazed(light: FloatArray, gel: GelSpec) -> FloatArray:
 
 
 def dispersed(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
-    """Red and blue images of their own size and place: ``red'(c + scale (p - c) + shift) = red(p)``, c the principal point."""
+    """Lateral chromatic aberration: ``red'(c + scale (p - c) + shift) = red(p)`` with c the principal point; blue alike."""
     own = {0: (camera.red_scale, camera.red_shift_px), 2: (camera.blue_scale, camera.blue_shift_px)}
     if light.ndim == 2 or all(scale == 1 and not any(shift) for scale, shift in own.values()):
         return light
@@ -108,7 +110,7 @@ def curve(light: FloatArray, response: ResponseSpec) -> FloatArray:
 
 
 def sharpened(light: FloatArray, response: ResponseSpec) -> FloatArray:
-    """Light with an unsharp mask of its luma added to every channel; the curve then makes more of the dark side of an edge."""
+    """Light with an unsharp mask of its luma added to every channel; the response curve then amplifies the dark side of an edge."""
     if response.sharpening == 0:
         return light
     luma = light @ luma_weights(response.stream) if light.ndim == 3 else light
@@ -119,9 +121,9 @@ def sharpened(light: FloatArray, response: ResponseSpec) -> FloatArray:
 def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
     """Gray levels of light, and of the same with its noise: the luma sharpened, colour taken from softer light.
 
-    A camera has one colour at each pixel of its sensor and guesses the other two from its neighbours, in linear light: colour is
-    softer than luma, and the curve moves its edges outwards. Its sharpening spares the noise. Colour differences are shared by
-    neighbouring columns of the full frame.
+    A camera measures one colour at each pixel of its sensor and takes the other two from neighbouring pixels, in linear light.
+    Therefore colour is softer than luma, and the response curve moves its edges outwards. The camera's sharpening leaves out the noise.
+    Neighbouring columns of the full frame share their colour differences.
     """
     gray = curve(sharpened(light, response), response)
     if grainy is not light:
@@ -147,7 +149,7 @@ def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
 
 
 def compressed(frame: ImageArray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:
-    """What a JPEG stream with halved chroma leaves of a frame (0: all). Blocks lie where the full frame's do."""
+    """A frame after JPEG compression with halved chroma (quality 0: not compressed). Blocks lie where those of the full frame lie."""
     if quality == 0:
         return frame
     left, top = (place % JPEG_BLOCK_PX for place in origin_px)

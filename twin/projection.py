@@ -1,12 +1,12 @@
 """The camera's projection: sensor-frame points to raw-frame pixels and back to rays, through the window.
 
-The camera stands in air behind a plane window (acrylic), before which is gel. All planes are normal to z, so a ray stays
-in one plane through the axis of the pupil and obeys n sin(theta) = const. With u the tangent of its angle in air,
-a point at a height h_k in each layer k is met at the distance
+The camera stands in air behind a plane window (acrylic); in front of the window is gel. All planes are normal to z, so a ray stays
+in one plane through the axis of the pupil and obeys n sin(theta) = const. With u the tangent of the ray's angle in air and h_k the
+height that it crosses in layer k, its distance
 
     rho(u) = sum_k h_k tan(theta_k),   sin(theta_k) = u / (n_k sqrt(1 + u^2))
 
-from that axis. rho grows with u and is concave: Newton's method from the left converges monotonically.
+from that axis follows. rho grows with u and is concave, so Newton's method from the left converges monotonically.
 
 Distortion: Brown-Conrady (Brown 1966) with x = X / Z, y = Y / Z, r^2 = x^2 + y^2,
 x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),
@@ -19,9 +19,14 @@ import numpy as np
 from scenes.sensor import CameraSpec, ViewSpec
 from twin.types import FloatArray
 
-NEWTON_STEPS = 12  # quadratic: the last ones only polish
-MOST_NEWTON_MOVE = 0.1  # per step, normalised: keeps far starts from jumping past the fold
-GRAZING = 1e6  # tangent beyond which a ray counts as parallel to the window
+NEWTON_STEPS = 12
+"""Steps of Newton's method; it converges quadratically, so that the last steps change only the last digits."""
+MOST_NEWTON_MOVE = 0.1
+"""Largest change of a normalised coordinate in one step: a start far from the solution does not jump past the distortion's fold."""
+GRAZING = 1e6
+"""Tangent beyond which a ray counts as parallel to the window."""
+LEAST_FISHEYE_SLOPE = 0.05
+"""Slope of the fisheye's radius by the angle that Newton's method assumes at least, near the distortion's fold."""
 
 
 def sensor_to_camera(camera: CameraSpec) -> FloatArray:
@@ -67,7 +72,7 @@ def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None 
         angle = radius if guess is None else np.arctan(np.linalg.norm(guess, axis=-1))
         for _ in range(NEWTON_STEPS):
             slope = 1 + 3 * camera.k1 * angle**2 + 5 * camera.k2 * angle**4
-            angle = np.clip(angle - (_fisheye(camera, angle) - radius) / np.maximum(slope, 0.05), 0, np.pi / 2 - 1e-6)
+            angle = np.clip(angle - (_fisheye(camera, angle) - radius) / np.maximum(slope, LEAST_FISHEYE_SLOPE), 0, np.pi / 2 - 1e-6)
         return seen * (np.tan(angle) / np.maximum(radius, 1e-12))[..., None]
     ideal, step = np.array(seen if guess is None else guess, float), 1e-6
     for _ in range(NEWTON_STEPS):

@@ -12,8 +12,10 @@ IntArray: TypeAlias = NDArray[np.integer]
 BoolArray: TypeAlias = NDArray[np.bool_]
 ComplexArray: TypeAlias = NDArray[np.complexfloating]
 ImageArray: TypeAlias = NDArray[np.uint8]
+"""Gray or RGB levels of a frame."""
 
-FINE = 20  # elements across the skin for calibrations and data sets: the outer pins of the deepest contacts are within 1 % of 32's
+FINE = 20
+"""Elements across the skin for calibrations and data sets. In the deepest contacts the outer pins then move as with 32 elements, to 1 %."""
 
 
 class Form(StrEnum):

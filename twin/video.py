@@ -8,12 +8,24 @@ import numpy as np
 
 from twin.types import BoolArray, FloatArray, ImageArray, IntArray
 
-RED_BLUE = {"rgb": (0.299, 0.114), "bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722)}  # of the luma: ITU-R BT.601 and BT.709
+RED_BLUE = {"rgb": (0.299, 0.114), "bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722)}
+"""Shares of red and blue in the luma, by stream (ITU-R BT.601 and BT.709)."""
 STREAMS = ("bt601", "bt709")
-LUMA_RANGE, CHROMA_RANGE, LUMA_FLOOR, CHROMA_MIDDLE = 219, 224, 16, 128
-ON_STREAM = 0.98  # of the pixels are colours that the stream can give
-CLIPPED = (2, 253)  # beyond, levels were cut off
-MOST_PIXELS = 20_000  # that are looked at
+"""Streams that can be told from the colours of a frame."""
+LUMA_RANGE = 219
+"""Studio range: number of steps of the luma."""
+CHROMA_RANGE = 224
+"""Studio range: number of steps of a colour difference."""
+LUMA_FLOOR = 16
+"""Studio range: luma of black."""
+CHROMA_MIDDLE = 128
+"""Studio range: colour difference of gray."""
+ON_STREAM = 0.98
+"""A frame came by a stream if at least this share of its pixels has colours that the stream can give."""
+CLIPPED = (2, 253)
+"""Pixels with a level at or beyond these are left out: their colours may have been cut off."""
+MOST_PIXELS = 20_000
+"""At most this many pixels are looked at."""
 
 
 def luma_weights(stream: str) -> FloatArray:

@@ -289,7 +289,8 @@ def test_caps_follow_the_slope_of_a_smooth_bulge(sensor):
 
 def test_the_mesh_s_surfaces_lie_on_their_spheres_and_quads_face_away_from_the_centre(sensor, mesh):
     outer = sensor.skin.outer_radius_mm
-    for quads, radius in ((mesh.outer_quads, outer), (mesh.inner_quads, outer - sensor.skin.thickness_mm)):
+    outer_quads = mesh.inner_quads - mesh.skin_layers * mesh.grid[1] * mesh.grid[2]  # nodes are numbered layer by layer from the outside
+    for quads, radius in ((outer_quads, outer), (mesh.inner_quads, outer - sensor.skin.thickness_mm)):
         corners = mesh.nodes_mm[quads]
         assert np.abs(np.linalg.norm(corners, axis=2) - radius).max() < ROUNDING_MM
         normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])

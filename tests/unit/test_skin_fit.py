@@ -5,7 +5,7 @@ import pytest
 
 from scenes import load_object, load_sensor
 from twin.geometry.pins import rest_pins
-from twin.geometry.skin_fit import SkinFit, centroid_offset_px, fit_skin
+from twin.geometry.skin_fit import SkinFit, centroid_offset_px
 from twin.mechanics import ContactPose, SkinSolver
 from twin.projection import project
 
@@ -94,8 +94,8 @@ def test_lost_pins_follow_the_skin(straight, fit, states):
 
 def test_refusals_say_what_came(straight):
     with pytest.raises(ValueError, match=r"shape \(331, 2\)"):
-        fit_skin(straight, np.zeros((127, 2)))
+        SkinFit(straight)(np.zeros((127, 2)))
     mostly_lost = np.full((331, 2), np.nan)
     mostly_lost[:100] = 0.0
     with pytest.raises(ValueError, match="100 of 331"):
-        fit_skin(straight, mostly_lost)
+        SkinFit(straight)(mostly_lost)

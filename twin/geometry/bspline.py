@@ -35,7 +35,7 @@ class Basis:
 
     @property
     def greville(self) -> FloatArray:
-        """(count,) means of adjoining knots: a linear function's coefficients are its values there."""
+        """(count,) Greville points, means of ``degree`` neighbouring knots: a linear function's coefficients are its values there."""
         knots = self._knots
         return np.array([knots[i + 1 : i + 1 + self.degree].mean() for i in range(self.count)])
 

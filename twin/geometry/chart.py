@@ -6,9 +6,9 @@ over the largest one, its azimuth the azimuth. A ``Focus`` turns and stretches t
     (u, v) -> w1 (squared disc) -> w2 = w1 s(|w1|) / |w1| -> w = e^(i phi) (w2 + a) / (1 + a w2)
 
 The elliptical map x = u sqrt(1 - v^2 / 2), y = v sqrt(1 - u^2 / 2) makes a disc of the square without
-collapsing an element (Fong, "Analytical methods for squaring the disc", 2015); s(r) = c r + (1 - c) r^5
-gathers the lines of the grid at the centre; a Moebius transformation moves the centre to where the
-contact is, keeping the rim on the rim. All are smooth.
+collapsing an element (Fong, "Analytical methods for squaring the disc", 2015). The function s(r) = c r + (1 - c) r^5
+gathers the lines of the grid at the centre. A Moebius transformation moves the centre to where the contact is and
+keeps the rim on the rim. All three maps are smooth.
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,18 @@ import numpy as np
 from twin.types import ComplexArray, FloatArray
 
 _POWER = 5
-_FINE = 0.75  # of the square's half side: lines within lie over the focus
+"""Power in s(r) = c r + (1 - c) r^5: the higher it is, the more evenly the lines lie within the focus."""
+_FINE = 0.75
+"""Share of the square's half side whose image is the focus."""
+_LARGEST_SHIFT = 0.6
+"""Largest shift a of the Moebius transformation: a larger one would stretch the far elements too much."""
+_LEAST_SLOPE = 0.2
+"""Smallest c: with less, the elements at the centre of the focus would be much smaller than the object's features."""
 
 
 @dataclass(frozen=True)
 class Focus:
-    """Where a grid over the dome is fine.
+    """The part of the dome over which the grid is fine.
 
     Attributes
     ----------
@@ -47,12 +53,12 @@ class Chart:
 
     @property
     def _shift(self) -> float:
-        return min(self.focus.polar_rad / self.largest_polar_rad, 0.6)
+        return min(self.focus.polar_rad / self.largest_polar_rad, _LARGEST_SHIFT)
 
     @property
     def _centre_slope(self) -> float:
         share = self.focus.radius_rad / self.largest_polar_rad / (1 - self._shift**2)
-        return float(np.clip((share - _FINE**_POWER) / (_FINE - _FINE**_POWER), 0.2, 1.0))
+        return float(np.clip((share - _FINE**_POWER) / (_FINE - _FINE**_POWER), _LEAST_SLOPE, 1.0))
 
     def disc(self, square: FloatArray) -> ComplexArray:
         """Complex disc points (k,) of square points (k, 2)."""

@@ -1,14 +1,15 @@
 """The pins in space that one frame shows, found without knowing what touched the sensor.
 
-A frame gives each cap's pixel, so each cap's ray in the gel, not its depth. What is between is the sensor's body: skin
-and gel in equilibrium under some traction t on the outer skin. With x(t) the body's shape, Gauss-Newton minimises
+A frame gives the pixel of each cap, and with it the cap's ray in the gel, but not its depth along the ray. The sensor's body
+gives the depth: skin and gel are in equilibrium under some traction t on the outer skin. With x(t) the body's shape,
+Gauss-Newton minimises
 
     sum_pins |project(cap(x)) - seen|^2 / sigma^2  +  integral over the skin at rest of t_n^2 / s_n^2 + |t_t|^2 / s_t^2
 
-over t and x together: each step solves the equilibrium linearised about the present shape. s_n^2 grows with the pressure
-of the step before, s_t^2 with a share of it (iteratively reweighted least squares: Daubechies et al. 2010): touch
-presses, it does not pull, it is confined to a part of the skin, and friction needs pressure. What is left, a fraction of
-a pixel, is taken by moving each pin parallel to the image.
+over t and x together. Each step solves the equilibrium that is linearised about the present shape. The scale s_n^2 grows with
+the pressure found in the step before, and s_t^2 with a share of it (iteratively reweighted least squares: Daubechies et al. 2010).
+This states what a touch is like: it presses and does not pull, it is confined to a part of the skin, and friction needs pressure.
+A difference of a fraction of a pixel remains; each pin is moved parallel to the image to remove it.
 """
 
 from dataclasses import dataclass, replace
@@ -25,12 +26,18 @@ from twin.mechanics.elements import PAIRS
 from twin.projection import pixel_rays, project
 from twin.types import BoolArray, FloatArray
 
-STEPS = 14  # of Gauss-Newton at most
-SETTLED_MM = 0.01  # largest move of a step that is the last
-LARGEST_MOVE_MM = 2.0  # of a control in one step
-EVEN_STEPS = 2  # with the same s everywhere, until there is a first idea of the pressure
+STEPS = 14
+"""Most steps of Gauss-Newton."""
+SETTLED_MM = 0.01
+"""The fit ends after a step in which no control moves farther than this."""
+LARGEST_MOVE_MM = 2.0
+"""No control moves farther than this in one step: the linearised equilibrium is trusted no farther."""
+EVEN_STEPS = 2
+"""The first steps take the same s everywhere, because there is no estimate of the pressure yet."""
 OUTLINE_CORNERS = 48
-PROBE_MM = 1e-4  # for the derivative of the projection
+"""Corners of the polygon that stands for a cap's outline."""
+PROBE_MM = 1e-4
+"""Step of the difference quotient that gives the derivative of the projection."""
 
 
 @dataclass(frozen=True)
@@ -76,17 +83,6 @@ class FittedPins:
     force_n: FloatArray
 
 
-def fit_skin(spec: SensorSpec, pins_px: FloatArray, *, prior: Prior | None = None, centroids: bool = True) -> FittedPins:
-    """Pins in space from pins in the image; see ``SkinFit`` for many frames of one sensor.
-
-    Raises
-    ------
-    ValueError
-        Not N pins, or fewer than half of them seen.
-    """
-    return SkinFit(spec, prior=prior)(pins_px, centroids=centroids)
-
-
 def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArray, axis: FloatArray) -> FloatArray:
     """(N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
     turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS + 1)[:, None, None]
@@ -99,7 +95,7 @@ def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArr
 
 
 class SkinFit:
-    """Fits of one sensor; what depends on the sensor alone is computed once.
+    """Fits pins of one sensor to frames; what depends on the sensor alone is computed once, when it is made.
 
     Parameters
     ----------

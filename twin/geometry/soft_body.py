@@ -10,7 +10,9 @@ from twin.mechanics.material import law_coefficients
 from twin.types import FloatArray, IntArray
 
 NO_STRESS = np.zeros((0, 8, 3, 3))
-SHIFT_SHARE = 1e-3  # of the mean stiffness, added while the tangent has a falling direction
+"""Given stress of an elastic body: none (see ``Elements.add_forces``)."""
+SHIFT_SHARE = 1e-3
+"""A tangent that is not positive definite gets this share of its mean diagonal added, and four times more each time that is too little."""
 
 
 class SoftBody:

@@ -1,6 +1,6 @@
 """The sensor's body as a spline solid: what the mechanics computes with.
 
-A square grid of columns is bent over the dome (``chart``); each runs through the skin and the gel down
+A square grid of columns is bent over the dome (``chart``). Each column runs through the skin and the gel down
 to the lens. Shape and displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell
 & Bazilevs 2005): quadratic and C1 over the dome, linear through the skin, quadratic through the gel. A
 skin bent by contact is smooth and needs fewer unknowns than with trilinear elements. What the gel does
@@ -19,9 +19,12 @@ from twin.geometry.chart import Chart, Focus, disc_points, dome_points
 from twin.geometry.pins import rest_pins
 from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-_VERSION = 1  # raised whenever the arrays change for the same key
+_VERSION = 1
+"""Raised whenever the same geometry and resolution give other arrays, so that arrays on disk are not used any more."""
 _CELL_PARTS = ("controls", "gradients", "weights_mm3")
-_GEL_GRADING = 1.5  # power law of the depths between the gel's elements: thin below the skin
+"""Arrays of ``Cells``, as they are named on disk."""
+_GEL_GRADING = 1.5
+"""Boundary k of n elements through the gel lies at the depth (k / n)^1.5: elements are thin below the skin, where strains change fast."""
 
 
 @dataclass(frozen=True)
@@ -305,7 +308,7 @@ def spline_cells(
 
 
 def joined_cells(parts: list[Cells]) -> Cells:
-    """One list of elements; of no layers, none of the gel's."""
+    """The elements of several layers as one list; no layers give a list of no elements with 27 controls each, as the gel's have."""
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
     return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in _CELL_PARTS))

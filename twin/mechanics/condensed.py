@@ -47,7 +47,7 @@ class Tangent:
 class Near:
     """The tangent once more eliminated, down to the controls that carry the points looked at.
 
-    The far part of the tangent is L L^T; all in single precision.
+    Controls that carry no point which is looked at are "far". The far part of the tangent is L L^T. All arrays are in single precision.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Near:
         stays = np.repeat(stays[:-1], 3)
         far = np.flatnonzero(~stays)
         factor, info = lapack.spotrf(matrix[np.ix_(far, far)].T, lower=1, clean=0, overwrite_a=1) if len(far) else (np.zeros((0, 0)), 0)
-        if info > 0:  # only contact holds some of the far controls up: let all stay
+        if info > 0:  # without contact some far controls have no stiffness: eliminate none
             stays[:], far, factor = True, far[:0], np.zeros((0, 0))
         near = np.flatnonzero(stays)
         controls = near[::3] // 3
@@ -152,7 +152,7 @@ class SmallContact:
             if norm <= wanted:
                 return y, True
             self.iterations += 1
-            if self._near.solved and self._near.solved[0] == soften:  # what touches and sticks may not have changed since
+            if self._near.solved and self._near.solved[0] == soften:  # perhaps the same points still touch and stick: try the old factors
                 trial_y = y - self._solved(residual)
                 trial, trial_contact = self._equations(trial_y, soften)
                 trial_norm = float(np.linalg.norm(trial))

@@ -5,11 +5,11 @@ g = max(-d, 0), the force on the skin is (Wriggers, "Computational Contact Mecha
 
     f = A (p n - min(mu p, tau) phi(|s| / delta) s / |s|),    phi(x) = 2 x - x^2 for x < 1 (stick), else 1 (slip)
 
-p is the pressure k g, but for g < eps it starts as k g^2 / 2 eps, so that touching is smooth. s is the
-tangential travel since the point's anchor, which is fixed to the object: where the point touched it,
-moved after a slip so that |s| = delta. tau bounds the shear stress that the pair of surfaces can bear,
-however hard it is pressed (as between rubbers; Orowan's friction). A sticking point creeps by less than
-delta; no point ever leaves Coulomb's cone. Everything here is in the object's frame.
+p is the pressure k (g - eps / 2); for g < eps it is k g^2 / 2 eps, so that the force begins smoothly. s is the
+tangential travel from the point's anchor. The anchor is fixed to the object: it is the place where the point touched
+the object first, and after a slip it is moved so that |s| = delta. tau bounds the shear stress that the two surfaces
+bear, however hard they are pressed together (as between rubbers; Orowan's friction). A sticking point creeps by less than
+delta, and no point ever leaves Coulomb's cone. Everything here is in the object's frame.
 """
 
 from dataclasses import dataclass
@@ -22,8 +22,11 @@ from twin.stimulus import Stimulus
 from twin.types import BoolArray, FloatArray, IntArray
 
 SMOOTH_GAP_MM = 0.006
+"""eps: penetration below which the pressure rises with its square, so that touching is smooth."""
 STICK_CREEP_MM = 0.01
-POINTS_PER_ELEMENT = 4  # along each side of an outer element
+"""delta: travel from its anchor at which a sticking point starts to slip; about a hundredth of a usual shear."""
+POINTS_PER_ELEMENT = 4
+"""Contact points along each side of an outer element."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,7 @@ def contact_forces(
     bound_n : (p,) float, optional
         Friction force that a point never exceeds (tau A).
     soften : float
-        Below 1: the penalty times it, and the smooth gap and the creep over it (on the way to a solution).
+        Below 1 on the way to a solution: the penalty is multiplied by it, the smooth gap and the creep are divided by it.
     """
     distance, normal, hessian = stimulus.probe(at_mm)
     scales = SMOOTH_GAP_MM / soften, STICK_CREEP_MM / soften

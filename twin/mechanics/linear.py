@@ -3,9 +3,8 @@
 Duff & Reid 1983 (multifrontal method), George 1973 (nested dissection of a grid). The elements stand on a
 square grid, so the dissection is known: cut the longer side in the middle, recurse; a control is
 eliminated in the smallest box that holds all of its elements. All arithmetic is dense LAPACK on the
-fronts; the order is found once per path. Some unknowns can be kept: what is left for them is a dense
-matrix (static condensation; Guyan 1965), on which contact, that changes from iteration to iteration, is
-cheap to solve.
+fronts; the order is found once per path. Some unknowns can be kept: a dense matrix for them remains
+(static condensation; Guyan 1965). Contact changes from iteration to iteration, and is cheap to solve on this matrix.
 """
 
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from twin.types import BoolArray, FloatArray, IntArray
 Box: TypeAlias = tuple[int, int, int, int]  # first row, last row + 1, first column, last column + 1
 
 _LEAF_ELEMENTS = 36
+"""A box of this many elements or fewer is not cut any more: smaller fronts cost more calls than they save arithmetic."""
 _I = np.array([i for i, _ in PAIRS])
 _K = np.array([k for _, k in PAIRS])
 
@@ -90,7 +90,7 @@ class FrontalSolver:
         side = int(max(lying[:, 1].max() for lying in boxes if len(lying)))
         tree: list[tuple[Box, list[int]]] = []
         _dissect((0, side, 0, side), tree)
-        stage = np.full(len(fixed), len(tree))  # where a control is eliminated: the smallest box that holds its support
+        stage = np.full(len(fixed), len(tree))  # box in which a control is eliminated: the smallest one around its support
         for number, (box, _) in enumerate(tree):
             stage[_inside(support, box) & free & ~keep & (stage == len(tree))] = number
 
@@ -163,7 +163,7 @@ class FrontalSolver:
         return Eliminated(self._fronts, self.kept)
 
     def _make_room(self, children: list[list[int]]) -> None:
-        """Give every front its ``rest``: what a front leaves is needed only until it was added to the next one, so few rooms do."""
+        """Give every front the memory of its ``rest``. A rest is needed only until the next front has added it, so fronts share memory."""
         room: list[int] = []
         sizes: list[int] = []
         unused: list[int] = []

@@ -1,10 +1,9 @@
 """One load step: from a converged state to the next one, the object moved.
 
-Two nested iterations. The outer one is Newton's method on the elastic body: its tangent is eliminated
-down to the controls of the outer skin that the object may touch, and kept while it serves (it usually
-lasts for several iterations, and from one load step into the next). The inner one solves contact and
-friction exactly against what is left, a small dense problem: which points touch, stick or slip changes
-often, and is cheap to find there.
+Two iterations are nested. The outer one is Newton's method on the elastic body. Its tangent is eliminated
+down to the controls of the outer skin that the object may touch, and is kept as long as it converges well enough
+(usually for several iterations, and from one load step into the next). The inner one solves contact and friction
+exactly on the small dense problem that remains: which points touch, stick or slip changes often, and is cheap to find there.
 """
 
 import numpy as np
@@ -17,15 +16,30 @@ from twin.mechanics.path import carried
 from twin.stimulus import Stimulus
 from twin.types import FloatArray, IntArray
 
-GAP_BOUND_MM = 0.01  # no contact point ends deeper inside the object
-RESIDUAL_TOLERANCE = 1e-6  # of the sum of the contact forces
-_PENALTY_GROWTH, _PENALTY_RAISES = 4.0, 5
+GAP_BOUND_MM = 0.01
+"""No contact point ends deeper inside the object than this."""
+RESIDUAL_TOLERANCE = 1e-6
+"""A step is solved when the norm of the residual is at most this share of the sum of the contact forces."""
+_PENALTY_GROWTH = 4.0
+"""Factor on the penalty when a point ends too deep."""
+_PENALTY_RAISES = 5
+"""Most solutions of one step: with a larger penalty, or with more contact points, than the one before."""
 _ITERATIONS = 30
-_INNER_ITERATIONS = 400  # in all; a step whose contact flickers for longer is soonest solved in shorter ones
-_WORSE = 2.0  # growth of the residual that is put up with
-_KEEP_TANGENT = 0.3  # contraction of the residual up to which an old tangent is kept
-_SMALLEST_SHIFT_N_MM, _LARGEST_SHIFT_N_MM = 0.01, 50.0  # on the tangent's diagonal, where it leads astray
-_REACH_MM = 0.15  # contact points farther than this from the object are left out, and checked at the end
+"""Most outer iterations of one solution."""
+_INNER_ITERATIONS = 400
+"""Most inner iterations of one solution, all outer ones together. Where contact flickers for longer, shorter load steps are faster."""
+_WORSE = 2.0
+"""A move that makes the residual larger than this many times is refused."""
+_KEEP_TANGENT = 0.3
+"""An old tangent is kept as long as it lowers the residual to this share or less."""
+_SMALLEST_SHIFT_N_MM = 0.01
+"""First shift on the diagonal of a tangent that leads to refused moves, or is not positive definite (N/mm)."""
+_SHIFT_GROWTH = 8
+"""Factor from one shift to the next."""
+_LARGEST_SHIFT_N_MM = 50.0
+"""With a shift beyond this (N/mm) the step counts as not solved."""
+_REACH_MM = 0.15
+"""Contact points farther than this from the object are left out of the equations; at the end it is checked that none of them touches."""
 
 
 class NoConvergence(Exception):
@@ -107,11 +121,11 @@ class LoadStepper:
         raise NoConvergence(balance.relative)
 
     def _extrapolate(self, state: LoadState, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where the body will be if it goes on as in the last step; where it is if the object turns another way.
+        """Controls and border to start from: the last step continued, or the present state if the object moves another way now.
 
-        If that leaves an element inside out, the step isn't solved, and a shorter one goes less far.
+        If the continued step turns an element inside out, the load step is not solved; a shorter one then continues less far.
         """
-        if self._last is None or not self._last.held.any():  # a first contact grows in no straight line
+        if self._last is None or not self._last.held.any():  # a first contact does not grow in proportion to the motion
             return state.control_mm, state.border
         old, at = self._last, self._body.points.positions(state.control_mm)[state.held]
         if not len(at):
@@ -164,13 +178,13 @@ class LoadStepper:
             new, new_border = control.copy(), border + size * border_move
             new[self._body.free] += size * move.reshape(-1, 3)
             trial = problem.balance(new, new_border)
-            # the first move brings the object's motion: only then may the residual be anything
+            # the first move takes up the object's motion, and its residual may be of any size; no later one may
             if trial is None or size < 1 or (accepted and trial.absolute > _WORSE * balance.absolute):
                 astray = True
                 if not fresh:
-                    last = 0.0  # an old tangent is to blame first
+                    last = 0.0  # first the old tangent is suspected: make a new one
                 else:
-                    shift = max(8 * shift, _SMALLEST_SHIFT_N_MM)
+                    shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
                     if shift > _LARGEST_SHIFT_N_MM:
                         raise NoConvergence(balance.relative)
                 continue
@@ -184,14 +198,14 @@ class LoadStepper:
     def _linearise(self, problem: Problem, control: FloatArray, border: FloatArray, shift: float) -> Tangent:
         """The body's tangent at a state, plus a shift on the diagonal."""
         self.eliminations += 1
-        self._tangent = None  # its room is used again
+        self._tangent = None  # its memory is overwritten below
         problem.stiffness(control, border, self._blocks)
         while True:
             try:
                 eliminated = self._frontal.eliminate(self._blocks, shift=shift)
                 break
             except NotPositiveDefinite:
-                shift = max(8 * shift, _SMALLEST_SHIFT_N_MM)
+                shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
                 if shift > _LARGEST_SHIFT_N_MM:
                     raise NoConvergence(np.inf) from None
         matrix = whole(eliminated.matrix, shift)

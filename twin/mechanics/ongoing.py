@@ -16,7 +16,9 @@ from twin.mechanics.relaxation import History
 from twin.types import ContactState, FloatArray, IntArray
 
 _PENALTY_MPA_MM = 30.0
-_SMALLEST_STRIDE = 1 / 64  # of a regular load step
+"""Contact penalty at the start of every contact (MPa per mm of penetration): usual pressures then end within the gap bound."""
+_SMALLEST_STRIDE = 1 / 64
+"""Smallest share of a regular load step that is tried before a contact counts as not converging."""
 
 
 @dataclass(frozen=True)

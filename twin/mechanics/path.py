@@ -11,10 +11,19 @@ from twin.stimulus import Stimulus
 from twin.types import FloatArray
 
 _LARGEST_TILT_DEG = 60.0
+"""Largest tilt of a contact pose about each axis: the dome reaches no further."""
 _LARGEST_TWIST_DEG = 90.0
+"""Largest twist of a contact pose: a quarter turn."""
 _TOUCH_TOLERANCE_MM = 1e-6
+"""The object is at first touch when its distance to the dome is at most this."""
 _DOME_POINTS = 20_000
+"""Points on the whole sphere at which the distance of the object is looked for: 0.5 mm apart on a dome of 20 mm."""
+_NEAR_POINTS = 2000
+"""Points around the nearest of them, 30 times finer, for the second search."""
 _START_MM = 60.0
+"""Height above the apex from which the object comes down."""
+_MOST_DESCENTS = 400
+"""Most steps in which the object is brought down."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +125,9 @@ def deepest_mm(geometry: GeometrySpec) -> float:
 def plan_path(geometry: GeometrySpec, stimulus: Stimulus, pose: ContactPose) -> ContactPath:
     """Check a pose and find its first touch with the undeformed skin: poses at touch, pressed, and (if it moves further) sheared.
 
-    The object comes down along z by its smallest distance to the dome, again and again, which never
-    passes the first touch where distances are exact (sphere tracing, Hart 1996). The dome is sampled evenly, then finely
-    around the nearest point.
+    The object comes down along z by its smallest distance to the dome, again and again. Where distances are exact this
+    never passes the first touch (sphere tracing, Hart 1996). The dome is sampled evenly at first, then finely around the nearest
+    point.
 
     Raises
     ------
@@ -139,7 +148,7 @@ def plan_path(geometry: GeometrySpec, stimulus: Stimulus, pose: ContactPose) -> 
     height, nearest = _bring_down(stimulus, T, radius * directions, _START_MM, radius - skin.rim_z_mm)
     # around the nearest point the sampling is refined 30 times
     spread = 3 / np.sqrt(_DOME_POINTS)
-    near = directions[nearest] + spread * _sphere_points(2000)
+    near = directions[nearest] + spread * _sphere_points(_NEAR_POINTS)
     near /= np.linalg.norm(near, axis=1, keepdims=True)
     near = near[near[:, 2] >= lowest_z]
     height, _ = _bring_down(stimulus, T, radius * near, height + spread * radius, radius - skin.rim_z_mm)
@@ -183,7 +192,7 @@ def _bring_down(stimulus: Stimulus, T: FloatArray, points_mm: FloatArray, height
     """Height above ``T`` (mm) where the object just touches the points, and the index of the touched one."""
     turn, shift = T[:3, :3], T[:3, 3]
     free_mm = None
-    for _ in range(400):
+    for _ in range(_MOST_DESCENTS):
         distance = stimulus.distance((points_mm - shift - [0, 0, height_mm]) @ turn)
         nearest = int(distance.argmin())
         if abs(distance[nearest]) <= _TOUCH_TOLERANCE_MM:
@@ -193,7 +202,7 @@ def _bring_down(stimulus: Stimulus, T: FloatArray, points_mm: FloatArray, height
             height_mm -= distance[nearest]
         elif free_mm is None:
             raise ContactError("the object is in the skin's way before it comes down; use a smaller tilt or another offset")
-        else:  # a distance was too large (wires, far from a mesh): back half way
+        else:  # the distance was too large, as it can be near wires and far from a mesh: go back half the way
             height_mm = (height_mm + free_mm) / 2
         if height_mm < -depth_mm:
             break

@@ -26,11 +26,20 @@ from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, d
 from twin.stimulus import Stimulus, build_stimulus
 from twin.types import ContactState, FloatArray
 
-_STEP_MM = 0.4  # largest motion of the object across the contact in one load step
-_LOOK_MM = 2.0  # between the poses of the path at which that is looked for
-_FOCUS_POINTS = 2000  # on the sphere, to see where the object will press
-_FOCUS_POLAR_DEG, _FOCUS_AZIMUTH_DEG = 5.0, 15.0  # the focus's direction is rounded to these
-_MARGIN_RAD = np.radians(15.0)  # skin this far around what the rigid object would pass through may touch it
+_STEP_MM = 0.4
+"""Largest motion of the object, seen from any pressed place of the dome, in one load step."""
+_LOOK_MM = 2.0
+"""Largest motion between two poses of the path at which the solver looks where the object will press."""
+_FOCUS_POINTS = 2000
+"""Directions on the whole sphere in which the solver looks where the object will press."""
+_FOCUS_POLAR_DEG = 5.0
+"""The focus's polar angle is rounded to multiples of this, so that similar contacts share a solid."""
+_FOCUS_AZIMUTH_DEG = 15.0
+"""The focus's azimuth is rounded to multiples of this."""
+_MARGIN_RAD = np.radians(15.0)
+"""Skin within this angle of a direction that the rigid object would pass through may come to touch it."""
+_START_INSIDE_MM = 0.05
+"""A path may begin with the object this deep inside the undeformed dome: rounding of a first touch."""
 
 
 class SkinSolver:
@@ -92,8 +101,8 @@ class SkinSolver:
         friction, compliance_mm_per_n : optional
             Override the object's.
         given_way : callable, optional
-            What else the force does to the object's pose: from the path's ``T_sensor_object`` (4, 4) and the force on the object
-            (3,), N, after the load step before, to the pose that is taken.
+            How an arm that gives way changes the pose. It gets the path's ``T_sensor_object`` (4, 4) and the force on the object (3,)
+            in N that the load step before ended with, and returns the pose that is taken instead.
         release : bool
             Afterwards lift the object off again, the way it came.
         step_mm : float
@@ -151,7 +160,7 @@ class SkinSolver:
         return contact
 
     def reach(self, contact: OngoingContact, field: Stimulus, law: Friction, compliance: float, reached: FloatArray) -> None:
-        """Let the contact go on where the object presses other directions (k, 3) of the dome than before."""
+        """Prepare the contact for an object that comes to press other directions (k, 3) of the dome than before."""
         with self._one_thread():
             frontal = self._frontal(contact.setting, reached)
             contact.stepper = LoadStepper(contact.setting.body, frontal, field, law, compliance)
@@ -193,7 +202,7 @@ class SkinSolver:
         for at in _stops(plan, directions, radius, _LOOK_MM):
             T = plan.at(at)
             gap = field.distance((radius * directions - T[:3, 3]) @ T[:3, :3])
-            if at == 0 and gap.min() < -0.05:
+            if at == 0 and gap.min() < -_START_INSIDE_MM:
                 raise ContactError(f"the object starts {-gap.min():.2f} mm inside the skin; begin the path clear of it")
             if -gap.min() > limit:
                 raise ContactError(

@@ -1,4 +1,4 @@
-"""Light of the lamps behind the window at places in the gel: closed forms without shadows (the ray's equation: ``twin.projection``)."""
+"""Light that the lamps behind the window send to places in the gel: closed forms without shadows (ray equation: ``twin.projection``)."""
 
 from collections.abc import Sequence
 
@@ -10,8 +10,10 @@ from twin.optics.lights import Patch
 from twin.optics.window import NEWTON_STEPS, fresnel
 from twin.types import FloatArray
 
-RING_PLACES = 24  # that stand for an annulus
-ON_AXIS_MM = 1e-4  # closer to the light's vertical than this, a way is straight
+RING_PLACES = 24
+"""Points that stand for the housing's ring."""
+ON_AXIS_MM = 1e-4
+"""A point that is closer to the vertical through the light than this is lit straight along it."""
 
 _reflectance = numba.njit(cache=True, error_model="numpy")(fresnel)
 

@@ -8,9 +8,12 @@ from scenes.sensor import CameraSpec
 from twin.projection import distort, undistort
 from twin.types import FloatArray
 
-FIELD_MARGIN = 0.97  # of the fold's radius: past it the table goes on straight, where a distortion model means nothing
-WIDEST_FIELD = 6.0  # tangent (80 deg off the axis): a perspective image ends somewhere
-WIDEST_FISHEYE = 57.0  # tangent (89 deg)
+FIELD_MARGIN = 0.97
+"""Share of the fold's radius up to which the distortion model is used. Beyond it the model means nothing: the table goes on linearly."""
+WIDEST_FIELD = 6.0
+"""Largest tangent of a perspective camera (80 deg off its axis)."""
+WIDEST_FISHEYE = 57.0
+"""Largest tangent of a fisheye camera (89 deg off its axis)."""
 
 
 def valid_radius(camera: CameraSpec) -> float:

@@ -11,7 +11,8 @@ from twin.optics.tracer import spectrum
 from twin.optics.variant import DrJit, use_variant
 from twin.types import FloatArray, IntArray, PinState
 
-SAMPLES = 32  # per pixel
+SAMPLES = 32
+"""Samples per pixel."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ import numpy as np
 from scenes.sensor import HousingSpec, LedRingSpec
 from twin.types import FloatArray
 
-LED_FLUX = 640.0  # radiance times area (mm^2) of an LED of power 1: a white cap then sends about 1, the unit of the linear image
+LED_FLUX = 640.0
+"""Radiance times area (mm^2) of an LED of power 1. A white cap then sends about 1, which is the unit of the linear image."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Patch:
 
     @property
     def area_mm2(self) -> float:
-        """Its size."""
+        """Area of the square or annulus."""
         inner, outer = self.radii_mm
         return 4 * abs(np.linalg.det(self.half_mm)) + np.pi * (outer**2 - inner**2)
 

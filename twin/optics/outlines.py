@@ -7,20 +7,23 @@ from twin.optics.surfaces import CAP_BEVEL, cap_outlines
 from twin.projection import project
 from twin.types import FloatArray
 
-SIDES = 16  # of an outline
-RIM_PLACES = 6  # a rim's image is smooth: these determine it
-EVENLY = np.sqrt(
-    np.sin(np.pi / 12) / (np.pi / 12) * (2 * np.pi / SIDES) / np.sin(2 * np.pi / SIDES)
-)  # gives a polygon its round outline's area
+SIDES = 16
+"""Corners of an outline's polygon."""
+RIM_PLACES = 6
+"""Places of a rim that are projected. The image of a rim is smooth, so that they determine it."""
+EVENLY = np.sqrt(np.sin(np.pi / 12) / (np.pi / 12) * (2 * np.pi / SIDES) / np.sin(2 * np.pi / SIDES))
+"""Factor on the radius that gives the polygon the area of its round outline."""
 TURN = np.arange(SIDES) * 2 * np.pi / SIDES
+"""Azimuths of an outline's corners (rad)."""
 
 
 class PinOutlines:
     """Projects the pins of one sensor.
 
     A cap's rim is projected at `RIM_PLACES` places t. The part of its image that is odd under half a turn grows with the
-    radius, the even part with its square, which gives every outline about the same axis: with f the radius relative to
-    the rim's, ``centre + f(t) odd(t) + f(t)^2 even(t)``. Discs further along the axis are taken to be shifted images.
+    radius, the even part with the square of the radius. That gives every outline about the same axis: with f the radius relative
+    to the rim's, it is ``centre + f(t) odd(t) + f(t)^2 even(t)``. The image of a disc further along the axis is taken to be the
+    same image, shifted.
     """
 
     def __init__(self, view: ViewSpec, pins: PinsSpec, appearance: AppearanceSpec) -> None:
@@ -56,7 +59,7 @@ class PinOutlines:
 
 
 def _hull(*discs: FloatArray) -> FloatArray:
-    """Outline (N, K, 2) about similar closed outlines (N, K, 2): of their points k the one furthest out."""
+    """Outline (N, K, 2) around similar closed outlines (N, K, 2) each: of their points number k the one that lies furthest out."""
     tangent = np.roll(discs[0], -1, axis=1) - np.roll(discs[0], 1, axis=1)
     outward = np.stack([tangent[..., 1], -tangent[..., 0]], axis=-1)
     arm = discs[0] - discs[0].mean(axis=1, keepdims=True)

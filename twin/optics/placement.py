@@ -1,4 +1,4 @@
-"""Where samples are worth their time: on the pins, whose edges are noisy; dark bare skin is even after a few."""
+"""Which pixels need many samples: those of pins, whose edges are noisy. Dark bare skin is even after a few samples."""
 
 import cv2
 import numpy as np
@@ -7,9 +7,12 @@ from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.projection import project
 from twin.types import BoolArray, PinState
 
-SKIN_SAVING = 4  # samples on a pin for one on bare skin
-MARGIN_PX = 2.0  # what a pin's edge may be off
+SKIN_SAVING = 4
+"""Samples of a pixel that may show a pin for every sample of one that shows bare skin only."""
+MARGIN_PX = 2.0
+"""Added to the radius of each pin: the estimate of where its edge is may be wrong by this."""
 SUBPIXEL_BITS = 4
+"""OpenCV draws lines with places in units of 1 / 16 px."""
 
 
 def near_pins(

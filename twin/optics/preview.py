@@ -1,8 +1,8 @@
 """A fast picture of the sensor for interaction and control loops: drawn, not traced.
 
 Skin, stems and caps are projected through the window, shaded with the lamps' direct light (no shadows), and drawn from
-far to near, pins with exact coverage. Light that comes by way of other surfaces is a gain and an offset of each
-material, which `Preview.calibrate` takes from a path-traced frame.
+far to near, the pins with exact coverage. Light that comes by way of other surfaces is described by a gain and an offset for
+each material; `Preview.calibrate` fits them to a path-traced frame.
 """
 
 from collections.abc import Callable
@@ -33,13 +33,20 @@ from twin.types import FloatArray, IntArray, PinState
 Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 """Irradiance (n, 3), over n^2 of the gel, at points (n, 3) in mm with normals (n, 3)."""
 
-SKIN, STEM, SIDE, FACE = range(4)  # materials; all but the skin belong to pins
-BELT_STEP_RAD = np.radians(8.0)  # of the skin between the outermost pins and the rim
+SKIN, STEM, SIDE, FACE = range(4)
+"""Materials: the skin, and a pin's stem, cap side and cap face."""
+BELT_STEP_RAD = np.radians(8.0)
+"""Largest step of polar angle between corners of the skin from the outermost pins to the rim."""
 BELT_PLACES = 48
-DARK = 1e-3  # linear light below which errors weigh alike in a fit
-TRUST = 3e-3  # of direct light alone, relative to the material seen best: decides what is hardly seen at all
-NEAR_PX = 4.0  # sd of the surroundings in which the skin's light is compared
+"""Corners of the skin around each of these circles."""
+DARK = 1e-3
+"""Linear light below which all errors have the same weight in a fit."""
+TRUST = 3e-3
+"""Weight of the guess "direct light alone", relative to the material that is seen best. It decides for what is hardly seen at all."""
+NEAR_PX = 4.0
+"""Sd of the Gaussian neighbourhood in which traced and drawn light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
+"""Largest gain of a corner of the skin."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ import numpy as np
 
 from twin.types import BoolArray, FloatArray, IntArray
 
-ON_EDGE = 1e-9  # px: a pixel's centre on an edge belongs to both triangles, so that no gap opens
+ON_EDGE = 1e-9
+"""px. A pixel whose centre is this close to an edge belongs to both triangles, so that no gap opens between them."""
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -24,10 +24,14 @@ from twin.optics.window import Window
 from twin.types import FloatArray, IntArray, PinState
 
 Quality = Literal["preview", "standard", "high"]
-SAMPLES = {"preview": 4, "standard": 16, "high": 64}  # per pixel
-SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}  # the scalar variant is several times slower
-BOUNCES = 2  # dark skin: a third changes no gray level
-MOST_SAMPLES_AT_ONCE = 6_000_000  # bounds the memory of one pass
+SAMPLES = {"preview": 4, "standard": 16, "high": 64}
+"""Samples per pixel, by quality."""
+SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}
+"""Samples per pixel of the scalar variant, which is several times slower."""
+BOUNCES = 2
+"""Scatterings of a path after its first. The skin is dark: a third one changes no gray level."""
+MOST_SAMPLES_AT_ONCE = 6_000_000
+"""Samples of one pass: this bounds the memory it needs."""
 
 
 class Renderer:

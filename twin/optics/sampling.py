@@ -4,7 +4,8 @@ from types import ModuleType
 
 from twin.optics.variant import DrJit
 
-GOLDEN = 0x9E3779B9  # spreads consecutive dimensions over the hash's seeds
+GOLDEN = 0x9E3779B9
+"""2^32 over the golden ratio: spreads consecutive dimensions over the seeds of the hash."""
 
 
 class PixelSamples:

@@ -1,7 +1,7 @@
 """The gel seen by the scalar variant, which runs anywhere: an approximation with Mitsuba's own path tracer.
 
-Its camera is the one pinhole in the gel that sees the caps best, its LEDs stand in the gel where the caps see them; the
-picture is then warped, by the depth of the caps, to where the window puts it. The window reflects nothing.
+Its camera is a pinhole in the gel, at the point that fits the caps' rays best. Its LEDs stand in the gel where the caps see them.
+The picture is then warped, with the depth of the caps, to where the window shows it. The window reflects nothing.
 """
 
 from collections.abc import Sequence
@@ -20,9 +20,12 @@ from twin.optics.variant import DrJit
 from twin.projection import pixel_rays, project, window_tangent
 from twin.types import FloatArray, IntArray, PinState
 
-OVERSAMPLING = 1.3  # pixels of the ideal image per pixel of the frame
-COARSE = 8  # px between the places where the depth is interpolated
-DEPTH_NEIGHBOURS = 24  # caps that give the depth of a place
+OVERSAMPLING = 1.3
+"""Pixels of the pinhole camera's image for each pixel of the frame, along a side."""
+COARSE = 8
+"""Distance in px of the places at which the caps' depth is interpolated."""
+DEPTH_NEIGHBOURS = 24
+"""Number of nearest caps that give the depth of a place."""
 
 
 class ScalarView:

@@ -1,6 +1,6 @@
-"""What the camera sees besides the gel: the housing, the LEDs' reflections in the window, specks. Contact never changes it.
+"""What the camera sees besides the gel: the housing, the LEDs' reflections in the window, specks.
 
-Found once, without noise.
+No contact changes this layer. It is computed once, without noise.
 """
 
 from collections.abc import Sequence
@@ -16,10 +16,14 @@ from twin.optics.window import fresnel
 from twin.projection import sensor_to_camera
 from twin.types import FloatArray
 
-ACROSS = 4  # places in a pixel, each way, where its corners differ
-EVEN = 0.02  # relative difference of the corners below which their mean is the pixel
-RIM_UNIT = 1000.0  # of the numbers in RimSpec.light
-SMALL = 1e-3  # light and cover below this need no relative precision
+ACROSS = 4
+"""Places along each side of a pixel at which it is evaluated if its corners differ."""
+EVEN = 0.02
+"""If the corners of a pixel differ by less than this share, their mean is the pixel."""
+RIM_UNIT = 1000.0
+"""The numbers in ``RimSpec.light`` are thousandths."""
+SMALL = 1e-3
+"""Light and cover below this need no relative precision."""
 
 
 def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:

@@ -13,12 +13,19 @@ from scenes.sensor import AppearanceSpec, PinsSpec, SkinSpec
 from twin.types import FloatArray, IntArray
 
 SKIN_POLAR_STEPS = 40
+"""Circles of the skin's grid between apex and rim."""
 SKIN_AZIMUTH_STEPS = 80
+"""Vertices on each circle."""
 STEM_SIDES = 8
+"""Sides of a stem."""
 CAP_SIDES = 16
-CAP_BEVEL = 0.25  # of the cap's height: printed edges are never sharp
-STEM_ROOT_MM = 0.3  # stems start inside the skin, so that no gap opens where it bends
-MOST_CONTROL_POINTS = 1200  # displacement interpolation solves a dense system of this size once
+"""Sides of a cap."""
+CAP_BEVEL = 0.25
+"""Bevel of a cap's edge as a share of the cap's height: printed edges are never sharp."""
+STEM_ROOT_MM = 0.3
+"""Stems start this deep inside the skin, so that no gap opens where the skin bends."""
+MOST_CONTROL_POINTS = 1200
+"""More control points than this are thinned out: the interpolation solves a dense system of their number, once."""
 
 
 @dataclass(frozen=True)

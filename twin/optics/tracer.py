@@ -1,8 +1,8 @@
 """Path tracing on the gel's side of the window.
 
-At every vertex the light of all patches is found through the window without shadows (a sum of closed forms), and one
-of them, drawn in proportion to what it would give, is tested for a shadow: where nothing is in the way there is no noise
-from the choice. Paths that leave towards the window are reflected by it (with total reflection) or lost in the housing.
+At every vertex the light of all patches through the window is computed without shadows, as a sum of closed forms. Then one
+patch, drawn in proportion to what it would give, is tested for a shadow. Where nothing is in the way, this choice causes no
+noise. Paths that leave towards the window are reflected by it (with total reflection) or lost in the housing.
 """
 
 from dataclasses import dataclass, field
@@ -17,8 +17,12 @@ from twin.optics.variant import DrJit
 from twin.optics.window import Window
 from twin.types import FloatArray
 
-SURVIVAL_GAIN, LEAST_SURVIVAL = 4.0, 0.05  # a path goes on with a probability of this times its weight, but no less
+SURVIVAL_GAIN = 4.0
+"""A path goes on with a probability of this times its weight (Russian roulette), at most 1."""
+LEAST_SURVIVAL = 0.05
+"""A path goes on at least with this probability."""
 NEVER = 1e-12
+"""Probability that counts as 0."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from twin.optics.probes import probe
 DrJit: TypeAlias = Any
 """A value of Dr.Jit or an object of Mitsuba. Their classes belong to the variant, which is chosen while the program runs."""
 
-OLDEST_LLVM = 16  # 14 and 15 abort at the first kernel
+OLDEST_LLVM = 16
+"""Versions 14 and 15 abort the process at the first kernel."""
 BACKENDS = ("cuda", "llvm", "scalar")
 REMEDY = "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19), or point DRJIT_LIBLLVM_PATH to its library"
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"

@@ -6,7 +6,8 @@ from types import ModuleType
 from scenes.sensor import ViewSpec
 from twin.optics.variant import DrJit
 
-NEWTON_STEPS = 5  # from the paraxial start; the sixth changes a direction by less than 1e-5
+NEWTON_STEPS = 5
+"""Steps of Newton's method from the paraxial start; a sixth step changes a direction by less than 1e-5."""
 
 
 @dataclass(frozen=True)

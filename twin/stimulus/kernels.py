@@ -10,7 +10,8 @@ import numpy as np
 from twin.stimulus.level_set import Probe, Triple
 from twin.types import FloatArray
 
-_CREASE_MM = 1e-3  # bent tighter than this is a crease, which has no curvature
+_CREASE_MM = 1e-3
+"""A surface with a smaller radius of curvature counts as a crease, which has no Hessian."""
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""What every signed-distance field shares: distance and gradient from one probe, and unit normals of a field that is no exact distance."""
+"""What all signed-distance fields share: distance and gradient from one probe, and unit normals of fields that are no exact distance."""
 
 from abc import ABC, abstractmethod
 from typing import TypeAlias
@@ -12,7 +12,8 @@ Probe: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Distance (k,) in mm, unit gradient (k, 3) and Hessian (k, 3, 3) in 1/mm at k points (or texture coordinates and their derivatives)."""
 Triple: TypeAlias = tuple[float, float, float]
 
-_FLAT = 1e-12  # slope below which a field has no direction
+_FLAT = 1e-12
+"""Slope below which a field counts as having no direction."""
 
 
 class Probed(ABC):
@@ -48,8 +49,8 @@ def rows(points_mm: FloatArray) -> FloatArray:
 def unit_normals(slope: FloatArray, hessian: FloatArray) -> None:
     """Turn, in place, a field's slope g (k, 3) into the unit normal n and its second derivative H (k, 3, 3) into P H P / |g|, P = I - n n.
 
-    That is the derivative of n along the level set: symmetric, H n = 0. What it leaves out, how n turns along
-    n itself, vanishes for an exact distance. A flat place looks to -z, unbent.
+    That is the derivative of n along the level set: it is symmetric, and H n = 0. It leaves out how n turns along n itself, which is
+    zero for an exact distance. A place without slope gets the normal -z and no curvature.
     """
     for k in range(len(slope)):
         size = np.sqrt(slope[k, 0] ** 2 + slope[k, 1] ** 2 + slope[k, 2] ** 2)

@@ -12,8 +12,10 @@ import trimesh
 from twin.stimulus.level_set import Triple
 from twin.types import FloatArray, IntArray
 
-_LEAF = 4  # at most so many triangles in a leaf
-_FLAT_MM2 = 1e-12  # a triangle without area has no inside; its neighbours cover it
+_LEAF = 4
+"""Most triangles in a leaf of the tree."""
+_FLAT_MM2 = 1e-12
+"""A triangle with a smaller area is left out: it has no inside, and its neighbours cover it."""
 
 
 def signed_distance(mesh: trimesh.Trimesh, points_mm: FloatArray) -> FloatArray:

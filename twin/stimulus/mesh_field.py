@@ -19,11 +19,16 @@ from twin.stimulus.mesh_file import place_mesh, read_mesh
 from twin.stimulus.spline import spline_probe, spline_value
 from twin.types import FloatArray
 
-_REACH_MM = 40.0  # half width of the sampled region around the origin: the dome and its shear
+_REACH_MM = 40.0
+"""The mesh is sampled up to this far from the origin along each axis: the dome, and how far it is sheared."""
 _MARGIN_MM = 4.0
-_NODES = 250_000  # of the sampled grid: about 1 s, 2 MB
+"""The grid goes on this far beyond the sampled part of the mesh."""
+_NODES = 250_000
+"""Nodes of the grid: sampling takes about 1 s, and the grid 2 MB."""
 _FINEST_MM = 0.25
-_SAMPLING = 1  # raised whenever the same mesh would be read, placed or sampled differently
+"""The grid's lines are never closer than this."""
+_SAMPLING = 1
+"""Raised whenever the same mesh is read, placed or sampled in another way, so that fields on disk are not used any more."""
 
 
 @dataclass(frozen=True)

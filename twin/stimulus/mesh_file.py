@@ -8,7 +8,10 @@ from twin.types import FloatArray
 
 _UNIT_REMEDY = "scale the file to mm, or name its unit in a TOML: shape = { kind = 'mesh', file = ..., unit = ... } (mm, cm, m or inch)"
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
-_SMALLEST_MM, _LARGEST_MM = 1.0, 2000.0
+_SMALLEST_MM = 1.0
+"""An object whose largest side is shorter was most likely given in another unit."""
+_LARGEST_MM = 2000.0
+"""An object whose largest side is longer was most likely given in another unit."""
 
 
 def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:

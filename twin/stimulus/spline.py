@@ -12,7 +12,8 @@ from twin.types import FloatArray
 
 Four: TypeAlias = tuple[float, float, float, float]
 
-_SUMS = {"contract", "reassoc"}  # sums may be reordered, which nearly halves the time; NaN stays NaN
+_SUMS = {"contract", "reassoc"}
+"""What the compiler may do with sums: reorder them and fuse products. This nearly halves the time, and NaN stays NaN."""
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
@@ -53,7 +54,7 @@ def _line(weights: Four, values: FloatArray, i: int, j: int, k: int) -> float:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
 def _step_in(point: float, low: float, spacing: float, count: int) -> tuple[float, float]:
-    """A coordinate's place in the grid in nodes, and its way there from outside in mm."""
+    """Where a coordinate lies in the grid, in nodes, and how far it lies outside of it, in mm."""
     inside = min(max(point, low + 2 * spacing), low + (count - 3) * spacing)
     return (inside - low) / spacing, point - inside
 
@@ -62,7 +63,7 @@ def _step_in(point: float, low: float, spacing: float, count: int) -> tuple[floa
 def _place(
     points: FloatArray, k: int, corner: FloatArray, spacing: float, counts: tuple[int, ...]
 ) -> tuple[tuple[int, float], tuple[int, float], tuple[int, float], tuple[float, float, float]]:
-    """Point k's cells along the three axes, and its way there from outside the grid in mm."""
+    """The cells of point k along the three axes, and how far it lies outside of the grid along each, in mm."""
     x, away_x = _step_in(points[k, 0], corner[0], spacing, counts[0])
     y, away_y = _step_in(points[k, 1], corner[1], spacing, counts[1])
     z, away_z = _step_in(points[k, 2], corner[2], spacing, counts[2])

@@ -8,14 +8,15 @@ import numpy as np
 from twin.stimulus.level_set import Probe, Probed, Wrapped, unit_normals
 from twin.types import FloatArray
 
-_BLEND = 0.15  # blending length of a joint, as a fraction of the wire's diameter
-_CREASE_MM = 1e-3  # nearer to a wire's axis there is no curvature
+_BLEND = 0.15
+"""Length over which wires and base are blended into each other, as a share of the wire's diameter."""
+_CREASE_MM = 1e-3
+"""Nearer to a wire's axis than this the field counts as not curved."""
 
 
 @dataclass(frozen=True)
 class WireMesh(Probed):
-    """Round wires that lie on the base's surface, in two crossing families at a pitch; one wire of
-    each family passes over the origin.
+    """Round wires that lie on the base's surface in two crossing families; one wire of each family passes over the origin.
 
     A wire's distance is sqrt((D - d/2)^2 + s^2) - d/2 with the base's distance D, the wire's
     diameter d and the distance s along the surface to the nearest wire; base and wires are joined

@@ -1,4 +1,4 @@
-"""The specification of an object (stimulus) that the sensor is pressed against.
+"""The specification of an object that the sensor is pressed against.
 
 Object frame: origin on the surface where the sensor touches first, z into the object. At
 rest the axes are parallel to the sensor's, so the sensor comes from -z.

@@ -23,7 +23,7 @@ class Spread(Section):
 
     @property
     def ends(self) -> Ends:
-        """The two ends, of whichever kind is given."""
+        """The two ends of the kind that is given."""
         return next(ends for ends in (self.scale, self.add, self.value) if ends is not None)
 
     @model_validator(mode="after")
@@ -60,13 +60,13 @@ class RandomisationSpec(Section):
     Attributes
     ----------
     executed_share : float
-        Share of the moves that are executed before the frame is taken.
+        Share of the contacts in which the move is executed before the frame is taken.
     pin_noise_px : float
         Sd of the noise that is added to the stored pins (not to pictures: those have the camera's own noise).
     friction : FrictionSpread, optional
-        Without it the rig's or the object's own.
+        Without it every contact has the friction of the rig or of the object.
     sensor : dict of str to Spread
-        By the key in the sensor's specification, with dots: material, geometry, camera, light, rig.
+        By the dotted key in the sensor's specification: material, geometry, camera, light, rig.
     """
 
     name: str

@@ -136,7 +136,7 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimu
 
     Parameters
     ----------
-    stimulus : Stimulus
+    stimulus : ObjectField
         Its origin is a material point of the object, so that the way from pose to pose is also the way that friction sees.
 
     Raises

@@ -67,7 +67,7 @@ class Simulator:
             self._renderer = Renderer(self.spec, quality=self._quality, mesh=self.solver.mesh)
         return self._renderer
 
-    def press(self, stimulus: ObjectSpec, pose: ContactPose, *, progress: Callable[[float], object] | None = None) -> ContactState:
+    def press(self, touched: ObjectSpec, pose: ContactPose, *, progress: Callable[[float], object] | None = None) -> ContactState:
         """Press an object against the sensor along approach and shear.
 
         Raises
@@ -75,7 +75,7 @@ class Simulator:
         ContactError
             If the pose is out of reach or the solver does not converge.
         """
-        return self.solver.press(stimulus, pose, progress=None if progress is None else lambda fraction, _: progress(fraction))
+        return self.solver.press(touched, pose, progress=None if progress is None else lambda fraction, _: progress(fraction))
 
     def shoot(self, state: ContactState, *, form: Form = Form.RAW, seed: int = 0, name: str = "frame.png") -> Shot:
         """Render what the camera sees, and capture it in the given form.

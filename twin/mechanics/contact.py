@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from twin.geometry.solid import Solid
-from twin.stimulus import Stimulus
+from twin.stimulus import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
 SMOOTH_GAP_MM = 0.006
@@ -123,7 +123,7 @@ class ContactForces:
 
 
 def contact_forces(
-    stimulus: Stimulus,
+    field: ObjectField,
     at_mm: FloatArray,
     stiff: FloatArray,
     anchor_mm: FloatArray,
@@ -147,7 +147,7 @@ def contact_forces(
     soften : float
         Below 1 on the way to a solution: the penalty is multiplied by it, the smooth gap and the creep are divided by it.
     """
-    distance, normal, hessian = stimulus.probe(at_mm)
+    distance, normal, hessian = field.probe(at_mm)
     scales = SMOOTH_GAP_MM / soften, STICK_CREEP_MM / soften
     bound = np.full(len(at_mm), np.inf) if bound_n is None else bound_n
     force, normal_n, depth, slipping, stiffness, anchors = _law(

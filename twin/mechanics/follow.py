@@ -8,7 +8,7 @@ from twin.geometry.chart import Focus
 from twin.mechanics.ongoing import OngoingContact
 from twin.mechanics.path import ContactPath, carried, deepest_mm, dome_directions
 from twin.mechanics.solver import SkinSolver, friction_of
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.types import ContactState
 
 STEP_MM = 1.2  # largest motion across the contact in one load step
@@ -36,7 +36,7 @@ class Follower:
 
     def __init__(self, solver: SkinSolver, stimulus: ObjectSpec, *, step_mm: float | None = None):
         self._solver, self._step_mm = solver, step_mm or _step_of(stimulus)
-        self._field = build_stimulus(stimulus)
+        self._field = build_field(stimulus)
         rig = solver.spec.rig
         self._law, self._compliance = friction_of(stimulus), stimulus.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
         self._radius_mm = solver.spec.skin.outer_radius_mm

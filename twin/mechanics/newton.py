@@ -13,7 +13,7 @@ from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, 
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
-from twin.stimulus import Stimulus
+from twin.stimulus import ObjectField
 from twin.types import FloatArray, IntArray
 
 GAP_BOUND_MM = 0.01
@@ -58,13 +58,13 @@ class LoadStepper:
     body : Body
     frontal : FrontalSolver
         Keeps the controls that the object may touch.
-    stimulus : Stimulus
+    field : ObjectField
     friction : Friction
     compliance_mm_per_n : float
     """
 
-    def __init__(self, body: Body, frontal: FrontalSolver, stimulus: Stimulus, friction: Friction, compliance_mm_per_n: float) -> None:
-        self._body, self._frontal, self._stimulus, self._friction = body, frontal, stimulus, friction
+    def __init__(self, body: Body, frontal: FrontalSolver, field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
+        self._body, self._frontal, self._field, self._friction = body, frontal, field, friction
         self._compliance = compliance_mm_per_n
         shapes = [(len(kind.cells.controls), 6, *2 * kind.cells.controls.shape[1:]) for kind in body.kinds]
         self._blocks = [np.empty(shape, np.float32) for shape in shapes]
@@ -96,7 +96,7 @@ class LoadStepper:
         """
         control, border = self._extrapolate(state, T)
         before, after = self._seen(state.control_mm, state.border, state.T), self._seen(control, border, T)
-        gap_before, gap = self._stimulus.distance(before), self._stimulus.distance(after)
+        gap_before, gap = self._field.distance(before), self._field.distance(after)
         looked = np.flatnonzero(self._reachable & (gap < _REACH_MM) | state.held)
         # a point that is driven into the object is anchored where it meets the surface on the way
         driven = (gap_before > 0) & (gap < 0)
@@ -104,10 +104,10 @@ class LoadStepper:
         anchors = np.where(state.held[:, None], state.anchor_mm, (1 - share) * before + share * after)
         penalty = state.penalty_mpa_mm
         for _ in range(_PENALTY_RAISES):
-            problem = Problem(self._body, self._stimulus, self._friction, self._compliance, state, anchors, looked, penalty, T, given)
+            problem = Problem(self._body, self._field, self._friction, self._compliance, state, anchors, looked, penalty, T, given)
             control, border, balance = self._solve(problem, control, border, control is not state.control_mm)
             left_out = np.setdiff1d(np.arange(len(gap)), looked, assume_unique=True)
-            missed = left_out[self._stimulus.distance(self._seen(control, border, T)[left_out]) < 0]
+            missed = left_out[self._field.distance(self._seen(control, border, T)[left_out]) < 0]
             if len(missed):
                 if not self._reachable[missed].all():
                     raise ContactError(

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from scenes.sensor import GeometrySpec, SkinSpec
 from twin.errors import ContactError
-from twin.stimulus import Stimulus
+from twin.stimulus import ObjectField
 from twin.types import FloatArray
 
 _LARGEST_TILT_DEG = 60.0
@@ -122,7 +122,7 @@ def deepest_mm(geometry: GeometrySpec) -> float:
     return 0.5 * (geometry.skin.outer_radius_mm - geometry.skin.thickness_mm - geometry.lens.z_mm)
 
 
-def plan_path(geometry: GeometrySpec, stimulus: Stimulus, pose: ContactPose) -> ContactPath:
+def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> ContactPath:
     """Check a pose and find its first touch with the undeformed skin: poses at touch, pressed, and (if it moves further) sheared.
 
     The object comes down along z by its smallest distance to the dome, again and again. Where distances are exact this
@@ -145,13 +145,13 @@ def plan_path(geometry: GeometrySpec, stimulus: Stimulus, pose: ContactPose) -> 
     T[:3, 3] = [*pose.offset_mm, radius]
     lowest_z = skin.rim_z_mm / radius
     directions = dome_directions(skin, _DOME_POINTS)
-    height, nearest = _bring_down(stimulus, T, radius * directions, _START_MM, radius - skin.rim_z_mm)
+    height, nearest = _bring_down(field, T, radius * directions, _START_MM, radius - skin.rim_z_mm)
     # around the nearest point the sampling is refined 30 times
     spread = 3 / np.sqrt(_DOME_POINTS)
     near = directions[nearest] + spread * _sphere_points(_NEAR_POINTS)
     near /= np.linalg.norm(near, axis=1, keepdims=True)
     near = near[near[:, 2] >= lowest_z]
-    height, _ = _bring_down(stimulus, T, radius * near, height + spread * radius, radius - skin.rim_z_mm)
+    height, _ = _bring_down(field, T, radius * near, height + spread * radius, radius - skin.rim_z_mm)
     T[2, 3] += height
     pressed = T.copy()
     pressed[2, 3] -= max(pose.indent_mm, 0.0)
@@ -188,12 +188,12 @@ def _check(geometry: GeometrySpec, pose: ContactPose) -> None:
             raise ContactError(f"{name}: {value:g} is more than {limit:g} ({reason}); give a smaller value")
 
 
-def _bring_down(stimulus: Stimulus, T: FloatArray, points_mm: FloatArray, height_mm: float, depth_mm: float) -> tuple[float, int]:
+def _bring_down(field: ObjectField, T: FloatArray, points_mm: FloatArray, height_mm: float, depth_mm: float) -> tuple[float, int]:
     """Height above ``T`` (mm) where the object just touches the points, and the index of the touched one."""
     turn, shift = T[:3, :3], T[:3, 3]
     free_mm = None
     for _ in range(_MOST_DESCENTS):
-        distance = stimulus.distance((points_mm - shift - [0, 0, height_mm]) @ turn)
+        distance = field.distance((points_mm - shift - [0, 0, height_mm]) @ turn)
         nearest = int(distance.argmin())
         if abs(distance[nearest]) <= _TOUCH_TOLERANCE_MM:
             return height_mm, nearest

@@ -23,7 +23,7 @@ from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
 from twin.mechanics.ongoing import OngoingContact, Setting
 from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, dome_directions, plan_path
-from twin.stimulus import Stimulus, build_stimulus
+from twin.stimulus import ObjectField, build_field
 from twin.types import ContactState, FloatArray
 
 _STEP_MM = 0.4
@@ -68,7 +68,7 @@ class SkinSolver:
 
     def press(
         self,
-        stimulus: Stimulus | ObjectSpec,
+        touched: ObjectField | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
         friction: float | Friction | None = None,
@@ -76,14 +76,14 @@ class SkinSolver:
         progress: Callable[[float, ContactState], object] | None = None,
     ) -> ContactState:
         """The state at the end of a contact; arguments and errors as ``path``."""
-        for at, state in self.path(stimulus, pose, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
+        for at, state in self.path(touched, pose, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
             if progress is not None:
                 progress(at, state)
         return state
 
     def path(
         self,
-        stimulus: Stimulus | ObjectSpec,
+        touched: ObjectField | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
         friction: float | Friction | None = None,
@@ -96,8 +96,8 @@ class SkinSolver:
 
         Parameters
         ----------
-        stimulus : Stimulus or ObjectSpec
-            With a bare ``Stimulus``, friction and compliance default to 0.
+        touched : ObjectField or ObjectSpec
+            With a bare ``ObjectField``, friction and compliance default to 0.
         friction, compliance_mm_per_n : optional
             Override the object's.
         given_way : callable, optional
@@ -120,7 +120,7 @@ class SkinSolver:
             Pose out of range, object out of reach or starting inside the skin, or no convergence: names the
             step and the residual.
         """
-        spec, field = (stimulus, build_stimulus(stimulus)) if isinstance(stimulus, ObjectSpec) else (None, stimulus)
+        spec, field = (touched, build_field(touched)) if isinstance(touched, ObjectSpec) else (None, touched)
         law = friction_of(spec, friction)
         compliance = compliance_mm_per_n if compliance_mm_per_n is not None else (spec.compliance_mm_per_n if spec else 0.0)
         plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec.geometry, field, pose)
@@ -144,7 +144,7 @@ class SkinSolver:
                 yield float(at / stops[-1]), state
 
     def begin(
-        self, field: Stimulus, law: Friction, compliance: float, reached: FloatArray, T: FloatArray, *, focus: Focus
+        self, field: ObjectField, law: Friction, compliance: float, reached: FloatArray, T: FloatArray, *, focus: Focus
     ) -> OngoingContact:
         """A contact at its start, the object at ``T`` and free of the skin.
 
@@ -159,7 +159,7 @@ class SkinSolver:
         self.reach(contact, field, law, compliance, reached)
         return contact
 
-    def reach(self, contact: OngoingContact, field: Stimulus, law: Friction, compliance: float, reached: FloatArray) -> None:
+    def reach(self, contact: OngoingContact, field: ObjectField, law: Friction, compliance: float, reached: FloatArray) -> None:
         """Prepare the contact for an object that comes to press other directions (k, 3) of the dome than before."""
         with self._one_thread():
             frontal = self._frontal(contact.setting, reached)
@@ -193,7 +193,7 @@ class SkinSolver:
         groups = [kind.cells.controls for kind in setting.body.kinds]
         return FrontalSolver(groups, list(solid.boxes), solid.fixed, keep & ~solid.fixed)
 
-    def _reached(self, field: Stimulus, plan: ContactPath) -> FloatArray:
+    def _reached(self, field: ObjectField, plan: ContactPath) -> FloatArray:
         """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""
         radius = self.spec.skin.outer_radius_mm
         directions = dome_directions(self.spec.skin, _FOCUS_POINTS)

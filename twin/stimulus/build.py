@@ -12,7 +12,7 @@ from twin.stimulus.texture import WireMesh
 from twin.types import FloatArray
 
 
-class Stimulus(Protocol):
+class ObjectField(Protocol):
     """A solid in the object frame, as a signed-distance field at points (k, 3) in mm."""
 
     def distance(self, points_mm: FloatArray) -> FloatArray:
@@ -32,7 +32,7 @@ class Stimulus(Protocol):
         ...
 
 
-def build_stimulus(spec: ObjectSpec) -> Stimulus:
+def build_field(spec: ObjectSpec) -> ObjectField:
     """The signed-distance field of an object, with its texture.
 
     Raises

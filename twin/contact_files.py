@@ -56,7 +56,7 @@ def look_at(simulator: Simulator, shot: Shot) -> Look:
     return Look(shot.frame, pipeline(shot.frame), rest)
 
 
-def contact_record(simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> dict:
+def contact_record(simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> dict[str, object]:
     """What ``truth.json`` holds: forces on the object in the sensor frame, pose, everything resolved."""
     return {
         "force_n": state.force_n.tolist(),

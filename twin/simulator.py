@@ -109,7 +109,7 @@ class Simulator:
         frame = replace(raw.frame, image=image, form=Form.RECORDING)
         return replace(raw, frame=frame, truth=cap_truth(self.spec, self.rest, state, Form.RECORDING))
 
-    def describe(self) -> dict:
+    def describe(self) -> dict[str, dict[str, object]]:
         """What a result depends on besides sensor and object: variant and samples, mesh and tolerances."""
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypedDict
 
 from twin.errors import RenderError
 from twin.optics.native import load_needed_libraries
@@ -171,19 +171,30 @@ def available_variants() -> tuple[str, ...]:
     return tuple(sorted(m.group(1) for m in found if m))
 
 
-def report() -> dict:
-    """What a diagnosis prints about rendering on this machine.
+class RenderReport(TypedDict):
+    """What a diagnosis prints about rendering on a machine."""
 
-    Returns
-    -------
-    dict
-        ``variants`` (compiled in), ``used`` ("color" and "mono" to variant, reason, llvm_path; variant None where
-        nothing works), ``llvm`` and ``llvm_rejected`` (path, version, ok, reason), ``gpu``, ``gpu_reason``,
-        ``override`` (TACTIP_VARIANT or None) and ``remedy`` (None where nothing is slow).
-    """
+    variants: list[str]
+    """Variants compiled into the installed Mitsuba."""
+    used: dict[str, dict[str, str | None]]
+    """For "color" and "mono" cameras: ``variant`` (None where nothing works), ``reason``, ``llvm_path``."""
+    llvm: dict[str, str | bool] | None
+    """The LLVM library in use, as `LlvmLibrary`."""
+    llvm_rejected: list[dict[str, str | bool]]
+    """Libraries that were looked at and do not work."""
+    gpu: bool
+    gpu_reason: str
+    override: str | None
+    """TACTIP_VARIANT."""
+    remedy: str | None
+    """What to install; None where nothing is slow."""
+
+
+def report() -> RenderReport:
+    """What a diagnosis prints about rendering on this machine."""
     llvm = find_llvm()
     gpu, gpu_reason = find_cuda()
-    used = {}
+    used: dict[str, dict[str, str | None]] = {}
     for channels in ("color", "mono"):
         try:
             used[channels] = asdict(choose_variant(channels))

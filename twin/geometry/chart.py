@@ -22,9 +22,9 @@ _POWER = 5
 _FINE = 0.75
 """Share of the square's half side whose image is the focus."""
 _LARGEST_SHIFT = 0.6
-"""Largest shift a of the Moebius transformation: a larger one would stretch the far elements too much."""
+"""Largest shift a of the Moebius transformation: it bounds how far the elements opposite the focus are stretched."""
 _LEAST_SLOPE = 0.2
-"""Smallest c: with less, the elements at the centre of the focus would be much smaller than the object's features."""
+"""Smallest c: it bounds how small the elements at the centre of the focus get."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ _VERSION = 1
 _CELL_PARTS = ("controls", "gradients", "weights_mm3")
 """Arrays of ``Cells``, as they are named on disk."""
 _GEL_GRADING = 1.5
-"""Boundary k of n elements through the gel lies at the depth (k / n)^1.5: elements are thin below the skin, where strains change fast."""
+"""Boundary k of n elements through the gel lies at the depth (k / n)^1.5: elements are thin below the skin."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from twin.types import BoolArray, FloatArray, IntArray
 Box: TypeAlias = tuple[int, int, int, int]  # first row, last row + 1, first column, last column + 1
 
 _LEAF_ELEMENTS = 36
-"""A box of this many elements or fewer is not cut any more: smaller fronts cost more calls than they save arithmetic."""
+"""A box of this many elements or fewer is not cut any more."""
 _I = np.array([i for i, _ in PAIRS])
 _K = np.array([k for _, k in PAIRS])
 

@@ -5,7 +5,7 @@ the work frame. For each contact a pose and a move are drawn evenly from their r
 ``pose - move + clear``, taps by ``tap``, moves by ``move`` (the shear), and the frame is taken at ``pose + clear + tap``.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -30,7 +30,7 @@ class PoseRanges(Section):
 
 
 class MoveRanges(Section):
-    """The same of the move that follows the tap."""
+    """Lowest and highest value of each coordinate of the move that follows the tap; equal: held there."""
 
     move_1: Range = (0.0, 0.0)
     move_2: Range = (0.0, 0.0)
@@ -46,19 +46,19 @@ class ExperimentSpec(Section):
     Attributes
     ----------
     object : str
-        What is touched, if nothing else is said: a name of ``twin objects`` or a file.
+        What is touched by default: a name of ``twin objects`` or a file.
     approach : {"x", "y", "z"}
         Axis of the work frame along which the sensor looks at the object (an arm of four axes holds it level: "y").
     zero_mm : float
-        How far an unturned sensor indents the object at ``pose + clear + tap`` where the approach's coordinate of the pose is 0.
+        Indentation of an unturned sensor at ``pose + clear + tap`` if the approach's coordinate of the pose is 0.
     clear, tap : six numbers
-        Added to the pose before the tap; the tap itself. mm and deg.
+        ``clear`` is added to the pose before the tap, ``tap`` is the tap itself; mm and deg.
     targets : tuple of str
         The labels a model is to learn.
     seed : int
-        Of the draws.
+        Seed of the random draws.
     wider : str
-        Name of an experiment that goes a little beyond this one's ranges: what models for this one are trained on in the twin.
+        Name of an experiment whose ranges go a little beyond this one's. Models for this experiment are trained on it in the twin.
     """
 
     name: str
@@ -90,7 +90,7 @@ class ExperimentSpec(Section):
         return self.ranges()[f"pose_{self.axis + 1}"][1] - self.ranges()[f"move_{self.axis + 1}"][0]
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         for label, (low, high) in self.ranges().items():
             if low > high:
                 raise ValueError(f"{label} = [{low:g}, {high:g}]: give the lower end first")

@@ -14,6 +14,7 @@ from scenes.object import MeshShape, ObjectSpec
 from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
 from scenes.servo import ServoSpec
+from scenes.tables import fill_in_tables
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
@@ -122,8 +123,8 @@ def _list(kind: str) -> dict[str, Path]:
 def _find(name_or_path: str | Path, kind: str) -> Path:
     path = Path(name_or_path)
     if path.suffix != ".toml" and path.is_file():
-        known = ", ".join((".toml", *MESH_SUFFIXES) if kind == "objects" else (".toml",))
-        raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {known}")
+        suffixes = ", ".join((".toml", *MESH_SUFFIXES) if kind == "objects" else (".toml",))
+        raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {suffixes}")
     if path.suffix == ".toml":
         if not path.is_file():
             raise SpecError(f"{path}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'")
@@ -143,6 +144,10 @@ def _read(path: Path, model: type[Spec]) -> Spec:
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SpecError(f"{path}: not readable as TOML: {error}") from error
     data.setdefault("name", path.stem)
+    try:
+        data = fill_in_tables(data, path.parent)
+    except ValueError as error:
+        raise SpecError(f"{path}: {error}") from error
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -165,7 +170,7 @@ def _explain(error: ValidationError, model: type[BaseModel]) -> str:
     return "; ".join(problems)
 
 
-def _keys_at(model: type[BaseModel], loc: tuple) -> list[str]:
+def _keys_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """Known keys of the section at ``loc`` (a tagged union's tag is one of its parts)."""
     candidates = [model]
     for part in loc:
@@ -175,12 +180,12 @@ def _keys_at(model: type[BaseModel], loc: tuple) -> list[str]:
     return sorted({key for c in candidates for key in c.model_fields})
 
 
-def _models_in(annotation) -> list[type[BaseModel]]:
+def _models_in(annotation: object) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [m for arg in getattr(annotation, "__args__", ()) for m in _models_in(arg)]
 
 
-def _tags(model: type[BaseModel]) -> tuple:
+def _tags(model: type[BaseModel]) -> tuple[str, ...]:
     kind = model.model_fields.get("kind")
     return getattr(kind.annotation, "__args__", ()) if kind else ()

@@ -1,10 +1,10 @@
-"""The specification of an object (stimulus) that the sensor is pressed against.
+"""The specification of an object that the sensor is pressed against.
 
 Object frame: origin on the surface where the sensor touches first, z into the object. At
 rest the axes are parallel to the sensor's, so the sensor comes from -z.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -97,7 +97,7 @@ class ObjectSpec(Section):
     compliance_mm_per_n: NonNegative = 0.0
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.kinetic_friction is not None and self.kinetic_friction > self.friction:
             raise ValueError("kinetic_friction must not be larger than friction")
         return self

@@ -1,6 +1,6 @@
 """The specification of what differs from one simulated frame to the next."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
@@ -23,11 +23,11 @@ class Spread(Section):
 
     @property
     def ends(self) -> Ends:
-        """The two ends, of whichever kind."""
-        return self.scale or self.add or self.value
+        """The two ends of the kind that is given."""
+        return next(ends for ends in (self.scale, self.add, self.value) if ends is not None)
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         given = [ends for ends in (self.scale, self.add, self.value) if ends is not None]
         if len(given) != 1:
             raise ValueError("give exactly one of scale, add and value")
@@ -46,7 +46,7 @@ class FrictionSpread(Section):
     stick: Positive = 3.0
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.low > self.high:
             raise ValueError("low must not be larger than high")
         if self.free_share + self.stick_share > 1:
@@ -60,13 +60,13 @@ class RandomisationSpec(Section):
     Attributes
     ----------
     executed_share : float
-        Share of the moves that are executed before the frame is taken.
+        Share of the contacts in which the move is executed before the frame is taken.
     pin_noise_px : float
         Sd of the noise that is added to the stored pins (not to pictures: those have the camera's own noise).
     friction : FrictionSpread, optional
-        Without it the rig's or the object's own.
+        Without it every contact has the friction of the rig or of the object.
     sensor : dict of str to Spread
-        By the key in the sensor's specification, with dots: material, geometry, camera, light, rig.
+        By the dotted key in the sensor's specification: material, geometry, camera, light, rig.
     """
 
     name: str
@@ -77,7 +77,7 @@ class RandomisationSpec(Section):
     sensor: Annotated[dict[str, Spread], Field(default_factory=dict)]
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         for key in self.sensor:
             if number_type(key) is None:
                 raise ValueError(f"sensor.'{key}' names no number of a sensor's specification; expected e.g. 'skin.young_modulus_mpa'")

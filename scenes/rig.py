@@ -16,10 +16,10 @@ class RigSpec(Section):
     contact_offset_mm : float
         Indentation of an unturned sensor beyond what the label says.
     tcp_to_dome_mm : float
-        From the tool point, about which the arm turns, to the dome's centre along the approach (negative: the
-        tool point lies in front of the centre; minus the dome's radius: it is the tip).
+        Along the approach, from the tool point, about which the arm turns, to the dome's centre. Negative: the tool point lies in front
+        of the centre; minus the dome's radius: the tool point is the tip.
     tcp_lateral_mm : float
-        The same across the approach.
+        From the tool point to the dome's centre across the approach.
     turn_offset_deg : three numbers
         Added to ``pose_4..6``.
     turn_sign : 1 or -1
@@ -32,9 +32,10 @@ class RigSpec(Section):
     friction : float
         One coefficient for all contacts.
     compliance_mm_per_n : float
-        How far the arm and its mount give way along the sensor's axis; labels say where the arm was sent.
+        How far the arm and its mount give way along the sensor's axis. Labels tell where the arm was sent, not where it ended.
     turn_compliance_deg_per_n : float
-        How far they turn, as the label in the plane of approach and across counts, for each N that the sensor pushes the object across.
+        How far they turn for each N with which the sensor pushes the object across; positive as the label in the plane of approach and
+        across counts.
     """
 
     contact_offset_mm: float = 0.0

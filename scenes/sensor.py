@@ -7,7 +7,7 @@ with (0, 0) at the centre of the first pixel of the *raw* camera frame.
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -23,11 +23,20 @@ class RelaxationTerm(Section):
 
 
 class MaterialSpec(Section):
-    """A nearly incompressible rubber: Young's modulus and Poisson's ratio at rest, and how it stiffens.
+    """A nearly incompressible rubber: its stiffness, and how it stiffens and relaxes.
 
-    ``law``: ``neo-hookean``; ``mooney-rivlin``, where ``second_invariant_share`` is c01 / (c10 + c01);
-    ``yeoh``, with ``c20_c10`` and ``c30_c10`` relative to c10. ``relaxation``: a Prony series; the moduli
-    above are the fast ones, before anything has relaxed.
+    Attributes
+    ----------
+    young_modulus_mpa, poisson_ratio : float
+        At small strain. In a rubber that relaxes: before anything has relaxed.
+    law : {"neo-hookean", "mooney-rivlin", "yeoh"}
+        See ``twin.mechanics.material``.
+    second_invariant_share : float
+        For Mooney-Rivlin: c01 / (c10 + c01).
+    c20_c10, c30_c10 : float
+        For Yeoh: c20 and c30 relative to c10.
+    relaxation : tuple of RelaxationTerm
+        A Prony series; empty: elastic.
     """
 
     young_modulus_mpa: Positive
@@ -39,7 +48,7 @@ class MaterialSpec(Section):
     relaxation: tuple[RelaxationTerm, ...] = ()
 
     @model_validator(mode="after")
-    def _check_law(self):
+    def _check_law(self) -> Self:
         if self.law != "mooney-rivlin" and self.second_invariant_share:
             raise ValueError("second_invariant_share belongs to law = 'mooney-rivlin'")
         if self.law != "yeoh" and (self.c20_c10 or self.c30_c10):
@@ -58,11 +67,19 @@ class SkinSpec(MaterialSpec):
 
 
 class GelSpec(MaterialSpec):
-    """Gel between skin and lens.
+    """Gel between skin and window.
 
-    ``sealed``: its volume as a whole stays exactly constant, whatever its Poisson's ratio. ``absorption_per_mm``:
-    Beer-Lambert coefficients for red, green and blue. ``haze``: share of the light towards the camera that the gel
-    scatters forward, over a Gaussian of ``haze_sigma_px``.
+    Attributes
+    ----------
+    sealed : bool
+        Whether the gel's volume as a whole stays exactly constant, whatever its Poisson's ratio.
+    refractive_index : float
+    absorption_per_mm : three numbers
+        Beer-Lambert coefficients for red, green and blue.
+    haze : float
+        Share of the light towards the camera that the gel scatters forward.
+    haze_sigma_px : float
+        Sd of the Gaussian over which it is scattered.
     """
 
     sealed: bool = False
@@ -87,13 +104,22 @@ class LensSpec(Section):
 
 
 class PinsSpec(Section):
-    """Pins on the skin's inside, normal to it.
+    """Pins on the skin's inside, normal to it. N = 1 + 3 r (r + 1) pins for r rings.
 
-    ``rings``: ring i has 6 i pins. ``hexagon``: hexagonal rings of 6 i pins. Both have
-    1 + 3 r (r + 1) pins for r rings, ``max_polar_deg`` being the outermost (corner) pin's
-    polar angle. ``spacing``: the ring's (flat hexagon's) radius is proportional to the polar
-    angle (``polar``), or to its sine, so that the pins are even in plan (``plan``).
-    ``phase_deg`` is the azimuth of the first pin of each ring, from x towards y.
+    Attributes
+    ----------
+    layout : {"rings", "hexagon"}
+        Ring i is a circle or a hexagon of 6 i pins.
+    spacing : {"polar", "plan"}
+        What is proportional to a ring's number: the polar angle, or its sine (the pins are then even in plan).
+    rings : int
+    max_polar_deg : float
+        Polar angle of the outermost pins (of the corner pins of a hexagon).
+    phase_deg : float
+        Azimuth of the first pin of each ring, from x towards y.
+    length_mm, diameter_mm : float
+        Of the stem.
+    cap_diameter_mm, cap_height_mm : float
     """
 
     layout: Literal["rings", "hexagon"]
@@ -113,15 +139,32 @@ class PinsSpec(Section):
 
 
 class CameraSpec(Section):
-    """Camera in the air behind the window; refraction at the window comes on top of what is given here.
+    """Camera in the air behind the window. Refraction at the window is not part of these numbers: it comes on top.
 
-    ``distance_mm``: entrance pupil to dome centre (the pupil is at z = -distance). Tilts turn the camera about its
-    pupil. ``projection``: ``perspective`` with Brown-Conrady distortion k1, k2, p1, p2 of the tangents, or ``fisheye``
-    (Kannala and Brandt 2006) with theta (1 + k1 theta^2 + k2 theta^4). ``aperture_mm`` is the pupil's diameter (0:
-    everything is sharp), ``focus_mm`` the distance in air, from the pupil, of what is sharp. ``vignetting`` is the
-    share of light lost at the corners, rising with the square of the distance from the image's middle.
-    ``red_scale`` and ``blue_scale``: size of these colours' images about (cx, cy) against green's; ``red_shift_px`` and
-    ``blue_shift_px``: how far they are shifted.
+    Attributes
+    ----------
+    width_px, height_px : int
+    channels : {"color", "mono"}
+    projection : {"perspective", "fisheye"}
+        Perspective: Brown-Conrady distortion k1, k2, p1, p2 of the tangents. Fisheye: theta (1 + k1 theta^2 + k2 theta^4)
+        (Kannala and Brandt 2006).
+    fx_px, fy_px, cx_px, cy_px : float
+        Focal lengths and principal point.
+    distance_mm : float
+        From the entrance pupil to the dome's centre: the pupil is at z = -distance.
+    tilt_x_deg, tilt_y_deg : float
+        The camera is turned about its pupil.
+    k1, k2, p1, p2 : float
+    aperture_mm : float
+        The pupil's diameter; 0: everything is sharp.
+    focus_mm : float
+        Distance in air, from the pupil, of what is sharp.
+    vignetting : float
+        Share of light that is lost at the corners; it rises with the square of the distance from the image's middle.
+    red_scale, blue_scale : float
+        Size of these colours' images about the principal point, relative to green's.
+    red_shift_px, blue_shift_px : (x, y)
+        How far these images are shifted.
     """
 
     width_px: Annotated[int, Field(ge=16, le=8192)]
@@ -148,19 +191,37 @@ class CameraSpec(Section):
     blue_shift_px: tuple[float, float] = (0.0, 0.0)
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.projection == "fisheye" and (self.p1 or self.p2):
             raise ValueError("p1 and p2 belong to projection = 'perspective'")
         return self
 
 
 class LedRingSpec(Section):
-    """LEDs in the air behind the window, shining along +z: azimuths in the sensor frame.
+    """LEDs in the air behind the window, shining along +z. Each is a square that is turned to face the axis.
 
-    Each is a square of ``size_mm`` at ``radius_mm`` from the axis in the plane ``z_mm``, turned to face the axis.
-    ``power`` is the light of one LED (independent of its size), ``balance`` each one's share of it (empty: all 1),
-    ``off`` lists indices of dead ones. In the LED's reflection in the window ``mirror_share`` of its light shows (the rest
-    is hidden from there by the housing), ``core_share`` of it in the middle (a Gaussian of sd ``core_mm``).
+    Attributes
+    ----------
+    azimuth_deg : tuple of float
+        One for each LED, sensor frame.
+    radius_mm, z_mm : float
+        Distance from the axis, and plane.
+    size_mm : float
+        Side of the square.
+    power : float
+        Light of one LED, whatever its size.
+    balance : tuple of float
+        Factor on each LED's power; empty: all 1.
+    color : three numbers
+        Linear RGB.
+    off : tuple of int
+        Indices of dead LEDs.
+    mirror_share : float
+        Share of an LED's light that shows in its reflection in the window; the housing hides the rest from there.
+    core_share : float
+        Share of that light in the middle of the LED.
+    core_mm : float
+        Sd of the Gaussian that stands for the middle.
     """
 
     azimuth_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=64)]
@@ -176,18 +237,22 @@ class LedRingSpec(Section):
     core_mm: Positive = 0.3
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.balance and len(self.balance) != len(self.azimuth_deg):
             raise ValueError("balance needs one number for each of azimuth_deg")
         return self
 
 
 class RimSpec(Section):
-    """Measured light of what no formula has: glue, burrs and glare where the housing meets the window.
+    """Measured light where the housing meets the window, on top of the formulas: glue, burrs, glare.
 
-    In the plane of the housing, about its centre, between the radii ``inner_mm`` and ``outer_mm``: ``light[j][k]`` is what is
-    added (linear red, green, blue, thousandths of saturation, may be negative) at azimuth 2 pi j / A and the k-th of evenly spaced radii,
-    linear between them.
+    Attributes
+    ----------
+    inner_mm, outer_mm : float
+        Radii about the housing's centre, in its plane, between which the light was measured.
+    light : (A, R, 3) int
+        Added linear red, green and blue in thousandths of saturation, may be negative. Row j is at azimuth 2 pi j / A, column k at
+        the k-th of R evenly spaced radii; linear between them.
     """
 
     inner_mm: Positive
@@ -195,7 +260,7 @@ class RimSpec(Section):
     light: Annotated[tuple[tuple[tuple[int, int, int], ...], ...], Field(min_length=3)]
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.outer_mm <= self.inner_mm:
             raise ValueError("outer_mm must be larger than inner_mm")
         if len({len(row) for row in self.light}) > 1 or len(self.light[0]) < 2:
@@ -204,14 +269,29 @@ class RimSpec(Section):
 
 
 class HousingSpec(Section):
-    """The bright ring and wall around the disc the camera sees, in the air.
+    """The bright ring and wall around the disc that the camera sees: a flat annulus in the air.
 
-    A flat annulus about (``center_mm``, ``z_mm``). Its light is relative to the LEDs' power: ``ambient``
-    falls off outwards over ``ambient_falloff_mm``; each LED adds ``glow * (1 + d^2 / h^2)^-n`` at a distance
-    d from its place at ``glow_radius_mm``, with h the ``glow_height_mm`` and n the ``glow_exponent`` (1.5: a
-    small source at height h above matt material; higher: a glossy one). Outside a lip of ``lip_width_mm``
-    the wall shows only ``wall_fraction`` of this light. ``fill`` is the radiance with which the innermost
-    ``fill_width_mm`` of the ring light the gel. ``rim`` is the light measured on top of all that.
+    Its light is relative to the LEDs' power (formula: ``twin.optics.static_layer.housing_light``).
+
+    Attributes
+    ----------
+    aperture_radius_mm, outer_radius_mm : float
+        Of the annulus.
+    z_mm, center_mm : float, (x, y)
+        Its plane and its centre.
+    albedo : three numbers
+        Linear RGB.
+    ambient : float
+        Light at the inner edge, which falls off outwards over ``ambient_falloff_mm``.
+    glow : float
+        Each LED adds ``glow (1 + d^2 / h^2)^-n`` at the distance d from its place at ``glow_radius_mm``, with h the
+        ``glow_height_mm`` and n the ``glow_exponent``. n = 1.5: a small source at the height h above matt material; higher: glossy.
+    lip_width_mm, wall_fraction : float
+        Farther out than the lip's width the wall shows only this share of the light.
+    fill : float
+        Radiance with which the innermost ``fill_width_mm`` of the ring light the gel.
+    rim : RimSpec, optional
+        Light measured on top of all that.
     """
 
     aperture_radius_mm: Positive
@@ -232,7 +312,7 @@ class HousingSpec(Section):
     rim: RimSpec | None = None
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         if self.outer_radius_mm <= self.aperture_radius_mm:
             raise ValueError("outer_radius_mm must be larger than aperture_radius_mm")
         return self
@@ -249,15 +329,26 @@ class SpeckSpec(Section):
 
 
 class AppearanceSpec(Section):
-    """Reflectances (linear, 0 to 1) of what the camera sees.
+    """Reflectances (linear RGB, 0 to 1) of what the camera sees in the gel.
 
-    ``skin_gloss`` and ``cap_gloss`` are the weights of a rough specular lobe. ``cap_bump`` is the share of the light that
-    a cap takes as a small ball would, whatever its direction, not as a flat disc: printed caps are round and translucent.
-    ``cap_levels`` is each cap's reflectance relative to ``cap_albedo``, in pin order, where it has been measured; without
-    them ``cap_variation`` is the relative sd of a random pattern of number ``cap_pattern`` (another number: another print
-    of the sensor). ``cap_shapes``: each cap's outline, relative to a circle, as measured: coefficients a_0, a_2, b_2, a_3,
-    b_3, ... of ``1 + a_0 + sum a_m cos(m t) + b_m sin(m t)``, t turning from the sensor's x towards y; ``cap_offsets``: a_1, b_1,
-    by which its middle lies beside the pin's, in cap radii.
+    Attributes
+    ----------
+    skin_albedo, pin_albedo, cap_albedo : three numbers
+    skin_gloss, cap_gloss : float
+        Weight of a rough specular lobe; ``skin_roughness`` and ``cap_roughness`` are its roughness.
+    cap_bump : float
+        Share of the light that a cap takes as a small ball does, from any direction, and not as a flat disc: printed caps are
+        round and translucent.
+    cap_levels : tuple of float
+        Reflectance of each cap relative to ``cap_albedo``, in pin order, where it was measured.
+    cap_variation, cap_pattern : float, int
+        Where no levels were measured: relative sd, and number, of a random pattern. Another number is another print of the sensor.
+    cap_shapes : (N, 1 + 2 n) float
+        Measured outline of each cap relative to a circle: a_0, a_2, b_2, a_3, b_3, ... of ``1 + a_0 + sum a_m cos(m t) + b_m sin(m t)``,
+        t turning from the sensor's x towards y.
+    cap_offsets : (N, 2) float
+        a_1 and b_1: how far the outline's middle lies beside the pin's, in cap radii.
+    specks : tuple of SpeckSpec
     """
 
     skin_albedo: Rgb
@@ -277,16 +368,32 @@ class AppearanceSpec(Section):
 
 
 class ResponseSpec(Section):
-    """From linear light to 8-bit gray levels, in this order.
+    """From linear light to 8-bit gray levels. The steps follow one another in this order.
 
-    ``blur_sigma_px`` of the optics; ``exposure`` and ``white_balance``; ``brightness_drift``: relative sd of a gain
-    drawn for each frame; noise with variance ``read_noise^2 + shot_noise * light``, light 1 being saturation;
-    ``sharpening``: weight of the unsharp mask of ``sharpening_sigma_px`` that cameras apply to the luma, not to its noise, which
-    they smooth by ``noise_sigma_px``; the curve ``black + (255 - black) light^(1 / gamma)``;
-    ``chroma_sigma_px``: further blur of the light that the colour differences are made of, of which ``chroma_columns``
-    neighbours have the first one's (2: a 4:2:2 stream); ``stream``: whole numbers of luma and colour differences (ITU-R BT.601
-    or BT.709, studio range)
-    that the frame comes as, or "rgb"; ``jpeg_quality`` of the stream (0: not compressed).
+    Attributes
+    ----------
+    blur_sigma_px : float
+        Blur of the optics.
+    exposure, white_balance : float, three numbers
+        Gain, and gain of each colour.
+    brightness_drift : float
+        Relative sd of a gain that is drawn for each frame.
+    read_noise, shot_noise : float
+        The noise has the variance ``read_noise^2 + shot_noise * light``; light 1 is saturation.
+    noise_sigma_px : float
+        The camera smooths the luma's noise by this.
+    sharpening, sharpening_sigma_px : float
+        Weight and sd of the unsharp mask that the camera applies to the luma, not to its noise.
+    gamma, black_level : float
+        The curve is ``black + (255 - black) light^(1 / gamma)``.
+    chroma_sigma_px : float
+        Further blur of the light that the colour differences are made of.
+    chroma_columns : {1, 2}
+        This many neighbouring columns share the colour differences of the first one (2: a 4:2:2 stream).
+    stream : {"rgb", "bt601", "bt709"}
+        The frame comes as whole numbers of luma and colour differences (ITU-R BT.601 or BT.709, studio range), or as RGB.
+    jpeg_quality : int
+        Of the stream; 0: not compressed.
     """
 
     exposure: Positive
@@ -309,8 +416,14 @@ class ResponseSpec(Section):
 class RecordingSpec(Section):
     """The capture side of the sensor's recordings: crop, adaptive threshold, resize.
 
-    ``crop_px`` = (x0, y0, x1, y1), end exclusive; ``threshold_block_px`` and
-    ``threshold_offset`` as OpenCV's adaptiveThreshold takes them.
+    Attributes
+    ----------
+    crop_px : (x0, y0, x1, y1)
+        End exclusive.
+    width_px, height_px : int
+        Size of the stored image.
+    threshold_block_px, threshold_offset : int, float
+        As OpenCV's ``adaptiveThreshold`` takes them.
     """
 
     crop_px: tuple[int, int, int, int]
@@ -320,7 +433,7 @@ class RecordingSpec(Section):
     threshold_offset: float
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         x0, y0, x1, y1 = self.crop_px
         if x1 <= x0 or y1 <= y0:
             raise ValueError("crop_px must be (x0, y0, x1, y1) with x1 > x0 and y1 > y0")
@@ -330,11 +443,19 @@ class RecordingSpec(Section):
 
 
 class BlobSpec(Section):
-    """How pins are found in one form of the sensor's frames.
+    """How pins are found in one form of the sensor's frames. All lengths are in px of that form's own frame.
 
-    All lengths are in px of that form's own frame. ``threshold`` is a fixed gray level
-    (0-255) where ``threshold_block_px`` is 0, else the offset of an adaptive mean threshold
-    over that block. ``erosion_px`` is the size of the square erosion kernel (1: none).
+    Attributes
+    ----------
+    threshold : float
+        A fixed gray level (0 to 255) if ``threshold_block_px`` is 0, else the offset of an adaptive mean threshold over that block.
+    threshold_block_px : int
+    erosion_px : int
+        Size of the square erosion kernel; 1: no erosion.
+    mask_center_px, mask_radius_px : (x, y), float
+        Disc within which pins are looked for.
+    min_area_px2 : float
+        Smaller blobs are left out.
     """
 
     threshold: float
@@ -350,6 +471,30 @@ class PipelineSpec(Section):
 
     raw: BlobSpec
     recording: BlobSpec | None = None
+
+
+class GeometrySpec(Section):
+    """Where skin, window and pins are: what the meshes of a sensor are made from (``SensorSpec.geometry``)."""
+
+    skin: SkinSpec
+    lens: LensSpec
+    pins: PinsSpec
+
+
+class ViewSpec(Section):
+    """What decides where the camera sees a place in the gel: the camera, the window and the gel's index (``SensorSpec.view``)."""
+
+    camera: CameraSpec
+    lens: LensSpec
+    gel_index: Index
+
+
+class CaptureSpec(Section):
+    """What makes a frame from the light on the film: the gel's haze, the camera's optics and its response (``SensorSpec.capture``)."""
+
+    gel: GelSpec
+    camera: CameraSpec
+    response: ResponseSpec
 
 
 class SensorSpec(Section):
@@ -371,8 +516,23 @@ class SensorSpec(Section):
     pipeline: PipelineSpec
     rig: RigSpec | None = None
 
+    @property
+    def geometry(self) -> GeometrySpec:
+        """Skin, window and pins."""
+        return GeometrySpec.model_construct(skin=self.skin, lens=self.lens, pins=self.pins)
+
+    @property
+    def view(self) -> ViewSpec:
+        """Camera, window and the gel's index."""
+        return ViewSpec.model_construct(camera=self.camera, lens=self.lens, gel_index=self.gel.refractive_index)
+
+    @property
+    def capture(self) -> CaptureSpec:
+        """The gel's haze, the camera's optics and its response."""
+        return CaptureSpec.model_construct(gel=self.gel, camera=self.camera, response=self.response)
+
     @model_validator(mode="after")
-    def _check(self):
+    def _check(self) -> Self:
         skin, pins = self.skin, self.pins
         inner_mm = skin.outer_radius_mm - skin.thickness_mm
         if inner_mm <= 0:

@@ -25,28 +25,28 @@ class ServoSpec(Section):
     Attributes
     ----------
     experiment : str
-        The one whose labels the model tells: its approach, and what they call zero.
+        Experiment whose labels the model estimates: it gives the approach and the zero of the depth.
     indent_mm, angle_deg : float
-        The reference: how deep, and how far from the normal.
+        Reference of the control: indentation, and angle from the surface's normal.
     feed_mm : float
-        Along the surface, in each step.
+        Way along the surface in each step.
     kp_*, ki_* : float
-        Share of the error, and of its sum over the steps, that a step takes back.
+        Share of the error (p), and of its sum over the steps (i), by which a step corrects.
     integral_mm, integral_deg : float
-        The sums never exceed these.
+        Bounds of the sums.
     largest_move_mm, largest_turn_deg : float
-        Of one step.
+        Bounds of one step's correction.
     clear_mm : float
-        From where the surface is approached, and to where the arm retreats.
+        Distance from which the surface is approached, and to which the arm retreats.
     linear_mm_s, angular_deg_s : float
         Of every move, to follow and to collect. Much slower than the sensor group's practice with an MG400, whose speed factor is 20 %
         to follow and 50 % to collect.
     plausible_mm, plausible_deg : (lowest, highest)
-        Depths and angles that a sensor in contact can have; a model that tells others is not believed, and the arm holds still.
+        Depths and angles that a sensor in contact can have. An estimate outside of them is not used, and the arm holds still.
     blind_mm : float
-        Without a newer frame the tool goes no farther than this from where the newest one was exposed.
+        Without a newer frame the tool goes no farther than this from the place where the newest one was exposed.
     max_frame_age_s : float
-        An older frame decides nothing: the arm stops and holds.
+        An older frame is not used: the arm stops and holds.
     placement : PlacementSpec
         Where the object stands.
     """

@@ -1,41 +1,53 @@
-"""A sensor's specification as TOML that a person can read and edit."""
-
-from typing import Any
+"""The text of a sensor's specification: a TOML file that a person can read and edit, its long arrays as tables beside it."""
 
 import tomlkit
 
 from scenes.sensor import SensorSpec
+from scenes.tables import significant, take_out_tables
 
-DIGITS = 6  # significant ones of a number
-ROW = 12  # numbers in a line of a long list
+ROW = 12
+"""Most numbers in a line of a list."""
 
 
-def sensor_text(spec: SensorSpec, comment: str = "") -> str:
-    """The text of a specification's file; values that are the defaults are left out, the name is the file's.
+def sensor_files(spec: SensorSpec, stem: str, comment: str = "") -> dict[str, str]:
+    """The files of a specification. Values that are the defaults are left out; the sensor's name is the file's.
 
     Parameters
     ----------
     spec : SensorSpec
+    stem : str
+        Name of the TOML file without its suffix. Tables are named after it.
     comment : str
         Lines that stand above everything.
+
+    Returns
+    -------
+    dict of str to str
+        Text of each file by its name. The TOML file comes last, because it names the tables (see ``scenes.tables``).
     """
     document = tomlkit.document()
     for line in comment.splitlines():
         document.add(tomlkit.comment(line))
-    plain = {key: value for key, value in spec.model_dump(exclude_defaults=True).items() if key != "name" and value is not None}
+    given = {key: value for key, value in spec.model_dump(exclude_defaults=True).items() if key != "name" and value is not None}
+    plain, tables = take_out_tables(given, stem)
     for key in sorted(plain, key=lambda k: isinstance(plain[k], dict)):  # tables come last
         document.add(key, _item(plain[key]))
-    return tomlkit.dumps(document)
+    return {**tables, f"{stem}.toml": tomlkit.dumps(document)}
 
 
-def _item(value: Any) -> Any:
+def _item(value: object) -> object:
+    """A value as tomlkit writes it: sections as tables, references to tables and lists of sections inline, lists in even lines."""
+    if isinstance(value, dict) and set(value) == {"csv", "shape"}:
+        reference = tomlkit.inline_table()
+        reference.update(value)
+        return reference
     if isinstance(value, dict):
         table = tomlkit.table()
         for key, part in value.items():
             table.add(key, _item(part))
         return table
     if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}")
+        return significant(value)
     if isinstance(value, list | tuple):
         array = tomlkit.array()
         if value and isinstance(value[0], dict):

@@ -3,17 +3,20 @@
 import cv2
 import numpy as np
 
-from scenes.sensor import CameraSpec, GelSpec, RecordingSpec, ResponseSpec, SensorSpec
+from scenes.sensor import CameraSpec, CaptureSpec, GelSpec, RecordingSpec, ResponseSpec
 from twin.errors import FrameError
+from twin.types import FloatArray, ImageArray
 from twin.video import luma_weights, through_stream
 
-JPEG_BLOCK_PX = 16  # the unit of a JPEG with halved chroma
-MEDIAN_PX = 5  # the recorder's own despeckling before its threshold
+JPEG_BLOCK_PX = 16
+"""Side of the blocks of a JPEG whose chroma has half the resolution."""
+MEDIAN_PX = 5
+"""Width of the median filter with which the recorder removes specks before its threshold."""
 
 
 def expose(
-    linear: np.ndarray, spec: SensorSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
-) -> np.ndarray:
+    linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
+) -> ImageArray:
     """What gel, lens and camera make of the light: a raw frame.
 
     Gel haze, lateral chromatic aberration, blur and vignetting act on light; then come gain, noise, sharpening of the luma,
@@ -24,7 +27,7 @@ def expose(
     ----------
     linear : (H, W, 3) or (H, W) float
         Chromatic aberration and white balance apply to colour only.
-    spec : SensorSpec
+    capture : CaptureSpec
     rng : numpy.random.Generator, optional
         Source of the frame's gain and noise; without it there is neither.
     origin_px : (x, y)
@@ -34,26 +37,26 @@ def expose(
     -------
     (H, W, 3) or (H, W) uint8
     """
-    response = spec.response
-    light = hazed(np.asarray(linear, np.float32), spec.gel)
-    light = dispersed(light, spec.camera, origin_px)
+    camera, response = capture.camera, capture.response
+    light = hazed(np.asarray(linear, np.float32), capture.gel)
+    light = dispersed(light, camera, origin_px)
     light = blurred(light, response.blur_sigma_px)
-    light = vignetted(light, spec.camera, origin_px)
+    light = vignetted(light, camera, origin_px)
     light = amplified(light, response, rng)
     gray = developed(light, noisy(light, response, rng), response, origin_px)
     frame = through_stream(gray, response.stream) if gray.ndim == 3 else np.clip(np.rint(gray), 0, 255).astype(np.uint8)
     return compressed(frame, response.jpeg_quality, origin_px)
 
 
-def hazed(light: np.ndarray, gel: GelSpec) -> np.ndarray:
+def hazed(light: FloatArray, gel: GelSpec) -> FloatArray:
     """A share of the light scattered forward by the gel."""
     if gel.haze == 0:
         return light
     return light + np.float32(gel.haze) * (blurred(light, gel.haze_sigma_px) - light)
 
 
-def dispersed(light: np.ndarray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """Red and blue images of their own size and place: ``red'(c + scale (p - c) + shift) = red(p)``, c the principal point."""
+def dispersed(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
+    """Lateral chromatic aberration: ``red'(c + scale (p - c) + shift) = red(p)`` with c the principal point; blue alike."""
     own = {0: (camera.red_scale, camera.red_shift_px), 2: (camera.blue_scale, camera.blue_shift_px)}
     if light.ndim == 2 or all(scale == 1 and not any(shift) for scale, shift in own.values()):
         return light
@@ -65,12 +68,14 @@ def dispersed(light: np.ndarray, camera: CameraSpec, origin_px: tuple[int, int] 
     return light
 
 
-def blurred(light: np.ndarray, sigma_px: float) -> np.ndarray:
+def blurred(light: FloatArray, sigma_px: float) -> FloatArray:
     """Gaussian blur that keeps the light's sum: the frame goes on mirrored."""
-    return cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT) if sigma_px > 0 else light
+    if sigma_px <= 0:
+        return light
+    return np.asarray(cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT), light.dtype)
 
 
-def vignetted(light: np.ndarray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
+def vignetted(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
     """Light times ``1 - vignetting r^2``, r the distance from the full frame's middle over that of its corners."""
     if camera.vignetting == 0:
         return light
@@ -81,7 +86,7 @@ def vignetted(light: np.ndarray, camera: CameraSpec, origin_px: tuple[int, int] 
     return light * (loss[..., None] if light.ndim == 3 else loss)
 
 
-def amplified(light: np.ndarray, response: ResponseSpec, rng: np.random.Generator | None = None) -> np.ndarray:
+def amplified(light: FloatArray, response: ResponseSpec, rng: np.random.Generator | None = None) -> FloatArray:
     """Exposure, white balance (colour only) and, with a generator, the frame's own gain."""
     gain = response.exposure * np.array(response.white_balance if light.ndim == 3 else 1.0)
     if rng is not None and response.brightness_drift > 0:
@@ -89,7 +94,7 @@ def amplified(light: np.ndarray, response: ResponseSpec, rng: np.random.Generato
     return light if np.all(gain == 1) else light * gain.astype(np.float32)
 
 
-def noisy(light: np.ndarray, response: ResponseSpec, rng: np.random.Generator | None = None) -> np.ndarray:
+def noisy(light: FloatArray, response: ResponseSpec, rng: np.random.Generator | None = None) -> FloatArray:
     """Normal noise of variance ``read_noise^2 + shot_noise * light``; none without a generator."""
     if rng is None or (response.read_noise == 0 and response.shot_noise == 0):
         return light
@@ -97,15 +102,15 @@ def noisy(light: np.ndarray, response: ResponseSpec, rng: np.random.Generator | 
     return light + sd * rng.standard_normal(light.shape, dtype=np.float32)
 
 
-def curve(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
+def curve(light: FloatArray, response: ResponseSpec) -> FloatArray:
     """Gray levels ``black + (255 - black) clip(light)^(1 / gamma)``, not rounded."""
     shown = np.clip(light, 0, 1)
     shown = shown if response.gamma == 1 else shown ** np.float32(1 / response.gamma)
     return np.float32(response.black_level) + np.float32(255 - response.black_level) * shown
 
 
-def sharpened(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
-    """Light with an unsharp mask of its luma added to every channel; the curve then makes more of the dark side of an edge."""
+def sharpened(light: FloatArray, response: ResponseSpec) -> FloatArray:
+    """Light with an unsharp mask of its luma added to every channel; the response curve then amplifies the dark side of an edge."""
     if response.sharpening == 0:
         return light
     luma = light @ luma_weights(response.stream) if light.ndim == 3 else light
@@ -113,12 +118,12 @@ def sharpened(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
     return light + (mask[..., None] if light.ndim == 3 else mask)
 
 
-def developed(light: np.ndarray, grainy: np.ndarray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
+def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
     """Gray levels of light, and of the same with its noise: the luma sharpened, colour taken from softer light.
 
-    A camera has one colour at each pixel of its sensor and guesses the other two from its neighbours, in linear light: colour is
-    softer than luma, and the curve moves its edges outwards. Its sharpening spares the noise. Colour differences are shared by
-    neighbouring columns of the full frame.
+    A camera measures one colour at each pixel of its sensor and takes the other two from neighbouring pixels, in linear light.
+    Therefore colour is softer than luma, and the response curve moves its edges outwards. The camera's sharpening leaves out the noise.
+    Neighbouring columns of the full frame share their colour differences.
     """
     gray = curve(sharpened(light, response), response)
     if grainy is not light:
@@ -131,7 +136,7 @@ def developed(light: np.ndarray, grainy: np.ndarray, response: ResponseSpec, ori
     return chroma + (gray @ weights)[..., None]
 
 
-def shared(chroma: np.ndarray, columns: int, left_px: int = 0) -> np.ndarray:
+def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
     """Chroma (H, W, 3) with that of the first of every ``columns`` neighbouring columns in all of them, as 4:2:2 streams sample it.
 
     Groups begin at the full frame's first column; ``left_px`` is this part's place in it.
@@ -143,19 +148,21 @@ def shared(chroma: np.ndarray, columns: int, left_px: int = 0) -> np.ndarray:
     return chroma[:, first]
 
 
-def compressed(frame: np.ndarray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """What a JPEG stream with halved chroma leaves of a frame (0: all). Blocks lie where the full frame's do."""
+def compressed(frame: ImageArray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:
+    """A frame after JPEG compression with halved chroma (quality 0: not compressed). Blocks lie where those of the full frame lie."""
     if quality == 0:
         return frame
     left, top = (place % JPEG_BLOCK_PX for place in origin_px)
     whole = cv2.copyMakeBorder(frame, top, 0, left, 0, cv2.BORDER_REPLICATE)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     _, stream = cv2.imencode(".jpg", whole[..., ::-1] if frame.ndim == 3 else whole, options)
-    back = cv2.imdecode(stream, cv2.IMREAD_UNCHANGED)[top:, left:]
+    decoded = cv2.imdecode(stream, cv2.IMREAD_UNCHANGED)
+    assert decoded is not None, "OpenCV decodes what it has just encoded"
+    back = decoded.astype(np.uint8, copy=False)[top:, left:]
     return np.ascontiguousarray(back[..., ::-1] if frame.ndim == 3 else back)
 
 
-def record(raw: np.ndarray, recording: RecordingSpec, *, origin_px: tuple[int, int] = (0, 0)) -> np.ndarray:
+def record(raw: ImageArray, recording: RecordingSpec, *, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:
     """A raw frame as the recorder stores it: crop, gray, median, adaptive Gaussian threshold, area resize.
 
     This is the preprocessing camera of the makers' capture software (``CvPreprocVideoCamera``). Where the
@@ -183,10 +190,11 @@ def record(raw: np.ndarray, recording: RecordingSpec, *, origin_px: tuple[int, i
     block, offset = recording.threshold_block_px, recording.threshold_offset
     binary = cv2.adaptiveThreshold(calm, 255, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, block, offset)
     size = (recording.width_px, recording.height_px)
-    return binary if binary.shape[::-1] == size else cv2.resize(binary, size, interpolation=cv2.INTER_AREA)
+    stored = binary if binary.shape[::-1] == size else cv2.resize(binary, size, interpolation=cv2.INTER_AREA)
+    return stored.astype(np.uint8, copy=False)
 
 
-def _scaled(plane: np.ndarray, scale: float, centre: float, shift: float) -> np.ndarray:
+def _scaled(plane: FloatArray, scale: float, centre: float, shift: float) -> FloatArray:
     """Rows of a plane (n, m) drawn apart about row ``centre`` and shifted: cubic convolution (Keys 1981), which keeps centroids exactly."""
     place = centre + (np.arange(len(plane)) - shift - centre) / scale
     first = np.floor(place).astype(int)

@@ -3,22 +3,20 @@
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
 from scenes.object import ObjectSpec
 from twin.mechanics.path import ContactPose
 from twin.optics.files import write_exr
 from twin.preprocess.pipeline import Pipeline
 from twin.recordings.images import write_image
 from twin.simulator import Shot, Simulator
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.store import made_by, write_json, write_npz
-from twin.types import ContactState
+from twin.types import ContactState, FloatArray
 from twin.views.panel import Look, contact_panel
 from twin.views.skin3d import displaced_skin, draw_contact_skin
 
 
-def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> list[Path]:
+def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> list[Path]:
     """Write everything about one contact into a folder.
 
     Returns
@@ -30,20 +28,20 @@ def write_contact(out: Path, simulator: Simulator, stimulus: ObjectSpec, pose: C
     write_image(out / "frame.png", shot.frame.image)
     write_exr(out / "frame.exr", shot.linear, simulator.renderer.choice)
     write_npz(out / "truth.npz", asdict(shot.truth) | contact_arrays(state), compressed=True)
-    record = contact_record(simulator, stimulus, pose, state, shot)
-    write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, stimulus, pose])})
+    record = contact_record(simulator, touched, pose, state, shot)
+    write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, touched, pose])})
 
     mesh = simulator.solver.mesh
     displaced_skin(mesh, state).save(out / "skin.vtp")
-    draw_contact_skin(mesh, spec.pins, state, build_stimulus(stimulus), out / "skin.png")
+    draw_contact_skin(mesh, spec.pins, state, build_field(touched), out / "skin.png")
     look = look_at(simulator, shot)
-    title = f"{spec.name} against {stimulus.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
+    title = f"{spec.name} against {touched.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
     contact_panel(out / "skin.png", look, title).savefig(out / "panel.png", dpi=110)
     names = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
     return [out / name for name in names]
 
 
-def contact_arrays(state: ContactState) -> dict[str, np.ndarray]:
+def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
     """The contact, place by place (see ``ContactState``)."""
     names = ("contact_mm", "point_area_mm2", "normal", "normal_n", "tangential_n", "slipping")
     return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}
@@ -57,7 +55,7 @@ def look_at(simulator: Simulator, shot: Shot) -> Look:
     return Look(shot.frame, pipeline(shot.frame), rest)
 
 
-def contact_record(simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> dict:
+def contact_record(simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> dict[str, object]:
     """What ``truth.json`` holds: forces on the object in the sensor frame, pose, everything resolved."""
     return {
         "force_n": state.force_n.tolist(),
@@ -71,5 +69,5 @@ def contact_record(simulator: Simulator, stimulus: ObjectSpec, pose: ContactPose
         "seconds": {"render": shot.seconds},
         **simulator.describe(),
         "sensor": simulator.spec.model_dump(mode="json"),
-        "object": stimulus.model_dump(mode="json"),
+        "object": touched.model_dump(mode="json"),
     }

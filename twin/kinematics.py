@@ -136,7 +136,7 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimu
 
     Parameters
     ----------
-    stimulus : Stimulus
+    stimulus : ObjectField
         Its origin is a material point of the object, so that the way from pose to pose is also the way that friction sees.
 
     Raises
@@ -151,7 +151,7 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimu
 
     tap = np.asarray(experiment.tap) * (1 + CLEAR_MM / experiment.tap[experiment.axis])
     tapped = np.asarray(label.pose, float) - label.move
-    share, touches = _first_touch(stimulus, at(tapped - tap), at(tapped), radius_mm * dome_directions(sensor, TOUCH_POINTS))
+    share, touches = _first_touch(stimulus, at(tapped - tap), at(tapped), radius_mm * dome_directions(sensor.skin, TOUCH_POINTS))
     still = np.zeros(6)
     labels = [ArmLabel(tapped - (1 - share) * tap, still), ArmLabel(tapped, still)]
     if label.executed:

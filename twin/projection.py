@@ -1,12 +1,12 @@
 """The camera's projection: sensor-frame points to raw-frame pixels and back to rays, through the window.
 
-The camera stands in air behind a plane window (acrylic), before which is gel. All planes are normal to z, so a ray stays
-in one plane through the axis of the pupil and obeys n sin(theta) = const. With u the tangent of its angle in air,
-a point at a height h_k in each layer k is met at the distance
+The camera stands in air behind a plane window (acrylic); in front of the window is gel. All planes are normal to z, so a ray stays
+in one plane through the axis of the pupil and obeys n sin(theta) = const. With u the tangent of the ray's angle in air and h_k the
+height that it crosses in layer k, its distance
 
     rho(u) = sum_k h_k tan(theta_k),   sin(theta_k) = u / (n_k sqrt(1 + u^2))
 
-from that axis. rho grows with u and is concave: Newton's method from the left converges monotonically.
+from that axis follows. rho grows with u and is concave, so Newton's method from the left converges monotonically.
 
 Distortion: Brown-Conrady (Brown 1966) with x = X / Z, y = Y / Z, r^2 = x^2 + y^2,
 x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),
@@ -16,14 +16,20 @@ or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 
 
 import numpy as np
 
-from scenes.sensor import CameraSpec, SensorSpec
+from scenes.sensor import CameraSpec, ViewSpec
+from twin.types import FloatArray
 
-NEWTON_STEPS = 12  # quadratic: the last ones only polish
-MOST_NEWTON_MOVE = 0.1  # per step, normalised: keeps far starts from jumping past the fold
-GRAZING = 1e6  # tangent beyond which a ray counts as parallel to the window
+NEWTON_STEPS = 12
+"""Steps of Newton's method; it converges quadratically, so that the last steps change only the last digits."""
+MOST_NEWTON_MOVE = 0.1
+"""Largest change of a normalised coordinate in one step: a start far from the solution does not jump past the distortion's fold."""
+GRAZING = 1e6
+"""Tangent beyond which a ray counts as parallel to the window."""
+LEAST_FISHEYE_SLOPE = 0.05
+"""Slope of the fisheye's radius by the angle that Newton's method assumes at least, near the distortion's fold."""
 
 
-def sensor_to_camera(camera: CameraSpec) -> np.ndarray:
+def sensor_to_camera(camera: CameraSpec) -> FloatArray:
     """``T_camera_sensor`` (4, 4): camera looks along +z with x right and y down.
 
     The entrance pupil is at (0, 0, -distance) of the sensor frame; the camera is turned about it
@@ -38,7 +44,7 @@ def sensor_to_camera(camera: CameraSpec) -> np.ndarray:
     return T_camera_sensor
 
 
-def distort(camera: CameraSpec, xy: np.ndarray) -> np.ndarray:
+def distort(camera: CameraSpec, xy: FloatArray) -> FloatArray:
     """Tangents (..., 2) of rays in the camera frame to normalised image coordinates."""
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -56,7 +62,7 @@ def distort(camera: CameraSpec, xy: np.ndarray) -> np.ndarray:
     )
 
 
-def undistort(camera: CameraSpec, seen: np.ndarray, *, guess: np.ndarray | None = None) -> np.ndarray:
+def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None = None) -> FloatArray:
     """Normalised image coordinates (..., 2) to tangents: Newton's method on ``distort(ideal) = seen``.
 
     Starts at ``guess`` (default: ``seen``). Meaningless where the distortion folds back, outside its valid field.
@@ -66,7 +72,7 @@ def undistort(camera: CameraSpec, seen: np.ndarray, *, guess: np.ndarray | None 
         angle = radius if guess is None else np.arctan(np.linalg.norm(guess, axis=-1))
         for _ in range(NEWTON_STEPS):
             slope = 1 + 3 * camera.k1 * angle**2 + 5 * camera.k2 * angle**4
-            angle = np.clip(angle - (_fisheye(camera, angle) - radius) / np.maximum(slope, 0.05), 0, np.pi / 2 - 1e-6)
+            angle = np.clip(angle - (_fisheye(camera, angle) - radius) / np.maximum(slope, LEAST_FISHEYE_SLOPE), 0, np.pi / 2 - 1e-6)
         return seen * (np.tan(angle) / np.maximum(radius, 1e-12))[..., None]
     ideal, step = np.array(seen if guess is None else guess, float), 1e-6
     for _ in range(NEWTON_STEPS):
@@ -78,23 +84,23 @@ def undistort(camera: CameraSpec, seen: np.ndarray, *, guess: np.ndarray | None 
     return ideal
 
 
-def project(spec: SensorSpec, points_mm: np.ndarray) -> np.ndarray:
+def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
     """Sensor-frame points (..., 3) in front of the camera to raw-frame pixels (..., 2), pixel centres at integers.
 
     A point's height decides the layers its ray passes: points behind the window are seen straight.
     """
-    camera = spec.camera
+    camera = view.camera
     rho = np.linalg.norm(points_mm[..., :2], axis=-1)
-    tangent = window_tangent(spec, rho, points_mm[..., 2])
+    tangent = window_tangent(view, rho, points_mm[..., 2])
     across = points_mm[..., :2] * (tangent / np.maximum(rho, 1e-12))[..., None]
     in_sensor = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
     in_camera = in_sensor @ sensor_to_camera(camera)[:3, :3].T
     return distort(camera, in_camera[..., :2] / in_camera[..., 2:]) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
 
 
-def window_tangent(spec: SensorSpec, rho_mm: np.ndarray, z_mm: np.ndarray, *, behind_mm: float | None = None) -> np.ndarray:
+def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
     """Tangent u of the angle in air of the rays that join (0, z0) to (rho, z), z0 the pupil's or ``behind_mm``."""
-    heights, indices = _layers(spec, z_mm, -spec.camera.distance_mm if behind_mm is None else behind_mm)
+    heights, indices = _layers(view, z_mm, -view.camera.distance_mm if behind_mm is None else behind_mm)
     u = rho_mm / sum(h / n for h, n in zip(heights, indices, strict=True))
     for _ in range(NEWTON_STEPS):
         reach, slope = 0.0, 0.0
@@ -106,9 +112,9 @@ def window_tangent(spec: SensorSpec, rho_mm: np.ndarray, z_mm: np.ndarray, *, be
     return u
 
 
-def pixel_rays(spec: SensorSpec, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Where the rays of raw-frame pixels (..., 2) enter the gel, (..., 3) mm, and their unit directions (..., 3) in it."""
-    camera = spec.camera
+    camera = view.camera
     ideal = undistort(camera, (np.asarray(pixels, float) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px])
     in_camera = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
     direction = in_camera @ sensor_to_camera(camera)[:3, :3]
@@ -116,9 +122,9 @@ def pixel_rays(spec: SensorSpec, pixels: np.ndarray) -> tuple[np.ndarray, np.nda
     place = np.zeros_like(direction)
     place[..., 2] = -camera.distance_mm
     for index, before, height in (
-        (1.0, 1.0, spec.lens.back_mm + camera.distance_mm),
-        (spec.lens.refractive_index, 1.0, spec.lens.thickness_mm),
-        (spec.gel.refractive_index, spec.lens.refractive_index, 0.0),
+        (1.0, 1.0, view.lens.back_mm + camera.distance_mm),
+        (view.lens.refractive_index, 1.0, view.lens.thickness_mm),
+        (view.gel_index, view.lens.refractive_index, 0.0),
     ):
         across = direction[..., :2] * before / index
         up = np.sqrt(np.maximum(1 - np.sum(across**2, axis=-1, keepdims=True), 0))
@@ -127,17 +133,17 @@ def pixel_rays(spec: SensorSpec, pixels: np.ndarray) -> tuple[np.ndarray, np.nda
     return place, direction
 
 
-def _layers(spec: SensorSpec, z_mm: np.ndarray, from_mm: float) -> tuple[tuple, tuple]:
+def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:
     """Heights of air, window and gel between the planes ``from_mm`` (in the air) and ``z_mm``, and their indices."""
-    back, front = spec.lens.back_mm, spec.lens.z_mm
+    back, front = view.lens.back_mm, view.lens.z_mm
     z = np.asarray(z_mm, float)
     heights = np.minimum(z, back) - from_mm, np.clip(z, back, front) - back, np.maximum(z - front, 0)
-    return heights, (1.0, spec.lens.refractive_index, spec.gel.refractive_index)
+    return heights, (1.0, view.lens.refractive_index, view.gel_index)
 
 
-def _fisheye(camera: CameraSpec, angle: np.ndarray) -> np.ndarray:
+def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:
     return angle * (1 + camera.k1 * angle**2 + camera.k2 * angle**4)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -1,18 +1,22 @@
-"""A sensor's specification as a file."""
+"""A sensor's specification as files."""
 
 from pathlib import Path
 
 from scenes.sensor import SensorSpec
-from scenes.write import sensor_text
+from scenes.write import sensor_files
 from twin.store import write_text
 
 
 def write_sensor(path: Path, spec: SensorSpec, comment: str = "") -> Path:
-    """Write a specification as ``scenes.write.sensor_text`` has it; the path.
+    """Write a specification, its tables beside it, and return the path.
+
+    Each file is written whole or not at all; the TOML file comes last.
 
     Raises
     ------
     StoreError
         It can't be written.
     """
-    return write_text(path, sensor_text(spec, comment))
+    for name, text in sensor_files(spec, path.stem, comment).items():
+        write_text(path.with_name(name), text)
+    return path

@@ -1,5 +1,6 @@
 """The twin of one sensor: press it, look through its camera, get frames with ground truth."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -8,13 +9,14 @@ import numpy as np
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.camera import expose, record
+from twin.errors import FrameError
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.optics.render import Renderer
+from twin.optics.render import Quality, Renderer
 from twin.preprocess.forms import frame_size
 from twin.truth import CapTruth, cap_truth
-from twin.types import ContactState, Form, Frame
+from twin.types import ContactState, FloatArray, Form, Frame
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Shot:
     """
 
     frame: Frame
-    linear: np.ndarray
+    linear: FloatArray
     truth: CapTruth
     seconds: float
 
@@ -50,7 +52,7 @@ class Simulator:
         Of the same sensor; by default one of the usual resolution.
     """
 
-    def __init__(self, spec: SensorSpec, *, quality: str = "standard", solver: SkinSolver | None = None) -> None:
+    def __init__(self, spec: SensorSpec, *, quality: Quality = "standard", solver: SkinSolver | None = None) -> None:
         self.spec = spec
         self.solver = solver or SkinSolver(spec)
         self.rest = self.solver.rest()
@@ -65,7 +67,7 @@ class Simulator:
             self._renderer = Renderer(self.spec, quality=self._quality, mesh=self.solver.mesh)
         return self._renderer
 
-    def press(self, stimulus: ObjectSpec, pose: ContactPose, *, progress=None) -> ContactState:
+    def press(self, touched: ObjectSpec, pose: ContactPose, *, progress: Callable[[float], object] | None = None) -> ContactState:
         """Press an object against the sensor along approach and shear.
 
         Raises
@@ -73,7 +75,7 @@ class Simulator:
         ContactError
             If the pose is out of reach or the solver does not converge.
         """
-        return self.solver.press(stimulus, pose, progress=progress and (lambda fraction, _: progress(fraction)))
+        return self.solver.press(touched, pose, progress=None if progress is None else lambda fraction, _: progress(fraction))
 
     def shoot(self, state: ContactState, *, form: Form = Form.RAW, seed: int = 0, name: str = "frame.png") -> Shot:
         """Render what the camera sees, and capture it in the given form.
@@ -88,7 +90,7 @@ class Simulator:
         self.check_form(form)
         start = perf_counter()
         linear = self.renderer.render(state, seed=seed)
-        image = expose(linear, self.spec, np.random.default_rng(seed))
+        image = expose(linear, self.spec.capture, np.random.default_rng(seed))
         seconds = perf_counter() - start
         raw = Shot(Frame(image, Form.RAW, name), linear, cap_truth(self.spec, self.rest, state, Form.RAW), seconds)
         return raw if form is Form.RAW else self.as_recorded(raw, state)
@@ -101,12 +103,13 @@ class Simulator:
 
     def as_recorded(self, raw: Shot, state: ContactState) -> Shot:
         """The shot of a raw frame in the form of the sensor's recordings."""
-        self.check_form(Form.RECORDING)
+        if self.spec.recording is None:
+            raise FrameError(f"{self.spec.name} has no recording form; give its specification the section 'recording', or use raw frames")
         image = record(raw.frame.image, self.spec.recording)
         frame = replace(raw.frame, image=image, form=Form.RECORDING)
         return replace(raw, frame=frame, truth=cap_truth(self.spec, self.rest, state, Form.RECORDING))
 
-    def describe(self) -> dict:
+    def describe(self) -> dict[str, dict[str, object]]:
         """What a result depends on besides sensor and object: variant and samples, mesh and tolerances."""
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},

@@ -14,7 +14,7 @@ import numpy as np
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from twin.mounting import Mounting
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Surface:
 
     Attributes
     ----------
-    field : Stimulus
+    field : ObjectField
         The object without its texture.
     raised_mm : float
         How far out the texture lies.
     """
 
     def __init__(self, spec: ObjectSpec) -> None:
-        self.field = build_stimulus(spec.model_copy(update={"texture": None}))
+        self.field = build_field(spec.model_copy(update={"texture": None}))
         self.raised_mm = spec.texture.wire_diameter_mm if spec.texture else 0.0
 
     def touched(self, mounting: Mounting, T_sensor_object: np.ndarray) -> Touch:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import SensorSpec, ViewSpec
 from twin.preprocess.forms import frame_size, from_raw
 from twin.projection import pixel_rays, project
-from twin.types import ContactState, Form
+from twin.types import BoolArray, ContactState, FloatArray, Form, PinState
 
 
 @dataclass(frozen=True)
@@ -25,31 +25,31 @@ class CapTruth:
         Inside the frame, and the line of sight to the cap's centre meets no other pin.
     """
 
-    caps_mm: np.ndarray
-    caps_px: np.ndarray
-    rest_px: np.ndarray
-    visible: np.ndarray
+    caps_mm: FloatArray
+    caps_px: FloatArray
+    rest_px: FloatArray
+    visible: BoolArray
 
 
 def cap_truth(spec: SensorSpec, rest: ContactState, state: ContactState, form: Form) -> CapTruth:
     """Ground truth of a contact for frames of the given form."""
-    caps_px = from_raw(spec, form, project(spec, state.caps_mm))
-    rest_px = from_raw(spec, form, project(spec, rest.caps_mm))
+    caps_px = from_raw(spec, form, project(spec.view, state.caps_mm))
+    rest_px = from_raw(spec, form, project(spec.view, rest.caps_mm))
     inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
-    return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec, state))
+    return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state))
 
 
-def occluded(spec: SensorSpec, state: ContactState) -> np.ndarray:
+def occluded(view: ViewSpec, cap_radius_mm: float, state: PinState) -> BoolArray:
     """(N,) bool: the ray in the gel from the window to the cap's centre passes through another pin.
 
     Pins count as capsules of the cap's radius around the axis from foot to cap.
     """
-    window_mm, _ = pixel_rays(spec, project(spec, state.caps_mm))
-    return _meets_another(window_mm, state.base_mm, state.caps_mm, spec.pins.cap_diameter_mm / 2)
+    window_mm, _ = pixel_rays(view, project(view, state.caps_mm))
+    return _meets_another(window_mm, state.base_mm, state.caps_mm, cap_radius_mm)
 
 
 @numba.njit(cache=True)
-def _meets_another(eyes: np.ndarray, base: np.ndarray, caps: np.ndarray, radius: float) -> np.ndarray:
+def _meets_another(eyes: FloatArray, base: FloatArray, caps: FloatArray, radius: float) -> BoolArray:
     """(N,) bool: the segment from ``eyes`` to ``caps``, (N, 3) each, comes nearer than ``radius`` to another pin's axis."""
     hidden = np.zeros(len(caps), np.bool_)
     for i in range(len(caps)):
@@ -61,7 +61,7 @@ def _meets_another(eyes: np.ndarray, base: np.ndarray, caps: np.ndarray, radius:
 
 
 @numba.njit(cache=True)
-def segment_distance(p0: np.ndarray, p1: np.ndarray, q0: np.ndarray, q1: np.ndarray) -> float:
+def segment_distance(p0: FloatArray, p1: FloatArray, q0: FloatArray, q1: FloatArray) -> float:
     """Distance of the segment p0-p1 to the segment q0-q1, (3,) each (Ericson 2004, 5.1.9)."""
     a = b = c = e = f = 0.0
     for k in range(3):

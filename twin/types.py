@@ -2,10 +2,20 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-FINE = 20  # elements across the skin for calibrations and data sets: the outer pins of the deepest contacts are within 1 % of 32's
+FloatArray: TypeAlias = NDArray[np.floating]
+IntArray: TypeAlias = NDArray[np.integer]
+BoolArray: TypeAlias = NDArray[np.bool_]
+ComplexArray: TypeAlias = NDArray[np.complexfloating]
+ImageArray: TypeAlias = NDArray[np.uint8]
+"""Gray or RGB levels of a frame."""
+
+FINE = 20
+"""Elements across the skin for calibrations and data sets. In the deepest contacts the outer pins then move as with 32 elements, to 1 %."""
 
 
 class Form(StrEnum):
@@ -31,11 +41,32 @@ class Frame:
     sequence : int
     """
 
-    image: np.ndarray
+    image: ImageArray
     form: Form
     name: str = ""
     time_s: float = 0.0
     sequence: int = 0
+
+
+class PinState(Protocol):
+    """Where the pins of a sensor are, in the sensor frame: at rest, in a contact, or as fitted to a frame.
+
+    Attributes
+    ----------
+    base_mm : (N, 3) float
+        Foot of each pin, on the inside of the skin.
+    axis : (N, 3) float
+        Unit vector from the foot to the cap.
+    caps_mm : (N, 3) float
+        Centre of each cap.
+    """
+
+    @property
+    def base_mm(self) -> FloatArray: ...
+    @property
+    def axis(self) -> FloatArray: ...
+    @property
+    def caps_mm(self) -> FloatArray: ...
 
 
 @dataclass(frozen=True)
@@ -72,32 +103,49 @@ class ContactState:
         Norm of the force residual relative to the contact force (N/N).
     """
 
-    nodes_mm: np.ndarray
-    base_mm: np.ndarray
-    axis: np.ndarray
-    caps_mm: np.ndarray
-    force_n: np.ndarray
-    torque_nmm: np.ndarray
+    nodes_mm: FloatArray
+    base_mm: FloatArray
+    axis: FloatArray
+    caps_mm: FloatArray
+    force_n: FloatArray
+    torque_nmm: FloatArray
     area_mm2: float
-    contact_mm: np.ndarray
-    point_area_mm2: np.ndarray
-    normal: np.ndarray
-    normal_n: np.ndarray
-    tangential_n: np.ndarray
-    slipping: np.ndarray
-    T_sensor_object: np.ndarray
+    contact_mm: FloatArray
+    point_area_mm2: FloatArray
+    normal: FloatArray
+    normal_n: FloatArray
+    tangential_n: FloatArray
+    slipping: BoolArray
+    T_sensor_object: FloatArray
     elastic_nmm: float
     dissipated_nmm: float
     residual: float
 
     @classmethod
-    def untouched(cls, nodes_mm, base_mm, axis, caps_mm, *, T_sensor_object=None) -> "ContactState":
+    def untouched(
+        cls, nodes_mm: FloatArray, base_mm: FloatArray, axis: FloatArray, caps_mm: FloatArray, *, T_sensor_object: FloatArray | None = None
+    ) -> "ContactState":
         """The undeformed sensor, nothing touching it."""
-        none, zero = np.zeros((0, 3)), np.zeros(3)
-        pose = np.eye(4) if T_sensor_object is None else T_sensor_object
-        contact = {"contact_mm": none, "point_area_mm2": none[:, 0], "normal": none, "normal_n": none[:, 0], "tangential_n": none}
-        forces = {"force_n": zero, "torque_nmm": zero, "area_mm2": 0.0, "elastic_nmm": 0.0, "dissipated_nmm": 0.0, "residual": 0.0}
-        return cls(nodes_mm, base_mm, axis, caps_mm, slipping=np.zeros(0, bool), T_sensor_object=pose, **contact, **forces)
+        no_vectors, no_numbers = np.zeros((0, 3)), np.zeros(0)
+        return cls(
+            nodes_mm=nodes_mm,
+            base_mm=base_mm,
+            axis=axis,
+            caps_mm=caps_mm,
+            force_n=np.zeros(3),
+            torque_nmm=np.zeros(3),
+            area_mm2=0.0,
+            contact_mm=no_vectors,
+            point_area_mm2=no_numbers,
+            normal=no_vectors,
+            normal_n=no_numbers,
+            tangential_n=no_vectors,
+            slipping=np.zeros(0, bool),
+            T_sensor_object=np.eye(4) if T_sensor_object is None else T_sensor_object,
+            elastic_nmm=0.0,
+            dissipated_nmm=0.0,
+            residual=0.0,
+        )
 
 
 @dataclass(frozen=True)
@@ -117,10 +165,10 @@ class PinGraph:
     """
 
     kind: str
-    nodes_px: np.ndarray
-    edges: np.ndarray
-    area_px2: np.ndarray
-    cells: list = field(default_factory=list)
+    nodes_px: FloatArray
+    edges: IntArray
+    area_px2: FloatArray
+    cells: list[FloatArray] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -145,11 +193,11 @@ class Observation:
         Time of each stage.
     """
 
-    pins_px: np.ndarray
-    predicted_px: np.ndarray
+    pins_px: FloatArray
+    predicted_px: FloatArray
     found: int
     valid: bool
     reason: str
     graph: PinGraph | None
-    extra_px: np.ndarray
-    ms: dict
+    extra_px: FloatArray
+    ms: dict[str, float]

@@ -103,7 +103,7 @@ class TwinCamera(LiveSource):
         light = self._preview.render(self.state)
         self._drawn += 1
         rng = np.random.default_rng((self._seed, self._drawn))
-        return Picture(steady(expose(light, self._spec, rng, origin_px=self._preview.window_px[:2]), self._spec, rng), told.time_s)
+        return Picture(steady(expose(light, self._spec.capture, rng, origin_px=self._preview.window_px[:2]), self._spec, rng), told.time_s)
 
     def _await_reader(self) -> None:
         """Until a frame is asked for; who asks from now on gets one that is drawn later."""

@@ -149,7 +149,7 @@ def print_scaling(repeats, out):
     unknowns, by_unknowns, by_step = [], [], []
     for across in ACROSS:
         resolution = Resolution(across=across)
-        unknowns.append(3 * int(np.count_nonzero(~build_solid(spec, resolution=resolution).fixed)))
+        unknowns.append(3 * int(np.count_nonzero(~build_solid(spec.geometry, resolution=resolution).fixed)))
         by_unknowns.append(time_path(SkinSolver(spec, resolution=resolution), plane, TAP_AND_SHEAR, repeats))
         print(f"{across:8d}{unknowns[-1]:10d}{row(*by_unknowns[-1])}", flush=True)
     print(f"\n{'step, mm':>8s}{head}")

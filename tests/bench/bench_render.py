@@ -54,13 +54,13 @@ class Bench:
     def frame(self, renderer: Renderer, k: int) -> np.ndarray:
         """A frame of a state that the one before was not of."""
         return expose(
-            renderer.render(self.states[k % 2], seed=k), renderer.spec, np.random.default_rng(k), origin_px=renderer.window_px[:2]
+            renderer.render(self.states[k % 2], seed=k), renderer.spec.capture, np.random.default_rng(k), origin_px=renderer.window_px[:2]
         )
 
     def truth(self, linear: np.ndarray) -> Truth:
         """A converged picture of the pressed sensor."""
         mask, origin = self.spec.pipeline.raw, np.array(self.window[:2])
-        places = project(self.spec, self.states[1].caps_mm) - origin
+        places = project(self.spec.view, self.states[1].caps_mm) - origin
         return Truth(self.spec, linear, places, np.array(mask.mask_center_px) - origin, mask.mask_radius_px)
 
     def samples(self) -> tuple[Truth, list]:
@@ -73,7 +73,7 @@ class Bench:
             wall, cpu = timed_ms(partial(self.frame, renderer), self.repeats)
             _, moving = timed_ms(lambda k, r=renderer: r._view.move(r.surfaces(self.states[k % 2])), self.repeats)
             linear = renderer.render(self.states[1], seed=1)
-            _, exposing = timed_ms(lambda k, image=linear: expose(image, self.spec, np.random.default_rng(k)), self.repeats)
+            _, exposing = timed_ms(lambda k, image=linear: expose(image, self.spec.capture, np.random.default_rng(k)), self.repeats)
             gray, rms, median = truth.errors(linear)
             rows.append((spp, wall, cpu, gray, rms))
             print(f"{spp:8d}{wall:12.0f}{cpu:8.0f}{moving:8.0f}{exposing:10.1f}{gray:10.2f}{rms:8.3f}{median:8.3f}", flush=True)
@@ -92,7 +92,7 @@ class Bench:
         print(f"\nplain path tracing, against {PLAIN_CONVERGED} samples")
         print(HEAD)
         for spp in PLAIN_LADDER:
-            wall, cpu = timed_ms(lambda k, n=spp: expose(plain.render(self.states[k % 2], n, k), self.spec), self.repeats)
+            wall, cpu = timed_ms(lambda k, n=spp: expose(plain.render(self.states[k % 2], n, k), self.spec.capture), self.repeats)
             gray, rms, _ = truth.errors(plain.render(state, spp, seed=1))
             theirs.append((spp, wall, cpu, gray, rms))
             print(f"{spp:8d}{wall:12.0f}{cpu:8.0f}{gray:10.2f}{rms:8.3f}", flush=True)
@@ -113,7 +113,9 @@ class Bench:
         preview = Preview(self.spec, window_px=self.window)
         shape, built = preview.render().shape, perf_counter() - start
         preview.calibrate(self.renderer(64))
-        wall, cpu = timed_ms(lambda k: expose(preview.render(self.states[k % 2]), self.spec, np.random.default_rng(k)), 10 * self.repeats)
+        wall, cpu = timed_ms(
+            lambda k: expose(preview.render(self.states[k % 2]), self.spec.capture, np.random.default_rng(k)), 10 * self.repeats
+        )
         gray, rms, median = truth.errors(preview.render(self.states[1]))
         print(f"\npreview {shape[1]} x {shape[0]} px, built in {built:.1f} s")
         print(f"{wall:.1f} ms a frame ({1e3 / wall:.0f} per s), {cpu:.1f} CPU ms")

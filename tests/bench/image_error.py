@@ -62,7 +62,7 @@ class Truth:
         return float(np.sqrt(np.mean(np.diff(grays, axis=0)[0][inside] ** 2))), float(np.sqrt(np.mean(apart**2))), float(np.median(apart))
 
     def _gray(self, linear: np.ndarray) -> np.ndarray:
-        gray = expose(linear, self.spec).astype(float)
+        gray = expose(linear, self.spec.capture).astype(float)
         return gray.mean(axis=2) if gray.ndim == 3 else gray
 
 

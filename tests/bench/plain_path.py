@@ -22,11 +22,11 @@ class PlainPath:
 
     def __init__(self, renderer: Renderer, size_px: int):
         self._mi, self._renderer, self.size_px = use_variant(renderer.choice), renderer, size_px
-        self._rest = rest_pins(renderer.spec)
+        self._rest = rest_pins(renderer.spec.geometry)
         self._view = ScalarView(self._mi, renderer.spec, renderer.window_px, renderer.surfaces(self._rest), BOUNCES)
         self._eye_mm = self._view._eye_mm
         tangents = self._tangents(self._rest.caps_mm)
-        film_px = np.ptp(project(renderer.spec, self._rest.caps_mm), axis=0).max()
+        film_px = np.ptp(project(renderer.spec.view, self._rest.caps_mm), axis=0).max()
         self._half_field = float(np.ptp(tangents, axis=0).max() * size_px / film_px / 2)
 
     def render(self, state, spp: int, seed: int) -> np.ndarray:

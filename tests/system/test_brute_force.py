@@ -140,8 +140,8 @@ def test_gel_absorbs_as_beer_and_lambert_say():
         if made.choice.backend == "scalar":
             pytest.skip("the scalar variant has no absorption")
         light.append(made.render()[11:13, 11:13].mean())
-    top = rest_pins(clear).caps_mm[0, 2] - 0.5 * clear.pins.cap_height_mm
-    u = window_tangent(clear, np.array(clear.leds.radius_mm), np.array(top), behind_mm=clear.leds.z_mm)
+    top = rest_pins(clear.geometry).caps_mm[0, 2] - 0.5 * clear.pins.cap_height_mm
+    u = window_tangent(clear.view, np.array(clear.leds.radius_mm), np.array(top), behind_mm=clear.leds.z_mm)
     cos_gel = np.sqrt(1 - u**2 / (1 + u**2) / clear.gel.refractive_index**2)
     height = top - clear.lens.z_mm
     across_the_pixels = 2e-3  # relative: ways differ over the tip's four pixels

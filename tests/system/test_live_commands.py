@@ -222,7 +222,9 @@ def test_the_browser_shows_the_newest_annotated_frame_and_figures():
 def test_a_view_draws_pins_graph_cells_and_text():
     sensor = load_sensor("mg400-331")
     preview = preview_of(sensor, Form.RECORDING)
-    image = record(expose(preview.render(), sensor, origin_px=preview.window_px[:2]), sensor.recording, origin_px=preview.window_px[:2])
+    image = record(
+        expose(preview.render(), sensor.capture, origin_px=preview.window_px[:2]), sensor.recording, origin_px=preview.window_px[:2]
+    )
     pipeline = Pipeline(sensor, Form.RECORDING)
     frame = Frame(image, Form.RECORDING, "rest")
     seen = pipeline(frame)

@@ -76,9 +76,9 @@ def test_displacement_by_depth_beside_the_simulated_one(real_dir, folder):
     raw_px = recording_to_raw(spec, np.stack([o.pins_px for o in seen]))
     measured = displacement_by_depth(labels, raw_px, recording_to_raw(spec, reference.pins_px))
     solver = SkinSolver(spec)
-    rest_px = project(spec, solver.rest().caps_mm)
+    rest_px = project(spec.view, solver.rest().caps_mm)
     states = [solver.press(load_object("plane"), ContactPose(indent_mm=d)) for d in DEPTH_MIDDLES_MM]
-    simulated = np.array([np.linalg.norm(project(spec, s.caps_mm) - rest_px, axis=1).mean() for s in states])
+    simulated = np.array([np.linalg.norm(project(spec.view, s.caps_mm) - rest_px, axis=1).mean() for s in states])
     print(f"\n{folder}: measured {np.round(measured, 2)} px, simulated {np.round(simulated, 2)} px")
     low, high = ORDER_OF_MAGNITUDE
     assert ((simulated > low * measured) & (simulated < high * measured)).all()

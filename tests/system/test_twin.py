@@ -45,7 +45,7 @@ def test_cells_at_the_contact_grow_with_depth(simulators):
     truth = [simulator.rest] + [simulator.press(load_object("plane"), ContactPose(indent_mm=d)) for d in (1.5, 3.0, 4.5)]
     from twin.projection import project
 
-    graphs = [make_graph("voronoi", project(simulator.spec, state.caps_mm), outmost=outmost) for state in truth]
+    graphs = [make_graph("voronoi", project(simulator.spec.view, state.caps_mm), outmost=outmost) for state in truth]
     middle = np.arange(37)  # the inner three rings and the centre
     means = [graph.area_px2[middle].mean() for graph in graphs]
     assert means == sorted(means) and means[-1] > 1.1 * means[0]

@@ -72,13 +72,13 @@ def reference(mi, spec, surfaces, size_px, spp, seed):
         "radius": lens.radius_mm,
         "bsdf": {"type": "twosided", "b": dark},
     }
-    for k, patch in enumerate(lights(spec)):
+    for k, patch in enumerate(lights(spec.leds, spec.housing)):
         square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ patch.half_mm
         corners = patch.center_mm + np.column_stack([square, np.zeros(4)])
         emitter = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": patch.radiance.tolist()}})
         surface = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]))
         extra[f"led{k}"] = mesh(mi, f"led{k}", surface, mi.load_dict({"type": "null"}), smooth=False, emitter=emitter)
-    scene = build_scene(mi, spec, **surfaces, extra=extra)
+    scene = build_scene(mi, spec.appearance, spec.gel.refractive_index, surfaces, extra=extra)
     to_world = np.eye(4)
     to_world[2, 3] = -spec.camera.distance_mm
     camera = build_pinhole_camera(mi, to_world, size_px / 2 / spec.camera.fx_px, size_px, spp)

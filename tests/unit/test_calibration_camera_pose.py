@@ -22,7 +22,7 @@ def changed(spec, *, camera=None, pins=None):
 
 def seen(spec, rng, noise_px=NOISE_PX):
     """Pins of a frame at rest, in any order."""
-    caps = project(spec, rest_pins(spec).caps_mm)
+    caps = project(spec.view, rest_pins(spec.geometry).caps_mm)
     return rng.permutation(caps + rng.normal(0, noise_px, caps.shape))
 
 
@@ -68,18 +68,18 @@ def test_what_is_held_could_not_have_been_seen(sensor):
 
 def test_pins_are_told_apart_whatever_the_cameras_place_scale_and_turn(sensor):
     order = np.random.default_rng(4).permutation(sensor.pins.count)
-    assert np.array_equal(nearest_order(perturbed(sensor), project(sensor, rest_pins(sensor).caps_mm)[order]), order)
+    assert np.array_equal(nearest_order(perturbed(sensor), project(sensor.view, rest_pins(sensor.geometry).caps_mm)[order]), order)
 
 
 def test_an_exact_frame_is_met_exactly_and_some_pins_may_be_missing(sensor):
-    pins_px = project(sensor, rest_pins(sensor).caps_mm)
+    pins_px = project(sensor.view, rest_pins(sensor.geometry).caps_mm)
     pins_px[3::17] = np.nan
     _, report = fit_camera(perturbed(sensor), pins_px, free=("fx_px", "cx_px", "cy_px", "k1", "phase_deg"))
     assert report.rms_px < SAME_PX and report.pins == np.isfinite(pins_px).all(axis=1).sum()
 
 
 def test_unknown_parameters_and_too_few_pins_are_refused(sensor):
-    pins_px = project(sensor, rest_pins(sensor).caps_mm)
+    pins_px = project(sensor.view, rest_pins(sensor.geometry).caps_mm)
     with pytest.raises(FrameError, match="focal.*fx_px"):
         fit_camera(sensor, pins_px, free=("focal",))
     with pytest.raises(FrameError, match="5 pins"):

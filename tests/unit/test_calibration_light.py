@@ -50,18 +50,18 @@ def light(known):
 
 @pytest.fixture(scope="module")
 def frame(known, light):
-    return aligned(known, expose(light, known))
+    return aligned(known, expose(light, known.capture))
 
 
 def aligned(spec, image) -> Aligned:
-    rest = rest_pins(spec)
+    rest = rest_pins(spec.geometry)
     state = FittedPins(rest.base_mm, rest.axis, rest.caps_mm, np.zeros(len(rest.caps_mm)), np.zeros(3))
-    return Aligned("rendered.png", image, project(spec, rest.caps_mm), state)
+    return Aligned("rendered.png", image, project(spec.view, rest.caps_mm), state)
 
 
 def shoot(spec, frames):
     renderer = Renderer(spec, spp=SPP)
-    return [expose(renderer.render(f.state), spec) for f in frames]
+    return [expose(renderer.render(f.state), spec.capture) for f in frames]
 
 
 def quiet(*_):
@@ -108,7 +108,7 @@ def test_each_caps_reflectance_and_outline_are_recovered(known):
     printed = revised(known, appearance=own)
     real = [aligned(printed, shoot(printed, [aligned(printed, None)])[0])]
     found = fit_caps(fit_caps(known, real, shoot), real, shoot)
-    seen = np.linalg.norm(rest_pins(known).caps_mm[:, :2], axis=1) < 10.0
+    seen = np.linalg.norm(rest_pins(known.geometry).caps_mm[:, :2], axis=1) < 10.0
     np.testing.assert_allclose(np.array(found.appearance.cap_levels)[seen], levels[seen], rtol=0.04)
     for got, true in ((found.appearance.cap_shapes, shapes), (found.appearance.cap_offsets, offsets)):
         left = (np.array(got) - true)[seen]
@@ -128,9 +128,9 @@ def test_the_rims_light_is_recovered(known):
     blot = np.rint(np.maximum(np.cos(turn - 1.0), 0) * np.hanning(6)[:, None] * np.array([60, 80, 120]))
     rim = {"inner_mm": edge_mm - 1.5, "outer_mm": edge_mm + 0.3, "light": blot.astype(int).tolist()}
     glued, start = revised(bare, housing={"rim": rim}), Renderer(bare, spp=4).render()
-    real = aligned(glued, expose(Renderer(glued, spp=4).render(), glued))
+    real = aligned(glued, expose(Renderer(glued, spp=4).render(), glued.capture))
     found = fit_rim(bare, [real], [start])
-    shown = [expose(Renderer(spec, spp=4).render(), spec).astype(float) for spec in (bare, found)]
+    shown = [expose(Renderer(spec, spp=4).render(), spec.capture).astype(float) for spec in (bare, found)]
     before, after = (np.abs(image - real.image) for image in shown)
     assert before.max() > 40 and after.mean() < 0.2 * before.mean()
     assert not np.array(fit_rim(bare, [aligned(bare, shown[0].astype(np.uint8))], [start]).housing.rim.light).any(), "light out of nothing"
@@ -138,10 +138,10 @@ def test_the_rims_light_is_recovered(known):
 
 def test_blur_and_sharpening_are_recovered(known, light, frame):
     real = revised(known, response={"blur_sigma_px": 1.1, "sharpening": 0.8, "sharpening_sigma_px": 1.6}, camera={"red_scale": 1.004})
-    seen = replace(frame, image=expose(light, real))
+    seen = replace(frame, image=expose(light, real.capture))
     found = fit_response(known, [seen], [light], np.ones(light.shape[:2], bool))
-    left = expose(light, found).astype(float) - seen.image
-    assert left.std() < 0.1 * (expose(light, known).astype(float) - seen.image).std()  # weight and width of the mask trade
+    left = expose(light, found.capture).astype(float) - seen.image
+    assert left.std() < 0.1 * (expose(light, known.capture).astype(float) - seen.image).std()  # weight and width of the mask trade
     assert found.response.blur_sigma_px == pytest.approx(1.1, abs=0.05)
     assert found.camera.red_scale == pytest.approx(1.004, abs=5e-4) and found.camera.blue_scale == pytest.approx(1.0, abs=5e-4)
     assert found.response.jpeg_quality == 0
@@ -150,7 +150,7 @@ def test_blur_and_sharpening_are_recovered(known, light, frame):
 def test_blur_is_found_from_edges_alone(known, light, frame):
     sharp = revised(known, response={"blur_sigma_px": 1.3, "sharpening": 0.4})
     start = revised(sharp, response={"blur_sigma_px": 0.5})
-    found = fit_blur(start, [replace(frame, image=expose(light, sharp))], [light])
+    found = fit_blur(start, [replace(frame, image=expose(light, sharp.capture))], [light])
     assert found.response.blur_sigma_px == pytest.approx(1.3, abs=0.02)
 
 
@@ -172,7 +172,7 @@ def sharpness_of(distance):
 
 
 def test_caps_near_the_rim_are_nearer_to_the_pupil(known):
-    caps = rest_pins(known).caps_mm
+    caps = rest_pins(known.geometry).caps_mm
     assert apparent_mm(known, caps[0, 2]) > apparent_mm(known, caps[-1, 2])
     bare = revised(known, gel={"refractive_index": 1.0}, lens={"refractive_index": 1.0})
     assert apparent_mm(bare, 5.0) == pytest.approx(5.0 + known.camera.distance_mm)
@@ -180,14 +180,14 @@ def test_caps_near_the_rim_are_nearer_to_the_pupil(known):
 
 def test_noise_is_recovered(known, light, frame):
     loud = revised(known, response={"read_noise": 6e-4, "shot_noise": 2e-4})
-    real = replace(frame, image=expose(light, loud, np.random.default_rng(5)))
+    real = replace(frame, image=expose(light, loud.capture, np.random.default_rng(5)))
     found = fit_noise(known, [real], [light])
-    again = expose(light, found, np.random.default_rng(6))
+    again = expose(light, found.capture, np.random.default_rng(6))
     bare = bare_skin(again.shape, frame.pins_px, lens_disc(known))
     assert noise_sd(gray_levels(again), bare) == pytest.approx(noise_sd(gray_levels(real.image), bare), rel=0.05)
 
 
 def test_sharper_frames_have_narrower_edges(known, light, frame):
-    soft = replace(frame, image=expose(light, revised(known, response={"blur_sigma_px": 1.6})))
+    soft = replace(frame, image=expose(light, revised(known, response={"blur_sigma_px": 1.6}).capture))
     found = sharpness(known, [soft], [frame.image], bins=2)
     assert (found.real_px > found.rendered_px).all()

@@ -65,14 +65,14 @@ def known():
     spec = revised(start, housing=HOUSING, leds=LEDS, appearance={"specks": SPECKS})
     light, cover = static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))
     rng = np.random.default_rng(5)
-    at_rest = project(spec, rest_pins(spec).caps_mm)
+    at_rest = project(spec.view, rest_pins(spec.geometry).caps_mm)
     images, pins = [], []
     for _ in range(FRAMES):
         pins_px = at_rest + rng.uniform(-MOVE_PX, MOVE_PX, 2)
         gel = np.full(light.shape, SKIN_LIGHT, np.float32)
         for x, y in np.rint(16 * pins_px).astype(int).tolist():
             cv2.circle(gel, (x, y), round(16 * CAP_PX), (CAP_LIGHT,) * 3, -1, cv2.LINE_8, 4)
-        images.append(expose(light + (1 - cover[..., None]) * gel, spec, rng))
+        images.append(expose(light + (1 - cover[..., None]) * gel, spec.capture, rng))
         pins.append(pins_px)
     return start, spec, np.array(images), np.array(pins)
 
@@ -107,7 +107,7 @@ def test_the_rings_light(known, found):
     _, spec, images, _ = known
     y, x = np.mgrid[: images.shape[1], : images.shape[2]]
     light, cover = static_layer(found, (0, 0, images.shape[2], images.shape[1]))
-    real, shown = np.median(images, axis=0), expose(light, found).astype(float)
+    real, shown = np.median(images, axis=0), expose(light, found.capture).astype(float)
     outside = cv2.erode((cover == 1).astype(np.uint8), np.ones((9, 9))) > 0
     miss = (shown - real)[outside & (real < SATURATED).all(axis=2)]
     assert np.sqrt(np.mean(miss**2)) < RING_LEVELS

@@ -86,19 +86,19 @@ def dots(gray: int = 120) -> np.ndarray:
 
 def test_a_neutral_camera_only_rounds():
     light = picture()
-    assert (expose(light, PLAIN) == np.rint(255 * light)).all()
-    assert (expose(light, PLAIN, np.random.default_rng(0)) == expose(light, PLAIN)).all(), "noise of size zero"
+    assert (expose(light, PLAIN.capture) == np.rint(255 * light)).all()
+    assert (expose(light, PLAIN.capture, np.random.default_rng(0)) == expose(light, PLAIN.capture)).all(), "noise of size zero"
 
 
 @pytest.mark.parametrize(("section", "key", "value"), SECTIONS)
 def test_each_step_acts_in_the_chain(section, key, value):
     full = changed(PLAIN, **FULL)
     without = changed(full, **{section: {key: NEUTRAL[section][key]}})
-    assert (expose(picture(), full) != expose(picture(), without)).any()
+    assert (expose(picture(), full.capture) != expose(picture(), without.capture)).any()
 
 
 def test_a_neutral_step_hands_the_very_same_light_on():
-    light, frame, rng = picture(), expose(picture(), PLAIN), np.random.default_rng(0)
+    light, frame, rng = picture(), expose(picture(), PLAIN.capture), np.random.default_rng(0)
     optics = hazed(light, PLAIN.gel), dispersed(light, PLAIN.camera), blurred(light, 0.0), vignetted(light, PLAIN.camera)
     film = amplified(light, PLAIN.response, rng), noisy(light, PLAIN.response, rng), sharpened(light, PLAIN.response)
     assert all(handed is light for handed in (*optics, *film)) and compressed(frame, 0) is frame
@@ -106,21 +106,23 @@ def test_a_neutral_step_hands_the_very_same_light_on():
 
 
 def test_black_is_the_black_level_and_white_saturates():
-    assert (expose(np.zeros((4, 5)), CURVED) == 4).all()
-    assert (expose(np.full((4, 5, 3), 7.0), CURVED) == 255).all()
+    assert (expose(np.zeros((4, 5)), CURVED.capture) == 4).all()
+    assert (expose(np.full((4, 5, 3), 7.0), CURVED.capture) == 255).all()
 
 
 def test_more_exposure_is_never_darker():
-    frames = [expose(picture(), changed(CURVED, response={"exposure": e, "blur_sigma_px": 0.8})).astype(int) for e in (0.3, 0.6, 1.2)]
+    frames = [
+        expose(picture(), changed(CURVED, response={"exposure": e, "blur_sigma_px": 0.8}).capture).astype(int) for e in (0.3, 0.6, 1.2)
+    ]
     assert (np.diff(frames, axis=0) >= 0).all() and frames[2].mean() > frames[0].mean() + 20
 
 
 def test_white_balance_acts_on_its_channel_and_on_colour_only():
     warm = changed(CURVED, response={"white_balance": (2.0, 1.0, 1.0)})
     light = np.full((4, 4, 3), 0.2)
-    assert expose(light, warm)[0, 0, 0] > expose(light, CURVED)[0, 0, 0]
-    assert (expose(light, warm)[..., 1:] == expose(light, CURVED)[..., 1:]).all()
-    assert (expose(light[..., 0], warm) == expose(light[..., 0], CURVED)).all()
+    assert expose(light, warm.capture)[0, 0, 0] > expose(light, CURVED.capture)[0, 0, 0]
+    assert (expose(light, warm.capture)[..., 1:] == expose(light, CURVED.capture)[..., 1:]).all()
+    assert (expose(light[..., 0], warm.capture) == expose(light[..., 0], CURVED.capture)).all()
 
 
 @pytest.mark.parametrize("gray", [23.0, 125.0])
@@ -128,7 +130,7 @@ def test_noise_is_read_and_shot_noise_through_the_curve(gray):
     """sd of gray = slope of the curve at the mean light times sqrt(read^2 + shot light); here dark skin and caps of real frames."""
     noise = {"read_noise": 2e-4, "shot_noise": 6e-5}
     light = np.float32(((gray - 4) / 251) ** 2.2)
-    frames = expose(np.full((600, 600), light), changed(CURVED, response=noise), np.random.default_rng(1)).astype(float)
+    frames = expose(np.full((600, 600), light), changed(CURVED, response=noise).capture, np.random.default_rng(1)).astype(float)
     slope = (251 / 2.2) * light ** (1 / 2.2 - 1)
     expected = np.hypot(slope * np.sqrt(noise["read_noise"] ** 2 + noise["shot_noise"] * light), np.sqrt(1 / 12))
     curvature = 0.03  # relative: the curve is not straight over the noise; sampling adds 0.1 %
@@ -139,7 +141,7 @@ def test_noise_is_read_and_shot_noise_through_the_curve(gray):
 
 def test_a_frames_gain_varies_by_the_drift_and_is_one_for_all_pixels():
     spec, rng = changed(PLAIN, response={"brightness_drift": 0.05}), np.random.default_rng(3)
-    frames = np.array([expose(np.full((4, 5, 3), 0.5), spec, rng) for _ in range(800)], float)
+    frames = np.array([expose(np.full((4, 5, 3), 0.5), spec.capture, rng) for _ in range(800)], float)
     assert (np.ptp(frames, axis=(1, 2, 3)) == 0).all()
     few = 0.08  # relative: 800 draws give a sd to 2.5 %
     assert frames[:, 0, 0, 0].std() == pytest.approx(0.05 * 0.5 * 255, rel=few)
@@ -149,10 +151,10 @@ def test_noise_is_new_in_every_frame_and_the_same_for_the_same_seed():
     light = np.full((50, 50), 0.2)
     spec = changed(CURVED, response={"read_noise": 1e-2, "brightness_drift": 0.01})
     rng = np.random.default_rng(5)
-    first, second = expose(light, spec, rng), expose(light, spec, rng)
+    first, second = expose(light, spec.capture, rng), expose(light, spec.capture, rng)
     assert (first != second).any()
-    assert (expose(light, spec, np.random.default_rng(5)) == first).all()
-    assert (expose(light, spec) == expose(light, CURVED)).all(), "no generator, no noise and no drift"
+    assert (expose(light, spec.capture, np.random.default_rng(5)) == first).all()
+    assert (expose(light, spec.capture) == expose(light, CURVED.capture)).all(), "no generator, no noise and no drift"
 
 
 def test_blur_widens_an_edge_by_its_sigma():
@@ -208,9 +210,9 @@ def test_vignetting_takes_its_share_at_the_corners_and_falls_with_the_square():
 def test_sharpening_leaves_even_light_and_overshoots_at_an_edge():
     sharp = changed(PLAIN, response={"sharpening": 1.0, "sharpening_sigma_px": 1.5})
     light = np.full((40, 40), 0.2)
-    assert (expose(light, sharp) == expose(light, PLAIN)).all()
+    assert (expose(light, sharp.capture) == expose(light, PLAIN.capture)).all()
     light[:, 20:] = 0.6
-    row = expose(light, sharp)[20].astype(int)
+    row = expose(light, sharp.capture)[20].astype(int)
     assert row[:20].min() < 51 - 10 and row[20:].max() > 153 + 10 and row[0] == 51 and row[-1] == 153
 
 
@@ -255,7 +257,7 @@ def test_noise_is_smoothed_but_not_sharpened():
     noise = {"read_noise": 0.01, "noise_sigma_px": 0.0}
     sd = {}
     for name, more in (("plain", {}), ("sharp", {"sharpening": 2.0}), ("smooth", {"noise_sigma_px": 0.6})):
-        sd[name] = expose(light, changed(PLAIN, response=noise | more), np.random.default_rng(0)).std()
+        sd[name] = expose(light, changed(PLAIN, response=noise | more).capture, np.random.default_rng(0)).std()
     assert sd["sharp"] == sd["plain"] > 1.2 * sd["smooth"]
 
 
@@ -264,20 +266,22 @@ def test_a_window_of_a_frame_is_exposed_as_the_frame_is():
     spec = changed(CURVED, **FULL)
     spec = changed(spec, response={"jpeg_quality": 80})
     x0, y0, border = 21, 13, 16 + 16
-    whole = expose(picture(), spec)
-    part = expose(picture()[y0:118, x0:157], spec, origin_px=(x0, y0))
+    whole = expose(picture(), spec.capture)
+    part = expose(picture()[y0:118, x0:157], spec.capture, origin_px=(x0, y0))
     gray_levels = 2  # sums of floats in another order may round to either side before the stream does
     apart = np.abs(part[border:-border, border:-border].astype(int) - whole[y0:118, x0:157][border:-border, border:-border])
     assert apart.mean() < 0.01 and apart.max() <= gray_levels
-    without = expose(picture()[y0:118, x0:157], spec)[border:-border, border:-border].astype(int)
+    without = expose(picture()[y0:118, x0:157], spec.capture)[border:-border, border:-border].astype(int)
     assert np.abs(without - whole[y0:118, x0:157][border:-border, border:-border]).mean() > 1, "the origin has no effect"
 
 
 @pytest.mark.parametrize("mono", [False, True])
 def test_a_stream_of_lower_quality_is_further_from_the_frame(mono):
     light = picture()[..., 1] if mono else picture()
-    clean = expose(light, PLAIN).astype(float)
-    errors = [np.sqrt(((expose(light, changed(PLAIN, response={"jpeg_quality": q})) - clean) ** 2).mean()) for q in (98, 80, 40, 10)]
+    clean = expose(light, PLAIN.capture).astype(float)
+    errors = [
+        np.sqrt(((expose(light, changed(PLAIN, response={"jpeg_quality": q}).capture) - clean) ** 2).mean()) for q in (98, 80, 40, 10)
+    ]
     fine_gray = 2 if mono else 6  # gray levels; the finest stream still halves the resolution of colour
     assert errors == sorted(errors) and errors[0] < fine_gray and errors[-1] > 1.5 * errors[0]
 
@@ -285,7 +289,10 @@ def test_a_stream_of_lower_quality_is_further_from_the_frame(mono):
 def test_a_stream_keeps_colours_in_their_channels():
     light = np.full((64, 64, 3), (0.7, 0.4, 0.1))
     gray_levels = 2  # colour is rounded in another space
-    assert np.abs(expose(light, changed(PLAIN, response={"jpeg_quality": 95})).astype(int) - expose(light, PLAIN)).max() <= gray_levels
+    assert (
+        np.abs(expose(light, changed(PLAIN, response={"jpeg_quality": 95}).capture).astype(int) - expose(light, PLAIN.capture)).max()
+        <= gray_levels
+    )
 
 
 def test_the_curve_is_the_inverse_of_its_power_law():

@@ -26,7 +26,7 @@ from twin.mechanics.solver import SkinSolver
 from twin.preprocess import nominal_reference
 from twin.preprocess.forms import raw_to_recording
 from twin.projection import project
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.store import atomic, locked
 from twin.types import Form
 
@@ -101,7 +101,7 @@ def test_a_state_on_the_way_is_the_end_of_its_own_label(tmp_path):
     truth = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")
     labels = read_arm_labels(_recording(tmp_path / "set", config))
     path_of, fraction = truth["path_id"][:], truth["fraction"][:]
-    solver, stimulus = SkinSolver(config.sensor, resolution=Resolution(config.across)), build_stimulus(config.object)
+    solver, stimulus = SkinSolver(config.sensor, resolution=Resolution(config.across)), build_field(config.object)
     for path in range(2):
         rows = np.flatnonzero(path_of == path)
         assert (np.diff(fraction[rows]) > 0).all() and fraction[rows[-1]] == 1
@@ -109,7 +109,7 @@ def test_a_state_on_the_way_is_the_end_of_its_own_label(tmp_path):
             way = arm_path(rig_of(config.sensor), config.experiment, config.sensor, stimulus, labels[row])
             state = solver.press(stimulus, way.path, friction=0.0)
             assert np.abs(state.T_sensor_object - truth["T_sensor_object"][row]).max() < ARC_MM
-            px = raw_to_recording(config.sensor, project(config.sensor, state.caps_mm))
+            px = raw_to_recording(config.sensor, project(config.sensor.view, state.caps_mm))
             assert np.abs(px - truth["caps_px"][row]).max() < SAME_STATE_PX
 
 

@@ -35,12 +35,12 @@ def sensor():
 
 @pytest.fixture(scope="module")
 def mesh(sensor):
-    return build_mesh(sensor)
+    return build_mesh(sensor.geometry)
 
 
 @pytest.fixture(scope="module")
 def solid(sensor):
-    return build_solid(sensor, resolution=Resolution(across=8), focus=Focus(0.4, 1.0))
+    return build_solid(sensor.geometry, resolution=Resolution(across=8), focus=Focus(0.4, 1.0))
 
 
 def square_points(count=300, seed=0):
@@ -172,7 +172,7 @@ def test_disc_points_undo_dome_points():
 @pytest.mark.parametrize("polar_deg", [0, 30, 60, 90])
 def test_every_element_has_positive_volume(sensor, across, skin_layers, gel_layers, polar_deg):
     focus = Focus(np.radians(polar_deg), 0.7)
-    solid = build_solid(sensor, resolution=Resolution(across, skin_layers, gel_layers), focus=focus)
+    solid = build_solid(sensor.geometry, resolution=Resolution(across, skin_layers, gel_layers), focus=focus)
     assert all(cells.weights_mm3.min(initial=1) > 0 for cells in all_cells(solid))
     counts = [len(cells.controls) for cells in all_cells(solid)]
     assert counts == [skin_layers * across**2, across**2, (gel_layers - 1) * (across // 2) ** 2]
@@ -186,7 +186,7 @@ def test_volumes_converge_to_the_shell_s_and_the_gel_s(sensor):
     gel = 2 / 3 * np.pi * inner**3 + np.pi * inner**2 * (skin.rim_z_mm - lens.z_mm)
     errors = []
     for across in (8, 16, 32):
-        cells = all_cells(build_solid(sensor, resolution=Resolution(across=across), focus=Focus(0.4, 1.0)))
+        cells = all_cells(build_solid(sensor.geometry, resolution=Resolution(across=across), focus=Focus(0.4, 1.0)))
         volumes = [c.weights_mm3.sum() for c in cells]
         errors.append([volumes[0] / shell - 1, (volumes[1] + volumes[2]) / gel - 1])
     errors = np.abs(errors)
@@ -199,7 +199,7 @@ def test_the_skin_s_surfaces_lie_on_their_spheres(sensor, depth, layer):
     radius = sensor.skin.outer_radius_mm - depth * sensor.skin.thickness_mm
     off = []
     for across in (16, 32):
-        solid = build_solid(sensor, resolution=Resolution(across=across), focus=Focus(0.4, 1.0))
+        solid = build_solid(sensor.geometry, resolution=Resolution(across=across), focus=Focus(0.4, 1.0))
         controls = solid.control_mm.reshape(-1, 3)[layer * solid.basis.count**2 :][: solid.basis.count**2]
         value, slope_u, slope_v = surface_operators(solid.basis, square_points() * 0.95)
         places = value @ controls
@@ -215,7 +215,7 @@ def test_every_layer_passes_through_the_body_at_its_greville_points(sensor, soli
     at = np.column_stack([u.ravel(), v.ravel()])
     below = solid.control_mm[solid.inner.stop :].reshape(len(solid.through.greville) - 1, -1, 3)
     for depth, controls in zip(solid.through.greville[1:], below, strict=True):
-        wanted = body_points(sensor, solid.chart.disc(at), depth)
+        wanted = body_points(sensor.geometry, solid.chart.disc(at), depth)
         assert np.abs(surface_operators(solid.coarse, at)[0] @ controls - wanted).max() < ROUNDING_MM
 
 
@@ -245,8 +245,8 @@ def test_a_solid_too_coarse_or_odd_is_refused():
 @pytest.mark.parametrize("focus", [Focus(), Focus(0.9, 2.0)])
 def test_pins_at_rest_are_the_specification_s(name, focus):
     spec = load_sensor(name)
-    solid = build_solid(spec, resolution=Resolution(across=16), focus=focus)
-    pins = rest_pins(spec)
+    solid = build_solid(spec.geometry, resolution=Resolution(across=16), focus=focus)
+    pins = rest_pins(spec.geometry)
     base, axis, caps = pin_pose(solid, solid.control_mm)
     for got, wanted in ((base, pins.base_mm), (axis, pins.axis), (caps, pins.caps_mm)):
         assert np.abs(got - wanted).max() < ROUNDING_MM
@@ -263,7 +263,7 @@ def test_pins_rotate_with_a_rigid_motion(solid):
 
 def test_caps_follow_the_slope_of_a_smooth_bulge(sensor):
     """On x -> x + bump(x), the axis is minus the exact normal of the bumped sphere."""
-    solid = build_solid(sensor, resolution=Resolution(across=16))
+    solid = build_solid(sensor.geometry, resolution=Resolution(across=16))
 
     def bump(points):
         return points * (1 - 0.05 * np.exp(-(points[:, 0] ** 2 + points[:, 1] ** 2) / 60))[:, None]
@@ -273,7 +273,7 @@ def test_caps_follow_the_slope_of_a_smooth_bulge(sensor):
     moved = solid.control_mm.copy()
     moved[solid.inner] = np.linalg.solve(value, bump(value @ solid.control_mm[solid.inner]))
     base, axis, _ = pin_pose(solid, moved)
-    rest, step = rest_pins(sensor).base_mm, 1e-5
+    rest, step = rest_pins(sensor.geometry).base_mm, 1e-5
     helper = np.where(np.abs(rest[:, [2]]) < 10, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(rest, helper) / 19
     second = np.cross(rest, first) / 19
@@ -289,7 +289,8 @@ def test_caps_follow_the_slope_of_a_smooth_bulge(sensor):
 
 def test_the_mesh_s_surfaces_lie_on_their_spheres_and_quads_face_away_from_the_centre(sensor, mesh):
     outer = sensor.skin.outer_radius_mm
-    for quads, radius in ((mesh.outer_quads, outer), (mesh.inner_quads, outer - sensor.skin.thickness_mm)):
+    outer_quads = mesh.inner_quads - mesh.skin_layers * mesh.grid[1] * mesh.grid[2]  # nodes are numbered layer by layer from the outside
+    for quads, radius in ((outer_quads, outer), (mesh.inner_quads, outer - sensor.skin.thickness_mm)):
         corners = mesh.nodes_mm[quads]
         assert np.abs(np.linalg.norm(corners, axis=2) - radius).max() < ROUNDING_MM
         normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
@@ -304,8 +305,8 @@ def test_nodes_rest_exactly_and_follow_an_affine_motion(sensor, mesh, gel_layers
     shift, slope = np.array([0.3, -0.1, 0.2]), 0.1 * rotation([1, 2, 3], 0.8)
     off = []
     for across in (16, 32):
-        solid = build_solid(sensor, resolution=Resolution(across, skin_layers, gel_layers), focus=Focus(0.4, 1.0))
-        view = NodeView.of(sensor, mesh, solid)
+        solid = build_solid(sensor.geometry, resolution=Resolution(across, skin_layers, gel_layers), focus=Focus(0.4, 1.0))
+        view = NodeView.of(mesh, solid)
         assert np.array_equal(view.nodes(solid.control_mm), mesh.nodes_mm)
         assert np.abs(view.nodes(solid.control_mm + shift) - (mesh.nodes_mm + shift)).max() < ROUNDING_MM
         moved = view.nodes(solid.control_mm + solid.control_mm @ slope.T) - (mesh.nodes_mm + mesh.nodes_mm @ slope.T)
@@ -315,7 +316,7 @@ def test_nodes_rest_exactly_and_follow_an_affine_motion(sensor, mesh, gel_layers
 
 
 def test_nodes_in_the_rim_on_the_wall_and_on_the_lens_never_move(sensor, mesh, solid):
-    view = NodeView.of(sensor, mesh, solid)
+    view = NodeView.of(mesh, solid)
     moved = solid.control_mm + np.where(solid.fixed, 0, 1)[:, None] * np.random.default_rng(0).normal(size=solid.control_mm.shape)
     motion = np.linalg.norm(view.nodes(moved) - mesh.nodes_mm, axis=1).reshape(mesh.grid)
     assert motion[-1].max() == 0

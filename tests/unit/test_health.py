@@ -83,7 +83,7 @@ def test_a_contact_is_not_taken_for_a_nearer_camera(contact):
     """The gel bulges at the rim by 1 to 4 %; what is left of the scale is within the limit of a well sensor, a zoomed camera is not."""
     spec = load_sensor("mg400-331")
     reference = nominal_reference(spec, Form.RAW)
-    seen = cap_truth(spec, rest_pins(spec), pins_under(spec, contact), Form.RAW).caps_px
+    seen = cap_truth(spec, rest_pins(spec.geometry), pins_under(spec, contact), Form.RAW).caps_px
     drift = drift_of(seen, reference.pins_px, reference.outmost)
     assert drift.scale > 1.008 and abs(drift.scale_at_rest - 1) < 0.015
     zoomed = drift_of(1.05 * seen, reference.pins_px, reference.outmost)

@@ -11,7 +11,7 @@ from twin.mechanics.contact import STICK_CREEP_MM, contact_forces, spread_forces
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import plan_path
 from twin.projection import project
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 
 SOLVER_MM = 1e-4  # what the residual's tolerance leaves open in a position
 BALANCE = 1e-6  # relative to the force: the residual's tolerance
@@ -51,7 +51,7 @@ def tilted(request, sensor):
 @pytest.mark.parametrize("friction", [0.0, 0.6])
 @pytest.mark.parametrize("soften, bound_n", [(1.0, np.inf), (0.1, np.inf), (1.0, 0.02)])
 def test_contact_stiffness_is_minus_the_derivative_of_its_forces(name, friction, soften, bound_n):
-    field, generator, count = build_stimulus(load_object(name)), np.random.default_rng(5), 400
+    field, generator, count = build_field(load_object(name)), np.random.default_rng(5), 400
     at = np.column_stack([generator.normal(scale=2, size=(count, 2)), np.zeros(count)])
     for _ in range(3):
         distance, normal, _ = field.probe(at)
@@ -74,7 +74,7 @@ def test_contact_stiffness_is_minus_the_derivative_of_its_forces(name, friction,
 
 
 def test_point_forces_are_normal_plus_friction_in_the_cone_and_slip_is_on_it():
-    field, generator = build_stimulus(load_object("sphere")), np.random.default_rng(5)
+    field, generator = build_field(load_object("sphere")), np.random.default_rng(5)
     at = np.column_stack([generator.normal(scale=1, size=(300, 2)), np.full(300, 0.2)])
     anchor, mu = at + generator.normal(scale=0.01, size=at.shape), generator.uniform(0, 1, 300)
     found = contact_forces(field, at, np.full(300, 2.0), anchor, mu)
@@ -152,7 +152,7 @@ def test_the_clamps_carry_the_force_and_its_torque(tilted):
 
 def test_nothing_lies_deeper_in_the_object_than_the_bound(tilted):
     solver, spec, state = tilted
-    T, field = state.T_sensor_object, build_stimulus(spec)
+    T, field = state.T_sensor_object, build_field(spec)
     at = solver.setting.body.points.positions(solver.state.control_mm)
     gap = field.distance((at - T[:3, 3]) @ T[:3, :3])
     assert gap.min() >= -GAP_BOUND_MM * 1.0001
@@ -179,11 +179,11 @@ def test_friction_vanishes_without_friction_and_slides_at_its_coefficient(solver
 
 
 def test_more_friction_drags_the_pins_further_along_the_shear(solver, sensor):
-    rest = project(sensor, solver.rest().caps_mm)
+    rest = project(sensor.view, solver.rest().caps_mm)
     moved = []
     for mu in (0.0, 0.2, 1.0):
         state = solver.press(load_object("plane"), ContactPose(2.0, shear_mm=(1.2, 0.0)), friction=mu)
-        moved.append((project(sensor, state.caps_mm) - rest).mean(axis=0)[0])
+        moved.append((project(sensor.view, state.caps_mm) - rest).mean(axis=0)[0])
     assert abs(moved[0]) < 0.1 < moved[1] < moved[2]
 
 
@@ -196,10 +196,10 @@ def test_tilt_presses_the_side_that_comes_first(solver):
 
 
 def test_area_force_energy_and_mean_spread_grow_with_depth(solver, sensor):
-    rest = project(sensor, solver.rest().caps_mm)
+    rest = project(sensor.view, solver.rest().caps_mm)
     centre, path = rest[0], []
     for _, state in solver.path(load_object("plane"), ContactPose(4.5)):
-        radial = np.linalg.norm(project(sensor, state.caps_mm) - centre, axis=1) - np.linalg.norm(rest - centre, axis=1)
+        radial = np.linalg.norm(project(sensor.view, state.caps_mm) - centre, axis=1) - np.linalg.norm(rest - centre, axis=1)
         path.append((state.force_n[2], radial.mean(), state.area_mm2, state.elastic_nmm))
     force, spread, area, energy = np.array(path).T
     assert (np.diff(force) > 0).all() and (np.diff(energy) > 0).all()
@@ -231,8 +231,8 @@ def turned(plan, angle_rad):
 @pytest.mark.parametrize("angle_deg", [90, 15, -105])
 def test_a_scene_turned_by_steps_of_the_focus_gives_the_turned_answer(solver, friction, angle_deg):
     """Off the axis the grid turns with the contact, by steps of 15 deg: all is the same but rounding."""
-    field = build_stimulus(load_object("cylinder"))
-    plan = plan_path(solver.spec, field, ContactPose(2.0, tilt_deg=(0.0, 20.0), shear_mm=(0.8, 0.3), offset_mm=(2.0, 0.0)))
+    field = build_field(load_object("cylinder"))
+    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, tilt_deg=(0.0, 20.0), shear_mm=(0.8, 0.3), offset_mm=(2.0, 0.0)))
     state = solver.press(field, plan, friction=friction)
     control, at = solver.state.control_mm, state.T_sensor_object
     plan, turn = turned(plan, np.radians(angle_deg))
@@ -249,8 +249,8 @@ def test_a_scene_turned_by_steps_of_the_focus_gives_the_turned_answer(solver, fr
 @pytest.mark.parametrize("name", ["plane", "sphere"])
 def test_a_scene_turned_by_any_angle_gives_about_the_turned_answer(solver, name):
     """On the axis the grid stays, off the axis it turns by a rounded angle: the answers differ by the grid's error."""
-    field = build_stimulus(load_object(name))
-    plan = plan_path(solver.spec, field, ContactPose(2.0, tilt_deg=(10.0, 0.0), shear_mm=(0.8, 0.3)))
+    field = build_field(load_object(name))
+    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, tilt_deg=(10.0, 0.0), shear_mm=(0.8, 0.3)))
     state = solver.press(field, plan, friction=0.5)
     plan, turn = turned(plan, np.radians(37))
     other = solver.press(field, plan, friction=0.5)
@@ -260,8 +260,8 @@ def test_a_scene_turned_by_any_angle_gives_about_the_turned_answer(solver, name)
 
 
 def test_a_contact_on_the_axis_turned_by_a_quarter_turns_the_nodes(solver):
-    field = build_stimulus(load_object("plane"))
-    plan = plan_path(solver.spec, field, ContactPose(2.0, shear_mm=(0.8, 0.3)))
+    field = build_field(load_object("plane"))
+    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, shear_mm=(0.8, 0.3)))
     state = solver.press(field, plan, friction=0.5)
     plan, turn = turned(plan, np.pi / 2)
     other = solver.press(field, plan, friction=0.5)
@@ -324,7 +324,7 @@ def test_other_laws_press_alike_at_little_indentation_and_yeoh_stiffer_at_more(s
 
 
 def drags(solver, friction, shear_mm=3.0, step_mm=0.1):
-    plan = plan_path(solver.spec, build_stimulus(load_object("plane")), ContactPose(1.5, shear_mm=(shear_mm, 0.0)))
+    plan = plan_path(solver.spec.geometry, build_field(load_object("plane")), ContactPose(1.5, shear_mm=(shear_mm, 0.0)))
     states = [(at, state) for at, state in solver.path(load_object("plane"), plan, friction=friction, step_mm=step_mm) if at > 0.5]
     return np.array([-state.force_n[0] / state.force_n[2] for _, state in states]), states
 

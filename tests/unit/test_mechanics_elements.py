@@ -20,7 +20,7 @@ PLATE = 0.03  # relative: a strip 20 thicknesses long against plate theory
 
 @pytest.fixture(scope="module")
 def solid():
-    return build_solid(load_sensor("mg400-331"), resolution=Resolution(8), focus=Focus(0.3, 0.5))
+    return build_solid(load_sensor("mg400-331").geometry, resolution=Resolution(8), focus=Focus(0.3, 0.5))
 
 
 @pytest.fixture(scope="module", params=["skin", "gel", "dome skin", "dome gel top", "dome gel"])

@@ -18,7 +18,7 @@ REFINED = 1e-9  # relative: after the residual, in double precision, was solved 
 
 @pytest.fixture(scope="module")
 def solid():
-    return build_solid(load_sensor("mg400-331"), resolution=Resolution(8))
+    return build_solid(load_sensor("mg400-331").geometry, resolution=Resolution(8))
 
 
 @pytest.fixture(scope="module")

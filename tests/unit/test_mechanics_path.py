@@ -12,7 +12,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics import ContactPath, ContactPose, Friction, SkinSolver
 from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
 from twin.mechanics.path import plan_path
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 
 SOLVER_MM = 1e-4  # what the residual's tolerance leaves open in a position
 STEP_SHARE = 0.03  # of the largest motion: load steps half as large, with friction
@@ -126,7 +126,7 @@ def test_skin_is_touched_wherever_the_object_meets_it(sensor, name, pose_, acros
 
 
 def test_an_object_that_crosses_the_dome_between_two_free_poses_touches_it(solver):
-    field = build_stimulus(load_object("sphere"))
+    field = build_field(load_object("sphere"))
     aside = pose(-24, 0, -1), pose(24, 0, -1)
     states = [state for _, state in solver.path(field, through(*aside), friction=0.0)]
     force = np.array([state.force_n[2] for state in states])
@@ -152,8 +152,8 @@ def test_every_state_s_progress_is_told_in_order(solver):
 
 @pytest.mark.parametrize("name, offset", [("plane", (0, 0)), ("sphere", (3, -4)), ("edge", (-2, 0)), ("mesh-can", (1, 1))])
 def test_path_starts_at_first_touch(sensor, name, offset):
-    field = build_stimulus(load_object(name))
-    T = plan_path(sensor, field, ContactPose(1.0, tilt_deg=(10.0, 5.0), offset_mm=offset)).at(0.0)
+    field = build_field(load_object(name))
+    T = plan_path(sensor.geometry, field, ContactPose(1.0, tilt_deg=(10.0, 5.0), offset_mm=offset)).at(0.0)
     angle = np.linspace(0, 2 * np.pi, 721)
     polar, azimuth = np.meshgrid(angle[:181], angle)
     dome = 20.0 * np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1).reshape(-1, 3)

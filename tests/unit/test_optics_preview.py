@@ -8,6 +8,7 @@ from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
 from twin.optics.direct_light import DirectLight
+from twin.optics.lights import lights
 from twin.optics.preview import Preview, Shading
 from twin.projection import pixel_rays, project
 
@@ -44,6 +45,10 @@ def straight(small) -> SensorSpec:
     return changed(small, camera=camera, leds={"azimuth_deg": tuple(60.0 * k for k in range(6))}, pins={"phase_deg": 0.0})
 
 
+def direct_light(spec: SensorSpec) -> DirectLight:
+    return DirectLight(spec.lens, spec.gel, lights(spec.leds, spec.housing))
+
+
 def area_and_centroid(polygon: np.ndarray) -> tuple[float, np.ndarray]:
     """Of a closed polygon (K, 2)."""
     after = np.roll(polygon, -1, axis=0)
@@ -53,11 +58,11 @@ def area_and_centroid(polygon: np.ndarray) -> tuple[float, np.ndarray]:
 
 def projected_discs(spec: SensorSpec) -> list[np.ndarray]:
     """Outlines (72, 2) of the caps' discs at rest."""
-    rest, turn, found = rest_pins(spec), np.linspace(0, 2 * np.pi, 73)[:-1, None], []
+    rest, turn, found = rest_pins(spec.geometry), np.linspace(0, 2 * np.pi, 73)[:-1, None], []
     for centre, axis in zip(rest.caps_mm, rest.axis, strict=True):
         u = np.cross(axis, [0.3, 0.9, 0.1])
         u /= np.linalg.norm(u)
-        found.append(project(spec, centre + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))))
+        found.append(project(spec.view, centre + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))))
     return found
 
 
@@ -84,8 +89,8 @@ def test_all_light_that_enters_the_gel_crosses_each_plane_in_it(depth_mm):
     cone = angle < 1.2  # where the plane's rings stay narrow
     expected = np.sum((passed * np.cos(angle) * 2 * np.pi * np.sin(angle))[cone]) * (angle[1] - angle[0])
     points = np.stack([out[0] + rho, np.full_like(rho, out[1]), np.full_like(rho, spec.lens.z_mm + depth_mm)], axis=1)
-    light = DirectLight(spec)(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)))[:, 1]
-    strength = DirectLight(changed(spec, gel={"refractive_index": 1.0}))(np.array([[*out, 1e4]]), np.array([[0.0, 0.0, -1.0]]))[0, 1]
+    light = direct_light(spec)(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)))[:, 1]
+    strength = direct_light(changed(spec, gel={"refractive_index": 1.0}))(np.array([[*out, 1e4]]), np.array([[0.0, 0.0, -1.0]]))[0, 1]
     flux = strength * (1e4 - spec.leds.z_mm) ** 2  # radiance times area: all indices 1, seen from far away
     ring = np.gradient(rho) * 2 * np.pi * rho
     quadrature = 2e-3
@@ -93,9 +98,9 @@ def test_all_light_that_enters_the_gel_crosses_each_plane_in_it(depth_mm):
 
 
 def test_a_way_to_the_camera_is_the_ray_of_the_pixel(small):
-    rest = rest_pins(small)
-    toward, length = DirectLight(small).ways(rest.caps_mm, np.array([0.0, 0.0, -small.camera.distance_mm]))
-    entry, inward = pixel_rays(small, project(small, rest.caps_mm))
+    rest = rest_pins(small.geometry)
+    toward, length = direct_light(small).ways(rest.caps_mm, np.array([0.0, 0.0, -small.camera.distance_mm]))
+    entry, inward = pixel_rays(small.view, project(small.view, rest.caps_mm))
     np.testing.assert_allclose(toward, -inward, atol=1e-5)
     np.testing.assert_allclose(rest.caps_mm + length[:, None] * toward, entry, atol=1e-3)
 
@@ -125,16 +130,16 @@ def test_outlines_of_their_own_keep_to_their_shape(small):
         Preview(changed(clear, appearance={"cap_shapes": s}), light=evenly, static=NOTHING).render() for s in ((), ((0.0, 0.2, 0.0),) * 19)
     )
     assert oval.sum() / round_.sum() == pytest.approx(1 + 0.2**2 / 2, rel=0.01)
-    u, v = np.rint(project(clear, rest_pins(clear).caps_mm[0])).astype(int)
+    u, v = np.rint(project(clear.view, rest_pins(clear.geometry).caps_mm[0])).astype(int)
     wider, lower = (oval - round_)[v, u - 9 : u + 10].sum(), (oval - round_)[v - 9 : v + 10, u].sum()
     assert wider > 0.1 and lower < -0.1
 
 
 def test_moving_one_cap_changes_its_neighbourhood_only(small):
-    preview, rest = Preview(small, static=NOTHING), rest_pins(small)
+    preview, rest = Preview(small, static=NOTHING), rest_pins(small.geometry)
     after, before = preview.render(moved(rest, 4, (0.3, 0.2, -0.4))), preview.render()
     y, x = np.nonzero(after != before)
-    away = np.hypot(x - project(small, rest.caps_mm[4])[0], y - project(small, rest.caps_mm[4])[1])
+    away = np.hypot(x - project(small.view, rest.caps_mm[4])[0], y - project(small.view, rest.caps_mm[4])[1])
     reach_px = 12.0  # of a stem and cap of 4 mm
     assert len(away) > 20 and away.max() < reach_px
     assert (preview.render() == before).all()
@@ -145,7 +150,7 @@ def test_a_turned_scene_is_a_turned_picture(straight):
     pictures = [Preview(changed(straight, leds={"off": (k,)}), static=NOTHING).render() for k in (0, 3)]
     rounding = 1e-4
     np.testing.assert_allclose(pictures[0], pictures[1][::-1, ::-1], atol=rounding * pictures[0].max())
-    places = np.rint(project(straight, rest_pins(straight).caps_mm[7:])).astype(int)
+    places = np.rint(project(straight.view, rest_pins(straight.geometry).caps_mm[7:])).astype(int)
     near, next_ = (np.array([p[v - 2 : v + 3, u - 2 : u + 3].mean() for u, v in places])
                    for p in (Preview(changed(straight, leds={"off": (k,)}), static=NOTHING).render() for k in (0, 1)))  # fmt: skip
     np.testing.assert_allclose(np.roll(near, 2), next_, rtol=0.01)
@@ -168,7 +173,7 @@ def test_light_is_proportional_to_the_leds(small):
 def test_levels_scale_their_caps(small):
     levels = tuple(0.5 + 0.02 * k for k in range(19))
     even, own = (Preview(changed(small, appearance={"cap_levels": each}), static=NOTHING).render() for each in ((), levels))
-    places = np.rint(project(small, rest_pins(small).caps_mm)).astype(int)
+    places = np.rint(project(small.view, rest_pins(small.geometry).caps_mm)).astype(int)
     np.testing.assert_allclose([own[v, u] / even[v, u] for u, v in places], levels, rtol=1e-4)
 
 
@@ -177,7 +182,7 @@ def test_an_absorbing_gel_takes_most_of_its_own_colour(small):
     clear, blue = (
         Preview(changed(color, gel={"absorption_per_mm": a}), static=NOTHING).render() for a in ((0.0, 0.0, 0.0), (0.02, 0.01, 0.0))
     )
-    u, v = np.rint(project(small, rest_pins(small).caps_mm[0])).astype(int)
+    u, v = np.rint(project(small.view, rest_pins(small.geometry).caps_mm[0])).astype(int)
     kept = blue[v, u] / clear[v, u]
     way_mm = 2 * 20.0  # in and out of the gel, at least
     assert kept[2] == pytest.approx(1) and kept[1] < np.exp(-0.01 * 0.9 * way_mm)
@@ -201,10 +206,10 @@ def test_what_is_static_lies_over_the_gel(small):
 def test_a_nearer_cap_hides_a_farther_one(small, towards_mm, seen):
     """Pin 1 (level 0.5) is put before, then behind pin 0 (level 1)."""
     levels = (1.0, 0.5, *[1.0] * 17)
-    rest = rest_pins(small)
+    rest = rest_pins(small.geometry)
     state = moved(rest, 1, rest.caps_mm[0] - rest.caps_mm[1] + [0.0, 0.0, towards_mm])
     image = Preview(changed(small, appearance={"cap_levels": levels}), light=evenly, static=NOTHING).render(state)
-    u, v = np.rint(project(small, rest.caps_mm[0])).astype(int)
+    u, v = np.rint(project(small.view, rest.caps_mm[0])).astype(int)
     window_takes = 0.05
     assert image[v, u] == pytest.approx(seen * 0.8 / np.pi, rel=window_takes)
 
@@ -227,7 +232,7 @@ def test_calibration_finds_the_shading_of_a_frame(channels):
 
 def test_calibration_finds_where_the_skin_is_shaded():
     spec = changed(plain(), pins={"rings": 4}, appearance={"cap_levels": (), "cap_shapes": ()})
-    preview, feet = Preview(spec, static=NOTHING), rest_pins(spec).base_mm
+    preview, feet = Preview(spec, static=NOTHING), rest_pins(spec.geometry).base_mm
     shade = np.ones_like(preview.calibrate(preview).skin)
     shade[: len(feet), 0] = 1 - 0.3 * np.exp(-np.sum((feet[:, :2] - [6.0, 2.0]) ** 2, axis=1) / (2 * 6.0**2))
     shaded = Preview(spec, static=NOTHING, shading=Shading(skin=shade))
@@ -238,6 +243,6 @@ def test_calibration_finds_where_the_skin_is_shaded():
 
 
 def test_a_state_of_another_sensor_is_refused(small):
-    rest = rest_pins(small)
+    rest = rest_pins(small.geometry)
     with pytest.raises(RenderError, match="19"):
         Preview(small, static=NOTHING).render(PinRest(rest.base_mm[:5], rest.axis[:5], rest.caps_mm[:5]))

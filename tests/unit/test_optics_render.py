@@ -45,19 +45,19 @@ def centroids(image: np.ndarray, near_px: np.ndarray) -> np.ndarray:
 
 def cap_light(image: np.ndarray, spec: SensorSpec, rest: PinRest) -> np.ndarray:
     """Mean light of each cap (N,), over 5 x 5 px at its projection."""
-    places = np.rint(project(spec, rest.caps_mm)).astype(int)
+    places = np.rint(project(spec.view, rest.caps_mm)).astype(int)
     return np.array([image[v - 2 : v + 3, u - 2 : u + 3].mean() for u, v in places])
 
 
 def projected_caps(spec: SensorSpec) -> np.ndarray:
     """Centroids (N, 2) of the outlines of the projected cap discs (polygon area formula)."""
-    rest, turn = rest_pins(spec), np.linspace(0, 2 * np.pi, 73)[:, None]
+    rest, turn = rest_pins(spec.geometry), np.linspace(0, 2 * np.pi, 73)[:, None]
     found = []
     for centre, axis in zip(rest.caps_mm, rest.axis, strict=True):
         u = np.cross(axis, [0.3, 0.9, 0.1])
         u /= np.linalg.norm(u)
         rim = centre + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
-        p = project(spec, rim)
+        p = project(spec.view, rim)
         twice = p[:-1, 0] * p[1:, 1] - p[1:, 0] * p[:-1, 1]
         found.append(((p[:-1] + p[1:]) * twice[:, None]).sum(axis=0) / (3 * twice.sum()))
     return np.array(found)
@@ -73,7 +73,7 @@ def test_a_rendered_cap_is_where_the_projection_says(small, variant, tolerance_p
     assert np.sqrt(((found - expected) ** 2).sum(axis=1).mean()) < tolerance_px
     assert np.abs((found - expected).mean(axis=0)).max() < tolerance_px / 2, "a systematic shift"
     shape_px = 0.2  # perspective and distortion move the centroid of a disc this little off its projected centre
-    assert np.abs(expected - project(even, rest_pins(even).caps_mm)).max() < shape_px
+    assert np.abs(expected - project(even.view, rest_pins(even.geometry).caps_mm)).max() < shape_px
 
 
 def test_a_window_is_a_part_of_the_whole_frame(small):
@@ -86,7 +86,7 @@ def test_a_window_is_a_part_of_the_whole_frame(small):
 
 def test_a_dead_led_darkens_its_side_and_turns_with_the_sensor(straight):
     """Switching off LED k + 1 instead of LED k turns the picture by 60 deg: outer cap j takes the place of cap j - 2."""
-    rest = rest_pins(straight)
+    rest = rest_pins(straight.geometry)
     lit = cap_light(Renderer(straight, spp=64).render(), straight, rest)[7:]
     dark = []
     for led in (0, 1):
@@ -99,13 +99,13 @@ def test_a_dead_led_darkens_its_side_and_turns_with_the_sensor(straight):
 
 
 def test_the_picture_of_a_symmetric_sensor_is_symmetric(straight):
-    light = cap_light(Renderer(straight, spp=64).render(), straight, rest_pins(straight))
+    light = cap_light(Renderer(straight, spp=64).render(), straight, rest_pins(straight.geometry))
     noise_relative = 0.02
     np.testing.assert_allclose(light[7:].reshape(6, 2), np.tile(light[7:].reshape(6, 2).mean(axis=0), (6, 1)), rtol=noise_relative)
 
 
 def test_caps_vary_as_specified_in_a_pattern_of_their_own(straight):
-    even, rest = Renderer(straight, spp=64).render(), rest_pins(straight)
+    even, rest = Renderer(straight, spp=64).render(), rest_pins(straight.geometry)
     patterns = []
     for pattern in (0, 0, 1):
         spec = changed(straight, appearance={"cap_variation": 0.1, "cap_pattern": pattern})
@@ -141,7 +141,7 @@ def test_variance_falls_at_least_as_one_over_samples(small):
 
 
 def test_moving_the_vertices_equals_building_anew(small):
-    rest = rest_pins(small)
+    rest = rest_pins(small.geometry)
     shift = np.array([0.4, -0.3, -0.8]) * (rest.base_mm[:, 2:] / 19.0) ** 4
     pressed = PinRest(rest.base_mm + shift, rest.axis, rest.caps_mm + shift)
     moved = Renderer(small, spp=4)
@@ -158,7 +158,7 @@ def test_a_color_camera_sees_three_channels_and_a_mono_one_their_luminance(small
     color = Renderer(changed(small, camera={"channels": "color"}), spp=64).render()
     mono = Renderer(small, spp=64).render()
     assert color.shape == (100, 120, 3) and mono.shape == (100, 120) and color.dtype == mono.dtype == np.float32
-    rest = rest_pins(small)
+    rest = rest_pins(small.geometry)
     luminance = cap_light(color @ np.float32([0.212671, 0.715160, 0.072169]), small, rest)
     interreflection = 0.02  # relative: products of spectra are not products of luminances
     np.testing.assert_allclose(cap_light(mono, small, rest).mean(), luminance.mean(), rtol=interreflection)
@@ -169,7 +169,7 @@ def test_what_cannot_be_rendered_is_refused(small):
         Renderer(small, quality="best")
     with pytest.raises(RenderError, match="window_px"):
         Renderer(small, window_px=(0, 0, 121, 100))
-    rest = rest_pins(small)
+    rest = rest_pins(small.geometry)
     with pytest.raises(RenderError, match="19"):
         Renderer(small, spp=1).render(PinRest(rest.base_mm[:5], rest.axis[:5], rest.caps_mm[:5]))
 
@@ -177,14 +177,14 @@ def test_what_cannot_be_rendered_is_refused(small):
 def test_the_samples_stand_where_pins_are():
     """A ray traced onto a pin belongs to a pixel that counts as near one; bare skin is left out."""
     spec, window = plain(), (200, 150, 400, 350)
-    rest = rest_pins(spec)
-    near = near_pins(spec, rest, window)
+    rest = rest_pins(spec.geometry)
+    near = near_pins(spec.view, spec.pins, spec.appearance, rest, window)
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     across = np.cross(rest.axis, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     way = np.cos(turn)[:, None, None] * across + np.sin(turn)[:, None, None] * np.cross(rest.axis, across)
-    rims = project(spec, rest.caps_mm + 0.5 * spec.pins.cap_diameter_mm * way).reshape(-1, 2)
-    at = np.rint(np.concatenate([rims, project(spec, rest.base_mm)])).astype(int) - window[:2]
+    rims = project(spec.view, rest.caps_mm + 0.5 * spec.pins.cap_diameter_mm * way).reshape(-1, 2)
+    at = np.rint(np.concatenate([rims, project(spec.view, rest.base_mm)])).astype(int) - window[:2]
     at = at[((at >= 0) & (at < 200)).all(axis=1)]
     assert len(at) > 1000 and near[at[:, 1], at[:, 0]].all()
     assert near.mean() < 0.8

@@ -28,7 +28,7 @@ def bare() -> SensorSpec:
 
 def seen_straight(spec: SensorSpec, points_mm: np.ndarray) -> np.ndarray:
     """Pixels of points that are seen through air alone."""
-    return project(changed(spec, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.0}), points_mm)
+    return project(changed(spec, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.0}).view, points_mm)
 
 
 def outline_of(patch, plane_mm: float) -> np.ndarray:
@@ -57,7 +57,7 @@ def test_a_glint_sits_where_the_mirrored_led_projects(bare, face):
     one = changed(bare, leds={"azimuth_deg": (40.0,)}, lens={"refractive_index": index if face == "back" else 1.0})
     light, _ = static_layer(one, WINDOW)
     plane_mm = one.lens.back_mm if face == "back" else one.lens.z_mm
-    patch = led_patches(one)[0]
+    patch = led_patches(one.leds)[0]
     area_px, middle_px = area_and_centroid(seen_straight(one, outline_of(patch, plane_mm)))
     assert centroid(light[..., 0]) == pytest.approx(middle_px, abs=SPOT_PX)
     # Fresnel at the angle under which the mirrored LED is seen
@@ -76,7 +76,7 @@ def test_the_image_in_the_front_face_lies_between_its_place_in_air_and_none(bare
     only_back = changed(thick, gel={"refractive_index": thick.lens.refractive_index})
     both, back = (static_layer(spec, WINDOW)[0][..., 0] for spec in (thick, only_back))
     seems_mm = thick.lens.back_mm + thick.lens.thickness_mm / thick.lens.refractive_index
-    _, expected_px = area_and_centroid(seen_straight(thick, outline_of(led_patches(thick)[0], seems_mm)))
+    _, expected_px = area_and_centroid(seen_straight(thick, outline_of(led_patches(thick.leds)[0], seems_mm)))
     paraxial_px = 0.2
     assert centroid(both - back) == pytest.approx(expected_px, abs=paraxial_px)
 
@@ -88,7 +88,7 @@ def test_a_dead_led_has_neither_glow_nor_glint():
     assert dead == pytest.approx(without, abs=1e-6)
     lost = (lit - dead)[..., 0]
     assert (lost > -1e-6).all() and lost.max() > 0.1
-    towards = project(spec, np.array([[0.0, 0.0, spec.housing.z_mm]]))[0] - centroid(lost)
+    towards = project(spec.view, np.array([[0.0, 0.0, spec.housing.z_mm]]))[0] - centroid(lost)
     assert np.degrees(np.arctan2(-towards[1], -towards[0])) % 360 == pytest.approx(spec.leds.azimuth_deg[2], abs=3)
 
 
@@ -116,13 +116,13 @@ def test_a_speck_hides_its_opacity_and_sends_its_light(bare):
     dark = changed(bare, leds={"off": tuple(range(6))}, appearance={"specks": (speck,)})
     light, cover = static_layer(dark, WINDOW)
     place = np.array([speck.x_mm, speck.y_mm, dark.lens.z_mm])
-    at = np.rint(project(dark, place) - WINDOW[:2]).astype(int)
+    at = np.rint(project(dark.view, place) - WINDOW[:2]).astype(int)
     assert cover[at[1], at[0]] == pytest.approx(speck.opacity, abs=1e-6)
     assert light[at[1], at[0]] == pytest.approx(speck.light, abs=1e-6)
-    assert centroid(cover) == pytest.approx(project(dark, place), abs=SPOT_PX)
+    assert centroid(cover) == pytest.approx(project(dark.view, place), abs=SPOT_PX)
     turn = np.linspace(0, 2 * np.pi, 181)[:-1]
     rim = place + speck.radius_mm * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-    area_px2, _ = area_and_centroid(project(dark, rim))
+    area_px2, _ = area_and_centroid(project(dark.view, rim))
     over_the_disc = 0.01  # relative: distortion varies over it
     assert cover.sum() == pytest.approx(7 / 12 * speck.opacity * area_px2, rel=over_the_disc)
 

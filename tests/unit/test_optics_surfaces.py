@@ -18,8 +18,8 @@ def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 def test_caps_are_discs_about_their_centres_open_below(sensor):
     sensor = sensor.model_copy(update={"appearance": sensor.appearance.model_copy(update={"cap_shapes": (), "cap_offsets": ()})})
-    rest, pins = rest_pins(sensor), sensor.pins
-    surface = caps(sensor, rest.caps_mm, rest.axis)
+    rest, pins = rest_pins(sensor.geometry), sensor.pins
+    surface = caps(sensor.pins, sensor.appearance, rest.caps_mm, rest.axis)
     disc_mm3 = pins.count * np.pi * (pins.cap_diameter_mm / 2) ** 2 * pins.cap_height_mm
     bevel = 0.05  # relative; the outline has the disc's area
     each = surface.vertices_mm.reshape(pins.count, -1, 3)
@@ -34,16 +34,16 @@ def test_caps_are_discs_about_their_centres_open_below(sensor):
 
 
 def test_stems_reach_from_the_skin_to_the_cap(sensor):
-    rest = rest_pins(sensor)
-    each = stems(sensor, rest.base_mm, rest.axis).vertices_mm.reshape(sensor.pins.count, -1, 3)
+    rest = rest_pins(sensor.geometry)
+    each = stems(sensor.pins, rest.base_mm, rest.axis).vertices_mm.reshape(sensor.pins.count, -1, 3)
     height = np.einsum("nvk,nk->nv", each - rest.base_mm[:, None], rest.axis)
     assert (height.min(axis=1) < 0).all(), "a gap between skin and stem"
     np.testing.assert_allclose(height.max(axis=1), sensor.pins.length_mm, atol=1e-9)
 
 
 def test_the_skin_rests_on_its_sphere_and_faces_the_camera(sensor):
-    rest = rest_pins(sensor)
-    skin = SkinSurface(sensor, rest.base_mm)
+    rest = rest_pins(sensor.geometry)
+    skin = SkinSurface(sensor.skin, rest.base_mm)
     vertices = skin.vertices(rest.base_mm)
     inner_mm = sensor.skin.outer_radius_mm - sensor.skin.thickness_mm
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), inner_mm, atol=1e-9)
@@ -54,8 +54,8 @@ def test_the_skin_rests_on_its_sphere_and_faces_the_camera(sensor):
 
 def test_the_skin_passes_through_its_control_points_and_is_smooth_between_them(sensor):
     """A dent given at the pins' feet appears on the fine grid as the same dent."""
-    rest = rest_pins(sensor)
-    skin = SkinSurface(sensor, rest.base_mm)
+    rest = rest_pins(sensor.geometry)
+    skin = SkinSurface(sensor.skin, rest.base_mm)
 
     def dent_mm(points):
         return -2.0 * np.exp(-(points[:, 0] ** 2 + points[:, 1] ** 2) / 8.0**2)[:, None] * [0.0, 0.0, 1.0]
@@ -68,8 +68,8 @@ def test_the_skin_passes_through_its_control_points_and_is_smooth_between_them(s
 
 def test_the_clamped_rim_does_not_move():
     spec = load_sensor("ur5-331")
-    rest = rest_pins(spec)
-    skin = SkinSurface(spec, rest.base_mm)
+    rest = rest_pins(spec.geometry)
+    skin = SkinSurface(spec.skin, rest.base_mm)
     rim = np.abs(skin.rest_mm[:, 2] - spec.skin.rim_z_mm) < 1e-9
     moved = skin.vertices(rest.base_mm + [0.0, 0.0, -1.0])
     clamping_mm = 0.02

@@ -28,7 +28,7 @@ def jit():
 
 @pytest.fixture(scope="module")
 def window() -> Window:
-    return Window.of(load_sensor("mg400-331"))
+    return Window.of(load_sensor("mg400-331").view)
 
 
 def gel_points(count: int = 300) -> np.ndarray:

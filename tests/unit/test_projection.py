@@ -11,8 +11,8 @@ ROUND_TRIP_MM = 1e-9
 
 
 def test_projection_and_rays_are_inverse(sensor):
-    caps = rest_pins(sensor).caps_mm
-    place, direction = pixel_rays(sensor, project(sensor, caps))
+    caps = rest_pins(sensor.geometry).caps_mm
+    place, direction = pixel_rays(sensor.view, project(sensor.view, caps))
     along = (caps[:, 2:] - place[:, 2:]) / direction[:, 2:]
     assert np.abs(place + along * direction - caps).max() < ROUND_TRIP_MM
     assert np.allclose(place[:, 2], sensor.lens.z_mm) and np.allclose(np.linalg.norm(direction, axis=1), 1)
@@ -21,22 +21,22 @@ def test_projection_and_rays_are_inverse(sensor):
 def test_rays_obey_snell_at_both_faces_of_the_window(sensor):
     """The tangential part of index times direction is the same in air and gel, whatever the window between them."""
     pixels = np.random.default_rng(1).uniform([200, 150], [420, 330], (200, 2))
-    _, in_gel = pixel_rays(sensor, pixels)
+    _, in_gel = pixel_rays(sensor.view, pixels)
     bare = sensor.model_copy(
         update={
             "lens": sensor.lens.model_copy(update={"refractive_index": 1.0}),
             "gel": sensor.gel.model_copy(update={"refractive_index": 1.0}),
         }
     )
-    _, in_air = pixel_rays(bare, pixels)
+    _, in_air = pixel_rays(bare.view, pixels)
     assert np.allclose(sensor.gel.refractive_index * in_gel[:, :2], in_air[:, :2], atol=1e-12)
 
 
 def test_the_way_through_the_window_takes_least_time(sensor):
     """Fermat: moving the points of entry does not shorten the optical path from pupil to cap."""
-    caps = rest_pins(sensor).caps_mm[::7]
+    caps = rest_pins(sensor.geometry).caps_mm[::7]
     pupil = np.array([0.0, 0.0, -sensor.camera.distance_mm])
-    front, direction = pixel_rays(sensor, project(sensor, caps))
+    front, direction = pixel_rays(sensor.view, project(sensor.view, caps))
     within = direction[:, :2] * sensor.gel.refractive_index / sensor.lens.refractive_index
     back = front[:, :2] - within / np.sqrt(1 - (within**2).sum(axis=1, keepdims=True)) * sensor.lens.thickness_mm
 
@@ -69,7 +69,7 @@ def test_undistort_inverts_distort_with_every_coefficient():
 
 def test_the_camera_looks_out_of_the_tip_with_x_right_and_y_down(sensor):
     apex = np.array([0.0, 0.0, sensor.skin.outer_radius_mm])
-    origin, right, down = project(sensor, apex + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    origin, right, down = project(sensor.view, apex + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
     assert right[0] > origin[0] + 1 and abs(right[1] - origin[1]) < 0.2
     assert down[1] > origin[1] + 1 and abs(down[0] - origin[0]) < 0.2
 
@@ -85,7 +85,7 @@ def test_lattice_counts_symmetry_and_spacing(layout, rings, count):
 
 
 def test_caps_hang_inside_the_skin_along_its_normal(sensor):
-    pins = rest_pins(sensor)
+    pins = rest_pins(sensor.geometry)
     assert np.allclose(np.linalg.norm(pins.axis, axis=1), 1)
     assert np.allclose(np.linalg.norm(pins.base_mm, axis=1), sensor.skin.outer_radius_mm - sensor.skin.thickness_mm)
     reach = np.linalg.norm(pins.caps_mm - pins.base_mm, axis=1)

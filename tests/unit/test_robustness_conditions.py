@@ -35,7 +35,7 @@ ACTS_ON = {
     "caps-uneven": lambda s: float(np.std(np.log(s.appearance.cap_levels or (1.0,)))),
     "skin-pale": lambda s: s.appearance.skin_albedo[2],
     "skin-swollen": lambda s: s.skin.outer_radius_mm,
-    "camera-shifted": lambda s: float(np.linalg.norm(project(s, np.array([0.0, 0.0, 10.0])))),
+    "camera-shifted": lambda s: float(np.linalg.norm(project(s.view, np.array([0.0, 0.0, 10.0])))),
     "camera-tilted": lambda s: s.camera.tilt_x_deg,
     "camera-zoomed": lambda s: spread(s),
     "camera-distorted": lambda s: -spread(s),
@@ -48,7 +48,7 @@ ACTS_ON = {
 
 def spread(spec):
     """Distance of the outermost pins on the film."""
-    px = project(spec, rest_pins(spec).caps_mm)
+    px = project(spec.view, rest_pins(spec.geometry).caps_mm)
     return float(np.linalg.norm(px[-60:] - px[0], axis=1).mean())
 
 
@@ -63,7 +63,7 @@ def sensor():
 
 @lru_cache(maxsize=1)
 def view():
-    return View.of(sensor(), project(sensor(), rest_pins(sensor()).caps_mm))
+    return View.of(sensor(), project(sensor().view, rest_pins(sensor().geometry).caps_mm))
 
 
 @lru_cache(maxsize=1)
@@ -73,7 +73,7 @@ def light():
 
 @lru_cache(maxsize=1)
 def image():
-    return expose(light(), sensor())
+    return expose(light(), sensor().capture)
 
 
 def hooks(name):
@@ -195,7 +195,7 @@ def detector():
 
 def test_px_per_mm_is_the_projection_s_scale():
     reference = nominal_reference(sensor(), Form.RAW)
-    caps = rest_pins(sensor()).caps_mm
+    caps = rest_pins(sensor().geometry).caps_mm
     apart_mm = np.linalg.norm(caps - caps[0], axis=1)[1:7]
     apart_px = np.linalg.norm(reference.pins_px - reference.pins_px[0], axis=1)[1:7]
     assert view().px_per_mm == pytest.approx((apart_px / apart_mm).mean(), rel=0.1)

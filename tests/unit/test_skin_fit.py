@@ -5,7 +5,7 @@ import pytest
 
 from scenes import load_object, load_sensor
 from twin.geometry.pins import rest_pins
-from twin.geometry.skin_fit import SkinFit, centroid_offset_px, fit_skin
+from twin.geometry.skin_fit import SkinFit, centroid_offset_px
 from twin.mechanics import ContactPose, SkinSolver
 from twin.projection import project
 
@@ -37,7 +37,7 @@ def states(straight):
 
 
 def seen_centroids(spec, caps_mm, axis):
-    return project(spec, caps_mm) + centroid_offset_px(spec, caps_mm, axis)
+    return project(spec.view, caps_mm) + centroid_offset_px(spec.view, spec.pins.cap_diameter_mm, caps_mm, axis)
 
 
 def axis_error_deg(found, true):
@@ -45,7 +45,7 @@ def axis_error_deg(found, true):
 
 
 def test_no_contact_is_found_as_no_contact(straight, fit):
-    rest = rest_pins(straight)
+    rest = rest_pins(straight.geometry)
     found = fit(seen_centroids(straight, rest.caps_mm, rest.axis))
     exact_mm = 1e-4  # the spline's normals differ that little from the sphere's
     np.testing.assert_allclose(found.caps_mm, rest.caps_mm, atol=exact_mm)
@@ -75,27 +75,27 @@ def test_rotated_pins_give_the_rotated_skin(straight, fit, states):
     first = [1 + 3 * ring * (ring - 1) for ring in range(1, straight.pins.rings + 1)]
     rings = [start + (np.arange(6 * (k + 1)) - (k + 1)) % (6 * (k + 1)) for k, start in enumerate(first)]
     order = np.concatenate([[0], *rings])
-    there = fit(project(straight, state.caps_mm), centroids=False).caps_mm
-    turned = fit(project(straight, (state.caps_mm @ turn.T)[order]), centroids=False).caps_mm
+    there = fit(project(straight.view, state.caps_mm), centroids=False).caps_mm
+    turned = fit(project(straight.view, (state.caps_mm @ turn.T)[order]), centroids=False).caps_mm
     grid_mm = 0.05  # the spline's square grid does not turn with the pins
     assert np.linalg.norm(turned - (there @ turn.T)[order], axis=1).mean() < grid_mm
 
 
 def test_lost_pins_follow_the_skin(straight, fit, states):
     state = states["tilted"]
-    pins_px = project(straight, state.caps_mm)
+    pins_px = project(straight.view, state.caps_mm)
     lost = np.random.default_rng(0).permutation(len(pins_px))[:30]
     pins_px[lost] = np.nan
     found = fit(pins_px, centroids=False)
     assert np.isnan(found.remainder_px[lost]).all() and np.isfinite(np.delete(found.remainder_px, lost)).all()
-    missed_px = np.linalg.norm(project(straight, found.caps_mm[lost]) - project(straight, state.caps_mm[lost]), axis=1)
+    missed_px = np.linalg.norm(project(straight.view, found.caps_mm[lost]) - project(straight.view, state.caps_mm[lost]), axis=1)
     assert np.median(missed_px) < 0.2
 
 
 def test_refusals_say_what_came(straight):
     with pytest.raises(ValueError, match=r"shape \(331, 2\)"):
-        fit_skin(straight, np.zeros((127, 2)))
+        SkinFit(straight)(np.zeros((127, 2)))
     mostly_lost = np.full((331, 2), np.nan)
     mostly_lost[:100] = 0.0
     with pytest.raises(ValueError, match="100 of 331"):
-        fit_skin(straight, mostly_lost)
+        SkinFit(straight)(mostly_lost)

@@ -7,7 +7,7 @@ import trimesh
 from scenes.load import list_objects, load_object
 from scenes.object import MeshShape, ObjectSpec, PrismShape, TextureSpec
 from twin.errors import MeshError
-from twin.stimulus import build_stimulus, mesh_field
+from twin.stimulus import build_field, mesh_field
 from twin.stimulus.analytic import Cylinder, Edge, Plane, Prism, Sphere
 from twin.stimulus.mesh_distance import signed_distance
 from twin.stimulus.mesh_field import MeshField, sample_mesh
@@ -117,7 +117,7 @@ def test_points_may_come_in_any_layout(order, points, fields):
 @pytest.mark.parametrize("name", list_objects())
 def test_gradient_is_unit_and_the_derivative_of_the_distance(name, points):
     spec = load_object(name)
-    field = build_stimulus(spec)
+    field = build_field(spec)
     gradient = field.gradient(points)
     assert np.abs(np.linalg.norm(gradient, axis=1) - 1).max() < 1e-9
     slope = differences(field, points)
@@ -129,7 +129,7 @@ def test_gradient_is_unit_and_the_derivative_of_the_distance(name, points):
 
 @pytest.mark.parametrize("name", [name for name in list_objects() if name != "edge" and name != "mesh-can"])
 def test_surface_passes_through_the_origin_with_the_object_behind_it(name):
-    field = build_stimulus(load_object(name))
+    field = build_field(load_object(name))
     z = np.array([[0, 0, -0.5], [0, 0, 0], [0, 0, 0.5]])
     distance = field.distance(z)
     assert distance[0] > 0 > distance[2]
@@ -137,13 +137,13 @@ def test_surface_passes_through_the_origin_with_the_object_behind_it(name):
 
 
 def test_filleted_edge_is_a_quarter_space_with_a_rounded_corner():
-    field = build_stimulus(load_object("edge"))
+    field = build_field(load_object("edge"))
     at = np.array([[5.0, 1.0, -2.0], [-2.0, 3.0, 5.0], [0.0, 0.0, 0.0]])
     assert np.allclose(field.distance(at), [2.0, 2.0, 0.5 * (np.sqrt(2) - 1)])
 
 
 def test_prism_of_many_sides_is_a_cylinder(points):
-    prism, cylinder = Prism(64, 33.0, 0.0, 0.0), build_stimulus(load_object("can"))
+    prism, cylinder = Prism(64, 33.0, 0.0, 0.0), build_field(load_object("can"))
     sagitta_mm = 33.0 * (1 / np.cos(np.pi / 64) - 1)
     assert np.abs(prism.distance(points) - cylinder.distance(points)).max() < sagitta_mm
 
@@ -159,14 +159,14 @@ def test_prism_fillet_and_taper_against_a_dense_sampling_of_the_surface():
 
 
 def test_positive_taper_narrows_towards_y():
-    field = build_stimulus(ObjectSpec(name="p", description="", shape=PrismShape(kind="prism", sides=6, inradius_mm=40.0, taper_deg=8.0)))
+    field = build_field(ObjectSpec(name="p", description="", shape=PrismShape(kind="prism", sides=6, inradius_mm=40.0, taper_deg=8.0)))
     low, high = field.distance(np.array([[0, -10, -1.0], [0, 10, -1.0]]))
     assert high - low == pytest.approx(2 * 10 * np.sin(np.radians(8)))
 
 
 def test_wires_stand_on_the_surface_at_their_pitch():
     spec = load_object("plane").model_copy(update={"texture": TextureSpec(kind="wire-mesh", pitch_mm=4.0, wire_diameter_mm=1.0)})
-    field = build_stimulus(spec)
+    field = build_field(spec)
     tops = np.array([[0, 2, -1.0], [4, 2, -1.0], [2, 8, -1.0]])
     between = np.array([[2, 2, 0.0], [6, -2, 0.0]])
     assert np.abs(field.distance(tops)).max() < 1e-9
@@ -175,7 +175,7 @@ def test_wires_stand_on_the_surface_at_their_pitch():
 
 def test_mesh_of_a_ball_is_nearly_the_ball(tmp_path, points):
     trimesh.creation.icosphere(subdivisions=4, radius=6.0).export(tmp_path / "ball.stl")
-    field = build_stimulus(load_object(tmp_path / "ball.stl"))
+    field = build_field(load_object(tmp_path / "ball.stl"))
     near = points[np.abs(Sphere(6.0).distance(points)) < 2]
     facets_mm = 0.02
     assert np.abs(field.distance(near) - Sphere(6.0).distance(near)).max() < facets_mm
@@ -272,7 +272,7 @@ def test_a_bad_mesh_says_what_is_wrong_and_what_to_do(tmp_path, kind):
         box.export(path)
     wanted = {"open": "not watertight: 3 open edges", "metre": "too small; scale the file to mm", "huge": "too large; scale the file to mm"}
     with pytest.raises(MeshError, match=wanted.get(kind, path.name)) as caught:
-        build_stimulus(ObjectSpec(name="x", description="", shape=MeshShape(kind="mesh", file=str(path), unit=unit)))
+        build_field(ObjectSpec(name="x", description="", shape=MeshShape(kind="mesh", file=str(path), unit=unit)))
     assert path.name in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -289,7 +289,7 @@ def sampled(monkeypatch) -> list:
 def test_the_same_mesh_is_sampled_once(tmp_path):
     trimesh.creation.box((8, 8, 8)).export(tmp_path / "box.stl")
     spec = load_object(tmp_path / "box.stl")
-    assert build_stimulus(spec) is build_stimulus(spec)
+    assert build_field(spec) is build_field(spec)
 
 
 def test_a_sampled_mesh_is_kept_on_disk_by_content_and_placement(tmp_path, monkeypatch, sampled):
@@ -298,7 +298,7 @@ def test_a_sampled_mesh_is_kept_on_disk_by_content_and_placement(tmp_path, monke
 
     def load(**changes) -> MeshField:
         mesh_field._sampled.cache_clear()  # as a new process would start
-        return build_stimulus(ObjectSpec(name="x", description="", shape=MeshShape(kind="mesh", file=str(path), **changes)))
+        return build_field(ObjectSpec(name="x", description="", shape=MeshShape(kind="mesh", file=str(path), **changes)))
 
     trimesh.creation.box((7, 8, 9)).export(path)
     first = load()

@@ -13,7 +13,7 @@ def state_at(base, axis, caps):
 
 
 def rest_state(spec):
-    pins = rest_pins(spec)
+    pins = rest_pins(spec.geometry)
     return state_at(pins.base_mm, pins.axis, pins.caps_mm)
 
 
@@ -29,18 +29,18 @@ def test_segment_distance_matches_a_fine_sampling():
 
 
 def test_every_cap_is_in_sight_at_rest(sensor):
-    assert not occluded(sensor, rest_state(sensor)).any()
+    assert not occluded(sensor.view, 0.5 * sensor.pins.cap_diameter_mm, rest_state(sensor)).any()
 
 
 def test_a_pin_between_camera_and_cap_hides_it():
     spec = load_sensor("mg400-127")
-    pins = rest_pins(spec)
+    pins = rest_pins(spec.geometry)
     eye = np.array([0.0, 0.0, -spec.camera.distance_mm])
     base, caps = pins.base_mm.copy(), pins.caps_mm.copy()
     toward = (eye - caps[0]) / np.linalg.norm(eye - caps[0])
     caps[1] = caps[0] + 3 * toward
     base[1] = caps[1] + [0.5, 0, 0]
-    hidden = occluded(spec, state_at(base, pins.axis, caps))
+    hidden = occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state_at(base, pins.axis, caps))
     assert hidden[0] and hidden.sum() == 1
 
 

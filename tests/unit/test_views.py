@@ -11,7 +11,7 @@ import pyvista as pv
 from scenes import load_sensor
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.views import skin3d
 from twin.views.plots import area_surface_figure, draw_area_change, new_figure
 
@@ -40,7 +40,7 @@ def test_the_object_is_drawn_where_its_pose_puts_it():
 
     T = np.eye(4)
     T[:3, 3] = [1, 2, 15]
-    surface = skin3d.stimulus_surface(build_stimulus(load_object("sphere")).distance, T, bounds_mm=skin3d.SCENE_BOUNDS_MM)
+    surface = skin3d.stimulus_surface(build_field(load_object("sphere")).distance, T, bounds_mm=skin3d.SCENE_BOUNDS_MM)
     radius = np.linalg.norm(surface.points - [1, 2, 25], axis=1)
     assert np.abs(radius - 10).max() < 0.1
 

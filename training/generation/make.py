@@ -14,7 +14,7 @@ from twin.mechanics.solver import SkinSolver
 from twin.optics.variant import one_thread
 from twin.preprocess.forms import gray_levels
 from twin.simulator import Simulator
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.truth import cap_truth
 from twin.types import ContactState
 
@@ -75,7 +75,7 @@ def make_contact(text: str, index: int) -> Outcome:
 
 def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
     simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, keep=False)
-    stimulus = build_stimulus(config.object)
+    stimulus = build_field(config.object)
     rig = rig_of(draw.sensor)
     way = arm_path(rig, config.experiment, draw.sensor, stimulus, draw.label)
     yields = giving_way(rig, config.experiment, config.object)

@@ -16,7 +16,7 @@ from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.preprocess import Pipeline, make_graph
 from twin.simulator import Simulator
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.types import Form, PinGraph
 from twin.views.plots import draw_area_change, new_figure
 
@@ -89,7 +89,7 @@ def twin_contacts(spec: SensorSpec, form: Form, *, depths_mm=DEPTHS_MM, names=tu
         stimulus, turn_deg, aside_mm = CONTACTS[name]
         thing = load_object(stimulus)
         for depth in depths_mm:
-            poses = plan_path(spec, build_stimulus(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
+            poses = plan_path(spec.geometry, build_field(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
             state = [state for _, state in simulator.solver.path(thing, ContactPath(_turned(turn_deg) @ poses))][-1]
             seen = pipeline(simulator.shoot(state, form=form).frame)
             if not seen.valid:

@@ -23,7 +23,7 @@ from twin.preprocess.batch import recording_reference
 from twin.preprocess.forms import from_raw
 from twin.projection import project
 from twin.recordings import open_recording
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.types import FINE, Form
 
 _SAME = 1e-9  # of the way: fractions that mean the same pose
@@ -106,7 +106,7 @@ class ContactModel:
 
     def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
         self.spec, self.experiment, self.form = spec, experiment, form
-        self.rig, self.stimulus = rig_of(spec), build_stimulus(touched)
+        self.rig, self.stimulus = rig_of(spec), build_field(touched)
         self.yields = giving_way(self.rig, experiment, touched)
         self.solver = SkinSolver(spec, resolution=Resolution(across), keep=False)
         self.rest_px = self._pixels(self.solver.rest().caps_mm)
@@ -135,4 +135,4 @@ class ContactModel:
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px
 
     def _pixels(self, caps_mm: np.ndarray) -> np.ndarray:
-        return from_raw(self.spec, self.form, project(self.spec, caps_mm))
+        return from_raw(self.spec, self.form, project(self.spec.view, caps_mm))

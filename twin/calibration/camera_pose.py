@@ -131,7 +131,7 @@ def nearest_order(spec: SensorSpec, pins_px: np.ndarray) -> np.ndarray:
     """
     best = None
     for turn in sorted(TURNS_DEG, key=abs):
-        ours = project(spec, rest_pins(_with(spec, {"phase_deg": spec.pins.phase_deg + turn})).caps_mm)
+        ours = project(spec.view, rest_pins(_with(spec, {"phase_deg": spec.pins.phase_deg + turn}).geometry).caps_mm)
         middle, size = ours.mean(axis=0), np.sqrt(np.mean(np.sum((ours - ours.mean(axis=0)) ** 2, axis=1)))
         center = pins_px.mean(axis=0)
         laid = (ours - middle) / size * np.sqrt(np.mean(np.sum((pins_px - center) ** 2, axis=1))) + center
@@ -172,7 +172,7 @@ def _fit(spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[s
 
     def caps_px(values: np.ndarray) -> np.ndarray:
         trial = _with(spec, dict(zip(names, values.tolist(), strict=True)))
-        return project(trial, rest_pins(trial).caps_mm)
+        return project(trial.view, rest_pins(trial.geometry).caps_mm)
 
     values = start
     for _ in range(ROUNDS):

@@ -84,8 +84,9 @@ def _changes(spec: SensorSpec, frame: Aligned, image: np.ndarray):
     u = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     face, radius = state.caps_mm + 0.5 * spec.pins.cap_height_mm * state.axis, 0.5 * spec.pins.cap_diameter_mm
-    middle = project(spec, face)
-    plane = np.stack([project(spec, face + radius * way) - middle for way in (u, np.cross(u, state.axis))], axis=-1)  # px of a cap radius
+    middle = project(spec.view, face)
+    ways = u, np.cross(u, state.axis)
+    plane = np.stack([project(spec.view, face + radius * way) - middle for way in ways], axis=-1)  # px of a cap radius
     others = cKDTree(middle)
     height, width = real.shape
     for cap in np.flatnonzero(np.isfinite(frame.pins_px).all(axis=1)):

@@ -72,7 +72,7 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
         return _changed(flat, dict(zip(names, map(float, values), strict=True)))
 
     def misfit(shown: SensorSpec) -> np.ndarray:
-        return np.concatenate([expose(x, shown)[u].astype(float).ravel() for x, u in zip(light, useful, strict=True)]) - real
+        return np.concatenate([expose(x, shown.capture)[u].astype(float).ravel() for x, u in zip(light, useful, strict=True)]) - real
 
     def residual(values) -> np.ndarray:
         return misfit(with_values(values))
@@ -125,7 +125,7 @@ def sharpness(spec: SensorSpec, frames: list[Aligned], rendered: list[np.ndarray
     for frame, image in zip(frames, rendered, strict=True):
         distance.append(apparent_mm(spec, frame.state.caps_mm[:, 2]))
         real.append(measure_caps(gray_levels(frame.image), frame.pins_px).edge_px)
-        ours.append(measure_caps(gray_levels(image), project(spec, frame.state.caps_mm)).edge_px)
+        ours.append(measure_caps(gray_levels(image), project(spec.view, frame.state.caps_mm)).edge_px)
     distance, real, ours = map(np.concatenate, (distance, real, ours))
     good = np.isfinite(real) & np.isfinite(ours)
     which = bin_of(distance, equal_count_edges(distance[good], bins))
@@ -139,7 +139,7 @@ def fit_blur(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], r
     Least squares on gray levels, where edges don't lie exactly on each other, prefer them too soft.
     """
     for _ in range(rounds):
-        seen = sharpness(spec, frames, [expose(x, spec) for x in light], bins=1)
+        seen = sharpness(spec, frames, [expose(x, spec.capture) for x in light], bins=1)
         lacking = float((seen.real_px**2 - seen.rendered_px**2)[0]) / GAUSSIAN_WIDTH**2
         blur = np.sqrt(max(spec.response.blur_sigma_px**2 + lacking, BOUNDS["blur_sigma_px"][0] ** 2))
         spec = revised(spec, response={"blur_sigma_px": round(float(blur), 4)})
@@ -185,9 +185,9 @@ def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], 
     def roughness(images) -> float:
         return float(np.median([noise_sd(gray_levels(image), skin) for image, skin in zip(images, bare, strict=True)]))
 
-    real, still = roughness(f.image for f in frames), roughness(expose(x, spec) for x in light)
+    real, still = roughness(f.image for f in frames), roughness(expose(x, spec.capture) for x in light)
     for _ in range(rounds):
-        ours = roughness(expose(x, _noisier(spec, scale), np.random.default_rng(k)) for k, x in enumerate(light))
+        ours = roughness(expose(x, _noisier(spec, scale).capture, np.random.default_rng(k)) for k, x in enumerate(light))
         grown = max(ours**2 - still**2, 1e-4)
         scale *= float(np.sqrt(max(real**2 - still**2, 0.01 * grown) / grown))
     return _noisier(spec, scale)

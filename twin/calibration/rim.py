@@ -56,7 +56,7 @@ def _with_rim(spec: SensorSpec, inner_mm: float, outer_mm: float, table: np.ndar
 
 def _missing(spec: SensorSpec, frame: Aligned, light: np.ndarray) -> np.ndarray:
     """Light of a real frame beyond that of a render, in the renderer's unit."""
-    shown = expose(light, spec)
+    shown = expose(light, spec.capture)
     lacking = to_light(frame.image, spec.response) - to_light(shown, spec.response)
     return np.where((frame.image >= SATURATED) & (shown >= SATURATED), 0.0, lacking)
 

@@ -83,7 +83,7 @@ class Studio:
 
     def shots(self, spec: SensorSpec, frames: list[Aligned], title: str) -> list[np.ndarray]:
         """Captured frames without noise."""
-        return [expose(light, spec) for light in self.light(spec, frames, title)]
+        return [expose(light, spec.capture) for light in self.light(spec, frames, title)]
 
 
 def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES, no_contact: Path | None = None) -> Calibration:

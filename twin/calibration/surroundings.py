@@ -116,7 +116,7 @@ def fit_surroundings(
     images = np.repeat(images[..., None], 3, axis=3) if images.ndim == 3 else images
     image = np.median(images, axis=0).astype(np.float32)
     y, x = np.mgrid[: size[0], : size[1]]
-    _, direction = pixel_rays(spec, np.stack([x, y], axis=-1))
+    _, direction = pixel_rays(spec.view, np.stack([x, y], axis=-1))
     sine = spec.gel.refractive_index * direction[..., :2]  # in air: index times sine stays (Snell)
     tangents = sine / np.sqrt(np.maximum(1 - np.sum(sine**2, axis=-1, keepdims=True), 1e-12))
     still = Still(image, gray_levels(image), tangents)
@@ -214,7 +214,7 @@ def fit_reflections(spec: SensorSpec, still: Still) -> SensorSpec:
         for n, k in enumerate(lit):
             turn = np.degrees(azimuth[n] + values[4 + n])
             one = shape | {"azimuth_deg": (turn,), "balance": (leds.balance[k],) if leds.balance else ()}
-            light = reflections(spec.model_copy(update={"leds": leds.model_copy(update=one)}), rays[n]).mean(axis=(2, 3))
+            light = reflections(spec.view, leds.model_copy(update=one), spec.housing, rays[n]).mean(axis=(2, 3))
             miss.append(_miss(blurred(light + ground[n], spec.response.blur_sigma_px), real[n], spec)[used[n]].ravel())
         return np.concatenate(miss)
 
@@ -252,7 +252,7 @@ def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
     def residual(values: np.ndarray) -> np.ndarray:
         trial = spec.model_copy(update={"housing": ring.model_copy(update=with_values(values))})
         light = inside.copy()
-        light[wall] = housing_light(trial, at_mm[wall])
+        light[wall] = housing_light(trial.leds, trial.housing, at_mm[wall])
         return _miss(hazed(light, haze) * loss, real, spec)[compared].ravel()
 
     plain = low.copy()
@@ -279,7 +279,7 @@ def fit_specks(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.n
     u2 = np.sum(still.tangents**2, axis=-1, keepdims=True)
     within = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)  # tangent in the window to that in air
     place_mm = still.tangents * (lens.back_mm + spec.camera.distance_mm + lens.thickness_mm * within)
-    shine = reflections(spec, still.tangents).max(axis=2) * response.exposure
+    shine = reflections(spec.view, spec.leds, spec.housing, still.tangents).max(axis=2) * response.exposure
     mirrored = cv2.dilate((shine > to_light(response.black_level + SPECK_RISE, response)).astype(np.uint8), np.ones((9, 9))) > 0
     usable = (disc.distance_px(np.stack([x, y], axis=-1)) < disc.radius_px - RIM_PX) & ~mirrored & (clear.sum(axis=0) >= CLEAR_FRAMES)
     behind = np.zeros(size[::-1], np.float32)

@@ -13,7 +13,7 @@ from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, Contac
 from twin.preprocess.forms import from_raw
 from twin.projection import project
 from twin.simulator import Simulator
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.types import Form
 from twin.views.page import render_page
 from twin.views.skin3d import draw_contact_skin
@@ -45,9 +45,7 @@ def run_demo(out: Path, bar) -> list[Path]:
         seconds[f"{sensor} against {stimulus}"] = perf_counter() - start
         with bar(f"{sensor}: pictures"):
             skin = pictures / f"{sensor}-{stimulus}-skin.png"
-            notes.add(
-                draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_stimulus(load_object(stimulus)), skin)
-            )
+            notes.add(draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_field(load_object(stimulus)), skin))
             contacts.append(_contact_content(simulator, result, skin, pictures))
 
     motion_sensor = CONTACTS[0][0]
@@ -93,7 +91,7 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
     written = contact_pictures(pictures, result)
     touched = result.state.contact_mm
     contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
-    contact_px = from_raw(spec, result.look.frame.form, project(spec, contact_mm[None]))[0]
+    contact_px = from_raw(spec, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
     return {
         "title": f"{spec.name} against {result.stimulus}",

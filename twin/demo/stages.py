@@ -85,14 +85,14 @@ def depth_table(sensor: str, *, progress=None) -> list[DepthRow]:
     """Press a plane to the four depths of the recordings' table (true caps, no rendering)."""
     spec = load_sensor(sensor)
     simulator = Simulator(spec)
-    rest_px = project(spec, simulator.rest.caps_mm)
+    rest_px = project(spec.view, simulator.rest.caps_mm)
     outmost = nominal_reference(spec, Form.RAW).outmost
     rest_area_px2 = make_graph("voronoi", rest_px, outmost=outmost).area_px2
     middle = np.argsort(np.hypot(*(rest_px - rest_px[0]).T))[: spec.pins.count // 8]
     rows = []
     for number, (indent_mm, measured_px) in enumerate(zip(TABLE_INDENTS_MM, MEASURED_DISPLACEMENT_PX[sensor], strict=True)):
         state = simulator.press(load_object("plane"), ContactPose(indent_mm=indent_mm))
-        caps_px = project(spec, state.caps_mm)
+        caps_px = project(spec.view, state.caps_mm)
         areas = make_graph("voronoi", caps_px, outmost=outmost).area_px2
         change = 100 * float(np.mean(areas[middle] / rest_area_px2[middle]) - 1)
         moved = float(np.hypot(*(caps_px - rest_px).T).mean())

@@ -53,7 +53,7 @@ class Sighting:
 
 def flat_layout(spec: SensorSpec) -> np.ndarray:
     """Pins (N, 2) of the layout laid flat, the outermost at distance 1: neither dome nor camera goes in."""
-    axis = rest_pins(spec).axis
+    axis = rest_pins(spec.geometry).axis
     polar = np.arccos(np.clip(np.abs(axis[:, 2]), -1, 1))
     rho = np.linalg.norm(axis[:, :2], axis=1, keepdims=True)
     outward = -axis[:, :2] / np.maximum(rho, 1e-12)

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline
 
+from twin.types import FloatArray, IntArray
+
 
 @dataclass(frozen=True)
 class Basis:
     """B-splines of a degree between ``breaks`` (elements + 1,)."""
 
-    breaks: np.ndarray
+    breaks: FloatArray
     degree: int = 2
 
     @property
@@ -28,25 +30,25 @@ class Basis:
         return self.elements + self.degree
 
     @property
-    def _knots(self) -> np.ndarray:
+    def _knots(self) -> FloatArray:
         return np.concatenate([[self.breaks[0]] * self.degree, self.breaks, [self.breaks[-1]] * self.degree])
 
     @property
-    def greville(self) -> np.ndarray:
-        """(count,) means of adjoining knots: a linear function's coefficients are its values there."""
+    def greville(self) -> FloatArray:
+        """(count,) Greville points, means of ``degree`` neighbouring knots: a linear function's coefficients are its values there."""
         knots = self._knots
         return np.array([knots[i + 1 : i + 1 + self.degree].mean() for i in range(self.count)])
 
-    def values(self, at: np.ndarray, *, derivative: int = 0) -> np.ndarray:
+    def values(self, at: FloatArray, *, derivative: int = 0) -> FloatArray:
         """(k, count) values, or a derivative's, of all functions at points (k,)."""
         splines = BSpline(self._knots, np.eye(self.count), self.degree)
         return (splines.derivative(derivative) if derivative else splines)(np.clip(at, self.breaks[0], self.breaks[-1]))
 
-    def element_of(self, at: np.ndarray) -> np.ndarray:
+    def element_of(self, at: FloatArray) -> IntArray:
         """(k,) index of the element that holds each point."""
         return np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, self.elements - 1)
 
-    def gauss(self, points: int) -> tuple[np.ndarray, np.ndarray]:
+    def gauss(self, points: int) -> tuple[FloatArray, FloatArray]:
         """Gauss points and weights (elements, points) of every element."""
         local, weights = np.polynomial.legendre.leggauss(points)
         half = np.diff(self.breaks)[:, None] / 2

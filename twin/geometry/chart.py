@@ -6,22 +6,30 @@ over the largest one, its azimuth the azimuth. A ``Focus`` turns and stretches t
     (u, v) -> w1 (squared disc) -> w2 = w1 s(|w1|) / |w1| -> w = e^(i phi) (w2 + a) / (1 + a w2)
 
 The elliptical map x = u sqrt(1 - v^2 / 2), y = v sqrt(1 - u^2 / 2) makes a disc of the square without
-collapsing an element (Fong, "Analytical methods for squaring the disc", 2015); s(r) = c r + (1 - c) r^5
-gathers the lines of the grid at the centre; a Moebius transformation moves the centre to where the
-contact is, keeping the rim on the rim. All are smooth.
+collapsing an element (Fong, "Analytical methods for squaring the disc", 2015). The function s(r) = c r + (1 - c) r^5
+gathers the lines of the grid at the centre. A Moebius transformation moves the centre to where the contact is and
+keeps the rim on the rim. All three maps are smooth.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from twin.types import ComplexArray, FloatArray
+
 _POWER = 5
-_FINE = 0.75  # of the square's half side: lines within lie over the focus
+"""Power in s(r) = c r + (1 - c) r^5: the higher it is, the more evenly the lines lie within the focus."""
+_FINE = 0.75
+"""Share of the square's half side whose image is the focus."""
+_LARGEST_SHIFT = 0.6
+"""Largest shift a of the Moebius transformation: it bounds how far the elements opposite the focus are stretched."""
+_LEAST_SLOPE = 0.2
+"""Smallest c: it bounds how small the elements at the centre of the focus get."""
 
 
 @dataclass(frozen=True)
 class Focus:
-    """Where a grid over the dome is fine.
+    """The part of the dome over which the grid is fine.
 
     Attributes
     ----------
@@ -45,14 +53,14 @@ class Chart:
 
     @property
     def _shift(self) -> float:
-        return min(self.focus.polar_rad / self.largest_polar_rad, 0.6)
+        return min(self.focus.polar_rad / self.largest_polar_rad, _LARGEST_SHIFT)
 
     @property
     def _centre_slope(self) -> float:
         share = self.focus.radius_rad / self.largest_polar_rad / (1 - self._shift**2)
-        return float(np.clip((share - _FINE**_POWER) / (_FINE - _FINE**_POWER), 0.2, 1.0))
+        return float(np.clip((share - _FINE**_POWER) / (_FINE - _FINE**_POWER), _LEAST_SLOPE, 1.0))
 
-    def disc(self, square: np.ndarray) -> np.ndarray:
+    def disc(self, square: FloatArray) -> ComplexArray:
         """Complex disc points (k,) of square points (k, 2)."""
         u, v = square.T
         w = u * np.sqrt(1 - v * v / 2) + 1j * v * np.sqrt(1 - u * u / 2)
@@ -62,7 +70,7 @@ class Chart:
         a = self._shift
         return (w + a) / (1 + a * w) * np.exp(1j * self.focus.azimuth_rad)
 
-    def square(self, disc: np.ndarray) -> np.ndarray:
+    def square(self, disc: ComplexArray) -> FloatArray:
         """Square points (k, 2) of complex disc points (k,)."""
         w = disc * np.exp(-1j * self.focus.azimuth_rad)
         a = self._shift
@@ -81,21 +89,21 @@ class Chart:
         x, y = w.real, w.imag
         root = 2 * np.sqrt(2)
 
-        def half(p, q):
+        def half(p: FloatArray, q: FloatArray) -> FloatArray:
             plus = np.sqrt(np.maximum(2 + p * p - q * q + root * p, 0))
             return (plus - np.sqrt(np.maximum(2 + p * p - q * q - root * p, 0))) / 2
 
         return np.column_stack([half(x, y), half(y, x)])
 
 
-def dome_points(disc: np.ndarray, radius_mm: float, rim_z_mm: float) -> np.ndarray:
+def dome_points(disc: ComplexArray, radius_mm: float, rim_z_mm: float) -> FloatArray:
     """Points (k, 3) on a sphere's cap that ends in the rim plane, from complex disc points (k,)."""
     polar = np.arccos(rim_z_mm / radius_mm) * np.abs(disc)
     azimuth = np.angle(disc)
     return radius_mm * np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
 
 
-def disc_points(points_mm: np.ndarray, radius_mm: float, rim_z_mm: float) -> np.ndarray:
+def disc_points(points_mm: FloatArray, radius_mm: float, rim_z_mm: float) -> ComplexArray:
     """Inverse of ``dome_points`` for points on its sphere."""
     across = np.hypot(points_mm[:, 0], points_mm[:, 1])
     polar = np.arctan2(across, points_mm[:, 2])

@@ -1,13 +1,16 @@
 """The mesh as VTK data sets, for views and files."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import pyvista as pv
 
 from twin.geometry.mesh import SKIN, SensorMesh
+from twin.types import FloatArray, IntArray
 
 
 def to_pyvista(
-    mesh: SensorMesh, *, nodes_mm: np.ndarray | None = None, point_data: dict[str, np.ndarray] | None = None
+    mesh: SensorMesh, *, nodes_mm: FloatArray | None = None, point_data: Mapping[str, FloatArray | IntArray] | None = None
 ) -> pv.UnstructuredGrid:
     """Skin and gel as one unstructured grid with cell data ``material``.
 
@@ -26,7 +29,9 @@ def to_pyvista(
     return grid
 
 
-def skin_surface(mesh: SensorMesh, *, nodes_mm: np.ndarray | None = None, point_data: dict[str, np.ndarray] | None = None) -> pv.PolyData:
+def skin_surface(
+    mesh: SensorMesh, *, nodes_mm: FloatArray | None = None, point_data: Mapping[str, FloatArray | IntArray] | None = None
+) -> pv.PolyData:
     """Closed surface of the skin alone (outside, inside, rim), ready to be written as ``.vtp``.
 
     Point data ``node`` is each point's index in ``mesh.nodes_mm``.

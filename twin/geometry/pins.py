@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec
+from twin.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -21,12 +22,12 @@ class PinRest:
         Centre of the cap's solid (mid-height), ``base + (length + cap_height / 2) axis``.
     """
 
-    base_mm: np.ndarray
-    axis: np.ndarray
-    caps_mm: np.ndarray
+    base_mm: FloatArray
+    axis: FloatArray
+    caps_mm: FloatArray
 
 
-def pin_lattice(layout: str, rings: int) -> np.ndarray:
+def pin_lattice(layout: str, rings: int) -> FloatArray:
     """Unit-disc lattice of a layout: (N, 2) of (radius / outermost radius, azimuth in rad).
 
     Order: the centre, then ring by ring, each from its first pin by increasing azimuth
@@ -46,9 +47,9 @@ def pin_lattice(layout: str, rings: int) -> np.ndarray:
     return np.array(points)
 
 
-def rest_pins(spec: SensorSpec) -> PinRest:
-    """Pins at rest of a sensor: the lattice wrapped onto the inside of the dome (``spec.pins.spacing``)."""
-    pins, skin = spec.pins, spec.skin
+def rest_pins(geometry: GeometrySpec) -> PinRest:
+    """Pins at rest of a sensor: the lattice wrapped onto the inside of the dome as ``PinsSpec.spacing`` says."""
+    pins, skin = geometry.pins, geometry.skin
     lattice = pin_lattice(pins.layout, pins.rings)
     largest = np.radians(pins.max_polar_deg)
     polar = largest * lattice[:, 0] if pins.spacing == "polar" else np.arcsin(np.sin(largest) * lattice[:, 0])

@@ -1,14 +1,15 @@
 """The pins in space that one frame shows, found without knowing what touched the sensor.
 
-A frame gives each cap's pixel, so each cap's ray in the gel, not its depth. What is between is the sensor's body: skin
-and gel in equilibrium under some traction t on the outer skin. With x(t) the body's shape, Gauss-Newton minimises
+A frame gives the pixel of each cap, and with it the cap's ray in the gel, but not its depth along the ray. The sensor's body
+gives the depth: skin and gel are in equilibrium under some traction t on the outer skin. With x(t) the body's shape,
+Gauss-Newton minimises
 
     sum_pins |project(cap(x)) - seen|^2 / sigma^2  +  integral over the skin at rest of t_n^2 / s_n^2 + |t_t|^2 / s_t^2
 
-over t and x together: each step solves the equilibrium linearised about the present shape. s_n^2 grows with the pressure
-of the step before, s_t^2 with a share of it (iteratively reweighted least squares: Daubechies et al. 2010): touch
-presses, it does not pull, it is confined to a part of the skin, and friction needs pressure. What is left, a fraction of
-a pixel, is taken by moving each pin parallel to the image.
+over t and x together. Each step solves the equilibrium that is linearised about the present shape. The scale s_n^2 grows with
+the pressure found in the step before, and s_t^2 with a share of it (iteratively reweighted least squares: Daubechies et al. 2010).
+This states what a touch is like: it presses and does not pull, it is confined to a part of the skin, and friction needs pressure.
+A difference of a fraction of a pixel remains; each pin is moved parallel to the image to remove it.
 """
 
 from dataclasses import dataclass, replace
@@ -18,18 +19,25 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 from threadpoolctl import ThreadpoolController
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import SensorSpec, ViewSpec
 from twin.geometry.soft_body import SoftBody
 from twin.geometry.solid import pin_pose, surface_operators
 from twin.mechanics.elements import PAIRS
 from twin.projection import pixel_rays, project
+from twin.types import BoolArray, FloatArray
 
-STEPS = 14  # of Gauss-Newton at most
-SETTLED_MM = 0.01  # largest move of a step that is the last
-LARGEST_MOVE_MM = 2.0  # of a control in one step
-EVEN_STEPS = 2  # with the same s everywhere, until there is a first idea of the pressure
+STEPS = 14
+"""Most steps of Gauss-Newton."""
+SETTLED_MM = 0.01
+"""The fit ends after a step in which no control moves farther than this."""
+LARGEST_MOVE_MM = 2.0
+"""No control moves farther than this in one step: the linearised equilibrium is trusted no farther."""
+EVEN_STEPS = 2
+"""The first steps take the same s everywhere, because there is no estimate of the pressure yet."""
 OUTLINE_CORNERS = 48
-PROBE_MM = 1e-4  # for the derivative of the projection
+"""Corners of the polygon that stands for a cap's outline."""
+PROBE_MM = 1e-4
+"""Step of the difference quotient that gives the derivative of the projection."""
 
 
 @dataclass(frozen=True)
@@ -68,37 +76,26 @@ class FittedPins:
         Sum of the tractions found, on the skin.
     """
 
-    base_mm: np.ndarray
-    axis: np.ndarray
-    caps_mm: np.ndarray
-    remainder_px: np.ndarray
-    force_n: np.ndarray
+    base_mm: FloatArray
+    axis: FloatArray
+    caps_mm: FloatArray
+    remainder_px: FloatArray
+    force_n: FloatArray
 
 
-def fit_skin(spec: SensorSpec, pins_px: np.ndarray, *, prior: Prior | None = None, centroids: bool = True) -> FittedPins:
-    """Pins in space from pins in the image; see ``SkinFit`` for many frames of one sensor.
-
-    Raises
-    ------
-    ValueError
-        Not N pins, or fewer than half of them seen.
-    """
-    return SkinFit(spec, prior=prior)(pins_px, centroids=centroids)
-
-
-def centroid_offset_px(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> np.ndarray:
+def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArray, axis: FloatArray) -> FloatArray:
     """(N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
     turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS + 1)[:, None, None]
     u = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    rim = caps_mm + 0.5 * spec.pins.cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
-    p = project(spec, rim) - project(spec, caps_mm)
+    rim = caps_mm + 0.5 * cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
+    p = project(view, rim) - project(view, caps_mm)
     twice = p[:-1, :, 0] * p[1:, :, 1] - p[1:, :, 0] * p[:-1, :, 1]
     return ((p[:-1] + p[1:]) * twice[..., None]).sum(axis=0) / (3 * twice.sum(axis=0))[:, None]
 
 
 class SkinFit:
-    """Fits of one sensor; what depends on the sensor alone is computed once.
+    """Fits pins of one sensor to frames; what depends on the sensor alone is computed once, when it is made.
 
     Parameters
     ----------
@@ -106,10 +103,11 @@ class SkinFit:
     prior : Prior, optional
     """
 
-    def __init__(self, spec: SensorSpec, *, prior: Prior | None = None):
+    def __init__(self, spec: SensorSpec, *, prior: Prior | None = None) -> None:
         self.spec, self.prior = spec, prior or Prior()
         self._blas = ThreadpoolController()
-        self._body = SoftBody(spec)
+        self._view = spec.view
+        self._body = SoftBody(spec.geometry, spec.gel)
         solid = self._solid = self._body.solid
         at, weights = (a.ravel() for a in solid.basis.gauss(2))
         v, u = (g.ravel() for g in np.meshgrid(at, at, indexing="ij"))
@@ -122,7 +120,7 @@ class SkinFit:
         self._mass = (self._value.T @ (self._area_mm2[:, None] * self._value)).toarray()  # traction coefficients to forces
         self._loaded = self._body.unknown[self._outer][moving]  # (m, 3) unknowns that carry the traction
 
-    def __call__(self, pins_px: np.ndarray, *, centroids: bool = True) -> FittedPins:
+    def __call__(self, pins_px: FloatArray, *, centroids: bool = True) -> FittedPins:
         """Fit one frame.
 
         Parameters
@@ -141,7 +139,7 @@ class SkinFit:
         count = self.spec.pins.count
         if pins_px.shape != (count, 2):
             raise ValueError(f"expected pins_px of shape ({count}, 2) for {self.spec.name}, got {pins_px.shape}")
-        seen = np.isfinite(pins_px).all(axis=1)
+        seen: BoolArray = np.all(np.isfinite(pins_px), axis=1)
         if 2 * seen.sum() < count:
             raise ValueError(f"{seen.sum()} of {count} pins are too few to fit a skin to; at least half are needed")
         control, traction = self._solid.control_mm.copy(), np.zeros(self._area_mm2.shape + (3,))
@@ -156,20 +154,22 @@ class SkinFit:
             pins = self._on_rays(control, pins_px - self._offset_px(control) * centroids, seen)
         return replace(pins, force_n=self._area_mm2 @ traction)
 
-    def _offset_px(self, control: np.ndarray) -> np.ndarray:
+    def _offset_px(self, control: FloatArray) -> FloatArray:
         _, axis, cap = pin_pose(self._solid, control)
-        return centroid_offset_px(self.spec, cap, axis)
+        return centroid_offset_px(self._view, self.spec.pins.cap_diameter_mm, cap, axis)
 
-    def _on_rays(self, control: np.ndarray, target_px: np.ndarray, seen: np.ndarray) -> FittedPins:
+    def _on_rays(self, control: FloatArray, target_px: FloatArray, seen: BoolArray) -> FittedPins:
         """Pins of a shape, the seen ones shifted parallel to the image onto their rays."""
         base, axis, cap = pin_pose(self._solid, control)
-        remainder = np.where(seen, np.linalg.norm(project(self.spec, cap) - target_px, axis=1), np.nan)
-        place, along = pixel_rays(self.spec, np.where(seen[:, None], target_px, 0.0))
+        remainder = np.where(seen, np.linalg.norm(project(self._view, cap) - target_px, axis=1), np.nan)
+        place, along = pixel_rays(self._view, np.where(seen[:, None], target_px, 0.0))
         on_ray = place + along * ((cap[:, 2] - place[:, 2]) / along[:, 2])[:, None]
         shift = np.where(seen[:, None], on_ray - cap, 0.0)
         return FittedPins(base + shift, axis, cap + shift, remainder, np.zeros(3))
 
-    def _step(self, control, target_px, seen, traction, *, even: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _step(
+        self, control: FloatArray, target_px: FloatArray, seen: BoolArray, traction: FloatArray, *, even: bool
+    ) -> tuple[FloatArray, FloatArray]:
         """Move (f, 3) of the free controls, and the traction (q, 3) in MPa at the skin's points that goes with it."""
         factor, force = self._body.factor(control), self._body.forces(control)
         seen_px, per_control = self._pin_rows(control, seen)
@@ -183,7 +183,7 @@ class SkinFit:
         load[self._loaded] += self._mass @ coefficients
         return cho_solve(factor, load).reshape(-1, 3), self._value @ coefficients
 
-    def _cost(self, control: np.ndarray, traction: np.ndarray, *, even: bool) -> np.ndarray:
+    def _cost(self, control: FloatArray, traction: FloatArray, *, even: bool) -> FloatArray:
         """Quadratic form (3 m, 3 m) of the traction's coefficients, weighted by the traction (q, 3) of the step before."""
         prior = self.prior
         outward = np.cross(*(s @ control[self._outer] for s in self._slopes))
@@ -198,15 +198,15 @@ class SkinFit:
             form[:, i, :, j] = form[:, j, :, i] = (self._value.T @ (weight[:, None] * self._value)).toarray()
         return form.reshape(3 * count, 3 * count)
 
-    def _pin_rows(self, control: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _pin_rows(self, control: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Projections (s, 2) of the seen caps, and their derivative (2 s, unknowns) by the free controls."""
         solid, inner = self._solid, control[self._solid.inner]
         _, axis, cap = pin_pose(solid, control)
         slopes = solid.pin_slope_u, solid.pin_slope_v
         t = np.stack([s @ inner for s in slopes], axis=1)
         dual = np.linalg.inv(t @ t.swapaxes(1, 2)) @ t
-        here = project(self.spec, cap)
-        per_mm = np.stack([(project(self.spec, cap + PROBE_MM * unit) - here) / PROBE_MM for unit in np.eye(3)], axis=2)
+        here = project(self._view, cap)
+        per_mm = np.stack([(project(self._view, cap + PROBE_MM * unit) - here) / PROBE_MM for unit in np.eye(3)], axis=2)
         rows = np.zeros((seen.sum(), 2, len(control), 3))
         part = solid.pin_value[seen, None, :, None] * per_mm[seen, :, None, :]
         for slope, toward in zip(slopes, dual.swapaxes(0, 1), strict=True):  # the axis turns as the normal: d a = -t^c (a . d t_c)

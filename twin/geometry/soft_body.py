@@ -3,13 +3,16 @@
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GelSpec, GeometrySpec
 from twin.geometry.solid import build_solid
 from twin.mechanics.elements import PAIRS, Elements
 from twin.mechanics.material import law_coefficients
+from twin.types import FloatArray, IntArray
 
 NO_STRESS = np.zeros((0, 8, 3, 3))
-SHIFT_SHARE = 1e-3  # of the mean stiffness, added while the tangent has a falling direction
+"""Given stress of an elastic body: none (see ``Elements.add_forces``)."""
+SHIFT_SHARE = 1e-3
+"""A tangent that is not positive definite gets this share of its mean diagonal added, and four times more each time that is too little."""
 
 
 class SoftBody:
@@ -24,24 +27,24 @@ class SoftBody:
         Number of each control's unknowns, control by control; -1 where clamped.
     """
 
-    def __init__(self, spec: SensorSpec):
-        solid = self.solid = build_solid(spec)
-        gel = law_coefficients(spec.gel, layer=False)
-        skin = Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True)
-        self._kinds = skin, Elements(solid.gel_top, gel), Elements(solid.gel_deep, gel)
+    def __init__(self, geometry: GeometrySpec, gel: GelSpec) -> None:
+        solid = self.solid = build_solid(geometry)
+        soft = law_coefficients(gel, layer=False)
+        skin = Elements(solid.skin, law_coefficients(geometry.skin, layer=True), layer=True)
+        self._kinds = skin, Elements(solid.gel_top, soft), Elements(solid.gel_deep, soft)
         self.free = np.flatnonzero(~solid.fixed)
         self.unknown = np.full((len(solid.fixed), 3), -1)
         self.unknown[self.free] = np.arange(3 * len(self.free)).reshape(-1, 3)
         self._entries = [_entries(self.unknown, kind.cells.controls) for kind in self._kinds]
 
-    def forces(self, control_mm: np.ndarray) -> np.ndarray:
+    def forces(self, control_mm: FloatArray) -> FloatArray:
         """Gradient of the elastic energy (3 f,) in N, by the free controls."""
         force = np.zeros_like(control_mm)
         for kind in self._kinds:
             kind.add_forces(control_mm, NO_STRESS, force)
         return force[self.free].ravel()
 
-    def factor(self, control_mm: np.ndarray):
+    def factor(self, control_mm: FloatArray) -> tuple[FloatArray, bool]:
         """Cholesky factor (single precision, as ``scipy.linalg.cho_solve`` takes it) of the tangent, made positive where it is not."""
         size = 3 * len(self.free)
         total = np.zeros(size * size)
@@ -58,7 +61,7 @@ class SoftBody:
                 shift = 4 * shift or SHIFT_SHARE * float(np.mean(np.diag(matrix)))
                 matrix[np.diag_indices(size)] += shift
 
-    def moved(self, control_mm: np.ndarray, move_mm: np.ndarray) -> np.ndarray:
+    def moved(self, control_mm: FloatArray, move_mm: FloatArray) -> FloatArray:
         """The shape (n, 3) after a move (f, 3) of the free controls, shortened until no element is inside out."""
         while True:
             moved = control_mm.copy()
@@ -68,7 +71,7 @@ class SoftBody:
             move_mm = move_mm / 2
 
 
-def _entries(unknown: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _entries(unknown: IntArray, controls: IntArray) -> tuple[IntArray, IntArray]:
     """Where each entry of the elements' stiffness blocks goes: flat places in the lower triangle, and flat places in the blocks."""
     m, b = controls.shape
     size = unknown.max() + 1

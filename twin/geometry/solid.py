@@ -1,6 +1,6 @@
 """The sensor's body as a spline solid: what the mechanics computes with.
 
-A square grid of columns is bent over the dome (``chart``); each runs through the skin and the gel down
+A square grid of columns is bent over the dome (``chart``). Each column runs through the skin and the gel down
 to the lens. Shape and displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell
 & Bazilevs 2005): quadratic and C1 over the dome, linear through the skin, quadratic through the gel. A
 skin bent by contact is smooth and needs fewer unknowns than with trilinear elements. What the gel does
@@ -12,14 +12,17 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec
 from twin.geometry.bspline import Basis
 from twin.geometry.chart import Chart, Focus, disc_points, dome_points
 from twin.geometry.pins import rest_pins
 from twin.store import cached_arrays
+from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _CELL_PARTS = ("controls", "gradients", "weights_mm3")
-_GEL_GRADING = 1.5  # power law of the depths between the gel's elements: thin below the skin
+"""Arrays of ``Cells``, as they are named on disk."""
+_GEL_GRADING = 1.5
+"""Boundary k of n elements through the gel lies at the depth (k / n)^1.5: elements are thin below the skin."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Resolution:
     skin_layers: int = 1
     gel_layers: int = 3
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.across < 4 or self.across % 2 or self.skin_layers < 1 or self.gel_layers < 1:
             raise ValueError(f"a solid needs an even across >= 4, skin_layers >= 1 and gel_layers >= 1, got {self}")
 
@@ -57,9 +60,9 @@ class Cells:
         Rest volume of each Gauss point.
     """
 
-    controls: np.ndarray
-    gradients: np.ndarray
-    weights_mm3: np.ndarray
+    controls: IntArray
+    gradients: FloatArray
+    weights_mm3: FloatArray
 
 
 @dataclass(frozen=True)
@@ -92,76 +95,89 @@ class Solid:
         Foot to cap centre.
     """
 
-    control_mm: np.ndarray
-    fixed: np.ndarray
+    control_mm: FloatArray
+    fixed: BoolArray
     skin: Cells
     gel_top: Cells
     gel_deep: Cells
-    boxes: tuple[np.ndarray, np.ndarray, np.ndarray]
+    boxes: tuple[IntArray, IntArray, IntArray]
     chart: Chart
     basis: Basis
     coarse: Basis
     through: Basis
     inner: slice
-    pin_value: np.ndarray
-    pin_slope_u: np.ndarray
-    pin_slope_v: np.ndarray
-    pin_base_mm: np.ndarray
-    pin_axis: np.ndarray
+    pin_value: FloatArray
+    pin_slope_u: FloatArray
+    pin_slope_v: FloatArray
+    pin_base_mm: FloatArray
+    pin_axis: FloatArray
     pin_cap_length_mm: float
 
     @cached_property
-    def pin_rest(self) -> tuple[np.ndarray, np.ndarray]:
+    def pin_rest(self) -> tuple[FloatArray, FloatArray]:
         """Foot (N, 3) and inverse frame (N, 3, 3) of the skin's inside under each pin at rest."""
         foot, frame = _surface(self, self.control_mm)
         return foot, np.linalg.inv(frame)
 
 
-def build_solid(spec: SensorSpec, *, resolution: Resolution | None = None, focus: Focus | None = None, keep: bool = True) -> Solid:
+def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None, focus: Focus | None = None, keep: bool = True) -> Solid:
     """The body of a sensor, its grid fine around a focus (default: around the apex).
 
     It depends on the sensor's geometry alone, and is kept on disk (see ``twin.store``) if ``keep``.
     """
     resolution, focus = resolution or Resolution(), focus or Focus()
-    inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
+    inner_mm = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm
     basis = Basis(np.linspace(-1, 1, resolution.across + 1))
-    frame = {
-        "chart": Chart(focus, float(np.arccos(spec.skin.rim_z_mm / inner_mm))),
-        "basis": basis,
-        "coarse": Basis(basis.breaks[::2]),
-        "through": Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING),
-    }
-    geometry = ("outer_radius_mm", "thickness_mm", "rim_z_mm")
+    chart = Chart(focus, float(np.arccos(geometry.skin.rim_z_mm / inner_mm)))
+    coarse = Basis(basis.breaks[::2])
+    through = Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING)
+    shape_of_skin = ("outer_radius_mm", "thickness_mm", "rim_z_mm")
     key = {
-        "skin": {name: getattr(spec.skin, name) for name in geometry},
-        "lens_mm": spec.lens.z_mm,
-        "pins": spec.pins.model_dump(mode="json"),
+        "skin": {name: getattr(geometry.skin, name) for name in shape_of_skin},
+        "lens_mm": geometry.lens.z_mm,
+        "pins": geometry.pins.model_dump(mode="json"),
         "resolution": asdict(resolution),
         "focus": asdict(focus),
     }
-    arrays = partial(_arrays, spec, resolution, **frame)
+    arrays = partial(_arrays, geometry, resolution, chart, basis, coarse, through)
     kept = cached_arrays("solid", key, arrays) if keep else arrays()
-    cells = {name: Cells(*(kept.pop(f"{name}_{part}") for part in _CELL_PARTS)) for name in ("skin", "gel_top", "gel_deep")}
-    boxes = tuple(kept.pop(f"boxes_{kind}") for kind in range(3))
     upper = basis.count**2
     return Solid(
-        **cells,
-        **frame,
-        **kept,
-        boxes=boxes,
+        control_mm=kept["control_mm"],
+        fixed=kept["fixed"],
+        skin=_kept_cells(kept, "skin"),
+        gel_top=_kept_cells(kept, "gel_top"),
+        gel_deep=_kept_cells(kept, "gel_deep"),
+        boxes=(kept["boxes_0"], kept["boxes_1"], kept["boxes_2"]),
+        chart=chart,
+        basis=basis,
+        coarse=coarse,
+        through=through,
+        pin_value=kept["pin_value"],
+        pin_slope_u=kept["pin_slope_u"],
+        pin_slope_v=kept["pin_slope_v"],
+        pin_base_mm=kept["pin_base_mm"],
+        pin_axis=kept["pin_axis"],
         inner=slice(resolution.skin_layers * upper, (resolution.skin_layers + 1) * upper),
-        pin_cap_length_mm=spec.pins.length_mm + spec.pins.cap_height_mm / 2,
+        pin_cap_length_mm=geometry.pins.length_mm + geometry.pins.cap_height_mm / 2,
     )
 
 
-def _arrays(spec: SensorSpec, resolution: Resolution, chart: Chart, basis: Basis, coarse: Basis, through: Basis) -> dict[str, np.ndarray]:
+def _kept_cells(kept: dict[str, np.ndarray], name: str) -> Cells:
+    """One kind of cells from the arrays that ``_arrays`` gives."""
+    return Cells(kept[f"{name}_controls"], kept[f"{name}_gradients"], kept[f"{name}_weights_mm3"])
+
+
+def _arrays(
+    geometry: GeometrySpec, resolution: Resolution, chart: Chart, basis: Basis, coarse: Basis, through: Basis
+) -> dict[str, np.ndarray]:
     """The arrays of a ``Solid``, by name."""
-    inner_mm, layers = spec.skin.outer_radius_mm - spec.skin.thickness_mm, resolution.skin_layers
+    inner_mm, layers = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm, resolution.skin_layers
     through_skin = Basis(np.linspace(0, 1, layers + 1), degree=1)
     side, coarse_side = basis.count, coarse.count
 
-    fine = [_fit(basis, chart, spec, depth) for depth in through_skin.greville]
-    deep = [_fit(coarse, chart, spec, depth) for depth in through.greville[1:]]
+    fine = [_fit(basis, chart, geometry, depth) for depth in through_skin.greville]
+    deep = [_fit(coarse, chart, geometry, depth) for depth in through.greville[1:]]
     control = np.concatenate(fine + deep)
     index = np.arange(len(fine) * side * side).reshape(-1, side, side)
     below = (len(fine) * side * side + np.arange(len(deep) * coarse_side**2)).reshape(-1, coarse_side, coarse_side)
@@ -178,8 +194,8 @@ def _arrays(spec: SensorSpec, resolution: Resolution, chart: Chart, basis: Basis
         "gel_top": spline_cells(basis, top, through, 0, control),
         "gel_deep": joined_cells([spline_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
     }
-    pins = rest_pins(spec)
-    value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, spec.skin.rim_z_mm)))
+    pins = rest_pins(geometry)
+    value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, geometry.skin.rim_z_mm)))
     return {
         **{f"{name}_{part}": getattr(kind, part) for name, kind in cells.items() for part in _CELL_PARTS},
         "boxes_0": np.tile(_boxes(resolution.across, 1), (layers, 1)),
@@ -195,16 +211,18 @@ def _arrays(spec: SensorSpec, resolution: Resolution, chart: Chart, basis: Basis
     }
 
 
-def surface_operators(basis: Basis, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def surface_operators(basis: Basis, square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rows (k, side^2) that give value, d/du and d/dv of a layer at points (k, 2) of the square from its controls."""
     u, v = square.T
     u0, u1, v0, v1 = basis.values(u), basis.values(u, derivative=1), basis.values(v), basis.values(v, derivative=1)
-    return tuple(
-        (along_v[:, :, None] * along_u[:, None, :]).reshape(len(square), -1) for along_v, along_u in ((v0, u0), (v0, u1), (v1, u0))
-    )
+
+    def rows(along_v: FloatArray, along_u: FloatArray) -> FloatArray:
+        return (along_v[:, :, None] * along_u[:, None, :]).reshape(len(square), -1)
+
+    return rows(v0, u0), rows(v0, u1), rows(v1, u0)
 
 
-def pin_pose(solid: Solid, control_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Feet, axes and cap centres of the pins on a deformed skin.
 
     The tangents and unit normal of the skin's inside at a foot, at rest and deformed, give
@@ -230,40 +248,42 @@ def pin_pose(solid: Solid, control_mm: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return base, axis, base + solid.pin_cap_length_mm * axis
 
 
-def body_points(spec: SensorSpec, disc: np.ndarray, depth: float) -> np.ndarray:
+def body_points(geometry: GeometrySpec, disc: ComplexArray, depth: float) -> FloatArray:
     """Places (k, 3) of the body at rest: depth 0 outside of the skin, 1 its inside, 2 the lens; straight lines between."""
-    skin = spec.skin
+    skin = geometry.skin
     inner_mm = skin.outer_radius_mm - skin.thickness_mm
     inner = dome_points(disc, inner_mm, skin.rim_z_mm)
     if depth <= 1:
         outer = dome_points(disc, skin.outer_radius_mm, skin.rim_z_mm)
         return outer + depth * (inner - outer)
     flat = np.sqrt(inner_mm**2 - skin.rim_z_mm**2) * disc
-    lens = np.column_stack([flat.real, flat.imag, np.full(len(disc), spec.lens.z_mm)])
+    lens = np.column_stack([flat.real, flat.imag, np.full(len(disc), geometry.lens.z_mm)])
     return inner + (depth - 1) * (lens - inner)
 
 
-def _fit(basis: Basis, chart: Chart, spec: SensorSpec, depth: float) -> np.ndarray:
+def _fit(basis: Basis, chart: Chart, geometry: GeometrySpec, depth: float) -> FloatArray:
     """Controls (side^2, 3) of the spline surface through the body's places at one depth."""
     v, u = np.meshgrid(basis.greville, basis.greville, indexing="ij")
-    places = body_points(spec, chart.disc(np.column_stack([u.ravel(), v.ravel()])), depth)
+    places = body_points(geometry, chart.disc(np.column_stack([u.ravel(), v.ravel()])), depth)
     inverse = np.linalg.inv(basis.values(basis.greville))
     return np.einsum("ri,cj,ijx->rcx", inverse, inverse, places.reshape(basis.count, basis.count, 3), optimize=True).reshape(-1, 3)
 
 
-def _local(through: Basis, element: int, function: int) -> tuple[np.ndarray, np.ndarray]:
+def _local(through: Basis, element: int, function: int) -> tuple[FloatArray, FloatArray]:
     """Value and slope (2,) at an element's Gauss points of one of the functions that live there."""
     at = through.gauss(2)[0][element]
-    return tuple(through.values(at, derivative=d)[:, element + function] for d in (0, 1))
+    return through.values(at)[:, element + function], through.values(at, derivative=1)[:, element + function]
 
 
-def spline_cells(grid: Basis, parts: list, through: Basis, layer: int, control_mm: np.ndarray) -> Cells:
+def spline_cells(
+    grid: Basis, parts: list[tuple[IntArray, Basis, tuple[FloatArray, FloatArray]]], through: Basis, layer: int, control_mm: FloatArray
+) -> Cells:
     """Elements of one layer over the intervals of ``grid``.
 
     ``parts``: for each function through the depth, its controls (side, side), their basis, and its values and slopes.
     """
     at, weights = grid.gauss(2)
-    shapes, controls = [], []
+    shape_parts, control_parts = [], []
     for index, basis, (value, slope) in parts:
         first = basis.element_of((grid.breaks[1:] + grid.breaks[:-1]) / 2)
         window = first[:, None] + np.arange(3)
@@ -272,9 +292,9 @@ def spline_cells(grid: Basis, parts: list, through: Basis, layer: int, control_m
         )
         # derivatives by (row, column, depth): right-handed, as depth runs inwards
         factors = ((value, f1, f0), (value, f0, f1), (slope, f0, f0))
-        shapes.append(np.stack([np.einsum("p,rqj,csk->rcpqsjk", *f).reshape(-1, 8, 9) for f in factors], axis=2))
-        controls.append(index[window[:, None, :, None], window[None, :, None, :]].reshape(-1, 9))
-    shapes, controls = np.concatenate(shapes, axis=3), np.concatenate(controls, axis=1)
+        shape_parts.append(np.stack([np.einsum("p,rqj,csk->rcpqsjk", *f).reshape(-1, 8, 9) for f in factors], axis=2))
+        control_parts.append(index[window[:, None, :, None], window[None, :, None, :]].reshape(-1, 9))
+    shapes, controls = np.concatenate(shape_parts, axis=3), np.concatenate(control_parts, axis=1)
     jacobian = np.einsum("mqja,mai->mqji", shapes, control_mm[controls], optimize=True).swapaxes(2, 3)
     depth_weights = through.gauss(2)[1][layer]
     volume = np.linalg.det(jacobian) * np.einsum("d,rq,cs->rcdqs", depth_weights, weights, weights).reshape(-1, 8)
@@ -285,19 +305,19 @@ def spline_cells(grid: Basis, parts: list, through: Basis, layer: int, control_m
 
 
 def joined_cells(parts: list[Cells]) -> Cells:
-    """One list of elements; of no layers, none of the gel's."""
+    """The elements of several layers as one list; no layers give a list of no elements with 27 controls each, as the gel's have."""
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
     return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in _CELL_PARTS))
 
 
-def _boxes(count: int, size: int) -> np.ndarray:
+def _boxes(count: int, size: int) -> IntArray:
     """(count^2, 4) row and column ranges of even elements of a size on the skin's grid."""
     rows, columns = (g.ravel() * size for g in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
     return np.column_stack([rows, rows + size, columns, columns + size])
 
 
-def _surface(solid: Solid, control_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _surface(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Foot (N, 3) and frame [t_u t_v n] (N, 3, 3) of the inner surface under each pin."""
     inner = control_mm[solid.inner]
     along_u, along_v = solid.pin_slope_u @ inner, solid.pin_slope_v @ inner

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
 from twin.geometry.mesh import SensorMesh
 from twin.geometry.solid import Solid, surface_operators
+from twin.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,14 @@ class NodeView:
     """
 
     mesh: SensorMesh
-    rest_mm: np.ndarray
-    fine: np.ndarray
-    coarse: np.ndarray
-    skin: np.ndarray
-    gel: np.ndarray
+    rest_mm: FloatArray
+    fine: FloatArray
+    coarse: FloatArray
+    skin: FloatArray
+    gel: FloatArray
 
     @classmethod
-    def of(cls, spec: SensorSpec, mesh: SensorMesh, solid: Solid) -> "NodeView":
+    def of(cls, mesh: SensorMesh, solid: Solid) -> "NodeView":
         """The map for one solid of a sensor."""
         at = solid.chart.square(mesh.disc)
         layers = np.linspace(0, 1, mesh.skin_layers + 1)
@@ -48,7 +48,7 @@ class NodeView:
             solid.through.values(below),
         )
 
-    def nodes(self, control_mm: np.ndarray) -> np.ndarray:
+    def nodes(self, control_mm: FloatArray) -> FloatArray:
         """Nodes (n, 3) of the deformed body."""
         moved = control_mm - self.rest_mm
         upper = self.skin.shape[1] * self.fine.shape[1]

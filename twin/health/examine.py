@@ -202,7 +202,7 @@ def _light(frames: list[Frame], seen: list[Observation], spec: SensorSpec, tuned
 @lru_cache(maxsize=2)
 def promised_caps(spec: SensorSpec) -> Caps:
     """The caps of the twin's own frame at rest."""
-    twin = expose(Preview(spec).render(), spec)
+    twin = expose(Preview(spec).render(), spec.capture)
     return measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)
 
 

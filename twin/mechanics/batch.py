@@ -21,7 +21,7 @@ _solver: SkinSolver | None = None
 class ContactJob:
     """One contact to solve (see ``SkinSolver.path``); ``every_state`` keeps the states on the way, too."""
 
-    stimulus: ObjectSpec
+    touched: ObjectSpec
     pose: ContactPose | ContactPath
     friction: float | Friction | None = None
     every_state: bool = False
@@ -84,12 +84,13 @@ def _start(spec: SensorSpec, resolution: Resolution | None) -> None:
 
 
 def _work(number: int, job: ContactJob) -> ContactOutcome:
+    assert _solver is not None, "the process was not started by press_many"
     return _solve(_solver, number, job)
 
 
 def _solve(solver: SkinSolver, number: int, job: ContactJob) -> ContactOutcome:
     try:
-        states = [state for _, state in solver.path(job.stimulus, job.pose, friction=job.friction)]
+        states = [state for _, state in solver.path(job.touched, job.pose, friction=job.friction)]
     except (ContactError, MeshError) as error:
         return ContactOutcome(number, [], str(error))
     return ContactOutcome(number, states if job.every_state else states[-1:])

@@ -9,12 +9,24 @@ from scipy.linalg import blas, lapack
 from twin.mechanics.balance import FORCE_FLOOR_N, Balance, Problem
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
 from twin.mechanics.linear import Eliminated
+from twin.types import FloatArray, IntArray
 
-_ITERATIONS, _HASTY_ITERATIONS = 60, 15
-LARGEST_MOVE_MM = 1.5  # of a control in one iteration
-_KEEP_FACTORS = 0.1  # contraction of the residual up to which old factors are kept
-_SOFTENING = 0.1  # of the contact, on the way to a far solution
-_INEXACT = 0.01  # the iteration ends at this share of the whole problem's residual, but not before ``least`` of the scale
+_ITERATIONS = 60
+"""Most iterations of Newton's method on the small problem."""
+_HASTY_ITERATIONS = 15
+"""Most iterations of the first attempt; where it fails, softened contact is solved first."""
+LARGEST_MOVE_MM = 1.5
+"""A control moves at most this far in one iteration."""
+_HALVINGS = 5
+"""Most times that the line search halves a step."""
+_LEAST_GAIN = 0.1
+"""The line search accepts a step of size s that lowers the residual's norm by at least this share of s."""
+_KEEP_FACTORS = 0.1
+"""Old factors of the matrix are used again as long as they lower the residual to this share or less."""
+_SOFTENING = 0.1
+"""Factor on the contact's stiffness while the solution is still far."""
+_INEXACT = 0.01
+"""The iteration ends when its residual is this share of the whole problem's: a better answer would not help the outer iteration."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +38,8 @@ class Tangent:
     """
 
     eliminated: Eliminated
-    matrix: np.ndarray  # (k, k), symmetric
-    volume_column: np.ndarray | None
+    matrix: FloatArray  # (k, k), symmetric
+    volume_column: FloatArray | None
     volume_pivot: float
 
 
@@ -35,7 +47,7 @@ class Tangent:
 class Near:
     """The tangent once more eliminated, down to the controls that carry the points looked at.
 
-    The far part of the tangent is L L^T; all in single precision.
+    Controls that carry no point which is looked at are "far". The far part of the tangent is L L^T. All arrays are in single precision.
 
     Attributes
     ----------
@@ -53,25 +65,25 @@ class Near:
         The contact's softening, and the factors of the matrix (n + 2, n + 2) for which Newton's direction was last found.
     """
 
-    near: np.ndarray
-    far: np.ndarray
-    local: np.ndarray
-    matrix: np.ndarray
-    column: np.ndarray
-    factor: np.ndarray
-    coupling: np.ndarray
-    far_column: np.ndarray
-    solved: tuple | None = None
+    near: IntArray
+    far: IntArray
+    local: IntArray
+    matrix: FloatArray
+    column: FloatArray
+    factor: FloatArray
+    coupling: FloatArray
+    far_column: FloatArray
+    solved: tuple[float, FloatArray, IntArray] | None = None
 
     @classmethod
-    def of(cls, tangent: Tangent, local: np.ndarray) -> "Near":
+    def of(cls, tangent: Tangent, local: IntArray) -> "Near":
         matrix, count = tangent.matrix, len(tangent.matrix)
         stays = np.zeros(count // 3 + 1, bool)
         stays[local] = True
         stays = np.repeat(stays[:-1], 3)
         far = np.flatnonzero(~stays)
         factor, info = lapack.spotrf(matrix[np.ix_(far, far)].T, lower=1, clean=0, overwrite_a=1) if len(far) else (np.zeros((0, 0)), 0)
-        if info > 0:  # only contact holds some of the far controls up: let all stay
+        if info > 0:  # without contact some far controls have no stiffness: eliminate none
             stays[:], far, factor = True, far[:0], np.zeros((0, 0))
         near = np.flatnonzero(stays)
         controls = near[::3] // 3
@@ -94,7 +106,16 @@ class SmallContact:
     S dz + v dp + r = forces of contact,   (w + dw) / c + sum f_z = 0,   v . dz + q dp + g = 0
     """
 
-    def __init__(self, problem: Problem, near: Near, pivot: float, residual, volume_residual, control, border):
+    def __init__(
+        self,
+        problem: Problem,
+        near: Near,
+        pivot: float,
+        residual: FloatArray,
+        volume_residual: float,
+        control: FloatArray,
+        border: FloatArray,
+    ) -> None:
         self._problem, self._border, self._near = problem, border, near
         self.iterations = 0
         self._at = positions(problem.controls, problem.weights, problem.lift, control)
@@ -104,7 +125,7 @@ class SmallContact:
         self._g = volume_residual - near.far_column @ self._far_residual
         self._q = pivot - near.far_column @ near.far_column
 
-    def solve(self, balance: Balance, *, soften: bool, least: float):
+    def solve(self, balance: Balance, *, soften: bool, least: float) -> tuple[FloatArray, FloatArray]:
         """Moves of all kept unknowns (k,) and of the border (2,).
 
         ``soften``: far from the solution; softened contact is solved first, and its answer is the start.
@@ -124,37 +145,38 @@ class SmallContact:
             out[near.far] = -lapack.strtrs(near.factor, right, lower=1, trans=1)[0]
         return out, y[-2:]
 
-    def _newton(self, y, soften: float, wanted: float, most: int):
+    def _newton(self, y: FloatArray, soften: float, wanted: float, most: int) -> tuple[FloatArray, bool]:
         residual, contact = self._equations(y, soften)
-        norm = np.linalg.norm(residual)
+        norm = float(np.linalg.norm(residual))
         for _ in range(most):
             if norm <= wanted:
                 return y, True
             self.iterations += 1
-            if self._near.solved and self._near.solved[0] == soften:  # what touches and sticks may not have changed since
+            if self._near.solved and self._near.solved[0] == soften:  # perhaps the same points still touch and stick: try the old factors
                 trial_y = y - self._solved(residual)
                 trial, trial_contact = self._equations(trial_y, soften)
-                trial_norm = np.linalg.norm(trial)
+                trial_norm = float(np.linalg.norm(trial))
                 if trial_norm < max(_KEEP_FACTORS * norm, wanted):
                     y, residual, contact, norm = trial_y, trial, trial_contact, trial_norm
                     continue
             self._factorise(contact, soften)
             move = -self._solved(residual)
             size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move[:-2]).max(initial=0.0), 1e-300))
-            best = None
-            for _ in range(6):
-                trial, trial_contact = self._equations(y + size * move, soften)
-                trial_norm = np.linalg.norm(trial)
-                if best is None or trial_norm < best[0]:
-                    best = (trial_norm, size, trial, trial_contact)
-                if trial_norm < (1 - 0.1 * size) * norm:
+            trial, trial_contact = self._equations(y + size * move, soften)
+            best = latest = float(np.linalg.norm(trial)), size, trial, trial_contact
+            for _ in range(_HALVINGS):
+                if latest[0] < (1 - _LEAST_GAIN * size) * norm:
                     break
                 size /= 2
+                trial, trial_contact = self._equations(y + size * move, soften)
+                latest = float(np.linalg.norm(trial)), size, trial, trial_contact
+                if latest[0] < best[0]:
+                    best = latest
             norm, size, residual, contact = best
             y = y + size * move
         return y, False
 
-    def _equations(self, y, soften: float):
+    def _equations(self, y: FloatArray, soften: float) -> tuple[FloatArray, ContactForces]:
         problem, near = self._problem, self._near
         border = self._border + y[-2:]
         at = _moved(near.local, problem.weights, self._at, y, problem.T, border[0])
@@ -167,7 +189,7 @@ class SmallContact:
             out[-1] = self._g + self._v @ y[:-2] + self._q * y[-1]
         return out, contact
 
-    def _factorise(self, contact: ContactForces, soften: float):
+    def _factorise(self, contact: ContactForces, soften: float) -> None:
         """The matrix of Newton's direction; in single precision, which costs half and no convergence."""
         problem, local, count = self._problem, self._near.local, len(self._near.near)
         turn = problem.T[:3, :3]
@@ -185,14 +207,18 @@ class SmallContact:
         if problem.body.sealed:
             matrix[:count, count + 1] = matrix[count + 1, :count] = self._v
             matrix[count + 1, count + 1] = self._q
-        self._near.solved = (soften, *lapack.sgetrf(matrix, overwrite_a=1)[:2])
+        factors, pivots, _ = lapack.sgetrf(matrix, overwrite_a=1)
+        self._near.solved = soften, factors, pivots
 
-    def _solved(self, right_side):
-        return lapack.sgetrs(*self._near.solved[1:], right_side.astype(np.float32))[0].astype(float)
+    def _solved(self, right_side: FloatArray) -> FloatArray:
+        """Newton's direction for a right side, with the factors found last."""
+        assert self._near.solved is not None, "factorise first"
+        _, factors, pivots = self._near.solved
+        return lapack.sgetrs(factors, pivots, right_side.astype(np.float32))[0].astype(float)
 
 
 @numba.njit(cache=True)
-def _moved(local, weights, at, y, T, yielded):
+def _moved(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatArray, T: FloatArray, yielded: float) -> FloatArray:
     """Points (q, 3) in the object's frame after moves ``y`` of their controls."""
     controls = (len(y) - 2) // 3
     out = np.empty_like(at)
@@ -211,7 +237,17 @@ def _moved(local, weights, at, y, T, yielded):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _residual(matrix, y, start, column, local, weights, force, T, out):
+def _residual(
+    matrix: FloatArray,
+    y: FloatArray,
+    start: FloatArray,
+    column: FloatArray,
+    local: IntArray,
+    weights: FloatArray,
+    force: FloatArray,
+    T: FloatArray,
+    out: FloatArray,
+) -> float:
     """Forces on the near controls into ``out``; the sum of the contact's along z, all in the sensor's frame."""
     count = len(y) - 2
     for r in range(count):

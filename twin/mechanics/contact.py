@@ -5,11 +5,11 @@ g = max(-d, 0), the force on the skin is (Wriggers, "Computational Contact Mecha
 
     f = A (p n - min(mu p, tau) phi(|s| / delta) s / |s|),    phi(x) = 2 x - x^2 for x < 1 (stick), else 1 (slip)
 
-p is the pressure k g, but for g < eps it starts as k g^2 / 2 eps, so that touching is smooth. s is the
-tangential travel since the point's anchor, which is fixed to the object: where the point touched it,
-moved after a slip so that |s| = delta. tau bounds the shear stress that the pair of surfaces can bear,
-however hard it is pressed (as between rubbers; Orowan's friction). A sticking point creeps by less than
-delta; no point ever leaves Coulomb's cone. Everything here is in the object's frame.
+p is the pressure k (g - eps / 2); for g < eps it is k g^2 / 2 eps, so that the force begins smoothly. s is the
+tangential travel from the point's anchor. The anchor is fixed to the object: it is the place where the point touched
+the object first, and after a slip it is moved so that |s| = delta. tau bounds the shear stress that the two surfaces
+bear, however hard they are pressed together (as between rubbers; Orowan's friction). A sticking point creeps by less than
+delta, and no point ever leaves Coulomb's cone. Everything here is in the object's frame.
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,15 @@ import numba
 import numpy as np
 
 from twin.geometry.solid import Solid
+from twin.stimulus import ObjectField
+from twin.types import BoolArray, FloatArray, IntArray
 
 SMOOTH_GAP_MM = 0.006
+"""eps: penetration below which the pressure rises with its square, so that touching is smooth."""
 STICK_CREEP_MM = 0.01
-POINTS_PER_ELEMENT = 4  # along each side of an outer element
+"""delta: travel from its anchor at which a sticking point starts to slip; about a hundredth of a usual shear."""
+POINTS_PER_ELEMENT = 4
+"""Contact points along each side of an outer element."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +45,13 @@ class ContactPoints:
         Element below the point.
     """
 
-    controls: np.ndarray
-    weights: np.ndarray
-    lift_mm: np.ndarray
-    area_mm2: np.ndarray
-    element: np.ndarray
+    controls: IntArray
+    weights: FloatArray
+    lift_mm: FloatArray
+    area_mm2: FloatArray
+    element: IntArray
 
-    def positions(self, control_mm: np.ndarray) -> np.ndarray:
+    def positions(self, control_mm: FloatArray) -> FloatArray:
         """(p, 3) in mm."""
         return positions(self.controls, self.weights, self.lift_mm, control_mm)
 
@@ -60,7 +65,7 @@ def contact_points(solid: Solid, radius_mm: float) -> ContactPoints:
     outer = solid.control_mm[: basis.count**2].reshape(basis.count, basis.count, 3)
     value, slope = basis.values(at), basis.values(at, derivative=1)
 
-    def surface(rows, columns):
+    def surface(rows: FloatArray, columns: FloatArray) -> FloatArray:
         return np.einsum("ri,cj,ijx->rcx", rows, columns, outer, optimize=True).reshape(-1, 3)
 
     flat = surface(value, value)
@@ -78,7 +83,7 @@ def contact_points(solid: Solid, radius_mm: float) -> ContactPoints:
 
 
 @numba.njit(cache=True)
-def positions(controls, weights, lift, control):
+def positions(controls: IntArray, weights: FloatArray, lift: FloatArray, control: FloatArray) -> FloatArray:
     """Places (p, 3) of points carried by nine controls each."""
     out = lift.copy()
     for p in range(len(controls)):
@@ -108,16 +113,25 @@ class ContactForces:
         The anchors of touched points if this state is accepted.
     """
 
-    normal: np.ndarray
-    force_n: np.ndarray
-    normal_n: np.ndarray
-    penetration_mm: np.ndarray
-    slipping: np.ndarray
-    stiffness: np.ndarray
-    anchor_mm: np.ndarray
+    normal: FloatArray
+    force_n: FloatArray
+    normal_n: FloatArray
+    penetration_mm: FloatArray
+    slipping: BoolArray
+    stiffness: FloatArray
+    anchor_mm: FloatArray
 
 
-def contact_forces(stimulus, at_mm, stiff, anchor_mm, friction, *, bound_n=None, soften: float = 1.0) -> ContactForces:
+def contact_forces(
+    field: ObjectField,
+    at_mm: FloatArray,
+    stiff: FloatArray,
+    anchor_mm: FloatArray,
+    friction: FloatArray,
+    *,
+    bound_n: FloatArray | None = None,
+    soften: float = 1.0,
+) -> ContactForces:
     """Forces and their stiffness with contact points at ``at_mm`` (p, 3), object frame.
 
     Parameters
@@ -131,16 +145,30 @@ def contact_forces(stimulus, at_mm, stiff, anchor_mm, friction, *, bound_n=None,
     bound_n : (p,) float, optional
         Friction force that a point never exceeds (tau A).
     soften : float
-        Below 1: the penalty times it, and the smooth gap and the creep over it (on the way to a solution).
+        Below 1 on the way to a solution: the penalty is multiplied by it, the smooth gap and the creep are divided by it.
     """
-    distance, normal, hessian = stimulus.probe(at_mm)
+    distance, normal, hessian = field.probe(at_mm)
     scales = SMOOTH_GAP_MM / soften, STICK_CREEP_MM / soften
     bound = np.full(len(at_mm), np.inf) if bound_n is None else bound_n
-    return ContactForces(normal, *_law(at_mm, distance, normal, hessian, soften * stiff, anchor_mm, friction, bound, *scales))
+    force, normal_n, depth, slipping, stiffness, anchors = _law(
+        at_mm, distance, normal, hessian, soften * stiff, anchor_mm, friction, bound, *scales
+    )
+    return ContactForces(normal, force, normal_n, depth, slipping, stiffness, anchors)
 
 
 @numba.njit(cache=True)
-def _law(at, distance, normal, hessian, stiff, anchor, friction, bound, eps, delta):
+def _law(
+    at: FloatArray,
+    distance: FloatArray,
+    normal: FloatArray,
+    hessian: FloatArray,
+    stiff: FloatArray,
+    anchor: FloatArray,
+    friction: FloatArray,
+    bound: FloatArray,
+    eps: float,
+    delta: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:
     count = len(at)
     force, k = np.zeros((count, 3)), np.zeros((count, 3, 3))
     pressing, depth = np.zeros(count), np.zeros(count)
@@ -207,7 +235,7 @@ def _law(at, distance, normal, hessian, stiff, anchor, friction, bound, eps, del
 
 
 @numba.njit(cache=True)
-def spread_forces(controls, weights, force, out):
+def spread_forces(controls: IntArray, weights: FloatArray, force: FloatArray, out: FloatArray) -> None:
     """Add point forces (p, 3) to the controls that carry the points, (n, 3)."""
     for p in range(len(controls)):
         if force[p, 0] != 0.0 or force[p, 1] != 0.0 or force[p, 2] != 0.0:
@@ -217,7 +245,7 @@ def spread_forces(controls, weights, force, out):
 
 
 @numba.njit(cache=True)
-def spread_stiffness(controls, weights, stiffness, out):
+def spread_stiffness(controls: IntArray, weights: FloatArray, stiffness: FloatArray, out: FloatArray) -> None:
     """Add point stiffnesses (p, 3, 3) to a matrix of the controls' unknowns, (3 n, 3 n); controls from n on are left out."""
     count = len(out) // 3
     for p in range(len(controls)):

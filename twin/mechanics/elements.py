@@ -26,6 +26,7 @@ import numpy as np
 
 from twin.geometry.solid import Cells
 from twin.mechanics.material import distortion, distortion_stiffness, invariants
+from twin.types import FloatArray, IntArray
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks
 _I = np.array([i for i, _ in PAIRS])
@@ -49,11 +50,11 @@ class Elements:
     """
 
     cells: Cells
-    law: np.ndarray
+    law: FloatArray
     layer: bool = False
-    difference_mpa: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    difference_mpa: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    def add_forces(self, control_mm: np.ndarray, stress: np.ndarray, out: np.ndarray, pressure_mpa: float = 0.0) -> float:
+    def add_forces(self, control_mm: FloatArray, stress: FloatArray, out: FloatArray, pressure_mpa: float = 0.0) -> float:
         """Elastic energy in N mm; adds its gradient by the controls to ``out`` (n, 3) in N.
 
         ``stress`` (m, 8, 3, 3) is the given stress S in MPa, or (0, 8, 3, 3) for none; ``pressure_mpa`` (positive:
@@ -62,24 +63,24 @@ class Elements:
         """
         return _forces(*self._arrays, control_mm, stress, pressure_mpa, out)
 
-    def add_volume(self, control_mm: np.ndarray, out: np.ndarray) -> float:
+    def add_volume(self, control_mm: FloatArray, out: FloatArray) -> float:
         """Growth of the volume in mm^3; adds its gradient by the controls to ``out`` (n, 3) in mm^2."""
         cells = self.cells
         return _forces(
             cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), np.zeros(0), control_mm, np.zeros((0, 8, 3, 3)), 1.0, out
         )
 
-    def distortion_stress(self, control_mm: np.ndarray) -> np.ndarray:
+    def distortion_stress(self, control_mm: FloatArray) -> FloatArray:
         """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa."""
         cells = self.cells
         return _distortion_stress(cells.controls, cells.gradients, cells.weights_mm3, self.law, control_mm)
 
-    def difference_stress(self, control_mm: np.ndarray) -> np.ndarray:
+    def difference_stress(self, control_mm: FloatArray) -> FloatArray:
         """kappa_d times half the difference of the levels' volume strains, (m,) in MPa."""
         cells = self.cells
         return self.law[5] * _half_difference(cells.controls, cells.gradients, cells.weights_mm3, control_mm)
 
-    def stiffness(self, control_mm: np.ndarray, stress: np.ndarray, pressure_mpa: float, out: np.ndarray) -> None:
+    def stiffness(self, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, out: FloatArray) -> None:
         """Second derivative of each element's energy into ``out`` (m, 6, b, b), N/mm; in its precision.
 
         Block p couples direction ``PAIRS[p][0]`` of the first control with ``PAIRS[p][1]`` of the second;
@@ -88,12 +89,14 @@ class Elements:
         _stiffness(*self._arrays, control_mm, stress, pressure_mpa, out)
 
     @property
-    def _arrays(self):
+    def _arrays(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         return self.cells.controls, self.cells.gradients, self.cells.weights_mm3, self.law, self.difference_mpa
 
 
 @numba.njit(cache=True, fastmath=True)
-def _kinematics(x, grad, weights, f, g, det):
+def _kinematics(
+    x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatArray, g: FloatArray, det: FloatArray
+) -> tuple[float, float, float, float]:
     """F, F^-T and det F at all points; (level volumes at rest, and deformed), or a negative first volume if inside out."""
     v0, v1, r0, r1 = 0.0, 0.0, 0.0, 0.0
     for q in range(8):
@@ -116,7 +119,17 @@ def _kinematics(x, grad, weights, f, g, det):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _forces(elements, gradients, weights, law, extra, control, given, sealing, out):
+def _forces(
+    elements: IntArray,
+    gradients: FloatArray,
+    weights: FloatArray,
+    law: FloatArray,
+    extra: FloatArray,
+    control: FloatArray,
+    given: FloatArray,
+    sealing: float,
+    out: FloatArray,
+) -> float:
     count = elements.shape[1]
     x, push = np.zeros((3, count)), np.zeros((3, count))
     f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
@@ -159,7 +172,17 @@ def _forces(elements, gradients, weights, law, extra, control, given, sealing, o
 
 
 @numba.njit(cache=True, fastmath=True)
-def _stiffness(elements, gradients, weights, law, extra, control, given, sealing, out):
+def _stiffness(
+    elements: IntArray,
+    gradients: FloatArray,
+    weights: FloatArray,
+    law: FloatArray,
+    extra: FloatArray,
+    control: FloatArray,
+    given: FloatArray,
+    sealing: float,
+    out: FloatArray,
+) -> None:
     count = elements.shape[1]
     x = np.zeros((3, count))
     f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
@@ -213,7 +236,7 @@ def _stiffness(elements, gradients, weights, law, extra, control, given, sealing
 
 
 @numba.njit(cache=True, fastmath=True)
-def _distortion_stress(elements, gradients, weights, law, control):
+def _distortion_stress(elements: IntArray, gradients: FloatArray, weights: FloatArray, law: FloatArray, control: FloatArray) -> FloatArray:
     count = elements.shape[1]
     x = np.zeros((3, count))
     f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
@@ -234,7 +257,7 @@ def _distortion_stress(elements, gradients, weights, law, control):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _half_difference(elements, gradients, weights, control):
+def _half_difference(elements: IntArray, gradients: FloatArray, weights: FloatArray, control: FloatArray) -> FloatArray:
     count = elements.shape[1]
     x = np.zeros((3, count))
     f, g, det = np.zeros((8, 3, 3)), np.zeros((8, 3, 3)), np.zeros(8)

@@ -8,7 +8,7 @@ from twin.geometry.chart import Focus
 from twin.mechanics.ongoing import OngoingContact
 from twin.mechanics.path import ContactPath, carried, deepest_mm, dome_directions
 from twin.mechanics.solver import SkinSolver, friction_of
-from twin.stimulus import build_stimulus
+from twin.stimulus import build_field
 from twin.types import ContactState
 
 STEP_MM = 1.2  # largest motion across the contact in one load step
@@ -36,11 +36,11 @@ class Follower:
 
     def __init__(self, solver: SkinSolver, stimulus: ObjectSpec, *, step_mm: float | None = None):
         self._solver, self._step_mm = solver, step_mm or _step_of(stimulus)
-        self._field = build_stimulus(stimulus)
+        self._field = build_field(stimulus)
         rig = solver.spec.rig
         self._law, self._compliance = friction_of(stimulus), stimulus.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
         self._radius_mm = solver.spec.skin.outer_radius_mm
-        self._dome_mm = self._radius_mm * dome_directions(solver.spec, _DIRECTIONS)
+        self._dome_mm = self._radius_mm * dome_directions(solver.spec.skin, _DIRECTIONS)
         self._rest = solver.rest()
         self._contact: OngoingContact | None = None
         self._reached = np.zeros((0, 3))
@@ -93,7 +93,7 @@ class Follower:
         return ContactState.untouched(rest.nodes_mm, rest.base_mm, rest.axis, rest.caps_mm, T_sensor_object=T)
 
     def _press(self, T: np.ndarray, time_s: float) -> None:
-        limit = deepest_mm(self._solver.spec)
+        limit = deepest_mm(self._solver.spec.geometry)
         if (deep := -self.gap_mm(T)) > limit:
             raise ContactError(f"the object is {deep:.1f} mm inside the dome, more than {limit:.1f} (half the gel's depth); move away")
         near = self._T is not None and np.linalg.norm(carried(self._dome_mm, self._T, T), axis=1).max() < LARGEST_MOVE_MM

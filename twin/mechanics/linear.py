@@ -3,20 +3,24 @@
 Duff & Reid 1983 (multifrontal method), George 1973 (nested dissection of a grid). The elements stand on a
 square grid, so the dissection is known: cut the longer side in the middle, recurse; a control is
 eliminated in the smallest box that holds all of its elements. All arithmetic is dense LAPACK on the
-fronts; the order is found once per path. Some unknowns can be kept: what is left for them is a dense
-matrix (static condensation; Guyan 1965), on which contact, that changes from iteration to iteration, is
-cheap to solve.
+fronts; the order is found once per path. Some unknowns can be kept: a dense matrix for them remains
+(static condensation; Guyan 1965). Contact changes from iteration to iteration, and is cheap to solve on this matrix.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numba
 import numpy as np
 from scipy.linalg import blas, lapack
 
 from twin.mechanics.elements import PAIRS
+from twin.types import BoolArray, FloatArray, IntArray
+
+Box: TypeAlias = tuple[int, int, int, int]  # first row, last row + 1, first column, last column + 1
 
 _LEAF_ELEMENTS = 36
+"""A box of this many elements or fewer is not cut any more."""
 _I = np.array([i for i, _ in PAIRS])
 _K = np.array([k for _, k in PAIRS])
 
@@ -27,14 +31,37 @@ class NotPositiveDefinite(Exception):
 
 @dataclass
 class _Front:
-    own: np.ndarray  # unknowns eliminated here
-    border: np.ndarray  # later unknowns they are coupled to
-    controls_left: np.ndarray  # controls of the border
-    assembled: list  # for each kind of element: which are assembled here, and (elements, 3 b) their rows, direction-major; -1 for clamped
-    children: list  # fronts that are added to this one, and the runs of their borders in it, see ``_runs``
-    head: np.ndarray  # (own, own), Fortran order, lower triangle, overwritten by its factor
-    below: np.ndarray  # (border, own)
-    rest: np.ndarray = None  # (border, border); in room that other fronts use before and after
+    """A dense part of the elimination.
+
+    Attributes
+    ----------
+    own : (o,) int
+        Unknowns that are eliminated here.
+    border : (r,) int
+        Unknowns, eliminated later, to which they are coupled.
+    controls_left : (r / 3,) int
+        Controls of the border.
+    assembled : list of (which, rows)
+        For each kind of element: the elements (e,) assembled here, and the front's rows (e, 3 b) of their unknowns,
+        direction by direction; -1 where a control is clamped.
+    children : list of (front, runs)
+        Fronts that are added to this one, and the runs of their borders in it (see ``_runs``).
+    head : (o, o) float
+        Fortran order, lower triangle; its Cholesky factor overwrites it.
+    below : (r, o) float
+        Coupling of border and own unknowns.
+    rest : (r, r) float
+        What is left for the border. It lies in memory that other fronts use before and after (see ``_make_room``).
+    """
+
+    own: IntArray
+    border: IntArray
+    controls_left: IntArray
+    assembled: list[tuple[IntArray, IntArray]]
+    children: list[tuple["_Front", IntArray]]
+    head: FloatArray
+    below: FloatArray
+    rest: FloatArray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
 
 class FrontalSolver:
@@ -51,30 +78,30 @@ class FrontalSolver:
         Controls that are not eliminated.
     """
 
-    def __init__(self, groups: list[np.ndarray], boxes: list[np.ndarray], fixed: np.ndarray, keep: np.ndarray):
+    def __init__(self, groups: list[IntArray], boxes: list[IntArray], fixed: BoolArray, keep: BoolArray) -> None:
         free = ~fixed
         self.unknown = np.full((len(fixed), 3), -1)
         self.unknown[free] = np.arange(3 * np.count_nonzero(free)).reshape(-1, 3)
         self.size = 3 * int(np.count_nonzero(free))
         support = np.tile([1 << 30, 0, 1 << 30, 0], (len(fixed), 1))
-        for controls, box in zip(groups, boxes, strict=True):
+        for controls, lying in zip(groups, boxes, strict=True):
             for column, better in enumerate((np.minimum, np.maximum, np.minimum, np.maximum)):
-                better.at(support[:, column], controls, box[:, column, None])
-        side = int(max(box[:, 1].max() for box in boxes if len(box)))
-        tree: list[tuple] = []
+                better.at(support[:, column], controls, lying[:, column, None])
+        side = int(max(lying[:, 1].max() for lying in boxes if len(lying)))
+        tree: list[tuple[Box, list[int]]] = []
         _dissect((0, side, 0, side), tree)
-        stage = np.full(len(fixed), len(tree))  # where a control is eliminated: the smallest box that holds its support
+        stage = np.full(len(fixed), len(tree))  # box in which a control is eliminated: the smallest one around its support
         for number, (box, _) in enumerate(tree):
             stage[_inside(support, box) & free & ~keep & (stage == len(tree))] = number
 
         self._fronts: list[_Front] = []
         for number, (box, children) in enumerate(tree):
-            assembled, touched = [], [self._fronts[c].controls_left for c in children]
+            assembled, parts = [], [self._fronts[c].controls_left for c in children]
             for controls, where in zip(groups, boxes, strict=True):
                 which = np.flatnonzero(_inside(where, box)) if not children else np.zeros(0, int)
                 assembled.append((which, controls[which]))
-                touched.append(controls[which].ravel())
-            touched = np.unique(np.concatenate(touched))
+                parts.append(controls[which].ravel())
+            touched = np.unique(np.concatenate(parts))
             touched = touched[free[touched]]
             order = np.lexsort((touched, stage[touched]))
             own, left = np.split(touched[order], [np.count_nonzero(stage[touched] == number)])
@@ -100,7 +127,7 @@ class FrontalSolver:
         self._make_room([children for _, children in tree])
         self.kept = self._fronts[-1].border
 
-    def eliminate(self, blocks: list[np.ndarray], *, shift: float = 0.0) -> "Eliminated":
+    def eliminate(self, blocks: list[FloatArray], *, shift: float = 0.0) -> "Eliminated":
         """Eliminate all but the kept unknowns; the result is valid until the next call.
 
         Parameters
@@ -136,8 +163,10 @@ class FrontalSolver:
         return Eliminated(self._fronts, self.kept)
 
     def _make_room(self, children: list[list[int]]) -> None:
-        """Give every front its ``rest``: what a front leaves is needed only until it was added to the next one, so few rooms do."""
-        room, sizes, unused = [], [], []
+        """Give every front the memory of its ``rest``. A rest is needed only until the next front has added it, so fronts share memory."""
+        room: list[int] = []
+        sizes: list[int] = []
+        unused: list[int] = []
         for front, before in zip(self._fronts, children, strict=True):
             if not unused:
                 unused.append(len(sizes))
@@ -162,11 +191,11 @@ class Eliminated:
         What is left for them (Schur complement); lower triangle.
     """
 
-    def __init__(self, fronts: list[_Front], kept: np.ndarray):
+    def __init__(self, fronts: list[_Front], kept: IntArray) -> None:
         self._fronts = [front for front in fronts if len(front.own)]
         self.kept, self.matrix = kept, fronts[-1].rest
 
-    def forward(self, right_side: np.ndarray) -> np.ndarray:
+    def forward(self, right_side: FloatArray) -> FloatArray:
         """Eliminate in a right side (unknowns,): what is left at ``kept`` is the right side for ``matrix``."""
         x = np.array(right_side, np.float32)
         for front in self._fronts:
@@ -175,7 +204,7 @@ class Eliminated:
             x[front.own] = part
         return x
 
-    def backward(self, eliminated: np.ndarray, kept_values: np.ndarray) -> np.ndarray:
+    def backward(self, eliminated: FloatArray, kept_values: FloatArray) -> FloatArray:
         """The whole solution (unknowns,) from an eliminated right side and the solution at ``kept``."""
         x = eliminated.astype(np.float32)
         x[self.kept] = kept_values
@@ -184,7 +213,7 @@ class Eliminated:
         return x
 
 
-def _dissect(box, tree):
+def _dissect(box: Box, tree: list[tuple[Box, list[int]]]) -> int:
     """Append (box, children) of a box of elements cut in two again and again, children before their parent; its place in the list."""
     row0, row1, column0, column1 = box
     children = []
@@ -200,12 +229,12 @@ def _dissect(box, tree):
     return len(tree) - 1
 
 
-def _inside(boxes, box):
+def _inside(boxes: IntArray, box: Box) -> BoolArray:
     return (boxes[:, 0] >= box[0]) & (boxes[:, 1] <= box[1]) & (boxes[:, 2] >= box[2]) & (boxes[:, 3] <= box[3])
 
 
 @numba.njit(cache=True)
-def whole(lower, shift):
+def whole(lower: FloatArray, shift: float) -> FloatArray:
     """A symmetric matrix from its lower triangle, plus a shift on the diagonal."""
     out = np.empty_like(lower)
     for c in range(len(lower)):
@@ -215,7 +244,7 @@ def whole(lower, shift):
     return out
 
 
-def _runs(places, own):
+def _runs(places: IntArray, own: int) -> IntArray:
     """Runs (k, 3) of rising places: first row, first place and length; none lies across ``own``."""
     first = np.flatnonzero(np.diff(places, prepend=-2) != 1)
     first = np.union1d(first, np.searchsorted(places, own))
@@ -224,7 +253,7 @@ def _runs(places, own):
 
 
 @numba.njit(cache=True)
-def _assemble(elements, which, places, head, below, rest):
+def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
     """Add symmetric blocks to a front's lower triangle."""
     own, count = len(head), elements.shape[2]
     for e in range(len(which)):
@@ -250,7 +279,7 @@ def _assemble(elements, which, places, head, below, rest):
 
 
 @numba.njit(cache=True)
-def _extend(update, runs, head, below, rest):
+def _extend(update: FloatArray, runs: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
     """Add what an earlier front leaves, (border, border), to a front; all transposed, so that columns lie in one piece."""
     own = len(head)
     for j in range(len(runs)):
@@ -268,6 +297,6 @@ def _extend(update, runs, head, below, rest):
 
 
 @numba.njit(cache=True)
-def _add(values, out):
+def _add(values: FloatArray, out: FloatArray) -> None:
     for k in range(len(values)):
         out[k] += values[k]

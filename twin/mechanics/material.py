@@ -13,9 +13,10 @@ import numba
 import numpy as np
 
 from scenes.sensor import MaterialSpec
+from twin.types import FloatArray
 
 
-def law_coefficients(spec: MaterialSpec, *, layer: bool) -> np.ndarray:
+def law_coefficients(spec: MaterialSpec, *, layer: bool) -> FloatArray:
     """(6,) c10, c01, c20, c30, kappa and kappa_d of a material, MPa.
 
     ``layer``: for elements that are linear through the depth of a skin (see ``elements``).
@@ -29,7 +30,7 @@ def law_coefficients(spec: MaterialSpec, *, layer: bool) -> np.ndarray:
 
 
 @numba.njit(cache=True, inline="always")
-def invariants(f, g):
+def invariants(f: FloatArray, g: FloatArray) -> float:
     """det F and, into ``g`` (3, 3), F^-T; det F <= 0 leaves ``g`` alone."""
     g00 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
     g01 = f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
@@ -48,7 +49,7 @@ def invariants(f, g):
 
 
 @numba.njit(cache=True, fastmath=True)
-def distortion(law, f, det, g, stress):
+def distortion(law: FloatArray, f: FloatArray, det: float, g: FloatArray, stress: FloatArray) -> float:
     """Energy density of the part of the law without kappa; its derivative by F into ``stress`` (3, 3), MPa."""
     trace, scale, first = _first_invariant(f, det)
     slope = law[0] + first * (2 * law[2] + 3 * law[3] * first)
@@ -67,7 +68,7 @@ def distortion(law, f, det, g, stress):
 
 
 @numba.njit(cache=True, fastmath=True)
-def distortion_stiffness(law, f, det, g, out):
+def distortion_stiffness(law: FloatArray, f: FloatArray, det: float, g: FloatArray, out: FloatArray) -> None:
     """Second derivative of ``distortion`` by F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
     trace, scale, first = _first_invariant(f, det)
     slope = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
@@ -86,7 +87,7 @@ def distortion_stiffness(law, f, det, g, out):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _add_second_stiffness(factor, f, g, trace, out):
+def _add_second_stiffness(factor: float, f: FloatArray, g: FloatArray, trace: float, out: FloatArray) -> None:
     """Add the c01 part of ``distortion_stiffness``."""
     second, slopes = _second_invariant(f, trace)
     for i in range(3):
@@ -105,7 +106,7 @@ def _add_second_stiffness(factor, f, g, trace, out):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _first_invariant(f, det):
+def _first_invariant(f: FloatArray, det: float) -> tuple[float, float, float]:
     """tr C, J^(-2/3) and I1 - 3."""
     trace = 0.0
     for i in range(3):
@@ -116,7 +117,7 @@ def _first_invariant(f, det):
 
 
 @numba.njit(cache=True, fastmath=True)
-def _second_invariant(f, trace):
+def _second_invariant(f: FloatArray, trace: float) -> tuple[float, FloatArray]:
     """I2 of C and its derivative 2 (tr C F - F C) by F."""
     c = f.T @ f
     second = (trace * trace - (c * c).sum()) / 2

@@ -1,10 +1,9 @@
 """One load step: from a converged state to the next one, the object moved.
 
-Two nested iterations. The outer one is Newton's method on the elastic body: its tangent is eliminated
-down to the controls of the outer skin that the object may touch, and kept while it serves (it usually
-lasts for several iterations, and from one load step into the next). The inner one solves contact and
-friction exactly against what is left, a small dense problem: which points touch, stick or slip changes
-often, and is cheap to find there.
+Two iterations are nested. The outer one is Newton's method on the elastic body. Its tangent is eliminated
+down to the controls of the outer skin that the object may touch, and is kept as long as it converges well enough
+(usually for several iterations, and from one load step into the next). The inner one solves contact and friction
+exactly on the small dense problem that remains: which points touch, stick or slip changes often, and is cheap to find there.
 """
 
 import numpy as np
@@ -14,22 +13,39 @@ from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, 
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
+from twin.stimulus import ObjectField
+from twin.types import FloatArray, IntArray
 
-GAP_BOUND_MM = 0.01  # no contact point ends deeper inside the object
-RESIDUAL_TOLERANCE = 1e-6  # of the sum of the contact forces
-_PENALTY_GROWTH, _PENALTY_RAISES = 4.0, 5
+GAP_BOUND_MM = 0.01
+"""No contact point ends deeper inside the object than this."""
+RESIDUAL_TOLERANCE = 1e-6
+"""A step is solved when the norm of the residual is at most this share of the sum of the contact forces."""
+_PENALTY_GROWTH = 4.0
+"""Factor on the penalty when a point ends too deep."""
+_PENALTY_RAISES = 5
+"""Most solutions of one step: with a larger penalty, or with more contact points, than the one before."""
 _ITERATIONS = 30
-_INNER_ITERATIONS = 400  # in all; a step whose contact flickers for longer is soonest solved in shorter ones
-_WORSE = 2.0  # growth of the residual that is put up with
-_KEEP_TANGENT = 0.3  # contraction of the residual up to which an old tangent is kept
-_SMALLEST_SHIFT_N_MM, _LARGEST_SHIFT_N_MM = 0.01, 50.0  # on the tangent's diagonal, where it leads astray
-_REACH_MM = 0.15  # contact points farther than this from the object are left out, and checked at the end
+"""Most outer iterations of one solution."""
+_INNER_ITERATIONS = 400
+"""Most inner iterations of one solution, all outer ones together. Where contact flickers for longer, shorter load steps are faster."""
+_WORSE = 2.0
+"""A move that makes the residual larger than this many times is refused."""
+_KEEP_TANGENT = 0.3
+"""An old tangent is kept as long as it lowers the residual to this share or less."""
+_SMALLEST_SHIFT_N_MM = 0.01
+"""First shift on the diagonal of a tangent that leads to refused moves, or is not positive definite (N/mm)."""
+_SHIFT_GROWTH = 8
+"""Factor from one shift to the next."""
+_LARGEST_SHIFT_N_MM = 50.0
+"""With a shift beyond this (N/mm) the step counts as not solved."""
+_REACH_MM = 0.15
+"""Contact points farther than this from the object are left out of the equations; at the end it is checked that none of them touches."""
 
 
 class NoConvergence(Exception):
     """A load step was not solved; ``relative`` is the relative residual reached."""
 
-    def __init__(self, relative: float):
+    def __init__(self, relative: float) -> None:
         super().__init__(relative)
         self.relative = relative
 
@@ -42,13 +58,13 @@ class LoadStepper:
     body : Body
     frontal : FrontalSolver
         Keeps the controls that the object may touch.
-    stimulus : Stimulus
+    field : ObjectField
     friction : Friction
     compliance_mm_per_n : float
     """
 
-    def __init__(self, body: Body, frontal: FrontalSolver, stimulus, friction: Friction, compliance_mm_per_n: float):
-        self._body, self._frontal, self._stimulus, self._friction = body, frontal, stimulus, friction
+    def __init__(self, body: Body, frontal: FrontalSolver, field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
+        self._body, self._frontal, self._field, self._friction = body, frontal, field, friction
         self._compliance = compliance_mm_per_n
         shapes = [(len(kind.cells.controls), 6, *2 * kind.cells.controls.shape[1:]) for kind in body.kinds]
         self._blocks = [np.empty(shape, np.float32) for shape in shapes]
@@ -60,7 +76,7 @@ class LoadStepper:
         self._reachable = ((self._local >= 0) | ~body.free[body.points.controls]).all(axis=1)
         self._tangent: Tangent | None = None
         self._shift = 0.0
-        self._near: tuple | None = None
+        self._near: tuple[Tangent, IntArray, Near] | None = None
         self._last: LoadState | None = None
         self.iterations, self.inner_iterations, self.eliminations = 0, 0, 0
 
@@ -68,7 +84,7 @@ class LoadStepper:
         """Go on with changed elements (a relaxing material's law is scaled by the step's duration)."""
         self._body = body
 
-    def step(self, state: LoadState, T: np.ndarray, given: list[np.ndarray]) -> tuple[LoadState, Balance, np.ndarray]:
+    def step(self, state: LoadState, T: FloatArray, given: list[FloatArray]) -> tuple[LoadState, Balance, IntArray]:
         """The converged state with the object at ``T``, no contact point deeper than the bound.
 
         ``given``: stress left of the past, for each kind of elements (see ``Elements.add_forces``).
@@ -80,7 +96,7 @@ class LoadStepper:
         """
         control, border = self._extrapolate(state, T)
         before, after = self._seen(state.control_mm, state.border, state.T), self._seen(control, border, T)
-        gap_before, gap = self._stimulus.distance(before), self._stimulus.distance(after)
+        gap_before, gap = self._field.distance(before), self._field.distance(after)
         looked = np.flatnonzero(self._reachable & (gap < _REACH_MM) | state.held)
         # a point that is driven into the object is anchored where it meets the surface on the way
         driven = (gap_before > 0) & (gap < 0)
@@ -88,10 +104,10 @@ class LoadStepper:
         anchors = np.where(state.held[:, None], state.anchor_mm, (1 - share) * before + share * after)
         penalty = state.penalty_mpa_mm
         for _ in range(_PENALTY_RAISES):
-            problem = Problem(self._body, self._stimulus, self._friction, self._compliance, state, anchors, looked, penalty, T, given)
+            problem = Problem(self._body, self._field, self._friction, self._compliance, state, anchors, looked, penalty, T, given)
             control, border, balance = self._solve(problem, control, border, control is not state.control_mm)
             left_out = np.setdiff1d(np.arange(len(gap)), looked, assume_unique=True)
-            missed = left_out[self._stimulus.distance(self._seen(control, border, T)[left_out]) < 0]
+            missed = left_out[self._field.distance(self._seen(control, border, T)[left_out]) < 0]
             if len(missed):
                 if not self._reachable[missed].all():
                     raise ContactError(
@@ -104,24 +120,24 @@ class LoadStepper:
                 return self._accepted(state, problem, control, border, balance), balance, looked
         raise NoConvergence(balance.relative)
 
-    def _extrapolate(self, state: LoadState, T: np.ndarray):
-        """Where the body will be if it goes on as in the last step; where it is if the object turns another way.
+    def _extrapolate(self, state: LoadState, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Controls and border to start from: the last step continued, or the present state if the object moves another way now.
 
-        If that leaves an element inside out, the step isn't solved, and a shorter one goes less far.
+        If the continued step turns an element inside out, the load step is not solved; a shorter one then continues less far.
         """
-        if self._last is None or not self._last.held.any():  # a first contact grows in no straight line
+        if self._last is None or not self._last.held.any():  # a first contact does not grow in proportion to the motion
             return state.control_mm, state.border
         old, at = self._last, self._body.points.positions(state.control_mm)[state.held]
         if not len(at):
             return state.control_mm, state.border
 
         before, now = carried(at, old.T, state.T).ravel(), carried(at, state.T, T).ravel()
-        ratio = (before @ now) / max(before @ before, 1e-300)
+        ratio = (before @ now) / max(float(before @ before), 1e-300)
         if before @ now < 0.95 * np.linalg.norm(before) * np.linalg.norm(now) or ratio > 2:
             return state.control_mm, state.border
         return state.control_mm + ratio * (state.control_mm - old.control_mm), state.border
 
-    def _accepted(self, state: LoadState, problem: Problem, control, border, balance: Balance) -> LoadState:
+    def _accepted(self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance) -> LoadState:
         contact, looked, count = balance.contact, problem.looked, len(state.held)
         self._last = state
         held, anchor, slid = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count)
@@ -132,18 +148,20 @@ class LoadStepper:
         lost = float((tangential * moved)[contact.slipping].sum())
         return LoadState(control, border, anchor, held, slid, problem.penalty, problem.T, balance.elastic_nmm, lost)
 
-    def _seen(self, control, border, T) -> np.ndarray:
+    def _seen(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
         """All contact points in the object's frame, (p, 3)."""
         return in_object(self._body.points.positions(control), T, border)
 
-    def _solve(self, problem: Problem, control, border, extrapolated: bool):
+    def _solve(
+        self, problem: Problem, control: FloatArray, border: FloatArray, extrapolated: bool
+    ) -> tuple[FloatArray, FloatArray, Balance]:
         balance = problem.balance(control, border)
+        if balance is None:
+            raise NoConvergence(np.inf)
         astray = False
         tangent, fresh, shift, last, accepted = self._tangent, False, 0.0, np.inf, 0
         most_inner = self.inner_iterations + _INNER_ITERATIONS
         for _ in range(_ITERATIONS):
-            if balance is None:
-                raise NoConvergence(np.inf)
             if balance.relative <= RESIDUAL_TOLERANCE:
                 return control, border, balance
             if self.inner_iterations > most_inner:
@@ -160,13 +178,13 @@ class LoadStepper:
             new, new_border = control.copy(), border + size * border_move
             new[self._body.free] += size * move.reshape(-1, 3)
             trial = problem.balance(new, new_border)
-            # the first move brings the object's motion: only then may the residual be anything
+            # the first move takes up the object's motion, and its residual may be of any size; no later one may
             if trial is None or size < 1 or (accepted and trial.absolute > _WORSE * balance.absolute):
                 astray = True
                 if not fresh:
-                    last = 0.0  # an old tangent is to blame first
+                    last = 0.0  # first the old tangent is suspected: make a new one
                 else:
-                    shift = max(8 * shift, _SMALLEST_SHIFT_N_MM)
+                    shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
                     if shift > _LARGEST_SHIFT_N_MM:
                         raise NoConvergence(balance.relative)
                 continue
@@ -177,17 +195,17 @@ class LoadStepper:
             return control, border, balance
         raise NoConvergence(balance.relative)
 
-    def _linearise(self, problem: Problem, control, border, shift: float) -> Tangent:
+    def _linearise(self, problem: Problem, control: FloatArray, border: FloatArray, shift: float) -> Tangent:
         """The body's tangent at a state, plus a shift on the diagonal."""
         self.eliminations += 1
-        self._tangent = None  # its room is used again
+        self._tangent = None  # its memory is overwritten below
         problem.stiffness(control, border, self._blocks)
         while True:
             try:
                 eliminated = self._frontal.eliminate(self._blocks, shift=shift)
                 break
             except NotPositiveDefinite:
-                shift = max(8 * shift, _SMALLEST_SHIFT_N_MM)
+                shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
                 if shift > _LARGEST_SHIFT_N_MM:
                     raise NoConvergence(np.inf) from None
         matrix = whole(eliminated.matrix, shift)
@@ -200,7 +218,9 @@ class LoadStepper:
         inner[eliminated.kept] = False
         return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]))
 
-    def _contact_move(self, problem: Problem, tangent: Tangent, control, border, balance: Balance, soften: bool):
+    def _contact_move(
+        self, problem: Problem, tangent: Tangent, control: FloatArray, border: FloatArray, balance: Balance, soften: bool
+    ) -> tuple[FloatArray, FloatArray]:
         """The move (unknowns,) and (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept

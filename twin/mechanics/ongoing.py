@@ -1,31 +1,43 @@
 """A contact that goes on: its state and memory, and the step to the object's next pose."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import RelaxationTerm
 from twin.errors import ContactError
 from twin.geometry.solid import Solid, pin_pose
 from twin.geometry.view import NodeView
 from twin.mechanics.balance import Balance, Body, LoadState
 from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
 from twin.mechanics.relaxation import History
-from twin.types import ContactState
+from twin.types import ContactState, FloatArray, IntArray
 
 _PENALTY_MPA_MM = 30.0
-_SMALLEST_STRIDE = 1 / 64  # of a regular load step
+"""Contact penalty at the start of every contact (MPa per mm of penetration): usual pressures then end within the gap bound."""
+_SMALLEST_STRIDE = 1 / 64
+"""Smallest share of a regular load step that is tried before a contact counts as not converging."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A solid, and what is derived from it."""
+    """A solid, and what is derived from it.
+
+    Attributes
+    ----------
+    solid : Solid
+    body : Body
+    view : NodeView
+    relaxation : tuple of tuples of RelaxationTerm
+        For each kind of the body's elements; empty where it is elastic.
+    """
 
     solid: Solid
     body: Body
     view: NodeView
+    relaxation: tuple[tuple[RelaxationTerm, ...], ...]
 
 
 class OngoingContact:
@@ -33,7 +45,6 @@ class OngoingContact:
 
     Parameters
     ----------
-    spec : SensorSpec
     setting : Setting
     T : (4, 4) float
         The object's pose at the start, free of contact.
@@ -46,7 +57,7 @@ class OngoingContact:
         The last converged one, of all controls.
     """
 
-    def __init__(self, spec: SensorSpec, setting: Setting, T: np.ndarray, one_thread: Callable[[], AbstractContextManager]):
+    def __init__(self, setting: Setting, T: FloatArray, one_thread: Callable[[], AbstractContextManager]) -> None:
         self.setting, self._one_thread = setting, one_thread
         self.stepper: LoadStepper | None = None  # set before the first step
         body = setting.body
@@ -60,13 +71,15 @@ class OngoingContact:
             penalty_mpa_mm=_PENALTY_MPA_MM,
             T=T,
         )
-        self._terms = [spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation]
+        self._terms = setting.relaxation
         self._past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, self._terms, strict=True)]
 
-    def step(self, T: np.ndarray, span_s: float) -> ContactState:
+    def step(self, T: FloatArray, span_s: float) -> ContactState:
         """The converged state with the object at ``T`` (4, 4), ``span_s`` later; after ``NoConvergence`` the contact is where it was."""
         kinds = self.setting.body.kinds
         now = [p.before(kind, term, span_s) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
+        if self.stepper is None:
+            raise RuntimeError("this contact has no stepper yet; SkinSolver.begin gives it one")
         with self._one_thread():
             self.stepper.follow(replace(self.setting.body, kinds=tuple(kind for kind, _ in now)))
             self.load, balance, looked = self.stepper.step(self.load, T, [given for _, given in now])
@@ -75,7 +88,9 @@ class OngoingContact:
         self._past = [p.after(kind, term, span_s, control_mm) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
         return result
 
-    def advance(self, pose_at, start: float, stop: float, time_at, where: str):
+    def advance(
+        self, pose_at: Callable[[float], FloatArray], start: float, stop: float, time_at: Callable[[float], float], where: str
+    ) -> Iterator[tuple[float, ContactState]]:
         """Go through one regular load step, in shorter ones where that does not converge.
 
         Parameters
@@ -115,7 +130,7 @@ class OngoingContact:
             yield at, result
 
 
-def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: np.ndarray) -> ContactState:
+def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: IntArray) -> ContactState:
     """What others see of a converged load step; ``looked`` (q,) int are the contact points the balance speaks of."""
     contact, points = balance.contact, setting.body.points
     touched = np.flatnonzero(contact.penetration_mm > 0)

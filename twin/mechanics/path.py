@@ -5,14 +5,25 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec, SkinSpec
 from twin.errors import ContactError
+from twin.stimulus import ObjectField
+from twin.types import FloatArray
 
 _LARGEST_TILT_DEG = 60.0
+"""Largest tilt of a contact pose about each axis: the dome reaches no further."""
 _LARGEST_TWIST_DEG = 90.0
+"""Largest twist of a contact pose: a quarter turn."""
 _TOUCH_TOLERANCE_MM = 1e-6
+"""The object is at first touch when its distance to the dome is at most this."""
 _DOME_POINTS = 20_000
+"""Points on the whole sphere at which the distance of the object is looked for: 0.5 mm apart on a dome of 20 mm."""
+_NEAR_POINTS = 2000
+"""Points around the nearest of them, 30 times finer, for the second search."""
 _START_MM = 60.0
+"""Height above the apex from which the object comes down."""
+_MOST_DESCENTS = 400
+"""Most steps in which the object is brought down."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +68,10 @@ class ContactPath:
         Default: one second each.
     """
 
-    poses: np.ndarray
-    times_s: np.ndarray | None = None
+    poses: FloatArray
+    times_s: FloatArray | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         poses = np.asarray(self.poses, float)
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2 or not np.isfinite(poses).all():
             raise ContactError(f"a path needs at least two finite 4x4 poses, got an array of shape {poses.shape}")
@@ -73,7 +84,13 @@ class ContactPath:
         object.__setattr__(self, "poses", poses)
         object.__setattr__(self, "times_s", times)
 
-    def at(self, progress: float) -> np.ndarray:
+    @property
+    def _clock(self) -> FloatArray:
+        """``times_s``, which is there once the path is made."""
+        assert self.times_s is not None
+        return self.times_s
+
+    def at(self, progress: float) -> FloatArray:
         """``T_sensor_object`` (4, 4) at a progress from 0 (first pose) to k - 1 (last)."""
         leg = int(np.clip(np.floor(progress), 0, len(self.poses) - 2))
         share = progress - leg
@@ -86,53 +103,55 @@ class ContactPath:
 
     def time_s(self, progress: float) -> float:
         """Time at a progress."""
-        return float(np.interp(progress, np.arange(len(self.poses)), self.times_s))
+        return float(np.interp(progress, np.arange(len(self.poses)), self._clock))
 
     def there_and_back(self) -> "ContactPath":
         """The path, then the same way back."""
-        span = self.times_s[-1] - self.times_s[::-1]
-        return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([self.times_s, self.times_s[-1] + span[1:]]))
+        clock = self._clock
+        span = clock[-1] - clock[::-1]
+        return ContactPath(np.concatenate([self.poses, self.poses[-2::-1]]), np.concatenate([clock, clock[-1] + span[1:]]))
 
 
-def carried(points_mm: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+def carried(points_mm: FloatArray, start: FloatArray, stop: FloatArray) -> FloatArray:
     """How far points (k, 3) move with an object that goes from one pose (4, 4) to another."""
     return (points_mm - start[:3, 3]) @ start[:3, :3] @ stop[:3, :3].T + stop[:3, 3] - points_mm
 
 
-def deepest_mm(spec: SensorSpec) -> float:
+def deepest_mm(geometry: GeometrySpec) -> float:
     """Half the gel's depth: no contact goes deeper."""
-    return 0.5 * (spec.skin.outer_radius_mm - spec.skin.thickness_mm - spec.lens.z_mm)
+    return 0.5 * (geometry.skin.outer_radius_mm - geometry.skin.thickness_mm - geometry.lens.z_mm)
 
 
-def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
+def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> ContactPath:
     """Check a pose and find its first touch with the undeformed skin: poses at touch, pressed, and (if it moves further) sheared.
 
-    The object comes down along z by its smallest distance to the dome, again and again, which never
-    passes the first touch where distances are exact (sphere tracing, Hart 1996). The dome is sampled evenly, then finely
-    around the nearest point.
+    The object comes down along z by its smallest distance to the dome, again and again. Where distances are exact this
+    never passes the first touch (sphere tracing, Hart 1996). The dome is sampled evenly at first, then finely around the nearest
+    point.
 
     Raises
     ------
     ContactError
         If a value is out of range, or the object misses the dome or starts inside it.
     """
-    _check(spec, pose)
+    _check(geometry, pose)
     rx, ry = np.radians(pose.tilt_deg)
     turn_x = np.array([[1, 0, 0], [0, np.cos(rx), -np.sin(rx)], [0, np.sin(rx), np.cos(rx)]])
     turn_y = np.array([[np.cos(ry), 0, np.sin(ry)], [0, 1, 0], [-np.sin(ry), 0, np.cos(ry)]])
-    radius = spec.skin.outer_radius_mm
+    skin = geometry.skin
+    radius = skin.outer_radius_mm
     T = np.eye(4)
     T[:3, :3] = turn_y @ turn_x
     T[:3, 3] = [*pose.offset_mm, radius]
-    lowest_z = spec.skin.rim_z_mm / radius
-    directions = dome_directions(spec, _DOME_POINTS)
-    height, nearest = _bring_down(stimulus, T, radius * directions, _START_MM, radius - spec.skin.rim_z_mm)
+    lowest_z = skin.rim_z_mm / radius
+    directions = dome_directions(skin, _DOME_POINTS)
+    height, nearest = _bring_down(field, T, radius * directions, _START_MM, radius - skin.rim_z_mm)
     # around the nearest point the sampling is refined 30 times
     spread = 3 / np.sqrt(_DOME_POINTS)
-    near = directions[nearest] + spread * _sphere_points(2000)
+    near = directions[nearest] + spread * _sphere_points(_NEAR_POINTS)
     near /= np.linalg.norm(near, axis=1, keepdims=True)
     near = near[near[:, 2] >= lowest_z]
-    height, _ = _bring_down(stimulus, T, radius * near, height + spread * radius, radius - spec.skin.rim_z_mm)
+    height, _ = _bring_down(field, T, radius * near, height + spread * radius, radius - skin.rim_z_mm)
     T[2, 3] += height
     pressed = T.copy()
     pressed[2, 3] -= max(pose.indent_mm, 0.0)
@@ -146,19 +165,19 @@ def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
     return ContactPath(np.stack(poses))
 
 
-def dome_directions(spec: SensorSpec, count: int) -> np.ndarray:
+def dome_directions(skin: SkinSpec, count: int) -> FloatArray:
     """(k, 3) unit vectors evenly over the dome, about ``count`` on the whole sphere."""
     directions = _sphere_points(count)
-    return directions[directions[:, 2] >= spec.skin.rim_z_mm / spec.skin.outer_radius_mm]
+    return directions[directions[:, 2] >= skin.rim_z_mm / skin.outer_radius_mm]
 
 
-def _check(spec: SensorSpec, pose: ContactPose) -> None:
+def _check(geometry: GeometrySpec, pose: ContactPose) -> None:
     values = np.concatenate([[pose.indent_mm, pose.twist_deg], pose.tilt_deg, pose.shear_mm, pose.offset_mm])
     if values.shape != (8,) or not np.isfinite(values).all():
         raise ContactError(f"a contact pose needs finite numbers, got {values}; give numbers in mm and deg")
-    radius = spec.skin.outer_radius_mm
+    radius = geometry.skin.outer_radius_mm
     limits = [
-        ("indent_mm", pose.indent_mm, deepest_mm(spec), "half the gel's depth"),
+        ("indent_mm", pose.indent_mm, deepest_mm(geometry), "half the gel's depth"),
         ("tilt_deg", max(map(abs, pose.tilt_deg)), _LARGEST_TILT_DEG, "the dome's reach"),
         ("shear_mm", float(np.hypot(*pose.shear_mm)), radius / 2, "half the dome's radius"),
         ("twist_deg", abs(pose.twist_deg), _LARGEST_TWIST_DEG, "a quarter turn"),
@@ -169,12 +188,12 @@ def _check(spec: SensorSpec, pose: ContactPose) -> None:
             raise ContactError(f"{name}: {value:g} is more than {limit:g} ({reason}); give a smaller value")
 
 
-def _bring_down(stimulus, T, points_mm, height_mm, depth_mm):
+def _bring_down(field: ObjectField, T: FloatArray, points_mm: FloatArray, height_mm: float, depth_mm: float) -> tuple[float, int]:
     """Height above ``T`` (mm) where the object just touches the points, and the index of the touched one."""
     turn, shift = T[:3, :3], T[:3, 3]
     free_mm = None
-    for _ in range(400):
-        distance = stimulus.distance((points_mm - shift - [0, 0, height_mm]) @ turn)
+    for _ in range(_MOST_DESCENTS):
+        distance = field.distance((points_mm - shift - [0, 0, height_mm]) @ turn)
         nearest = int(distance.argmin())
         if abs(distance[nearest]) <= _TOUCH_TOLERANCE_MM:
             return height_mm, nearest
@@ -183,14 +202,14 @@ def _bring_down(stimulus, T, points_mm, height_mm, depth_mm):
             height_mm -= distance[nearest]
         elif free_mm is None:
             raise ContactError("the object is in the skin's way before it comes down; use a smaller tilt or another offset")
-        else:  # a distance was too large (wires, far from a mesh): back half way
+        else:  # the distance was too large, as it can be near wires and far from a mesh: go back half the way
             height_mm = (height_mm + free_mm) / 2
         if height_mm < -depth_mm:
             break
     raise ContactError("the object misses the dome; use a smaller offset or tilt")
 
 
-def _sphere_points(count: int) -> np.ndarray:
+def _sphere_points(count: int) -> FloatArray:
     """(count, 3) nearly even unit vectors (Fibonacci sphere)."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count

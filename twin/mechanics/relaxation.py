@@ -15,6 +15,7 @@ import numpy as np
 
 from scenes.sensor import RelaxationTerm
 from twin.mechanics.elements import Elements
+from twin.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -30,10 +31,10 @@ class History:
         the gel.
     """
 
-    stress: np.ndarray
-    branches: np.ndarray
-    difference: np.ndarray
-    difference_branches: np.ndarray
+    stress: FloatArray
+    branches: FloatArray
+    difference: FloatArray
+    difference_branches: FloatArray
 
     @classmethod
     def at_rest(cls, kind: Elements, terms: tuple[RelaxationTerm, ...]) -> "History":
@@ -42,7 +43,7 @@ class History:
         shape = (count, 8, 3, 3)
         return cls(np.zeros(shape), np.zeros((len(terms), *shape)), np.zeros(count), np.zeros((len(terms), count)))
 
-    def before(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float) -> tuple[Elements, np.ndarray]:
+    def before(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float) -> tuple[Elements, FloatArray]:
         """The elements of a step of a duration, their law scaled, and the given stress (see ``Elements.add_forces``)."""
         if not terms:
             return kind, self.stress
@@ -56,7 +57,7 @@ class History:
             changed = replace(changed, difference_mpa=fade @ self.difference_branches - kept * self.difference)
         return changed, np.einsum("t,tmqij->mqij", fade, self.branches) - kept * self.stress
 
-    def after(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float, control_mm: np.ndarray) -> "History":
+    def after(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float, control_mm: FloatArray) -> "History":
         """What is remembered after the step; ``kind`` with the unscaled law."""
         if not terms:
             return self
@@ -72,6 +73,6 @@ class History:
         )
 
 
-def _decay(terms, step_s):
+def _decay(terms: tuple[RelaxationTerm, ...], step_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     share, time = np.array([[term.fraction, term.time_s] for term in terms]).T
     return share, np.exp(-step_s / time), np.exp(-step_s / (2 * time))

@@ -1,6 +1,7 @@
 """From a sensor, an object and a path to converged contact states."""
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from itertools import pairwise
 
@@ -22,14 +23,23 @@ from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
 from twin.mechanics.ongoing import OngoingContact, Setting
 from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, dome_directions, plan_path
-from twin.stimulus import Stimulus, build_stimulus
-from twin.types import ContactState
+from twin.stimulus import ObjectField, build_field
+from twin.types import ContactState, FloatArray
 
-_STEP_MM = 0.4  # largest motion of the object across the contact in one load step
-_LOOK_MM = 2.0  # between the poses of the path at which that is looked for
-_FOCUS_POINTS = 2000  # on the sphere, to see where the object will press
-_FOCUS_POLAR_DEG, _FOCUS_AZIMUTH_DEG = 5.0, 15.0  # the focus's direction is rounded to these
-_MARGIN_RAD = np.radians(15.0)  # skin this far around what the rigid object would pass through may touch it
+_STEP_MM = 0.4
+"""Largest motion of the object, seen from any pressed place of the dome, in one load step."""
+_LOOK_MM = 2.0
+"""Largest motion between two poses of the path at which the solver looks where the object will press."""
+_FOCUS_POINTS = 2000
+"""Directions on the whole sphere in which the solver looks where the object will press."""
+_FOCUS_POLAR_DEG = 5.0
+"""The focus's polar angle is rounded to multiples of this, so that similar contacts share a solid."""
+_FOCUS_AZIMUTH_DEG = 15.0
+"""The focus's azimuth is rounded to multiples of this."""
+_MARGIN_RAD = np.radians(15.0)
+"""Skin within this angle of a direction that the rigid object would pass through may come to touch it."""
+_START_INSIDE_MM = 0.05
+"""A path may begin with the object this deep inside the undeformed dome: rounding of a first touch."""
 
 
 class SkinSolver:
@@ -43,13 +53,13 @@ class SkinSolver:
         Whether what depends on the geometry is kept on disk; not for geometries that are used once.
     """
 
-    def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None, keep: bool = True):
+    def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None, keep: bool = True) -> None:
         self.spec, self.resolution, self._keep = spec, resolution or Resolution(), keep
-        self.mesh = build_mesh(spec)
+        self.mesh = build_mesh(spec.geometry)
         self._blas = ThreadpoolController()
         self._setting = lru_cache(maxsize=32)(self._set_up)
 
-    def rest(self, *, T_sensor_object: np.ndarray | None = None) -> ContactState:
+    def rest(self, *, T_sensor_object: FloatArray | None = None) -> ContactState:
         """The undeformed sensor."""
         with self._one_thread():
             setting = self._setting(Focus())
@@ -58,27 +68,27 @@ class SkinSolver:
 
     def press(
         self,
-        stimulus: Stimulus | ObjectSpec,
+        touched: ObjectField | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
         friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
-        progress: Callable[[float, ContactState], None] | None = None,
+        progress: Callable[[float, ContactState], object] | None = None,
     ) -> ContactState:
         """The state at the end of a contact; arguments and errors as ``path``."""
-        for at, state in self.path(stimulus, pose, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
+        for at, state in self.path(touched, pose, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
             if progress is not None:
                 progress(at, state)
         return state
 
     def path(
         self,
-        stimulus: Stimulus | ObjectSpec,
+        touched: ObjectField | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
         friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
-        given_way: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+        given_way: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
         release: bool = False,
         step_mm: float = _STEP_MM,
     ) -> Iterator[tuple[float, ContactState]]:
@@ -86,13 +96,13 @@ class SkinSolver:
 
         Parameters
         ----------
-        stimulus : Stimulus or ObjectSpec
-            With a bare ``Stimulus``, friction and compliance default to 0.
+        touched : ObjectField or ObjectSpec
+            With a bare ``ObjectField``, friction and compliance default to 0.
         friction, compliance_mm_per_n : optional
             Override the object's.
         given_way : callable, optional
-            What else the force does to the object's pose: from the path's ``T_sensor_object`` (4, 4) and the force on the object
-            (3,), N, after the load step before, to the pose that is taken.
+            How an arm that gives way changes the pose. It gets the path's ``T_sensor_object`` (4, 4) and the force on the object (3,)
+            in N that the load step before ended with, and returns the pose that is taken instead.
         release : bool
             Afterwards lift the object off again, the way it came.
         step_mm : float
@@ -110,11 +120,10 @@ class SkinSolver:
             Pose out of range, object out of reach or starting inside the skin, or no convergence: names the
             step and the residual.
         """
-        spec = stimulus if isinstance(stimulus, ObjectSpec) else None
-        field = build_stimulus(spec) if spec else stimulus
+        spec, field = (touched, build_field(touched)) if isinstance(touched, ObjectSpec) else (None, touched)
         law = friction_of(spec, friction)
         compliance = compliance_mm_per_n if compliance_mm_per_n is not None else (spec.compliance_mm_per_n if spec else 0.0)
-        plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec, field, pose)
+        plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec.geometry, field, pose)
         if release:
             plan = plan.there_and_back()
         if isinstance(pose, ContactPose) and pose.indent_mm <= 0:
@@ -123,9 +132,9 @@ class SkinSolver:
         reached = self._reached(field, plan)
         contact = self.begin(field, law, compliance, reached, plan.at(0.0), focus=_focus(reached))
         stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
-        force_n = np.zeros(3)
+        force_n: FloatArray = np.zeros(3)
 
-        def pose_at(progress: float) -> np.ndarray:
+        def pose_at(progress: float) -> FloatArray:
             return plan.at(progress) if given_way is None else given_way(plan.at(progress), force_n)
 
         for number, (start, stop) in enumerate(pairwise(stops), 1):
@@ -135,7 +144,7 @@ class SkinSolver:
                 yield float(at / stops[-1]), state
 
     def begin(
-        self, field: Stimulus, law: Friction, compliance: float, reached: np.ndarray, T: np.ndarray, *, focus: Focus
+        self, field: ObjectField, law: Friction, compliance: float, reached: FloatArray, T: FloatArray, *, focus: Focus
     ) -> OngoingContact:
         """A contact at its start, the object at ``T`` and free of the skin.
 
@@ -146,23 +155,23 @@ class SkinSolver:
         """
         with self._one_thread():
             setting = self._setting(focus)
-        contact = OngoingContact(self.spec, setting, T, self._one_thread)
+        contact = OngoingContact(setting, T, self._one_thread)
         self.reach(contact, field, law, compliance, reached)
         return contact
 
-    def reach(self, contact: OngoingContact, field: Stimulus, law: Friction, compliance: float, reached: np.ndarray) -> None:
-        """Let the contact go on where the object presses other directions (k, 3) of the dome than before."""
+    def reach(self, contact: OngoingContact, field: ObjectField, law: Friction, compliance: float, reached: FloatArray) -> None:
+        """Prepare the contact for an object that comes to press other directions (k, 3) of the dome than before."""
         with self._one_thread():
             frontal = self._frontal(contact.setting, reached)
             contact.stepper = LoadStepper(contact.setting.body, frontal, field, law, compliance)
 
-    def _one_thread(self):
+    def _one_thread(self) -> AbstractContextManager[object]:
         """BLAS on one thread: the matrices are small, and the result must not depend on the number of cores."""
         return self._blas.limit(limits=1, user_api="blas")
 
     def _set_up(self, focus: Focus) -> Setting:
         spec = self.spec
-        solid = build_solid(spec, resolution=self.resolution, focus=focus, keep=self._keep)
+        solid = build_solid(spec.geometry, resolution=self.resolution, focus=focus, keep=self._keep)
         gel = law_coefficients(spec.gel, layer=False)
         kinds = (
             Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True),
@@ -170,9 +179,11 @@ class SkinSolver:
             Elements(solid.gel_deep, gel),
         )
         points = contact_points(solid, spec.skin.outer_radius_mm)
-        return Setting(solid, Body(kinds, points, ~solid.fixed, spec.gel.sealed), NodeView.of(spec, self.mesh, solid))
+        body = Body(kinds, points, ~solid.fixed, spec.gel.sealed)
+        relaxation = spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation
+        return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
 
-    def _frontal(self, setting: Setting, reached: np.ndarray) -> FrontalSolver:
+    def _frontal(self, setting: Setting, reached: FloatArray) -> FrontalSolver:
         """Elimination of all but the outer controls that may be touched: those that carry points around the reached directions."""
         solid, points = setting.solid, setting.body.points
         directions = points.positions(solid.control_mm) / self.spec.skin.outer_radius_mm
@@ -182,16 +193,16 @@ class SkinSolver:
         groups = [kind.cells.controls for kind in setting.body.kinds]
         return FrontalSolver(groups, list(solid.boxes), solid.fixed, keep & ~solid.fixed)
 
-    def _reached(self, field: Stimulus, plan: ContactPath) -> np.ndarray:
+    def _reached(self, field: ObjectField, plan: ContactPath) -> FloatArray:
         """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""
         radius = self.spec.skin.outer_radius_mm
-        directions = dome_directions(self.spec, _FOCUS_POINTS)
+        directions = dome_directions(self.spec.skin, _FOCUS_POINTS)
         deepest = np.full(len(directions), np.inf)
-        limit = deepest_mm(self.spec)
+        limit = deepest_mm(self.spec.geometry)
         for at in _stops(plan, directions, radius, _LOOK_MM):
             T = plan.at(at)
             gap = field.distance((radius * directions - T[:3, 3]) @ T[:3, :3])
-            if at == 0 and gap.min() < -0.05:
+            if at == 0 and gap.min() < -_START_INSIDE_MM:
                 raise ContactError(f"the object starts {-gap.min():.2f} mm inside the skin; begin the path clear of it")
             if -gap.min() > limit:
                 raise ContactError(
@@ -214,7 +225,7 @@ def friction_of(spec: ObjectSpec | None, override: float | Friction | None = Non
     return Friction(spec.friction, kinetic, spec.slip_weakening_mm, spec.shear_strength_mpa or np.inf)
 
 
-def _focus(reached: np.ndarray) -> Focus:
+def _focus(reached: FloatArray) -> Focus:
     """Where the object presses, rounded, so that similar contacts share a solid."""
     middle = reached.mean(axis=0)
     polar = np.degrees(np.arctan2(np.hypot(middle[0], middle[1]), middle[2]))
@@ -223,7 +234,7 @@ def _focus(reached: np.ndarray) -> Focus:
     return Focus(float(np.radians(polar)), float(np.radians(azimuth)))
 
 
-def _stops(plan: ContactPath, directions: np.ndarray, radius_mm: float, step_mm: float) -> np.ndarray:
+def _stops(plan: ContactPath, directions: FloatArray, radius_mm: float, step_mm: float) -> FloatArray:
     """Progress at regular load steps: the poses, and between them no point of the dome in these directions sees the object move farther."""
     out = [np.zeros(1)]
     for leg in range(len(plan.poses) - 1):

@@ -1,10 +1,14 @@
 """Rays of the raw frame's pixels through lens and window into the gel, in Dr.Jit's terms."""
 
+from types import ModuleType
+
 import numpy as np
 
 from scenes.sensor import CameraSpec
 from twin.optics.arrays import with_room
 from twin.optics.lens import ray_table
+from twin.optics.sampling import PixelSamples
+from twin.optics.variant import DrJit
 from twin.optics.window import Window
 from twin.projection import sensor_to_camera
 
@@ -22,7 +26,7 @@ class CameraRays:
         Part of the raw frame, end exclusive.
     """
 
-    def __init__(self, mi, dr, camera: CameraSpec, window: Window, window_px: tuple[int, int, int, int]):
+    def __init__(self, mi: ModuleType, dr: ModuleType, camera: CameraSpec, window: Window, window_px: tuple[int, int, int, int]) -> None:
         table = ray_table(camera, window_px)
         self._columns, self._rows = table.shape[1] - 1, table.shape[0] - 1
         texels = mi.TensorXf(with_room(table, np.float32))
@@ -30,7 +34,7 @@ class CameraRays:
         self._to_sensor = mi.Matrix3f(sensor_to_camera(camera)[:3, :3].T)
         self._camera, self._window = camera, window
 
-    def sample(self, mi, dr, pixel, random):
+    def sample(self, mi: ModuleType, dr: ModuleType, pixel: DrJit, random: PixelSamples) -> tuple[DrJit, DrJit, DrJit]:
         """Rays in the gel for pixel numbers (row by row).
 
         Returns

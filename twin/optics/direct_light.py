@@ -1,14 +1,19 @@
-"""Light of the lamps behind the window at places in the gel: closed forms without shadows (the ray's equation: ``twin.projection``)."""
+"""Light that the lamps behind the window send to places in the gel: closed forms without shadows (ray equation: ``twin.projection``)."""
+
+from collections.abc import Sequence
 
 import numba
 import numpy as np
 
-from scenes.sensor import SensorSpec
-from twin.optics.lights import lights
+from scenes.sensor import GelSpec, LensSpec
+from twin.optics.lights import Patch
 from twin.optics.window import NEWTON_STEPS, fresnel
+from twin.types import FloatArray
 
-RING_PLACES = 24  # that stand for an annulus
-ON_AXIS_MM = 1e-4  # closer to the light's vertical than this, a way is straight
+RING_PLACES = 24
+"""Points that stand for the housing's ring."""
+ON_AXIS_MM = 1e-4
+"""A point that is closer to the vertical through the light than this is lit straight along it."""
 
 _reflectance = numba.njit(cache=True, error_model="numpy")(fresnel)
 
@@ -18,23 +23,25 @@ class DirectLight:
 
     Parameters
     ----------
-    spec : SensorSpec
+    lens : LensSpec
+    gel : GelSpec
+    patches : sequence of Patch
+        What lights the gel (see ``twin.optics.lights.lights``).
     """
 
-    def __init__(self, spec: SensorSpec):
-        lens, gel = spec.lens, spec.gel
+    def __init__(self, lens: LensSpec, gel: GelSpec, patches: Sequence[Patch]) -> None:
         self._window = np.array([lens.back_mm, lens.z_mm, lens.refractive_index, gel.refractive_index])
         self._absorption = np.array(gel.absorption_per_mm, float)
         places, powers = [], []
         turn = np.arange(RING_PLACES) * 2 * np.pi / RING_PLACES
-        for patch in lights(spec):
+        for patch in patches:
             ring = 0 if patch.radii_mm[1] == 0 else np.sqrt(np.mean(patch.radii_mm**2))
             around = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1) if ring else np.zeros((1, 3))
             places.append(patch.center_mm + ring * around)
             powers.append(np.tile(patch.area_mm2 * patch.radiance / len(around), (len(around), 1)))
         self._places, self._powers = np.concatenate(places or [np.zeros((0, 3))]), np.concatenate(powers or [np.zeros((0, 3))])
 
-    def __call__(self, points_mm: np.ndarray, normals: np.ndarray, bump: float = 0.0) -> np.ndarray:
+    def __call__(self, points_mm: FloatArray, normals: FloatArray, bump: float = 0.0) -> FloatArray:
         """Irradiance times ``1 / n^2`` of the gel: a matt place then sends ``albedo / pi`` times this into the air.
 
         Parameters
@@ -51,13 +58,15 @@ class DirectLight:
         """
         return _irradiance(points_mm, normals, bump, self._places, self._powers, self._window, self._absorption)
 
-    def ways(self, points_mm: np.ndarray, place_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def ways(self, points_mm: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Unit directions (n, 3) in the gel, from points (n, 3), of the ways to a place (3,) in the air; lengths (n,) in the gel."""
         return _ways(points_mm, np.asarray(place_mm, float), self._window)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _irradiance(points, normals, bump, places, powers, window, absorption):
+def _irradiance(
+    points: FloatArray, normals: FloatArray, bump: float, places: FloatArray, powers: FloatArray, window: FloatArray, absorption: FloatArray
+) -> FloatArray:
     result = np.zeros((len(points), 3))
     absorbs = np.any(absorption > 0)
     for i in range(len(points)):
@@ -73,7 +82,7 @@ def _irradiance(points, normals, bump, places, powers, window, absorption):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _ways(points, place, window):
+def _ways(points: FloatArray, place: FloatArray, window: FloatArray) -> tuple[FloatArray, FloatArray]:
     toward, lengths = np.empty((len(points), 3)), np.empty(len(points))
     for i in range(len(points)):
         toward[i, 0], toward[i, 1], toward[i, 2], lengths[i], _ = _way(points[i], place, window)
@@ -81,7 +90,7 @@ def _ways(points, place, window):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _way(point, place, window):
+def _way(point: FloatArray, place: FloatArray, window: FloatArray) -> tuple[float, float, float, float, float]:
     """The refracted way from a point in the gel to a place in the air: direction in the gel, length there, and the solid
     angle at the point per area at the place (facing +z) times transmittance, ``d omega = sin d(theta) d(phi)``."""
     back, front, n_window, n_gel = window

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from twin.optics.variant import VariantChoice, use_variant
+from twin.types import FloatArray
 
 
-def write_exr(path: Path, linear: np.ndarray, choice: VariantChoice) -> None:
+def write_exr(path: Path, linear: FloatArray, choice: VariantChoice) -> None:
     """Write linear light as a half-float OpenEXR file.
 
     Parameters

@@ -6,10 +6,14 @@ import numpy as np
 
 from scenes.sensor import CameraSpec
 from twin.projection import distort, undistort
+from twin.types import FloatArray
 
-FIELD_MARGIN = 0.97  # of the fold's radius: past it the table goes on straight, where a distortion model means nothing
-WIDEST_FIELD = 6.0  # tangent (80 deg off the axis): a perspective image ends somewhere
-WIDEST_FISHEYE = 57.0  # tangent (89 deg)
+FIELD_MARGIN = 0.97
+"""Share of the fold's radius up to which the distortion model is used. Beyond it the model means nothing: the table goes on linearly."""
+WIDEST_FIELD = 6.0
+"""Largest tangent of a perspective camera (80 deg off its axis)."""
+WIDEST_FISHEYE = 57.0
+"""Largest tangent of a fisheye camera (89 deg off its axis)."""
 
 
 def valid_radius(camera: CameraSpec) -> float:
@@ -23,7 +27,7 @@ def valid_radius(camera: CameraSpec) -> float:
     return float(np.tan(radius[folded[0]]) if fisheye else radius[folded[0]])
 
 
-def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.ndarray:
+def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> FloatArray:
     """Unit directions (H + 1, W + 1, 3) in the camera frame, in air, at the corners of a window's pixels.
 
     ``window_px`` = (x0, y0, x1, y1), end exclusive; corner (j, i) is at pixel (x0 + i - 0.5, y0 + j - 0.5).
@@ -33,7 +37,7 @@ def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.nd
 
 
 @lru_cache(maxsize=4)
-def _ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.ndarray:
+def _ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> FloatArray:
     x0, y0, x1, y1 = window_px
     x, y = np.meshgrid(np.arange(x0, x1 + 1) - 0.5, np.arange(y0, y1 + 1) - 0.5)
     seen = np.stack([(x - camera.cx_px) / camera.fx_px, (y - camera.cy_px) / camera.fy_px], axis=-1)
@@ -52,7 +56,7 @@ def _ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> np.n
     return rays
 
 
-def subpixel_rays(corners: np.ndarray, across: int) -> np.ndarray:
+def subpixel_rays(corners: FloatArray, across: int) -> FloatArray:
     """Directions (n, across^2, 3) of a regular grid of places within n pixels, not normalised; ``corners`` (2, 2, n, 3) by row, column."""
     offset = (np.arange(across) + 0.5) / across
     s, t = (g.ravel()[:, None] for g in np.meshgrid(offset, offset))

@@ -8,9 +8,11 @@ from twin.errors import RenderError
 from twin.optics.arrays import with_room
 from twin.optics.render import BOUNCES, GelView, Renderer
 from twin.optics.tracer import spectrum
-from twin.optics.variant import use_variant
+from twin.optics.variant import DrJit, use_variant
+from twin.types import FloatArray, IntArray, PinState
 
-SAMPLES = 32  # per pixel
+SAMPLES = 32
+"""Samples per pixel."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,11 @@ class Knobs:
     skin, caps, stems : (3,) float
     """
 
-    leds: np.ndarray
+    leds: FloatArray
     fill: float
-    skin: np.ndarray
-    caps: np.ndarray
-    stems: np.ndarray
+    skin: FloatArray
+    caps: FloatArray
+    stems: FloatArray
 
     @classmethod
     def neutral(cls, leds: int) -> "Knobs":
@@ -57,7 +59,7 @@ class LightModel:
         Where only the scalar variant works.
     """
 
-    def __init__(self, renderer: Renderer, state, pixels: np.ndarray, seed: int):
+    def __init__(self, renderer: Renderer, state: PinState, pixels: IntArray, seed: int) -> None:
         if renderer.choice.backend == "scalar":
             raise RenderError(
                 "calibration differentiates the renderer, which the scalar variant can't: run 'twin doctor' for what is missing"
@@ -78,12 +80,12 @@ class LightModel:
         """Lit LEDs."""
         return self._led_count
 
-    def light(self, knobs: Knobs) -> np.ndarray:
+    def light(self, knobs: Knobs) -> FloatArray:
         """(n, channels) light of the gel on the film."""
         self._turn(knobs, {})
         return np.array(self._view.trace(self._pixels, SAMPLES, self._seed)).T
 
-    def slopes(self, knobs: Knobs) -> dict[str, np.ndarray]:
+    def slopes(self, knobs: Knobs) -> dict[str, FloatArray]:
         """Derivatives (n, channels) by the logarithm of each knob: ``led0``..., ``fill``, ``skin``, ``caps``, ``stems``.
 
         A coloured knob acts on each channel alone, so that one pass serves all channels; all passes share one kernel.
@@ -103,11 +105,11 @@ class LightModel:
             found[name] = np.array(dr.forward_to(image)).T
         return found
 
-    def _turn(self, knobs: Knobs, steps: dict) -> None:
+    def _turn(self, knobs: Knobs, steps: dict[str, DrJit]) -> None:
         """Set the knobs, each with its step (zero, but with a gradient) in its logarithm."""
         mi, dr, tracer = self._mi, self._dr, self._view.tracer
 
-        def factor(knob, value):
+        def factor(knob: str, value: DrJit) -> DrJit:
             return value * (1 + steps[knob]) if knob in steps else value
 
         leds = [*((f"led{k}", float(v)) for k, v in enumerate(knobs.leds)), ("fill", float(knobs.fill))]

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import HousingSpec, LedRingSpec
+from twin.types import FloatArray
 
-LED_FLUX = 640.0  # radiance times area (mm^2) of an LED of power 1: a white cap then sends about 1, the unit of the linear image
+LED_FLUX = 640.0
+"""Radiance times area (mm^2) of an LED of power 1. A white cap then sends about 1, which is the unit of the linear image."""
 
 
 @dataclass(frozen=True)
@@ -24,21 +26,20 @@ class Patch:
         Linear RGB.
     """
 
-    center_mm: np.ndarray
-    half_mm: np.ndarray
-    radii_mm: np.ndarray
-    radiance: np.ndarray
+    center_mm: FloatArray
+    half_mm: FloatArray
+    radii_mm: FloatArray
+    radiance: FloatArray
 
     @property
     def area_mm2(self) -> float:
-        """Its size."""
+        """Area of the square or annulus."""
         inner, outer = self.radii_mm
         return 4 * abs(np.linalg.det(self.half_mm)) + np.pi * (outer**2 - inner**2)
 
 
-def led_patches(spec: SensorSpec) -> list[Patch]:
+def led_patches(leds: LedRingSpec) -> list[Patch]:
     """The LEDs, dead ones with no radiance, in the order of ``leds.azimuth_deg``."""
-    leds = spec.leds
     turn = np.radians(leds.azimuth_deg)
     balance = np.array(leds.balance or np.ones(len(turn)))
     balance[[k for k in leds.off if k < len(turn)]] = 0
@@ -51,13 +52,12 @@ def led_patches(spec: SensorSpec) -> list[Patch]:
     return patches
 
 
-def lights(spec: SensorSpec) -> list[Patch]:
+def lights(leds: LedRingSpec, ring: HousingSpec) -> list[Patch]:
     """All that lights the gel: the lit LEDs and, where it has a ``fill``, the housing's ring."""
-    found = [patch for patch in led_patches(spec) if patch.radiance.any()]
-    ring = spec.housing
+    found = [patch for patch in led_patches(leds) if patch.radiance.any()]
     if ring.fill > 0:
-        lit = len(found) / len(spec.leds.azimuth_deg)
+        lit = len(found) / len(leds.azimuth_deg)
         radii = np.array([ring.aperture_radius_mm, ring.aperture_radius_mm + ring.fill_width_mm])
-        radiance = ring.fill * lit * spec.leds.power * np.array(spec.leds.color) * np.array(ring.albedo)
+        radiance = ring.fill * lit * leds.power * np.array(leds.color) * np.array(ring.albedo)
         found.append(Patch(np.array([*ring.center_mm, ring.z_mm]), np.zeros((2, 2)), radii, radiance))
     return found

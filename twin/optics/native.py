@@ -4,7 +4,8 @@ import ctypes
 import sys
 from pathlib import Path
 
-PRIVATE_FOLDER = Path(sys.prefix) / "lib" / "private"  # where 'make setup' puts its own copies if it may not install
+PRIVATE_FOLDER = Path(sys.prefix) / "lib" / "private"
+"""Where 'make setup' puts its own copies of libraries if it may not install them."""
 REMEDY = "install it (Debian, Ubuntu: apt-get install libatomic1)"
 
 

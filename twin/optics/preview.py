@@ -1,37 +1,52 @@
 """A fast picture of the sensor for interaction and control loops: drawn, not traced.
 
 Skin, stems and caps are projected through the window, shaded with the lamps' direct light (no shadows), and drawn from
-far to near, pins with exact coverage. Light that comes by way of other surfaces is a gain and an offset of each
-material, which `Preview.calibrate` takes from a path-traced frame.
+far to near, the pins with exact coverage. Light that comes by way of other surfaces is described by a gain and an offset for
+each material; `Preview.calibrate` fits them to a path-traced frame.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 from scipy.optimize import nnls
 from scipy.spatial import Delaunay
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.optics.direct_light import DirectLight
 from twin.optics.lens import ray_table
+from twin.optics.lights import lights
 from twin.optics.outlines import PinOutlines
 from twin.optics.raster import draw_polygons, draw_triangles
+from twin.optics.render import Renderer
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import cap_albedo
 from twin.optics.tracer import luminance
 from twin.optics.window import Window
 from twin.projection import project, sensor_to_camera
+from twin.types import FloatArray, IntArray, PinState
 
-SKIN, STEM, SIDE, FACE = range(4)  # materials; all but the skin belong to pins
-BELT_STEP_RAD = np.radians(8.0)  # of the skin between the outermost pins and the rim
+Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
+"""Irradiance (n, 3), over n^2 of the gel, at points (n, 3) in mm with normals (n, 3)."""
+
+SKIN, STEM, SIDE, FACE = range(4)
+"""Materials: the skin, and a pin's stem, cap side and cap face."""
+BELT_STEP_RAD = np.radians(8.0)
+"""Largest step of polar angle between corners of the skin from the outermost pins to the rim."""
 BELT_PLACES = 48
-DARK = 1e-3  # linear light below which errors weigh alike in a fit
-TRUST = 3e-3  # of direct light alone, relative to the material seen best: decides what is hardly seen at all
-NEAR_PX = 4.0  # sd of the surroundings in which the skin's light is compared
+"""Corners of the skin around each of these circles."""
+DARK = 1e-3
+"""Linear light below which all errors have the same weight in a fit."""
+TRUST = 3e-3
+"""Weight of the guess "direct light alone", relative to the material that is seen best. It decides for what is hardly seen at all."""
+NEAR_PX = 4.0
+"""Sd of the Gaussian neighbourhood in which traced and drawn light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
+"""Largest gain of a corner of the skin."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +61,9 @@ class Shading:
         Gain of each of the skin's corners on top of that (or one for all): pins shade it.
     """
 
-    gain: np.ndarray = field(default_factory=lambda: np.ones((4, 1)))
-    offset: np.ndarray = field(default_factory=lambda: np.zeros((4, 1)))
-    skin: np.ndarray = field(default_factory=lambda: np.ones((1, 1)))
+    gain: FloatArray = field(default_factory=lambda: np.ones((4, 1)))
+    offset: FloatArray = field(default_factory=lambda: np.zeros((4, 1)))
+    skin: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
 
 
 @dataclass(frozen=True)
@@ -67,11 +82,11 @@ class _Drawing:
         Irradiance of each material and that of unit light from everywhere, both times what the gel lets through to the camera.
     """
 
-    corners_px: np.ndarray
-    outlines_px: np.ndarray
-    seen: np.ndarray
-    direct: list
-    ambient: list
+    corners_px: FloatArray
+    outlines_px: FloatArray
+    seen: IntArray
+    direct: list[FloatArray]
+    ambient: list[FloatArray]
 
 
 class Preview:
@@ -90,26 +105,39 @@ class Preview:
         What `static_layer` gives, which is the default.
     """
 
-    def __init__(self, spec: SensorSpec, *, window_px=None, light=None, shading: Shading | None = None, static=None):
+    def __init__(
+        self,
+        spec: SensorSpec,
+        *,
+        window_px: tuple[int, int, int, int] | None = None,
+        light: Lamp | None = None,
+        shading: Shading | None = None,
+        static: tuple[FloatArray, FloatArray] | None = None,
+    ) -> None:
         self.spec, self.shading = spec, shading or Shading()
-        self.window_px = tuple(window_px or (0, 0, spec.camera.width_px, spec.camera.height_px))
+        self.window_px = window_px or (0, 0, spec.camera.width_px, spec.camera.height_px)
         self._color = spec.camera.channels == "color"
-        self._direct = DirectLight(spec)
+        self._direct = DirectLight(spec.lens, spec.gel, lights(spec.leds, spec.housing))
         self._light = light or self._direct
         shine, cover = static_layer(spec, self.window_px) if static is None else static
-        through = (1 - np.asarray(cover)) * _transmittance(spec, self.window_px)
+        through = (1 - np.asarray(cover)) * _transmittance(spec.view, self.window_px)
         self._through = through[..., None].astype(np.float32)
         self._shine = self._on_film(np.broadcast_to(shine, (*through.shape, 3)))
-        self._rest = rest_pins(spec)
-        self._outlines = PinOutlines(spec)
-        self._belt_mm, self._faces = _belt(spec, self._rest.base_mm)
-        self._belt_px = project(spec, self._belt_mm)
+        self._rest = rest_pins(spec.geometry)
+        self._outlines = PinOutlines(spec.view, spec.pins, spec.appearance)
+        self._belt_mm, self._faces = _belt(spec.geometry, self._rest.base_mm)
+        self._belt_px = project(spec.view, self._belt_mm)
         self._belt_light = self._light(self._belt_mm, -_unit(self._belt_mm))
         self._mean_light = self._cap_light(self._rest.caps_mm, self._rest.axis).mean()
         look = spec.appearance
-        self._albedo = np.array([look.skin_albedo]), np.array([look.pin_albedo]), cap_albedo(spec), cap_albedo(spec)
+        self._albedo = (
+            np.array([look.skin_albedo]),
+            np.array([look.pin_albedo]),
+            cap_albedo(look, spec.pins.count),
+            cap_albedo(look, spec.pins.count),
+        )
 
-    def render(self, state=None) -> np.ndarray:
+    def render(self, state: PinState | None = None) -> FloatArray:
         """Linear light on the film, as a `Renderer` gives it.
 
         Parameters
@@ -131,7 +159,7 @@ class Preview:
         film = self._shine + self._through * self._gel(drawing, self.shading)
         return film if self._color else film[..., 0]
 
-    def calibrate(self, renderer) -> Shading:
+    def calibrate(self, renderer: Renderer) -> Shading:
         """Fit the shading to a path-traced frame at rest, and use it from here on.
 
         Least squares over the film, weighted so that an error counts about as it does in gray levels.
@@ -146,8 +174,8 @@ class Preview:
         RenderError
             If the renderer has another window.
         """
-        if tuple(renderer.window_px) != self.window_px:
-            raise RenderError(f"the renderer's window_px is {tuple(renderer.window_px)}, the preview's {self.window_px}: build both alike")
+        if renderer.window_px != self.window_px:
+            raise RenderError(f"the renderer's window_px is {renderer.window_px}, the preview's {self.window_px}: build both alike")
         traced = renderer.render().reshape(self._shine.shape)
         drawing = self._drawing(self._rest)
         gel, weight = traced - self._shine, (np.maximum(traced, 0) + DARK) ** -0.5
@@ -158,25 +186,25 @@ class Preview:
         self.shading = replace(fit, skin=self._skin_gain(drawing, fit, gel))
         return self.shading
 
-    def _skin_gain(self, drawing: _Drawing, fit: Shading, gel: np.ndarray) -> np.ndarray:
+    def _skin_gain(self, drawing: _Drawing, fit: Shading, gel: FloatArray) -> FloatArray:
         """Traced light (H, W, C) over that of a fit, near each of the skin's corners, where there is no pin: (v, 1)."""
         bare = np.array([[1.0], [0.0], [0.0], [0.0]])
         pins = self._gel(drawing, Shading(1 - bare, 1 - bare)).max(axis=2)
         free = (cv2.dilate(pins, np.ones((3, 3))) == 0) & (self._through[..., 0] > 0.5 * self._through.max())
         skin = self._through * self._gel(drawing, Shading(fit.gain * bare, fit.offset * bare))
-        near = [cv2.GaussianBlur(np.where(free, light.sum(axis=2), 0), (0, 0), NEAR_PX) for light in (gel, skin)]
-        ratio = np.divide(*near, out=np.ones_like(near[0]), where=near[1] > 1e-3 * near[1].max())
-        x, y = np.float32(drawing.corners_px).T[..., None]
-        at_corners = cv2.remap(np.float32(ratio), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
+        traced, drawn = (cv2.GaussianBlur(np.where(free, light.sum(axis=2), 0), (0, 0), NEAR_PX) for light in (gel, skin))
+        ratio = np.divide(traced, drawn, out=np.ones_like(traced), where=drawn > 1e-3 * drawn.max())
+        x, y = drawing.corners_px.astype(np.float32).T[..., None]
+        at_corners = cv2.remap(ratio.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
         return np.clip(at_corners, 0, MOST_SKIN_GAIN)
 
-    def _cap_light(self, places_mm: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    def _cap_light(self, places_mm: FloatArray, normals: FloatArray) -> FloatArray:
         """Irradiance of caps, which take light as balls do (``cap_bump``) where the lamps are the sensor's own."""
         if self._light is self._direct:
             return self._direct(places_mm, normals, self.spec.appearance.cap_bump)
         return self._light(places_mm, normals)
 
-    def _drawing(self, state) -> _Drawing:
+    def _drawing(self, state: PinState) -> _Drawing:
         base, axis, caps = state.base_mm, state.axis, state.caps_mm
         if base.shape != self._rest.base_mm.shape:
             raise RenderError(f"the state has {len(base)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
@@ -198,40 +226,41 @@ class Preview:
         corners_px = np.concatenate([feet_px, self._belt_px]) - self.window_px[:2]
         return _Drawing(corners_px, outlines_px.reshape(3 * len(base), -1, 2)[rows] - self.window_px[:2], rows, direct, kept)
 
-    def _gel(self, drawing: _Drawing, shading: Shading) -> np.ndarray:
+    def _gel(self, drawing: _Drawing, shading: Shading) -> FloatArray:
         """Light (H, W, C) of skin and pins, before it goes through the window."""
         image = np.zeros(self._shine.shape, np.float32)
         offset = shading.offset * self._mean_light
         parts = zip(self._albedo, shading.gain, drawing.direct, offset, drawing.ambient, strict=True)
         skin, *pins = (self._on_film(albedo / np.pi * (gain * direct + more * ambient)) for albedo, gain, direct, more, ambient in parts)
         draw_triangles(image, drawing.corners_px, skin * shading.skin.astype(np.float32), self._faces)
-        light = np.stack(pins, axis=1).reshape(-1, image.shape[2])[drawing.seen]
+        light = np.concatenate([part[:, None] for part in pins], axis=1).reshape(3 * len(pins[0]), -1)[drawing.seen]
         draw_polygons(image, drawing.outlines_px, light, drawing.seen % 3 == FACE - STEM)
         return image
 
-    def _kept(self, points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
+    def _kept(self, points_mm: FloatArray, pupil_mm: FloatArray) -> FloatArray:
         """Share (n, 3) of light that the gel lets through from points (n, 3) to the camera."""
         absorption = np.array(self.spec.gel.absorption_per_mm)
         if not absorption.any():
             return np.ones_like(points_mm)
         return np.exp(-absorption * self._direct.ways(points_mm, pupil_mm)[1][:, None])
 
-    def _on_film(self, rgb: np.ndarray) -> np.ndarray:
+    def _on_film(self, rgb: FloatArray) -> FloatArray:
         """RGB (..., 3) as the film's channels (..., C)."""
         return np.asarray(rgb if self._color else luminance(rgb)[..., None], np.float32)
 
 
-def _fit(parts: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _fit(parts: FloatArray, target: FloatArray) -> FloatArray:
     """Gains and offsets (8,) for which parts (m, 8) best sum to a target (m,): not negative; direct light alone where it hardly matters."""
     trust = TRUST * np.linalg.norm(parts, axis=0).max()
     plain = np.repeat([1.0, 0.0], 4)
     return nnls(np.concatenate([parts, trust * np.eye(8)]).astype(float), np.concatenate([target, trust * plain]).astype(float))[0]
 
 
-def _belt(spec: SensorSpec, feet_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _belt(geometry: GeometrySpec, feet_mm: FloatArray) -> tuple[FloatArray, IntArray]:
     """Points (b, 3) of the skin at rest from the outermost pins to the rim, and triangles (t, 3) over the feet (N, 3) and them."""
-    inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
-    start, end = np.radians(spec.pins.max_polar_deg), np.arccos(np.clip(spec.skin.rim_z_mm / inner_mm, -1, 1))
+    skin = geometry.skin
+    inner_mm = skin.outer_radius_mm - skin.thickness_mm
+    start, end = np.radians(geometry.pins.max_polar_deg), np.arccos(np.clip(skin.rim_z_mm / inner_mm, -1, 1))
     steps = np.linspace(start, end, int(np.ceil((end - start) / BELT_STEP_RAD)) + 1)[1:]
     polar, turn = (g.ravel() for g in np.meshgrid(steps, np.arange(BELT_PLACES) * 2 * np.pi / BELT_PLACES, indexing="ij"))
     belt = inner_mm * np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
@@ -241,13 +270,13 @@ def _belt(spec: SensorSpec, feet_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return belt, Delaunay(chart).simplices
 
 
-def _transmittance(spec: SensorSpec, window_px) -> np.ndarray:
+def _transmittance(view: ViewSpec, window_px: tuple[int, int, int, int]) -> FloatArray:
     """Share (H, W) of radiance that the window lets through to each pixel."""
-    corners = (ray_table(spec.camera, window_px) @ sensor_to_camera(spec.camera)[:3, :3])[..., 2]
+    corners = (ray_table(view.camera, window_px) @ sensor_to_camera(view.camera)[:3, :3])[..., 2]
     cos_air = np.clip(0.25 * (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]), 1e-6, 1)
-    cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (spec.lens.refractive_index, spec.gel.refractive_index))
-    return Window.of(spec).transmittance(np, cos_air, cos_window, cos_gel)
+    cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (view.lens.refractive_index, view.gel_index))
+    return Window.of(view).transmittance(np, cos_air, cos_window, cos_gel)
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def _unit(vectors: FloatArray) -> FloatArray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

@@ -6,11 +6,14 @@ Places are (x, y) in px, integers at pixel centres; images are (H, W, C) and are
 import numba
 import numpy as np
 
-ON_EDGE = 1e-9  # px: a pixel's centre on an edge belongs to both triangles, so that no gap opens
+from twin.types import BoolArray, FloatArray, IntArray
+
+ON_EDGE = 1e-9
+"""px. A pixel whose centre is this close to an edge belongs to both triangles, so that no gap opens between them."""
 
 
 @numba.njit(cache=True, error_model="numpy")
-def draw_polygons(image, polygons, light, inner):
+def draw_polygons(image: FloatArray, polygons: FloatArray, light: FloatArray, inner: BoolArray) -> None:
     """Paint closed polygons (P, K, 2) of one light (P, C) each over the image, in the order given.
 
     A pixel takes the share of the light that the polygon covers of its square. A polygon that is ``inner`` (P,) lies
@@ -35,7 +38,7 @@ def draw_polygons(image, polygons, light, inner):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _cover(polygon, x0, y0, width, height):
+def _cover(polygon: FloatArray, x0: int, y0: int, width: int, height: int) -> FloatArray:
     """Covered share of the pixels of a box from (x0, y0), two columns wider than asked for.
 
     Each edge adds, row by row, the area to its right that it bounds; the running sum of the row is the cover.
@@ -63,7 +66,7 @@ def _cover(polygon, x0, y0, width, height):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _add_edge(row, start, end, rise):
+def _add_edge(row: FloatArray, start: float, end: float, rise: float) -> None:
     """Add to a row of differences an edge that crosses it from x = start to end while it rises by ``rise``."""
     left, right = min(start, end), max(start, end)
     first, last = int(left), int(right)
@@ -82,7 +85,7 @@ def _add_edge(row, start, end, rise):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def draw_triangles(image, corners, light, faces):
+def draw_triangles(image: FloatArray, corners: FloatArray, light: FloatArray, faces: IntArray) -> None:
     """Fill triangles ``faces (m, 3)`` over corners (v, 2), lights (v, C) interpolated linearly, where pixel centres lie inside."""
     height, width, channels = image.shape
     at = np.empty(channels)
@@ -116,7 +119,7 @@ def draw_triangles(image, corners, light, faces):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _inside(slope, at_zero, low, high):
+def _inside(slope: float, at_zero: float, low: float, high: float) -> tuple[float, float]:
     """The part of [low, high] where ``at_zero + slope x >= 0``."""
     if slope > 0:
         return max(low, -at_zero / slope), high

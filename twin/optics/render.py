@@ -1,12 +1,14 @@
 """From a sensor's state to the linear light on its camera's film."""
 
 from functools import cached_property
+from types import ModuleType
 from typing import Literal
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError
+from twin.geometry.mesh import SensorMesh
 from twin.geometry.pins import rest_pins
 from twin.optics.arrays import with_room
 from twin.optics.camera_rays import CameraRays
@@ -17,14 +19,19 @@ from twin.optics.scene import build_scene, move_meshes
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import SkinSurface, Surface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
-from twin.optics.variant import VariantChoice, choose_variant, use_variant
+from twin.optics.variant import DrJit, VariantChoice, choose_variant, use_variant
 from twin.optics.window import Window
+from twin.types import FloatArray, IntArray, PinState
 
 Quality = Literal["preview", "standard", "high"]
-SAMPLES = {"preview": 4, "standard": 16, "high": 64}  # per pixel
-SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}  # the scalar variant is several times slower
-BOUNCES = 2  # dark skin: a third changes no gray level
-MOST_SAMPLES_AT_ONCE = 6_000_000  # bounds the memory of one pass
+SAMPLES = {"preview": 4, "standard": 16, "high": 64}
+"""Samples per pixel, by quality."""
+SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}
+"""Samples per pixel of the scalar variant, which is several times slower."""
+BOUNCES = 2
+"""Scatterings of a path after its first. The skin is dark: a third one changes no gray level."""
+MOST_SAMPLES_AT_ONCE = 6_000_000
+"""Samples of one pass: this bounds the memory it needs."""
 
 
 class Renderer:
@@ -53,11 +60,11 @@ class Renderer:
         variant: str | VariantChoice | None = None,
         quality: Quality = "standard",
         *,
-        mesh=None,
+        mesh: SensorMesh | None = None,
         window_px: tuple[int, int, int, int] | None = None,
         spp: int | None = None,
         bounces: int = BOUNCES,
-    ):
+    ) -> None:
         if quality not in SAMPLES:
             raise RenderError(f"quality={quality!r} is unknown: use {', '.join(SAMPLES)}")
         camera = spec.camera
@@ -70,20 +77,20 @@ class Renderer:
         self.choice = variant if isinstance(variant, VariantChoice) else choose_variant(camera.channels, variant)
         self._scalar = self.choice.backend == "scalar"
         self.spp = spp or (SCALAR_SAMPLES if self._scalar else SAMPLES)[quality]
-        self._rest = rest_pins(spec)
+        self._rest = rest_pins(spec.geometry)
         self._inner = None if mesh is None else np.unique(mesh.inner_quads)
-        self._skin = SkinSurface(spec, self._rest.base_mm if mesh is None else mesh.nodes_mm[self._inner])
+        self._skin = SkinSurface(spec.skin, self._rest.base_mm if mesh is None else mesh.nodes_mm[self._inner])
         self._bounces = bounces
-        self._view = None
+        self._view: GelView | ScalarView | None = None
 
     @cached_property
-    def static(self) -> tuple[np.ndarray, np.ndarray]:
+    def static(self) -> tuple[FloatArray, FloatArray]:
         """Light (H, W, 3) or (H, W) of the static layer, and the share (H, W) of the gel's light that it lets through."""
         light, cover = static_layer(self.spec, self.window_px)
         mono = self.spec.camera.channels == "mono"
         return (luminance(light).astype(np.float32) if mono else light), 1 - cover
 
-    def render(self, state=None, seed: int = 0) -> np.ndarray:
+    def render(self, state: PinState | None = None, seed: int = 0) -> FloatArray:
         """Linear light on the film.
 
         Parameters
@@ -103,7 +110,7 @@ class Renderer:
         state = self._rest if state is None else state
         surfaces = self.surfaces(state)
         if self._view is None:
-            kind = ScalarView if self._scalar else GelView
+            kind: type[GelView] | type[ScalarView] = ScalarView if self._scalar else GelView
             self._view = kind(mi, self.spec, self.window_px, surfaces, self._bounces)
         else:
             self._view.move(surfaces)
@@ -116,7 +123,7 @@ class Renderer:
         image.reshape(through.size, -1)[pixels] += (through.ravel()[pixels, None] * gel).astype(np.float32)
         return np.maximum(image, 0)
 
-    def surfaces(self, state) -> dict[str, Surface]:
+    def surfaces(self, state: PinState) -> dict[str, Surface]:
         """Skin, stems and caps of a state, by the names of the scene's meshes."""
         if state.base_mm.shape != self._rest.base_mm.shape:
             raise RenderError(f"the state has {len(state.base_mm)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
@@ -124,8 +131,8 @@ class Renderer:
         control = state.base_mm if self._inner is None else (self._skin.control_mm if nodes is None else nodes[self._inner])
         return {
             "skin": Surface(self._skin.vertices(control), self._skin.faces),
-            "stems": stems(self.spec, state.base_mm, state.axis),
-            "caps": caps(self.spec, state.caps_mm, state.axis),
+            "stems": stems(self.spec.pins, state.base_mm, state.axis),
+            "caps": caps(self.spec.pins, self.spec.appearance, state.caps_mm, state.axis),
         }
 
 
@@ -143,30 +150,32 @@ class GelView:
     bounces : int
     """
 
-    def __init__(self, mi, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int):
+    def __init__(
+        self, mi: ModuleType, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int
+    ) -> None:
         import drjit as dr
 
         self._mi, self._dr, self._spec, self._window_px = mi, dr, spec, window_px
-        scene = build_scene(mi, spec, **surfaces)
+        scene = build_scene(mi, spec.appearance, spec.gel.refractive_index, surfaces)
         self.params = mi.traverse(scene)
         self.tracer = GelTracer.of(mi, spec, scene, bounces)
-        self.rays = CameraRays(mi, dr, spec.camera, Window.of(spec), window_px)
+        self.rays = CameraRays(mi, dr, spec.camera, Window.of(spec.view), window_px)
 
     def move(self, surfaces: dict[str, Surface]) -> None:
         """Move the meshes' vertices."""
         move_meshes(self.params, surfaces)
 
-    def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state) -> np.ndarray:
+    def gel_light(self, pixels: IntArray, spp: int, seed: int, state: PinState) -> FloatArray:
         """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row; fewer samples on bare skin."""
         mi, dr = self._mi, self._dr
-        pins = near_pins(self._spec, state, self._window_px).ravel()[pixels]
+        pins = near_pins(self._spec.view, self._spec.pins, self._spec.appearance, state, self._window_px).ravel()[pixels]
         passes, each, few = 1, spp, -(-spp // SKIN_SAVING)
         while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
             passes, each, few = 2 * passes, -(-each // 2), -(-few // 2)  # halves: nets of powers of two are even
         counts = np.where(pins, each, few)
         rows = np.repeat(np.arange(len(pixels), dtype=np.uint32), counts)
         index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        row, total = mi.UInt32(with_room(rows, np.uint32)), 0.0
+        row, total = mi.UInt32(with_room(rows, np.uint32)), np.zeros(1, np.float32)
         pixel, number = mi.UInt32(with_room(pixels[rows], np.uint32)), mi.UInt32(with_room(index, np.uint32))
         for k in range(passes):
             light = self._light(pixel, number, each, (seed * 1009 + k) % 2**32)
@@ -175,14 +184,14 @@ class GelView:
             total = total + np.array(found).T
         return total / (passes * counts[:, None])
 
-    def trace(self, pixels, spp: int, seed: int):
+    def trace(self, pixels: DrJit, spp: int, seed: int) -> DrJit:
         """Mean light of pixels as a spectrum of Dr.Jit, differentiable in what the tracer and the scene hold."""
         mi, dr = self._mi, self._dr
         number = dr.arange(mi.UInt32, len(pixels) * spp)
         light = self._light(dr.gather(mi.UInt32, pixels, number // spp), number % spp, spp, seed)
         return mi.Spectrum(*(dr.block_sum(channel, spp) / spp for channel in light))
 
-    def _light(self, pixel, number, spp: int, seed: int):
+    def _light(self, pixel: DrJit, number: DrJit, spp: int, seed: int) -> DrJit:
         """Light of samples: of the pixel and the number, below ``spp``, of each."""
         mi, dr = self._mi, self._dr
         random = PixelSamples(mi, dr, pixel, number, spp, seed)

@@ -1,46 +1,58 @@
 """The gel seen by the scalar variant, which runs anywhere: an approximation with Mitsuba's own path tracer.
 
-Its camera is the one pinhole in the gel that sees the caps best, its LEDs stand in the gel where the caps see them; the
-picture is then warped, by the depth of the caps, to where the window puts it. The window reflects nothing.
+Its camera is a pinhole in the gel, at the point that fits the caps' rays best. Its LEDs stand in the gel where the caps see them.
+The picture is then warped, with the depth of the caps, to where the window shows it. The window reflects nothing.
 """
+
+from collections.abc import Sequence
+from types import ModuleType
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import map_coordinates
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import SensorSpec, ViewSpec
 from twin.geometry.pins import rest_pins
 from twin.optics.lights import Patch, lights
 from twin.optics.scene import build_pinhole_camera, build_scene, mesh, move_meshes
 from twin.optics.surfaces import Surface
+from twin.optics.variant import DrJit
 from twin.projection import pixel_rays, project, window_tangent
+from twin.types import FloatArray, IntArray, PinState
 
-OVERSAMPLING = 1.3  # pixels of the ideal image per pixel of the frame
-COARSE = 8  # px between the places where the depth is interpolated
-DEPTH_NEIGHBOURS = 24  # caps that give the depth of a place
+OVERSAMPLING = 1.3
+"""Pixels of the pinhole camera's image for each pixel of the frame, along a side."""
+COARSE = 8
+"""Distance in px of the places at which the caps' depth is interpolated."""
+DEPTH_NEIGHBOURS = 24
+"""Number of nearest caps that give the depth of a place."""
 
 
 class ScalarView:
     """As ``GelView``, for scalar variants."""
 
-    def __init__(self, mi, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int):
-        self._mi, self._spec, self._window_px = mi, spec, window_px
-        emitters = _apparent_lights(mi, spec)
+    def __init__(
+        self, mi: ModuleType, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int
+    ) -> None:
+        self._mi, self._view, self._window_px = mi, spec.view, window_px
+        rest_mm = rest_pins(spec.geometry).caps_mm
+        rest_px = project(self._view, rest_mm)
+        emitters = _apparent_lights(mi, self._view, lights(spec.leds, spec.housing), rest_mm)
         integrator = {"type": "path", "max_depth": bounces + 2, "rr_depth": 100}
-        self._scene = build_scene(mi, spec, **surfaces, extra=emitters | {"integrator": integrator})
+        self._scene = build_scene(mi, spec.appearance, spec.gel.refractive_index, surfaces, extra=emitters | {"integrator": integrator})
         self._params = mi.traverse(self._scene)
-        place, direction = pixel_rays(spec, project(spec, rest_pins(spec).caps_mm))
+        place, direction = pixel_rays(self._view, rest_px)
         self._eye_mm = np.array([0.0, 0.0, nearest_point(place, direction)[2]])
-        across = rest_pins(spec).caps_mm - self._eye_mm
+        across = rest_mm - self._eye_mm
         self._half_field = 1.25 * float(np.abs(across[:, :2] / across[:, 2:]).max())
-        pitch_px = np.ptp(project(spec, rest_pins(spec).caps_mm), axis=0).max()
+        pitch_px = np.ptp(rest_px, axis=0).max()
         self._size = int(OVERSAMPLING * 1.25 * pitch_px)
 
     def move(self, surfaces: dict[str, Surface]) -> None:
         """Move the meshes' vertices."""
         move_meshes(self._params, surfaces)
 
-    def gel_light(self, pixels: np.ndarray, spp: int, seed: int, state) -> np.ndarray:
+    def gel_light(self, pixels: IntArray, spp: int, seed: int, state: PinState) -> FloatArray:
         """Mean light (n, channels) of the given pixels (n,) of the window, numbered row by row."""
         mi = self._mi
         to_world = np.eye(4)
@@ -50,39 +62,38 @@ class ScalarView:
         at = self._places(state)[pixels]
         return np.stack([map_coordinates(channel, at[:, ::-1].T, order=3, mode="nearest") for channel in np.moveaxis(image, 2, 0)], axis=1)
 
-    def _places(self, state) -> np.ndarray:
+    def _places(self, state: PinState) -> FloatArray:
         """Where in the ideal image each pixel of the window looks (H W, 2): along its ray to the depth of the caps about it."""
         caps_mm = state.caps_mm
         x0, y0, x1, y1 = self._window_px
         coarse = [np.arange(lo, hi + COARSE, COARSE) for lo, hi in ((x0, x1), (y0, y1))]
         grid = np.stack(np.meshgrid(*coarse), axis=-1)
-        depth = RBFInterpolator(project(self._spec, caps_mm), caps_mm[:, 2], neighbors=min(DEPTH_NEIGHBOURS, len(caps_mm)))
-        z = np.maximum(depth(grid.reshape(-1, 2)), self._spec.lens.z_mm).reshape(grid.shape[:2])
-        place, direction = pixel_rays(self._spec, grid)
+        depth = RBFInterpolator(project(self._view, caps_mm), caps_mm[:, 2], neighbors=min(DEPTH_NEIGHBOURS, len(caps_mm)))
+        z = np.maximum(depth(grid.reshape(-1, 2)), self._view.lens.z_mm).reshape(grid.shape[:2])
+        place, direction = pixel_rays(self._view, grid.astype(float))
         seen = place + direction * ((z - place[..., 2]) / direction[..., 2])[..., None] - self._eye_mm
         ideal = (seen[..., :2] / np.maximum(seen[..., 2:], 1e-3) / self._half_field + 1) * 0.5 * self._size - 0.5
         fine = np.stack([_refined(channel, (y1 - y0, x1 - x0)) for channel in np.moveaxis(ideal, 2, 0)], axis=-1)
         return fine.reshape(-1, 2)
 
 
-def nearest_point(place: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def nearest_point(place: FloatArray, direction: FloatArray) -> FloatArray:
     """The point (3,) with the least sum of squared distances to the lines through ``place`` (n, 3) along ``direction``."""
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, place))
 
 
-def _refined(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _refined(values: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """A grid with COARSE px between its places, at every pixel."""
     rows, columns = (np.arange(n) / COARSE for n in shape)
     return map_coordinates(values, np.meshgrid(rows, columns, indexing="ij"), order=3, mode="nearest")
 
 
-def _apparent_lights(mi, spec: SensorSpec) -> dict:
+def _apparent_lights(mi: ModuleType, view: ViewSpec, patches: Sequence[Patch], caps_mm: FloatArray) -> dict[str, DrJit]:
     """An emitter for every LED, at the point in the gel from which its light seems to come, as bright there."""
-    caps_mm = rest_pins(spec).caps_mm
     made, unseen = {}, mi.load_dict({"type": "null"})
-    for k, patch in enumerate(p for p in lights(spec) if p.half_mm.any()):
-        place, direction, gain = _seen_from(spec, patch, caps_mm)
+    for k, patch in enumerate(p for p in patches if p.half_mm.any()):
+        place, direction, gain = _seen_from(view, patch, caps_mm)
         middle = nearest_point(place, direction)
         square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ patch.half_mm
         corners = middle + np.column_stack([square, np.zeros(4)])
@@ -95,13 +106,13 @@ def _apparent_lights(mi, spec: SensorSpec) -> dict:
     return made
 
 
-def _seen_from(spec: SensorSpec, patch: Patch, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _seen_from(view: ViewSpec, patch: Patch, points_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Refracted rays from points in the gel to a patch: places and unit directions (n, 3), and solid angle per area of the patch."""
     across = points_mm[:, :2] - patch.center_mm[:2]
     rho = np.linalg.norm(across, axis=1)
     lift = 1e-3
-    u, wider = (window_tangent(spec, r, points_mm[:, 2], behind_mm=patch.center_mm[2]) for r in (rho, rho + lift))
-    n = spec.gel.refractive_index
+    u, wider = (window_tangent(view, r, points_mm[:, 2], behind_mm=patch.center_mm[2]) for r in (rho, rho + lift))
+    n = view.gel_index
     sine, next_sine = (t / np.sqrt(1 + t * t) / n for t in (u, wider))
     cosine = np.sqrt(1 - sine**2)
     direction = np.column_stack([across / np.maximum(rho, 1e-9)[:, None] * sine[:, None], cosine])

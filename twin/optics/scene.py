@@ -1,22 +1,33 @@
 """Skin, stems and caps in Mitsuba's terms; the only module that names its plugins."""
 
+from collections.abc import Mapping
+from types import ModuleType
+
 import numpy as np
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import AppearanceSpec
 from twin.optics.arrays import with_room
 from twin.optics.surfaces import Surface
 from twin.optics.tracer import luminance
+from twin.optics.variant import DrJit
+from twin.types import FloatArray
 
 SKIN_INDEX = 1.52  # acrylate rubber
 
 PAINT = {"type": "mesh_attribute", "name": "vertex_paint"}
 
 
-def build_scene(mi, spec: SensorSpec, *, skin: Surface, stems: Surface, caps: Surface, extra: dict | None = None):
+def build_scene(
+    mi: ModuleType, look: AppearanceSpec, gel_index: float, surfaces: Mapping[str, Surface], *, extra: dict[str, DrJit] | None = None
+) -> DrJit:
     """A Mitsuba scene of what is in the gel, without camera or lights.
 
     Parameters
     ----------
+    look : AppearanceSpec
+    gel_index : float
+    surfaces : mapping of str to Surface
+        By the names ``skin``, ``stems`` and ``caps``.
     extra : dict, optional
         More of the scene's dictionary: lights, an integrator.
 
@@ -25,19 +36,20 @@ def build_scene(mi, spec: SensorSpec, *, skin: Surface, stems: Surface, caps: Su
     mi.Scene
         Its updatable meshes have the ids ``skin``, ``stems`` and ``caps``.
     """
-    look, gel = spec.appearance, spec.gel.refractive_index
-    skin_bsdf = _rubber(mi, {"type": "rgb", "value": list(look.skin_albedo)}, look.skin_gloss, look.skin_roughness, gel)
-    cap_bsdf = _rubber(mi, PAINT, look.cap_gloss, look.cap_roughness, gel)
+    skin_bsdf = _rubber(mi, {"type": "rgb", "value": list(look.skin_albedo)}, look.skin_gloss, look.skin_roughness, gel_index)
+    cap_bsdf = _rubber(mi, PAINT, look.cap_gloss, look.cap_roughness, gel_index)
     description = {
         "type": "scene",
-        "skin": mesh(mi, "skin", skin, skin_bsdf, smooth=True),
-        "stems": mesh(mi, "stems", stems, _rubber(mi, {"type": "rgb", "value": list(look.pin_albedo)}, 0.0, 1.0, gel), smooth=True),
-        "caps": mesh(mi, "caps", caps, cap_bsdf, smooth=False),
+        "skin": mesh(mi, "skin", surfaces["skin"], skin_bsdf, smooth=True),
+        "stems": mesh(
+            mi, "stems", surfaces["stems"], _rubber(mi, {"type": "rgb", "value": list(look.pin_albedo)}, 0.0, 1.0, gel_index), smooth=True
+        ),
+        "caps": mesh(mi, "caps", surfaces["caps"], cap_bsdf, smooth=False),
     }
     return mi.load_dict(description | (extra or {}), parallel=False)
 
 
-def build_pinhole_camera(mi, to_world: np.ndarray, half_field: float, size_px: int, spp: int):
+def build_pinhole_camera(mi: ModuleType, to_world: FloatArray, half_field: float, size_px: int, spp: int) -> DrJit:
     """An ideal square pinhole camera that sees tangents within +-half_field.
 
     ``to_world`` is the pose (4, 4) of a frame with z ahead, x right and y down: pixel (i, j) sees
@@ -59,7 +71,7 @@ def build_pinhole_camera(mi, to_world: np.ndarray, half_field: float, size_px: i
     )
 
 
-def mesh(mi, name: str, surface: Surface, bsdf, *, smooth: bool, emitter=None):
+def mesh(mi: ModuleType, name: str, surface: Surface, bsdf: DrJit, *, smooth: bool, emitter: DrJit | None = None) -> DrJit:
     """A Mitsuba mesh of that id; its paint becomes a vertex attribute."""
     props = mi.Properties()
     props["bsdf"] = bsdf
@@ -78,14 +90,14 @@ def mesh(mi, name: str, surface: Surface, bsdf, *, smooth: bool, emitter=None):
     return made
 
 
-def move_meshes(params, surfaces: dict[str, Surface]) -> None:
+def move_meshes(params: DrJit, surfaces: dict[str, Surface]) -> None:
     """Move the vertices of a scene's meshes, given its traversed parameters and surfaces by the meshes' ids."""
     for name, surface in surfaces.items():
         params[f"{name}.vertex_positions"] = with_room(surface.vertices_mm.ravel(), np.float32)
     params.update()
 
 
-def _rubber(mi, reflectance: dict, gloss: float, roughness: float, gel_index: float) -> object:
+def _rubber(mi: ModuleType, reflectance: Mapping[str, object], gloss: float, roughness: float, gel_index: float) -> DrJit:
     """Matt, with a rough specular lobe of weight ``gloss`` where it meets the gel."""
     if gloss == 0:
         return mi.load_dict({"type": "diffuse", "reflectance": reflectance})

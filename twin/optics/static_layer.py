@@ -1,25 +1,32 @@
-"""What the camera sees besides the gel: the housing, the LEDs' reflections in the window, specks. Contact never changes it.
+"""What the camera sees besides the gel: the housing, the LEDs' reflections in the window, specks.
 
-Found once, without noise.
+No contact changes this layer. It is computed once, without noise.
 """
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from scenes.sensor import HousingSpec, SensorSpec
+from scenes.sensor import HousingSpec, LedRingSpec, SensorSpec, SpeckSpec, ViewSpec
 from twin.optics.lens import ray_table, subpixel_rays
-from twin.optics.lights import led_patches, lights
+from twin.optics.lights import Patch, led_patches, lights
 from twin.optics.window import fresnel
 from twin.projection import sensor_to_camera
+from twin.types import FloatArray
 
-ACROSS = 4  # places in a pixel, each way, where its corners differ
-EVEN = 0.02  # relative difference of the corners below which their mean is the pixel
-RIM_UNIT = 1000.0  # of the numbers in RimSpec.light
-SMALL = 1e-3  # light and cover below this need no relative precision
+ACROSS = 4
+"""Places along each side of a pixel at which it is evaluated if its corners differ."""
+EVEN = 0.02
+"""If the corners of a pixel differ by less than this share, their mean is the pixel."""
+RIM_UNIT = 1000.0
+"""The numbers in ``RimSpec.light`` are thousandths."""
+SMALL = 1e-3
+"""Light and cover below this need no relative precision."""
 
 
-def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:
     """Light and cover of a window of the raw frame.
 
     Returns
@@ -41,19 +48,19 @@ def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tupl
     return both[..., :3].astype(np.float32), both[..., 3].astype(np.float32)
 
 
-def _seen(spec: SensorSpec, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _seen(spec: SensorSpec, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Light (..., 3) and cover (...) along rays (..., 3) from the pupil, sensor frame, of any length."""
     camera, ring = spec.camera, spec.housing
     tangents = rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)
     at_ring = tangents * (ring.z_mm + camera.distance_mm)
     wall = np.linalg.norm(at_ring - ring.center_mm, axis=-1) >= ring.aperture_radius_mm
-    light = np.where(wall[..., None], housing_light(spec, at_ring), reflections(spec, tangents))
-    hidden, shine = _specks(spec, tangents)
+    light = np.where(wall[..., None], housing_light(spec.leds, ring, at_ring), reflections(spec.view, spec.leds, ring, tangents))
+    hidden, shine = _specks(spec.view, spec.appearance.specks, tangents)
     light = np.where(wall[..., None], light, light + shine) + rim_light(ring, at_ring)
     return light, np.where(wall, 1.0, hidden)
 
 
-def rim_light(ring: HousingSpec, at_mm: np.ndarray) -> np.ndarray:
+def rim_light(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
     """Light (..., 3) measured on top of the formulas at places (..., 2) of the housing's plane; linear in azimuth and radius."""
     if ring.rim is None:
         return np.zeros((*at_mm.shape[:-1], 3))
@@ -69,8 +76,8 @@ def rim_light(ring: HousingSpec, at_mm: np.ndarray) -> np.ndarray:
 
 
 def rim_places(
-    ring: HousingSpec, inner_mm: float, outer_mm: float, shape: tuple[int, int], at_mm: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    ring: HousingSpec, inner_mm: float, outer_mm: float, shape: tuple[int, int], at_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Row and column (...) in a rim's table, of ``shape`` azimuths and radii, of places (..., 2) of the housing's plane."""
     place = at_mm - ring.center_mm
     turn = np.arctan2(place[..., 1], place[..., 0]) % (2 * np.pi) / (2 * np.pi) * shape[0]
@@ -78,13 +85,13 @@ def rim_places(
     return turn, along
 
 
-def housing_light(spec: SensorSpec, at_mm: np.ndarray) -> np.ndarray:
+def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
     """Radiance (..., 3) that the ring and wall send to the camera from places (..., 2) of their plane.
 
     ``albedo * power * (ambient * lit share of LEDs * exp(-(rho - aperture) / falloff)
     + glow * sum over LEDs of balance * (1 + |p - led|^2 / h^2)^-n)``.
     """
-    ring, patches = spec.housing, led_patches(spec)
+    patches = led_patches(leds)
     place = at_mm - ring.center_mm
     out = np.linalg.norm(place, axis=-1) - ring.aperture_radius_mm
     full = max(p.radiance.max() for p in patches) or 1.0
@@ -94,51 +101,51 @@ def housing_light(spec: SensorSpec, at_mm: np.ndarray) -> np.ndarray:
         led = patch.center_mm[:2] / np.linalg.norm(patch.center_mm[:2])
         away2 = np.sum((place - ring.glow_radius_mm * led) ** 2, axis=-1) / ring.glow_height_mm**2
         light = light + ring.glow * share * (1 + away2) ** -ring.glow_exponent
-    light = spec.leds.power * light * np.where(out < ring.lip_width_mm, 1.0, ring.wall_fraction)
+    light = leds.power * light * np.where(out < ring.lip_width_mm, 1.0, ring.wall_fraction)
     return light[..., None] * np.array(ring.albedo)
 
 
-def reflections(spec: SensorSpec, tangents: np.ndarray) -> np.ndarray:
+def reflections(view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, tangents: FloatArray) -> FloatArray:
     """Radiance (..., 3) of the lights mirrored in both faces of the window, for tangents (..., 2) of rays in air."""
-    lens, distance = spec.lens, spec.camera.distance_mm
+    lens, distance = view.lens, view.camera.distance_mm
     u2 = np.sum(tangents**2, axis=-1)
     cos_air = 1 / np.sqrt(1 + u2)
     sine2 = 1 - cos_air**2
     cos_window = np.sqrt(1 - sine2 / lens.refractive_index**2)
-    cos_gel = np.sqrt(np.maximum(1 - sine2 / spec.gel.refractive_index**2, 0))
+    cos_gel = np.sqrt(np.maximum(1 - sine2 / view.gel_index**2, 0))
     outer = fresnel(1 / lens.refractive_index, cos_air, cos_window)
-    inner = fresnel(lens.refractive_index / spec.gel.refractive_index, cos_window, cos_gel)
+    inner = fresnel(lens.refractive_index / view.gel_index, cos_window, cos_gel)
     from_front = (1 - outer) ** 2 * inner / (1 - outer * inner)
     # tan(window) / tan(air): the detour through the window and back
     detour = 2 * lens.thickness_mm * cos_air / (lens.refractive_index * cos_window)
-    total = 0.0
-    for patch in lights(spec):
+    total: FloatArray = np.zeros((*u2.shape, 3))
+    for patch in lights(leds, ring):
         straight = (lens.back_mm + distance) + (lens.back_mm - patch.center_mm[2])
         for weight, reach in ((outer, straight), (from_front, straight + detour)):
             at = tangents * np.asarray(reach)[..., None] - patch.center_mm[:2]
-            total = total + (weight * _profile(spec, patch, at))[..., None] * patch.radiance
+            total = total + (weight * _profile(leds, patch, at))[..., None] * patch.radiance
     return total
 
 
-def _profile(spec: SensorSpec, patch, at_mm: np.ndarray) -> np.ndarray:
+def _profile(leds: LedRingSpec, patch: Patch, at_mm: FloatArray) -> FloatArray:
     """A light's radiance at places (..., 2) about its centre, relative to its mean."""
     inner, outer = patch.radii_mm
     if outer > 0:
         rho = np.linalg.norm(at_mm, axis=-1)
         return ((rho >= inner) & (rho <= outer)).astype(float)
     within = np.all(np.abs(at_mm @ np.linalg.inv(patch.half_mm)) <= 1, axis=-1)
-    share, sd = spec.leds.core_share, spec.leds.core_mm
+    share, sd = leds.core_share, leds.core_mm
     core = patch.area_mm2 / (2 * np.pi * sd**2) * np.exp(-np.sum(at_mm**2, axis=-1) / (2 * sd**2)) if share else 0.0
-    return spec.leds.mirror_share * ((1 - share) * within + share * core)
+    return leds.mirror_share * ((1 - share) * within + share * core)
 
 
-def _specks(spec: SensorSpec, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _specks(view: ViewSpec, specks: Sequence[SpeckSpec], tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cover (...) and light (..., 3) of the specks on the window's gel side."""
     hidden, shine = np.zeros(tangents.shape[:-1]), np.zeros((*tangents.shape[:-1], 3))
-    lens, u2 = spec.lens, np.sum(tangents**2, axis=-1, keepdims=True)
+    lens, u2 = view.lens, np.sum(tangents**2, axis=-1, keepdims=True)
     within = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)
-    at = tangents * (lens.back_mm + spec.camera.distance_mm + lens.thickness_mm * within)
-    for speck in spec.appearance.specks:
+    at = tangents * (lens.back_mm + view.camera.distance_mm + lens.thickness_mm * within)
+    for speck in specks:
         away = np.linalg.norm(at - [speck.x_mm, speck.y_mm], axis=-1) / speck.radius_mm
         disc = np.clip(2 - 2 * away, 0, 1)  # full up to half the radius
         hidden = 1 - (1 - hidden) * (1 - speck.opacity * disc)

@@ -9,24 +9,32 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import AppearanceSpec, PinsSpec, SkinSpec
+from twin.types import FloatArray, IntArray
 
 SKIN_POLAR_STEPS = 40
+"""Circles of the skin's grid between apex and rim."""
 SKIN_AZIMUTH_STEPS = 80
+"""Vertices on each circle."""
 STEM_SIDES = 8
+"""Sides of a stem."""
 CAP_SIDES = 16
-CAP_BEVEL = 0.25  # of the cap's height: printed edges are never sharp
-STEM_ROOT_MM = 0.3  # stems start inside the skin, so that no gap opens where it bends
-MOST_CONTROL_POINTS = 1200  # displacement interpolation solves a dense system of this size once
+"""Sides of a cap."""
+CAP_BEVEL = 0.25
+"""Bevel of a cap's edge as a share of the cap's height: printed edges are never sharp."""
+STEM_ROOT_MM = 0.3
+"""Stems start this deep inside the skin, so that no gap opens where the skin bends."""
+MOST_CONTROL_POINTS = 1200
+"""More control points than this are thinned out: the interpolation solves a dense system of their number, once."""
 
 
 @dataclass(frozen=True)
 class Surface:
     """Triangles ``faces (m, 3)`` over ``vertices_mm (n, 3)``; ``paint (n, 3)``: reflectance of each vertex."""
 
-    vertices_mm: np.ndarray
-    faces: np.ndarray
-    paint: np.ndarray | None = None
+    vertices_mm: FloatArray
+    faces: IntArray
+    paint: FloatArray | None = None
 
 
 class SkinSurface:
@@ -38,14 +46,14 @@ class SkinSurface:
 
     Parameters
     ----------
-    spec : SensorSpec
+    skin : SkinSpec
     control_mm : (n, 3) float
         Rest positions, on the inside of the skin, at which displacements will be given.
     """
 
-    def __init__(self, spec: SensorSpec, control_mm: np.ndarray):
-        inner_mm = spec.skin.outer_radius_mm - spec.skin.thickness_mm
-        rim_rad = np.arccos(np.clip(spec.skin.rim_z_mm / inner_mm, -1, 1))
+    def __init__(self, skin: SkinSpec, control_mm: FloatArray) -> None:
+        inner_mm = skin.outer_radius_mm - skin.thickness_mm
+        rim_rad = np.arccos(np.clip(skin.rim_z_mm / inner_mm, -1, 1))
         polar = np.linspace(0, rim_rad, SKIN_POLAR_STEPS + 1)[1:]
         azimuth = np.arange(SKIN_AZIMUTH_STEPS) * 2 * np.pi / SKIN_AZIMUTH_STEPS
         theta, phi = (a.ravel() for a in np.meshgrid(polar, azimuth, indexing="ij"))
@@ -63,40 +71,40 @@ class SkinSurface:
         self._weights = RBFInterpolator(sites, unit, kernel="thin_plate_spline")(_chart(self.rest_mm)).astype(np.float32)
         self.control_mm = control_mm
 
-    def vertices(self, control_mm: np.ndarray) -> np.ndarray:
+    def vertices(self, control_mm: FloatArray) -> FloatArray:
         """Fine grid (v, 3) when the control points have moved to ``control_mm`` (n, 3)."""
         moved = (control_mm - self.control_mm)[self._keep]
         return self.rest_mm + self._weights @ moved.astype(np.float32)
 
 
-def stems(spec: SensorSpec, base_mm: np.ndarray, axis: np.ndarray) -> Surface:
+def stems(pins: PinsSpec, base_mm: FloatArray, axis: FloatArray) -> Surface:
     """All pin stems, one surface: cylinders from the skin to the cap."""
-    length = spec.pins.length_mm
-    profile = np.array([[0.5 * spec.pins.diameter_mm, -STEM_ROOT_MM], [0.5 * spec.pins.diameter_mm, length]])
+    length = pins.length_mm
+    profile = np.array([[0.5 * pins.diameter_mm, -STEM_ROOT_MM], [0.5 * pins.diameter_mm, length]])
     return _lathe(profile, base_mm, axis, STEM_SIDES)
 
 
-def caps(spec: SensorSpec, caps_mm: np.ndarray, axis: np.ndarray) -> Surface:
+def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: FloatArray) -> Surface:
     """All caps, one surface: bevelled discs, or of their own outlines, about their centres; open below, where nothing is seen of them."""
-    radius, half = 0.5 * spec.pins.cap_diameter_mm, 0.5 * spec.pins.cap_height_mm
-    bevel = min(CAP_BEVEL * spec.pins.cap_height_mm, 0.5 * radius)
+    radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
+    bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
     radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
     profile = np.array([[radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
-    body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(spec, CAP_SIDES))
-    return Surface(body.vertices_mm, body.faces, np.repeat(cap_albedo(spec), len(body.vertices_mm) // len(caps_mm), axis=0))
+    body = _lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(appearance, CAP_SIDES))
+    return Surface(
+        body.vertices_mm, body.faces, np.repeat(cap_albedo(appearance, pins.count), len(body.vertices_mm) // len(caps_mm), axis=0)
+    )
 
 
-def cap_albedo(spec: SensorSpec) -> np.ndarray:
+def cap_albedo(look: AppearanceSpec, count: int) -> FloatArray:
     """Reflectance (N, 3) of each cap: measured, or drawn."""
-    look, count = spec.appearance, spec.pins.count
     drawn = 1 + look.cap_variation * np.random.default_rng(look.cap_pattern).standard_normal(count)
     each = np.array(look.cap_levels) if look.cap_levels else drawn
     return np.clip(each[:, None] * np.array(look.cap_albedo), 0, 1)
 
 
-def cap_outlines(spec: SensorSpec, sides: int) -> np.ndarray | None:
+def cap_outlines(look: AppearanceSpec, sides: int) -> FloatArray | None:
     """Radius (N, sides) of each cap's outline relative to its circle's, or None where all are round."""
-    look = spec.appearance
     if not look.cap_shapes and not look.cap_offsets:
         return None
     shapes, offsets = np.array(look.cap_shapes or [[0.0]]), np.array(look.cap_offsets or [[0.0, 0.0]])
@@ -106,7 +114,7 @@ def cap_outlines(spec: SensorSpec, sides: int) -> np.ndarray | None:
     return 1 + shapes[:, :1] + shapes[:, 1::2] @ np.cos(orders * turn) + shapes[:, 2::2] @ np.sin(orders * turn) + beside
 
 
-def _chart(points_mm: np.ndarray) -> np.ndarray:
+def _chart(points_mm: FloatArray) -> FloatArray:
     """Azimuthal equidistant chart (n, 2), rad, of points seen from the dome's centre."""
     unit = points_mm / np.linalg.norm(points_mm, axis=1, keepdims=True)
     polar = np.arccos(np.clip(unit[:, 2], -1, 1))
@@ -114,21 +122,21 @@ def _chart(points_mm: np.ndarray) -> np.ndarray:
     return unit[:, :2] * np.divide(polar, rho, out=np.ones_like(rho), where=rho > 1e-9)[:, None]
 
 
-def _fan_grid(rings: int, around: int) -> np.ndarray:
+def _fan_grid(rings: int, around: int) -> IntArray:
     """Triangles of an apex (vertex 0) and ``rings`` circles of ``around`` vertices; normals towards the inside of a dome."""
     k = np.arange(around)
     fan = np.stack([np.zeros_like(k), 1 + (k + 1) % around, 1 + k], axis=1)
     return np.concatenate([fan, 1 + _ring_grid(rings - 1, around)[:, ::-1]])
 
 
-def _ring_grid(bands: int, around: int) -> np.ndarray:
+def _ring_grid(bands: int, around: int) -> IntArray:
     """Triangles between ``bands + 1`` circles of ``around`` vertices each."""
     j, k = (g.ravel() for g in np.meshgrid(np.arange(bands), np.arange(around), indexing="ij"))
     a, b = j * around + k, j * around + (k + 1) % around
     return np.concatenate([np.stack([a, a + around, b], axis=1), np.stack([b, a + around, b + around], axis=1)])
 
 
-def _lathe(profile: np.ndarray, origin_mm: np.ndarray, axis: np.ndarray, sides: int, outlines: np.ndarray | None = None) -> Surface:
+def _lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: int, outlines: FloatArray | None = None) -> Surface:
     """Copies of a turned body, profile (k, 2) of (radius, height), at each origin along its axis; normals outwards.
 
     The turn starts where the sensor's x falls onto the body's plane, towards y. ``outlines`` (N, sides) scale the radius.

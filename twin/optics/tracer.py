@@ -1,20 +1,28 @@
 """Path tracing on the gel's side of the window.
 
-At every vertex the light of all patches is found through the window without shadows (a sum of closed forms), and one
-of them, drawn in proportion to what it would give, is tested for a shadow: where nothing is in the way there is no noise
-from the choice. Paths that leave towards the window are reflected by it (with total reflection) or lost in the housing.
+At every vertex the light of all patches through the window is computed without shadows, as a sum of closed forms. Then one
+patch, drawn in proportion to what it would give, is tested for a shadow. Where nothing is in the way, this choice causes no
+noise. Paths that leave towards the window are reflected by it (with total reflection) or lost in the housing.
 """
 
 from dataclasses import dataclass, field
+from types import ModuleType
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.optics.lights import Patch, lights
+from twin.optics.sampling import PixelSamples
+from twin.optics.variant import DrJit
 from twin.optics.window import Window
+from twin.types import FloatArray
 
-SURVIVAL_GAIN, LEAST_SURVIVAL = 4.0, 0.05  # a path goes on with a probability of this times its weight, but no less
+SURVIVAL_GAIN = 4.0
+"""A path goes on with a probability of this times its weight (Russian roulette), at most 1."""
+LEAST_SURVIVAL = 0.05
+"""A path goes on at least with this probability."""
 NEVER = 1e-12
+"""Probability that counts as 0."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +30,7 @@ class Emitters:
     """Patches as arrays for Dr.Jit, radiances as its spectra so that they can carry gradients."""
 
     patches: list[Patch]
-    radiance: list
+    radiance: list[DrJit]
 
 
 @dataclass
@@ -45,24 +53,24 @@ class GelTracer:
         Factors on what shapes reflect, which can carry gradients.
     """
 
-    scene: object
+    scene: DrJit
     window: Window
     emitters: Emitters
-    absorption: tuple
+    absorption: tuple[float, float, float]
     bounces: int
     bump: float
-    caps: object
-    tints: list = field(default_factory=list)
+    caps: DrJit
+    tints: list[tuple[DrJit, DrJit]] = field(default_factory=list)
 
     @classmethod
-    def of(cls, mi, spec: SensorSpec, scene, bounces: int) -> "GelTracer":
+    def of(cls, mi: ModuleType, spec: SensorSpec, scene: DrJit, bounces: int) -> "GelTracer":
         """For a sensor, its gel-side scene and a number of bounces."""
-        patches = lights(spec)
+        patches = lights(spec.leds, spec.housing)
         emitters = Emitters(patches, [spectrum(mi, p.radiance) for p in patches])
         caps = next(mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == "caps")
-        return cls(scene, Window.of(spec), emitters, spec.gel.absorption_per_mm, bounces, spec.appearance.cap_bump, caps)
+        return cls(scene, Window.of(spec.view), emitters, spec.gel.absorption_per_mm, bounces, spec.appearance.cap_bump, caps)
 
-    def radiance(self, mi, dr, place, direction, random):
+    def radiance(self, mi: ModuleType, dr: ModuleType, place: DrJit, direction: DrJit, random: PixelSamples) -> DrJit:
         """Radiance in the gel, divided by n^2, along rays that start at the window's gel side.
 
         Few paths go on after the first vertex (the skin is dark): they are gathered, so that the others cost nothing.
@@ -108,7 +116,7 @@ class GelTracer:
             ray, hit, weight, active = self._follow(mi, dr, ray, weight, random)
         return result / self.window.gel_index**2
 
-    def _follow(self, mi, dr, ray, weight, random):
+    def _follow(self, mi: ModuleType, dr: ModuleType, ray: DrJit, weight: DrJit, random: PixelSamples) -> tuple[DrJit, DrJit, DrJit, DrJit]:
         """The next vertices of rays within the gel; those that miss everything on their way to the window come back from it."""
         first = self.scene.ray_intersect_preliminary(ray, coherent=False)
         up = ~first.is_valid() & (ray.d.z < -1e-6)
@@ -121,7 +129,7 @@ class GelTracer:
         weight *= dr.select(up, share, 1.0) * self._absorbed(mi, dr, far + hit.t, active)
         return ray, hit, weight, active
 
-    def _direct(self, mi, dr, hit, bsdf, random, active):
+    def _direct(self, mi: ModuleType, dr: ModuleType, hit: DrJit, bsdf: DrJit, random: PixelSamples, active: DrJit) -> DrJit:
         """Reflected radiance of the patches' light at a vertex."""
         place, ways, shares = random.next_2d(), [], []
         total = mi.Float(0.0)
@@ -151,34 +159,34 @@ class GelTracer:
         arriving *= self._absorbed(mi, dr, length, lit) * self._tint(mi, dr, hit)
         return dr.select(lit, reflected * arriving * (total / dr.maximum(share, NEVER)), 0.0)
 
-    def _tint(self, mi, dr, hit):
+    def _tint(self, mi: ModuleType, dr: ModuleType, hit: DrJit) -> DrJit:
         factor = mi.Spectrum(1.0)
         for shape, tint in self.tints:
             factor = dr.select(hit.shape == shape, tint, factor)
         return factor
 
-    def _absorbed(self, mi, dr, length, active):
+    def _absorbed(self, mi: ModuleType, dr: ModuleType, length: DrJit, active: DrJit) -> DrJit:
         if not any(self.absorption):
             return mi.Spectrum(1.0)
         return dr.exp(-spectrum(mi, np.array(self.absorption)) * dr.select(active, length, 0.0))
 
 
-def _taken(dr, cosine, bump):
+def _taken(dr: ModuleType, cosine: DrJit, bump: DrJit) -> DrJit:
     """Cosine law of a flat place, and of a ball: half of what arrives, averaged over the side that is seen."""
     return dr.select(cosine > 0, (1 - bump) * cosine + 0.5 * bump, 0.0)
 
 
-def spectrum(mi, rgb: np.ndarray):
+def spectrum(mi: ModuleType, rgb: FloatArray) -> DrJit:
     """Linear RGB (3,) as a spectrum of the current variant (luminance in a mono one)."""
     return mi.Spectrum(luminance(rgb)) if mi.variant().endswith("mono") else mi.Spectrum(*(float(c) for c in rgb))
 
 
-def luminance(rgb: np.ndarray) -> np.ndarray:
+def luminance(rgb: FloatArray) -> FloatArray:
     """Rec. 709 luminance (...,) of linear RGB (..., 3)."""
     return np.asarray(rgb) @ [0.212671, 0.715160, 0.072169]
 
 
-def _point(mi, dr, patch: Patch, square):
+def _point(mi: ModuleType, dr: ModuleType, patch: Patch, square: DrJit) -> DrJit:
     """Points of a patch for points of the unit square, uniform over its area."""
     (x, y, z), (inner, outer) = (float(v) for v in patch.center_mm), (float(r) for r in patch.radii_mm)
     if outer > 0:

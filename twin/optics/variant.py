@@ -15,12 +15,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeAlias, TypedDict
 
 from twin.errors import RenderError
 from twin.optics.native import load_needed_libraries
 from twin.optics.probes import probe
 
-OLDEST_LLVM = 16  # 14 and 15 abort at the first kernel
+DrJit: TypeAlias = Any
+"""A value of Dr.Jit or an object of Mitsuba. Their classes belong to the variant, which is chosen while the program runs."""
+
+OLDEST_LLVM = 16
+"""Versions 14 and 15 abort the process at the first kernel."""
 BACKENDS = ("cuda", "llvm", "scalar")
 REMEDY = "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19), or point DRJIT_LIBLLVM_PATH to its library"
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -118,7 +124,7 @@ def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_s
     if backend not in (*BACKENDS, "auto"):
         names = ", ".join(v for v in available_variants() if v.endswith(("_rgb", "_mono")))
         raise RenderError(f"{source}={wish!r} is no variant: use auto, {', '.join(BACKENDS)}, or one of {names}")
-    failed = []
+    failed: list[str] = []
     for kind in BACKENDS if backend == "auto" else (backend,):
         choice, reason = _try(kind, exact or _name(kind, channels), llvm_search)
         if choice is not None:
@@ -128,7 +134,7 @@ def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_s
     raise RenderError(f"{source}={wish!r} does not work here: {failed[0]}; {REMEDY if backend == 'llvm' else 'use TACTIP_VARIANT=auto'}")
 
 
-def use_variant(choice: VariantChoice):
+def use_variant(choice: VariantChoice) -> ModuleType:
     """Make ``choice`` Mitsuba's current variant and return the ``mitsuba`` module."""
     if choice.llvm_path:
         os.environ[_LLVM_VARIABLE] = choice.llvm_path
@@ -165,19 +171,30 @@ def available_variants() -> tuple[str, ...]:
     return tuple(sorted(m.group(1) for m in found if m))
 
 
-def report() -> dict:
-    """What a diagnosis prints about rendering on this machine.
+class RenderReport(TypedDict):
+    """What a diagnosis prints about rendering on a machine."""
 
-    Returns
-    -------
-    dict
-        ``variants`` (compiled in), ``used`` ("color" and "mono" to variant, reason, llvm_path; variant None where
-        nothing works), ``llvm`` and ``llvm_rejected`` (path, version, ok, reason), ``gpu``, ``gpu_reason``,
-        ``override`` (TACTIP_VARIANT or None) and ``remedy`` (None where nothing is slow).
-    """
+    variants: list[str]
+    """Variants compiled into the installed Mitsuba."""
+    used: dict[str, dict[str, str | None]]
+    """For "color" and "mono" cameras: ``variant`` (None where nothing works), ``reason``, ``llvm_path``."""
+    llvm: dict[str, str | bool] | None
+    """The LLVM library in use, as `LlvmLibrary`."""
+    llvm_rejected: list[dict[str, str | bool]]
+    """Libraries that were looked at and do not work."""
+    gpu: bool
+    gpu_reason: str
+    override: str | None
+    """TACTIP_VARIANT."""
+    remedy: str | None
+    """What to install; None where nothing is slow."""
+
+
+def report() -> RenderReport:
+    """What a diagnosis prints about rendering on this machine."""
     llvm = find_llvm()
     gpu, gpu_reason = find_cuda()
-    used = {}
+    used: dict[str, dict[str, str | None]] = {}
     for channels in ("color", "mono"):
         try:
             used[channels] = asdict(choose_variant(channels))
@@ -202,7 +219,7 @@ def _name(backend: str, channels: str) -> str:
     return mono if channels == "mono" and mono in available_variants() else f"{prefix}_rgb"
 
 
-def _try(backend: str, variant: str, llvm_search) -> tuple[VariantChoice | None, str]:
+def _try(backend: str, variant: str, llvm_search: Sequence[Path] | None) -> tuple[VariantChoice | None, str]:
     if variant not in available_variants():
         return None, f"{variant} is not compiled into the installed Mitsuba"
     if missing := load_needed_libraries():

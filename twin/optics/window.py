@@ -1,10 +1,13 @@
 """The plane window between camera, LEDs and gel, in Dr.Jit's terms (see ``twin.projection`` for the ray's equation)."""
 
 from dataclasses import dataclass
+from types import ModuleType
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import ViewSpec
+from twin.optics.variant import DrJit
 
-NEWTON_STEPS = 5  # from the paraxial start; the sixth changes a direction by less than 1e-5
+NEWTON_STEPS = 5
+"""Steps of Newton's method from the paraxial start; a sixth step changes a direction by less than 1e-5."""
 
 
 @dataclass(frozen=True)
@@ -18,11 +21,12 @@ class Window:
     radius: float
 
     @classmethod
-    def of(cls, spec: SensorSpec) -> "Window":
+    def of(cls, view: ViewSpec) -> "Window":
         """The window of a sensor."""
-        return cls(spec.lens.back_mm, spec.lens.z_mm, spec.lens.refractive_index, spec.gel.refractive_index, spec.lens.radius_mm)
+        lens = view.lens
+        return cls(lens.back_mm, lens.z_mm, lens.refractive_index, view.gel_index, lens.radius_mm)
 
-    def enter(self, dr, mi, origin, direction):
+    def enter(self, dr: ModuleType, mi: ModuleType, origin: DrJit, direction: DrJit) -> tuple[DrJit, DrJit, DrJit]:
         """A ray in the air, ``direction.z > 0``, followed to the window's gel side.
 
         Returns
@@ -40,7 +44,7 @@ class Window:
         in_gel = _bent(dr, mi, in_window, self.window_index / self.gel_index)
         return place, in_gel, self.transmittance(dr, direction.z, in_window.z, in_gel.z)
 
-    def connect(self, dr, mi, point, light):
+    def connect(self, dr: ModuleType, mi: ModuleType, point: DrJit, light: DrJit) -> tuple[DrJit, DrJit, DrJit]:
         """The refracted way from points in the gel to points of a light in the air whose normal is +z.
 
         Returns
@@ -74,12 +78,12 @@ class Window:
         factor = solid * self.transmittance(dr, cos_air, cos_window, cos_gel) * self.gel_index**2
         return toward, (point.z - self.front) / cos_gel, factor
 
-    def transmittance(self, dr, cos_air, cos_window, cos_gel):
+    def transmittance(self, dr: ModuleType, cos_air: DrJit, cos_window: DrJit, cos_gel: DrJit) -> DrJit:
         """Of the slab, unpolarised at each face, with the light that goes to and fro in it."""
         outer, inner = fresnel(1 / self.window_index, cos_air, cos_window), self._inner_face(cos_gel, cos_window)
         return (1 - outer) * (1 - inner) / (1 - outer * inner)
 
-    def mirror(self, dr, mi, place, direction, choice):
+    def mirror(self, dr: ModuleType, mi: ModuleType, place: DrJit, direction: DrJit, choice: DrJit) -> tuple[DrJit, DrJit, DrJit]:
         """A ray that reaches the window's gel side at ``place`` from within the gel, reflected.
 
         One of both faces is chosen by the uniform number ``choice``; at the back the ray is displaced.
@@ -105,16 +109,16 @@ class Window:
         moved = mi.Point3f(place.x + direction.x * bend * shift, place.y + direction.y * bend * shift, place.z)
         return moved, mi.Vector3f(direction.x, direction.y, cos_gel), weight
 
-    def _inner_face(self, cos_gel, cos_window):
+    def _inner_face(self, cos_gel: DrJit, cos_window: DrJit) -> DrJit:
         return fresnel(self.gel_index / self.window_index, cos_gel, cos_window)
 
 
-def _bent(dr, mi, direction, ratio: float):
+def _bent(dr: ModuleType, mi: ModuleType, direction: DrJit, ratio: float) -> DrJit:
     x, y = direction.x * ratio, direction.y * ratio
     return mi.Vector3f(x, y, dr.sqrt(dr.maximum(1 - x * x - y * y, 1e-8)))
 
 
-def _reach(dr, layers, u):
+def _reach(dr: ModuleType, layers: tuple[tuple[DrJit, float], ...], u: DrJit) -> tuple[DrJit, DrJit]:
     reach, slope = 0.0, 0.0
     for height, n in layers:
         rest = dr.rsqrt(n * n + (n * n - 1) * u * u)
@@ -123,7 +127,7 @@ def _reach(dr, layers, u):
     return reach, slope
 
 
-def fresnel(index: float, cos_here, cos_there):
+def fresnel(index: DrJit, cos_here: DrJit, cos_there: DrJit) -> DrJit:
     """Unpolarised reflectance of a face with n_here / n_there = ``index``, for numbers or arrays of any kind."""
     s = (index * cos_here - cos_there) / (index * cos_here + cos_there)
     p = (cos_here - index * cos_there) / (cos_here + index * cos_there)

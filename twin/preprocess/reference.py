@@ -59,7 +59,7 @@ def make_reference(pins_px: np.ndarray, rings: int) -> Reference:
 
 def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
     """Reference from the specification alone: rest caps projected by its camera."""
-    return make_reference(from_raw(spec, form, project(spec, rest_pins(spec).caps_mm)), spec.pins.rings)
+    return make_reference(from_raw(spec, form, project(spec.view, rest_pins(spec.geometry).caps_mm)), spec.pins.rings)
 
 
 def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -93,7 +93,7 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
         def simulate(contacts: np.ndarray) -> np.ndarray:
             pins = []
             for contact in contacts:
-                pins.append(project(spec, tap(solver, contact).caps_mm))
+                pins.append(project(spec.view, tap(solver, contact).caps_mm))
                 progress(len(pins), len(contacts))
             return np.array(pins)
 
@@ -102,7 +102,7 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     with bar("press and render from the labels") as progress:
         for number, (real, contact) in enumerate(zip(frames, contacts, strict=True)):
             state = tap(solver, contact)
-            error_px = mean_pin_error_px(project(spec, state.caps_mm), real.pins_px)
+            error_px = mean_pin_error_px(project(spec.view, state.caps_mm), real.pins_px)
             pairs.append(shoot(real, state, float(error_px), seed=number))
             progress(number + 1, len(frames))
     return PoseAligned(tap_map, fitted, contacts, pairs)
@@ -127,7 +127,7 @@ class _Shooter:
         self._pipeline = Pipeline(spec, Form.RAW)
 
     def __call__(self, real: RealFrame, state, remainder_px: float, *, seed: int) -> Pair:
-        image = expose(self._renderer.render(state, seed=seed), self._spec, np.random.default_rng(seed))
+        image = expose(self._renderer.render(state, seed=seed), self._spec.capture, np.random.default_rng(seed))
         seen = self._pipeline(replace(real.frame, image=image))
         exact = seen.valid and seen.found == len(seen.pins_px)
         recorded = real.frame.image if image.ndim == real.frame.image.ndim else real.gray

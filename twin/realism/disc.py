@@ -42,7 +42,7 @@ def lens_disc(spec: SensorSpec) -> Disc:
     """The housing's aperture as the specification's camera sees it: centre and mean radius of its projected rim."""
     turn, housing = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False), spec.housing
     rim = np.column_stack([housing.aperture_radius_mm * np.cos(turn), housing.aperture_radius_mm * np.sin(turn), np.zeros(CORNERS)])
-    rim_px = project(spec, rim + [*housing.center_mm, housing.z_mm])
+    rim_px = project(spec.view, rim + [*housing.center_mm, housing.z_mm])
     center = rim_px.mean(axis=0)
     radius = float(np.linalg.norm(rim_px - center, axis=1).mean())
     return round_disc((spec.camera.width_px, spec.camera.height_px), center, radius)

@@ -106,7 +106,7 @@ class TapBank:
         self._scale = np.array([deepest, steepest, steepest])
         pins = []
         for done, contact in enumerate(contacts):
-            pins.append(project(solver.spec, tap(solver, contact).caps_mm).ravel())
+            pins.append(project(solver.spec.view, tap(solver, contact).caps_mm).ravel())
             if progress:
                 progress(done + 1, len(contacts))
         self._coefficients = np.linalg.lstsq(self._terms(contacts), np.array(pins), rcond=None)[0]

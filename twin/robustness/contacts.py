@@ -49,7 +49,7 @@ def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
         The contact can't be solved.
     """
     if contact.pose.indent_mm <= 0:
-        rest = rest_pins(spec)
+        rest = rest_pins(spec.geometry)
         return PinState(rest.base_mm, rest.axis, rest.caps_mm)
 
     def solve():

@@ -75,7 +75,7 @@ class RenderedSource:
         for film in _films(_with_response_of(self.spec, spec), geometry, geometry if case.solves else self.spec, self.contacts):
             view = replace(view, caps_px=film.truth.caps_px)
             light = case.on_light(film.light, severity, view, film.draw)
-            image = case.on_frame(expose(light, spec, np.random.default_rng(film.draw)), severity, view, film.draw)
+            image = case.on_frame(expose(light, spec.capture, np.random.default_rng(film.draw)), severity, view, film.draw)
             shot = _shot(film.contact.name, image, self.form, case, severity, view, film.truth.visible)
             shots.append(replace(shot, touched=film.contact.pose.indent_mm > 0))
         return shots
@@ -117,7 +117,7 @@ class RealSource:
             view, image = replace(view, caps_px=caps_px), frame.image
             if in_light:
                 light = to_light(image, neutral.response).astype(np.float32)
-                image = expose(case.on_light(light, severity, view, draw), spec, np.random.default_rng(draw))
+                image = expose(case.on_light(light, severity, view, draw), spec.capture, np.random.default_rng(draw))
             image = case.on_frame(image, severity, view, draw)
             shots.append(_shot(frame.name, image, self.form, case, severity, view, np.isfinite(caps_px[:, 0])))
         return shots
@@ -173,7 +173,7 @@ def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contac
 def _pressed(spec: SensorSpec, mechanics: SensorSpec, contact: Contact) -> tuple[PinState, CapTruth]:
     """Pins under a contact of the sensor ``mechanics``, and where the camera of ``spec`` sees them."""
     state = pins_under(mechanics, contact)
-    return state, cap_truth(spec, rest_pins(spec), state, Form.RAW)
+    return state, cap_truth(spec, rest_pins(spec.geometry), state, Form.RAW)
 
 
 def _static(spec: SensorSpec) -> tuple:

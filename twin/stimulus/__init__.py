@@ -1,5 +1,5 @@
 """Objects as signed-distance fields, in the object frame (origin touched first, z into the object)."""
 
-from twin.stimulus.build import Stimulus, build_stimulus
+from twin.stimulus.build import ObjectField, build_field
 
-__all__ = ["Stimulus", "build_stimulus"]
+__all__ = ["ObjectField", "build_field"]

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.stimulus import kernels
-from twin.stimulus.level_set import Probed, rows
+from twin.stimulus.level_set import Probe, Wrapped, rows
+from twin.types import FloatArray
 
-Probe = tuple[np.ndarray, np.ndarray, np.ndarray]
 
-
-def project_on_xy(points_mm: np.ndarray) -> Probe:
+def project_on_xy(points_mm: FloatArray) -> Probe:
     """Texture coordinates of a pattern projected along z."""
     slopes = np.zeros((len(points_mm), 2, 3))
     slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
@@ -22,57 +21,57 @@ def project_on_xy(points_mm: np.ndarray) -> Probe:
 
 
 @dataclass(frozen=True)
-class Plane(Probed):
+class Plane(Wrapped):
     """Half space z >= 0."""
 
-    def probe(self, points_mm: np.ndarray) -> Probe:
+    def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.plane(rows(points_mm))
 
-    def unroll(self, points_mm: np.ndarray) -> Probe:
+    def unroll(self, points_mm: FloatArray) -> Probe:
         return project_on_xy(points_mm)
 
 
 @dataclass(frozen=True)
-class Sphere(Probed):
+class Sphere(Wrapped):
     """Ball behind its pole at the origin. A texture is projected along z."""
 
     radius_mm: float
 
-    def probe(self, points_mm: np.ndarray) -> Probe:
+    def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.round_solid(rows(points_mm), self.radius_mm, 0.0)
 
-    def unroll(self, points_mm: np.ndarray) -> Probe:
+    def unroll(self, points_mm: FloatArray) -> Probe:
         return project_on_xy(points_mm)
 
 
 @dataclass(frozen=True)
-class Cylinder(Probed):
+class Cylinder(Wrapped):
     """Cylinder along y that touches the origin from z > 0."""
 
     radius_mm: float
 
-    def probe(self, points_mm: np.ndarray) -> Probe:
+    def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.round_solid(rows(points_mm), self.radius_mm, 1.0)
 
-    def unroll(self, points_mm: np.ndarray) -> Probe:
+    def unroll(self, points_mm: FloatArray) -> Probe:
         return kernels.unroll_cylinder(rows(points_mm), self.radius_mm)
 
 
 @dataclass(frozen=True)
-class Edge(Probed):
+class Edge(Wrapped):
     """Quarter space x >= 0, z >= 0, its edge rounded by a fillet (which takes the edge back from the origin)."""
 
     fillet_mm: float
 
-    def probe(self, points_mm: np.ndarray) -> Probe:
+    def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.edge(rows(points_mm), self.fillet_mm)
 
-    def unroll(self, points_mm: np.ndarray) -> Probe:
+    def unroll(self, points_mm: FloatArray) -> Probe:
         return project_on_xy(points_mm)
 
 
 @dataclass(frozen=True)
-class Prism(Probed):
+class Prism(Wrapped):
     """Regular polygon in x-z extruded along y, edges rounded, faces leaning by a taper about x.
 
     Face 0 passes through the origin and looks to -z; with a positive taper its normal leans to +y
@@ -85,8 +84,8 @@ class Prism(Probed):
     fillet_mm: float
     taper_rad: float
 
-    def probe(self, points_mm: np.ndarray) -> Probe:
+    def probe(self, points_mm: FloatArray) -> Probe:
         return kernels.prism(rows(points_mm), self.sides, self.inradius_mm, self.fillet_mm, self.taper_rad)
 
-    def unroll(self, points_mm: np.ndarray) -> Probe:
+    def unroll(self, points_mm: FloatArray) -> Probe:
         return kernels.unroll_prism(rows(points_mm), self.sides, self.inradius_mm)

@@ -6,22 +6,24 @@ import numpy as np
 
 from scenes.object import CylinderShape, EdgeShape, MeshShape, ObjectSpec, PlaneShape, PrismShape, SphereShape
 from twin.stimulus.analytic import Cylinder, Edge, Plane, Prism, Sphere
+from twin.stimulus.level_set import Probe, Wrapped
 from twin.stimulus.mesh_field import load_mesh_field
 from twin.stimulus.texture import WireMesh
+from twin.types import FloatArray
 
 
-class Stimulus(Protocol):
+class ObjectField(Protocol):
     """A solid in the object frame, as a signed-distance field at points (k, 3) in mm."""
 
-    def distance(self, points_mm: np.ndarray) -> np.ndarray:
+    def distance(self, points_mm: FloatArray) -> FloatArray:
         """(k,) in mm, positive outside."""
         ...
 
-    def gradient(self, points_mm: np.ndarray) -> np.ndarray:
+    def gradient(self, points_mm: FloatArray) -> FloatArray:
         """(k, 3) unit, outwards."""
         ...
 
-    def probe(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def probe(self, points_mm: FloatArray) -> Probe:
         """Distance (k,), gradient (k, 3) and Hessian (k, 3, 3) in 1/mm, in one evaluation.
 
         The Hessian is the second derivative of the distance: symmetric, with the gradient in its null space, zero across
@@ -30,7 +32,7 @@ class Stimulus(Protocol):
         ...
 
 
-def build_stimulus(spec: ObjectSpec) -> Stimulus:
+def build_field(spec: ObjectSpec) -> ObjectField:
     """The signed-distance field of an object, with its texture.
 
     Raises
@@ -39,6 +41,7 @@ def build_stimulus(spec: ObjectSpec) -> Stimulus:
         If a mesh file is not closed, in the wrong unit, empty or unreadable.
     """
     shape = spec.shape
+    base: Wrapped
     match shape:
         case PlaneShape():
             base = Plane()

@@ -7,16 +7,20 @@ with the normal n and the line's direction a (none for a point); over a flat fac
 import numba
 import numpy as np
 
-_CREASE_MM = 1e-3  # bent tighter than this is a crease, which has no curvature
+from twin.stimulus.level_set import Probe, Triple
+from twin.types import FloatArray
+
+_CREASE_MM = 1e-3
+"""A surface with a smaller radius of curvature counts as a crease, which has no Hessian."""
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _results(count):
+def _results(count: int) -> Probe:
     return np.empty(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _write(normal, hessian, k, n, a, radius):
+def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple, radius: float) -> None:
     """Point k's normal n and (I - n n - a a) / radius; plain numbers, since slices of arrays cost more than the sums."""
     normal[k, 0], normal[k, 1], normal[k, 2] = n
     if radius > _CREASE_MM:
@@ -30,7 +34,7 @@ def _write(normal, hessian, k, n, a, radius):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def plane(points):
+def plane(points: FloatArray) -> Probe:
     distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
         distance[k] = -points[k, 2]
@@ -39,7 +43,7 @@ def plane(points):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def round_solid(points, radius, along_y):
+def round_solid(points: FloatArray, radius: float, along_y: float) -> Probe:
     """Ball, or cylinder along y (``along_y`` 1.0, for the ball 0.0), behind the origin."""
     distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
@@ -52,7 +56,7 @@ def round_solid(points, radius, along_y):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def edge(points, fillet):
+def edge(points: FloatArray, fillet: float) -> Probe:
     distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
         # how far the point lies in front of the faces moved in by the fillet
@@ -69,13 +73,13 @@ def edge(points, fillet):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _sector(x, z, sides):
+def _sector(x: float, z: float, sides: int) -> int:
     """Number of the nearest face around the axis."""
     return int(np.floor(np.arctan2(x, -z) * sides / (2 * np.pi) + 0.5))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def prism(points, sides, inradius, fillet, taper):
+def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper: float) -> Probe:
     """A point is folded into the sector of its nearest face, into coordinates out, along the face, y.
 
     There the nearest point of the polyhedron moved in by the fillet lies on that face or on the edge between two faces.
@@ -111,7 +115,7 @@ def prism(points, sides, inradius, fillet, taper):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def unroll_cylinder(points, radius):
+def unroll_cylinder(points: FloatArray, radius: float) -> Probe:
     along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
     for k in range(len(points)):
         x, z = points[k, 0], points[k, 2] - radius
@@ -126,7 +130,7 @@ def unroll_cylinder(points, radius):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def unroll_prism(points, sides, inradius):
+def unroll_prism(points: FloatArray, sides: int, inradius: float) -> Probe:
     along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
     width = 2 * inradius * np.tan(np.pi / sides)
     for k in range(len(points)):

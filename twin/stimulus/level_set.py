@@ -1,34 +1,56 @@
-"""What every signed-distance field shares: distance and gradient from one probe, and unit normals of a field that is no exact distance."""
+"""What all signed-distance fields share: distance and gradient from one probe, and unit normals of fields that are no exact distance."""
+
+from abc import ABC, abstractmethod
+from typing import TypeAlias
 
 import numba
 import numpy as np
 
-_FLAT = 1e-12  # slope below which a field has no direction
+from twin.types import FloatArray
+
+Probe: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Distance (k,) in mm, unit gradient (k, 3) and Hessian (k, 3, 3) in 1/mm at k points (or texture coordinates and their derivatives)."""
+Triple: TypeAlias = tuple[float, float, float]
+
+_FLAT = 1e-12
+"""Slope below which a field counts as having no direction."""
 
 
-class Probed:
-    """Distance and gradient of a field whose ``probe`` gives distance, unit gradient and Hessian at once."""
+class Probed(ABC):
+    """A signed-distance field whose ``probe`` gives distance, unit gradient and Hessian at once."""
 
-    def distance(self, points_mm: np.ndarray) -> np.ndarray:
+    @abstractmethod
+    def probe(self, points_mm: FloatArray) -> Probe:
+        """Distance (k,) in mm, unit gradient (k, 3) and Hessian (k, 3, 3) in 1/mm at points (k, 3)."""
+
+    def distance(self, points_mm: FloatArray) -> FloatArray:
         """(k,) in mm, positive outside."""
         return self.probe(points_mm)[0]
 
-    def gradient(self, points_mm: np.ndarray) -> np.ndarray:
+    def gradient(self, points_mm: FloatArray) -> FloatArray:
         """(k, 3) unit, outwards."""
         return self.probe(points_mm)[1]
 
 
-def rows(points_mm: np.ndarray) -> np.ndarray:
+class Wrapped(Probed):
+    """A field on whose surface a texture can be laid."""
+
+    @abstractmethod
+    def unroll(self, points_mm: FloatArray) -> Probe:
+        """Two coordinates (k, 2) in mm along the surface, their gradients (k, 2, 3) and their Hessians (k, 2, 3, 3) in 1/mm."""
+
+
+def rows(points_mm: FloatArray) -> FloatArray:
     """Points as the kernels take them: C-ordered float64, so that each kernel is compiled once."""
     return np.ascontiguousarray(points_mm, dtype=np.float64)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def unit_normals(slope, hessian):
+def unit_normals(slope: FloatArray, hessian: FloatArray) -> None:
     """Turn, in place, a field's slope g (k, 3) into the unit normal n and its second derivative H (k, 3, 3) into P H P / |g|, P = I - n n.
 
-    That is the derivative of n along the level set: symmetric, H n = 0. What it leaves out, how n turns along
-    n itself, vanishes for an exact distance. A flat place looks to -z, unbent.
+    That is the derivative of n along the level set: it is symmetric, and H n = 0. It leaves out how n turns along n itself, which is
+    zero for an exact distance. A place without slope gets the normal -z and no curvature.
     """
     for k in range(len(slope)):
         size = np.sqrt(slope[k, 0] ** 2 + slope[k, 1] ** 2 + slope[k, 2] ** 2)

@@ -9,11 +9,16 @@ import numba
 import numpy as np
 import trimesh
 
-_LEAF = 4  # at most so many triangles in a leaf
-_FLAT_MM2 = 1e-12  # a triangle without area has no inside; its neighbours cover it
+from twin.stimulus.level_set import Triple
+from twin.types import FloatArray, IntArray
+
+_LEAF = 4
+"""Most triangles in a leaf of the tree."""
+_FLAT_MM2 = 1e-12
+"""A triangle with a smaller area is left out: it has no inside, and its neighbours cover it."""
 
 
-def signed_distance(mesh: trimesh.Trimesh, points_mm: np.ndarray) -> np.ndarray:
+def signed_distance(mesh: trimesh.Trimesh, points_mm: FloatArray) -> FloatArray:
     """Distance of points to a closed mesh wound outwards.
 
     Parameters
@@ -39,7 +44,7 @@ def signed_distance(mesh: trimesh.Trimesh, points_mm: np.ndarray) -> np.ndarray:
     return _search(triangles, np.ascontiguousarray(normals[order]), low, high, np.ascontiguousarray(points_mm, dtype=float))
 
 
-def _feature_normals(triangles: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _feature_normals(triangles: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
     """Normals (f, 7, 3), not unit, of each triangle, its corners a, b, c and its edges ab, bc, ca; and the triangles' areas (f,).
 
     All from the corners: the normals that trimesh keeps come from the file, and stay as they were when a mesh is inverted.
@@ -56,7 +61,7 @@ def _feature_normals(triangles: np.ndarray, faces: np.ndarray) -> tuple[np.ndarr
     return np.concatenate([face[:, None], corner[faces], edge[edge_of].reshape(-1, 3, 3)], axis=1), size / 2
 
 
-def _halved(centres: np.ndarray) -> tuple[np.ndarray, int]:
+def _halved(centres: FloatArray) -> tuple[IntArray, int]:
     """Indices of points (f, 3) so that each half, quarter, ... of the list keeps together, and the number of leaves.
 
     Some points come twice, which fills the leaves.
@@ -76,7 +81,7 @@ def _halved(centres: np.ndarray) -> tuple[np.ndarray, int]:
     return order, leaves
 
 
-def _boxes(triangles: np.ndarray, leaves: int) -> tuple[np.ndarray, np.ndarray]:
+def _boxes(triangles: FloatArray, leaves: int) -> tuple[FloatArray, FloatArray]:
     """Lowest and highest corners (2 leaves, 3) of the tree's boxes: root at 1, leaves from ``leaves`` on."""
     low, high = np.empty((2 * leaves, 3)), np.empty((2 * leaves, 3))
     corners = triangles.reshape(leaves, -1, 3)
@@ -89,18 +94,18 @@ def _boxes(triangles: np.ndarray, leaves: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _dot(p, q):
+def _dot(p: Triple, q: Triple) -> float:
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _minus(p, q, s, u, t, v):
+def _minus(p: Triple, q: Triple, s: float, u: Triple, t: float, v: Triple) -> Triple:
     """p - q - s u - t v"""
     return p[0] - q[0] - s * u[0] - t * v[0], p[1] - q[1] - s * u[1] - t * v[1], p[2] - q[2] - s * u[2] - t * v[2]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _from_triangle(p, corners, k):
+def _from_triangle(p: Triple, corners: FloatArray, k: int) -> tuple[Triple, int]:
     """The way from triangle k's nearest point to p, and where that is: 0 face, 1-3 corner, 4-6 edge (Ericson 2005, section 5.1.5)."""
     a = (corners[k, 0, 0], corners[k, 0, 1], corners[k, 0, 2])
     ab = (corners[k, 1, 0] - a[0], corners[k, 1, 1] - a[1], corners[k, 1, 2] - a[2])
@@ -131,7 +136,7 @@ def _from_triangle(p, corners, k):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _from_box(p, low, high, k):
+def _from_box(p: Triple, low: FloatArray, high: FloatArray, k: int) -> float:
     """Squared distance of p to box k."""
     x = max(low[k, 0] - p[0], p[0] - high[k, 0], 0.0)
     y = max(low[k, 1] - p[1], p[1] - high[k, 1], 0.0)
@@ -140,7 +145,7 @@ def _from_box(p, low, high, k):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _search(triangles, normals, low, high, points):
+def _search(triangles: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray, points: FloatArray) -> FloatArray:
     leaves = len(low) // 2
     leaf = len(triangles) // leaves
     stack, bound = np.empty(64, np.int64), np.empty(64)

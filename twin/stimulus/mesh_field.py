@@ -11,21 +11,26 @@ from scipy.ndimage import spline_filter
 
 from scenes.object import MeshShape
 from twin.errors import MeshError
-from twin.stimulus.analytic import Probe, project_on_xy
-from twin.stimulus.level_set import Probed, rows, unit_normals
+from twin.stimulus.analytic import project_on_xy
+from twin.stimulus.level_set import Probe, Wrapped, rows, unit_normals
 from twin.stimulus.mesh_distance import signed_distance
 from twin.stimulus.mesh_file import place_mesh, read_mesh
 from twin.stimulus.spline import spline_probe, spline_value
 from twin.store import cached_arrays
+from twin.types import FloatArray
 
-_REACH_MM = 40.0  # half width of the sampled region around the origin: the dome and its shear
+_REACH_MM = 40.0
+"""The mesh is sampled up to this far from the origin along each axis: the dome, and how far it is sheared."""
 _MARGIN_MM = 4.0
-_NODES = 250_000  # of the sampled grid: about 1 s, 2 MB
+"""The grid goes on this far beyond the sampled part of the mesh."""
+_NODES = 250_000
+"""Nodes of the grid: sampling takes about 1 s, and the grid 2 MB."""
 _FINEST_MM = 0.25
+"""The grid's lines are never closer than this."""
 
 
 @dataclass(frozen=True)
-class MeshField(Probed):
+class MeshField(Wrapped):
     """Signed distance on a regular grid, interpolated by the tricubic B-spline through its nodes (C2).
 
     Outside the grid the distance to the grid is added: positive, and never too small.
@@ -39,19 +44,19 @@ class MeshField(Probed):
         B-spline coefficients.
     """
 
-    corner_mm: np.ndarray
+    corner_mm: FloatArray
     spacing_mm: float
-    coefficients: np.ndarray
+    coefficients: FloatArray
 
-    def distance(self, points_mm: np.ndarray) -> np.ndarray:
+    def distance(self, points_mm: FloatArray) -> FloatArray:
         return spline_value(self.coefficients, self.corner_mm, self.spacing_mm, rows(points_mm))
 
-    def probe(self, points_mm: np.ndarray) -> Probe:
+    def probe(self, points_mm: FloatArray) -> Probe:
         distance, slope, hessian = spline_probe(self.coefficients, self.corner_mm, self.spacing_mm, rows(points_mm))
         unit_normals(slope, hessian)
         return distance, slope, hessian
 
-    def unroll(self, points_mm: np.ndarray) -> Probe:
+    def unroll(self, points_mm: FloatArray) -> Probe:
         return project_on_xy(points_mm)
 
 
@@ -74,14 +79,14 @@ def load_mesh_field(shape: MeshShape) -> MeshField:
 
 
 @lru_cache(maxsize=8)
-def _sampled(file: str, digest: str, unit: str, rotation_deg: tuple) -> MeshField:
+def _sampled(file: str, digest: str, unit: str, rotation_deg: tuple[float, float, float]) -> MeshField:
     key = {
         "file": [digest, Path(file).suffix.lower()],
         "placement": [unit, list(rotation_deg)],
         "grid": [_REACH_MM, _MARGIN_MM, _NODES, _FINEST_MM],
     }
 
-    def sample():
+    def sample() -> dict[str, FloatArray]:
         field = sample_mesh(place_mesh(read_mesh(file, unit=unit), rotation_deg=rotation_deg))
         return {"corner_mm": field.corner_mm, "spacing_mm": np.array(field.spacing_mm), "coefficients": field.coefficients}
 

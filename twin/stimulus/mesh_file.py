@@ -4,10 +4,14 @@ import numpy as np
 import trimesh
 
 from twin.errors import MeshError
+from twin.types import FloatArray
 
 _UNIT_REMEDY = "scale the file to mm, or name its unit in a TOML: shape = { kind = 'mesh', file = ..., unit = ... } (mm, cm, m or inch)"
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
-_SMALLEST_MM, _LARGEST_MM = 1.0, 2000.0
+_SMALLEST_MM = 1.0
+"""An object whose largest side is shorter was most likely given in another unit."""
+_LARGEST_MM = 2000.0
+"""An object whose largest side is longer was most likely given in another unit."""
 
 
 def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:
@@ -43,7 +47,8 @@ def place_mesh(mesh: trimesh.Trimesh, *, rotation_deg: tuple[float, float, float
     A mesh with a hole there is put down on its lowest vertex.
     """
     mesh = mesh.copy()
-    mesh.apply_transform(trimesh.transformations.euler_matrix(*np.radians(rotation_deg), axes="rxyz"))
+    x, y, z = np.radians(rotation_deg)
+    mesh.apply_transform(trimesh.transformations.euler_matrix(x, y, z, axes="rxyz"))
     middle = mesh.bounds.mean(axis=0)
     mesh.apply_translation([-middle[0], -middle[1], 0.0])
     triangles = mesh.triangles
@@ -53,11 +58,11 @@ def place_mesh(mesh: trimesh.Trimesh, *, rotation_deg: tuple[float, float, float
     return mesh
 
 
-def _heights_at_origin(triangles: np.ndarray) -> np.ndarray:
+def _heights_at_origin(triangles: FloatArray) -> FloatArray:
     """z where the line x = y = 0 crosses the triangles (k, 3, 3)."""
     a, b, c = triangles[:, 0, :2], triangles[:, 1, :2], triangles[:, 2, :2]
 
-    def cross(p, q):
+    def cross(p: FloatArray, q: FloatArray) -> FloatArray:
         return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
 
     shares = np.stack([cross(b, c), cross(c, a), cross(a, b)], axis=1)

@@ -3,39 +3,46 @@
 Loops over tuples and plain numbers: slices of arrays would cost more than the sums.
 """
 
+from typing import TypeAlias
+
 import numba
 import numpy as np
 
-_SUMS = {"contract", "reassoc"}  # sums may be reordered, which nearly halves the time; NaN stays NaN
+from twin.types import FloatArray
+
+Four: TypeAlias = tuple[float, float, float, float]
+
+_SUMS = {"contract", "reassoc"}
+"""What the compiler may do with sums: reorder them and fuse products. This nearly halves the time, and NaN stays NaN."""
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def _cell(at, count):
+def _cell(at: float, count: int) -> tuple[int, float]:
     """Node below ``at`` (in nodes) that has a neighbour before it and two behind, and the way from it."""
     cell = min(max(int(np.floor(at)), 1), count - 3)
     return cell, at - cell
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def _weights(t):
+def _weights(t: float) -> Four:
     """Shares of the four nodes around a place ``t`` after the second."""
     s = 1 - t
     return s**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * s**2 + 3 * s**3) / 6, t**3 / 6
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def _slopes(t):
+def _slopes(t: float) -> Four:
     s = 1 - t
     return -(s**2) / 2, (3 * t - 4) * t / 2, (4 - 3 * s) * s / 2, t**2 / 2
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def _bends(t):
+def _bends(t: float) -> Four:
     return 1 - t, 3 * t - 2, 1 - 3 * t, t
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def _line(weights, values, i, j, k):
+def _line(weights: Four, values: FloatArray, i: int, j: int, k: int) -> float:
     """Weighted sum over four nodes along the last axis."""
     return (
         weights[0] * values[i, j, k]
@@ -46,15 +53,17 @@ def _line(weights, values, i, j, k):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def _step_in(point, low, spacing, count):
-    """A coordinate's place in the grid in nodes, and its way there from outside in mm."""
+def _step_in(point: float, low: float, spacing: float, count: int) -> tuple[float, float]:
+    """Where a coordinate lies in the grid, in nodes, and how far it lies outside of it, in mm."""
     inside = min(max(point, low + 2 * spacing), low + (count - 3) * spacing)
     return (inside - low) / spacing, point - inside
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def _place(points, k, corner, spacing, counts):
-    """Point k's cells along the three axes, and its way there from outside the grid in mm."""
+def _place(
+    points: FloatArray, k: int, corner: FloatArray, spacing: float, counts: tuple[int, ...]
+) -> tuple[tuple[int, float], tuple[int, float], tuple[int, float], tuple[float, float, float]]:
+    """The cells of point k along the three axes, and how far it lies outside of the grid along each, in mm."""
     x, away_x = _step_in(points[k, 0], corner[0], spacing, counts[0])
     y, away_y = _step_in(points[k, 1], corner[1], spacing, counts[1])
     z, away_z = _step_in(points[k, 2], corner[2], spacing, counts[2])
@@ -62,7 +71,7 @@ def _place(points, k, corner, spacing, counts):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def spline_value(coefficients, corner, spacing, points):
+def spline_value(coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray) -> FloatArray:
     """Values (k,) at points (k, 3); outside the grid the distance to it is added."""
     value = np.empty(len(points))
     counts = coefficients.shape
@@ -78,7 +87,9 @@ def spline_value(coefficients, corner, spacing, points):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def spline_probe(coefficients, corner, spacing, points):
+def spline_probe(
+    coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Values (k,), slopes (k, 3) and second derivatives (k, 3, 3) at points (k, 3); outside the grid the distance to it is added."""
     value, slope, hessian = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3, 3))
     counts, per_mm = coefficients.shape, 1 / spacing
@@ -112,7 +123,7 @@ def spline_probe(coefficients, corner, spacing, points):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def _add_gap(slope, hessian, away):
+def _add_gap(slope: FloatArray, hessian: FloatArray, away: tuple[float, float, float]) -> float:
     """Beyond the grid the spline is constant along ``away``'s axes, and the distance to the grid, returned, grows along them."""
     gap = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
     for i in range(3):

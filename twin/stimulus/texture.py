@@ -5,27 +5,29 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from twin.stimulus.level_set import Probed, unit_normals
+from twin.stimulus.level_set import Probe, Probed, Wrapped, unit_normals
+from twin.types import FloatArray
 
-_BLEND = 0.15  # blending length of a joint, as a fraction of the wire's diameter
-_CREASE_MM = 1e-3  # nearer to a wire's axis there is no curvature
+_BLEND = 0.15
+"""Length over which wires and base are blended into each other, as a share of the wire's diameter."""
+_CREASE_MM = 1e-3
+"""Nearer to a wire's axis than this the field counts as not curved."""
 
 
 @dataclass(frozen=True)
 class WireMesh(Probed):
-    """Round wires that lie on the base's surface, in two crossing families at a pitch; one wire of
-    each family passes over the origin.
+    """Round wires that lie on the base's surface in two crossing families; one wire of each family passes over the origin.
 
     A wire's distance is sqrt((D - d/2)^2 + s^2) - d/2 with the base's distance D, the wire's
     diameter d and the distance s along the surface to the nearest wire; base and wires are joined
     by the polynomial smooth minimum (Quilez), which only adds material.
     """
 
-    base: object
+    base: Wrapped
     pitch_mm: float
     wire_diameter_mm: float
 
-    def probe(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def probe(self, points_mm: FloatArray) -> Probe:
         distance, slope, hessian = self.base.probe(points_mm)
         along, along_slope, along_bend = self.base.unroll(points_mm)
         _lay_wires(distance, slope, hessian, along, along_slope, along_bend, self.pitch_mm, self.wire_diameter_mm)
@@ -34,7 +36,16 @@ class WireMesh(Probed):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _lay_wires(distance, slope, hessian, along, along_slope, along_bend, pitch, diameter):
+def _lay_wires(
+    distance: FloatArray,
+    slope: FloatArray,
+    hessian: FloatArray,
+    along: FloatArray,
+    along_slope: FloatArray,
+    along_bend: FloatArray,
+    pitch: float,
+    diameter: float,
+) -> None:
     """Join both families of wires to the base's distance (k,), slope (k, 3) and Hessian (k, 3, 3), in place."""
     radius, blend = diameter / 2, _BLEND * diameter
     base, base_bend, wire = np.empty(3), np.empty((3, 3)), np.empty(3)

@@ -15,7 +15,7 @@ import pyvista as pv
 from scenes.sensor import PinsSpec
 from twin.geometry.export import skin_surface
 from twin.geometry.mesh import SensorMesh
-from twin.stimulus import Stimulus
+from twin.stimulus import ObjectField
 from twin.types import ContactState
 
 SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)
@@ -46,7 +46,7 @@ def pins_surface(pins: PinsSpec, state: ContactState) -> pv.PolyData:
     return pv.merge(parts)
 
 
-def draw_contact_skin(mesh: SensorMesh, pins: PinsSpec, state: ContactState, stimulus: Stimulus, path: Path) -> str:
+def draw_contact_skin(mesh: SensorMesh, pins: PinsSpec, state: ContactState, stimulus: ObjectField, path: Path) -> str:
     """Draw a contact: skin, pins and the object's surface near it (see ``draw_skin``)."""
     surface = stimulus_surface(stimulus.distance, state.T_sensor_object, bounds_mm=SCENE_BOUNDS_MM)
     return draw_skin(displaced_skin(mesh, state), pins_surface(pins, state), surface, path)

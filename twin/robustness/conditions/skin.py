@@ -19,7 +19,11 @@ def cap_levels(spec) -> np.ndarray:
     """Level (N,) of each cap relative to ``cap_albedo``: measured, or as the print's random pattern has it."""
     albedo = np.array(spec.appearance.cap_albedo)
     k = int(albedo.argmax())
-    return np.array(spec.appearance.cap_levels) if spec.appearance.cap_levels else np.maximum(cap_albedo(spec)[:, k] / albedo[k], GONE)
+    return (
+        np.array(spec.appearance.cap_levels)
+        if spec.appearance.cap_levels
+        else np.maximum(cap_albedo(spec.appearance, spec.pins.count)[:, k] / albedo[k], GONE)
+    )
 
 
 def with_levels(spec, levels):
@@ -97,7 +101,7 @@ def swollen(spec, value, rng):
 
 def cap_cover(shape, view: View) -> np.ndarray:
     """(H, W) share of each pixel under a cap, caps taken as discs at their places in this view; leaning ones look smaller."""
-    facing = np.clip(np.abs(rest_pins(view.spec).axis[:, 2]), 0.3, 1)
+    facing = np.clip(np.abs(rest_pins(view.spec.geometry).axis[:, 2]), 0.3, 1)
     cover = np.zeros(shape[:2], np.uint8)
     for (x, y), radius in zip(view.caps_px, view.cap_radius_px * np.sqrt(facing), strict=True):
         cv2.circle(cover, (round(x * FINE), round(y * FINE)), round(radius * FINE), 255, -1, cv2.LINE_AA, FINE_BITS)

@@ -1,0 +1,146 @@
+"""Measured arrays of a specification, kept as CSV files beside its TOML file.
+
+In the TOML file a reference stands where the array would::
+
+    light = { csv = "ur5-331.housing.rim.light.csv", shape = [120, 32, 3] }
+
+The CSV file has one line for each index of the first dimension; the further dimensions follow one another in the line, the last one
+fastest. Lines that begin with ``#`` are comments. Whole numbers stay whole numbers. A specification that was loaded holds the numbers,
+not the reference: its dump and its digest cover them.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import prod
+from pathlib import Path
+from typing import TypeAlias
+
+Nested: TypeAlias = "int | float | list[Nested] | tuple[Nested, ...]"
+"""A number, or evenly nested lists of numbers."""
+
+MOST_INLINE = 120
+"""A list of more numbers than this leaves the TOML file when a specification is written: about ten lines of an editor."""
+
+DIGITS = 6
+"""Significant digits of a number that is written: no length or light of a sensor is known better."""
+
+_REFERENCE = {"csv", "shape"}
+
+
+def fill_in_tables(section: Mapping[str, object], folder: Path, key: str = "") -> dict[str, object]:
+    """A section as TOML gives it, with every reference replaced by the numbers of its table.
+
+    Parameters
+    ----------
+    section : mapping
+        Keys and values; sections within it are filled in, too.
+    folder : Path
+        Where the TOML file lies. A table lies in the same folder.
+    key : str
+        Dotted name of the section, for errors.
+
+    Raises
+    ------
+    ValueError
+        A table is missing, lies elsewhere, holds something else than numbers, or has another shape than its reference says.
+    """
+    filled: dict[str, object] = {}
+    for name, value in section.items():
+        here = f"{key}.{name}" if key else name
+        if isinstance(value, dict):
+            filled[name] = _read_table(value, folder, here) if set(value) == _REFERENCE else fill_in_tables(value, folder, here)
+        else:
+            filled[name] = value
+    return filled
+
+
+def take_out_tables(section: Mapping[str, object], stem: str, key: str = "") -> tuple[dict[str, object], dict[str, str]]:
+    """A section with a reference in the place of every long list of numbers, and the tables' texts by file name.
+
+    Parameters
+    ----------
+    section : mapping
+        Keys and values, as ``model_dump`` gives them.
+    stem : str
+        Name of the TOML file without its suffix; every table's name begins with it.
+    key : str
+        Dotted name of the section.
+    """
+    kept: dict[str, object] = {}
+    texts: dict[str, str] = {}
+    for name, value in section.items():
+        here = f"{key}.{name}" if key else name
+        shape = _shape(value)
+        if isinstance(value, dict):
+            kept[name], more = take_out_tables(value, stem, here)
+            texts |= more
+        elif isinstance(value, list | tuple) and shape is not None and prod(shape) > MOST_INLINE:
+            file = f"{stem}.{here}.csv"
+            kept[name] = {"csv": file, "shape": list(shape)}
+            lines = (",".join(f"{significant(number)}" for number in _flat(row)) for row in value)
+            texts[file] = f"# {here}: {' x '.join(map(str, shape))} numbers\n" + "\n".join(lines) + "\n"
+        else:
+            kept[name] = value
+    return kept, texts
+
+
+def significant(number: int | float) -> int | float:
+    """A float rounded to ``DIGITS`` significant digits; a whole number as it is."""
+    return float(f"{number:.{DIGITS}g}") if isinstance(number, float) else number
+
+
+def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list[Nested]:
+    file, shape = reference["csv"], reference["shape"]
+    if not isinstance(file, str) or not isinstance(shape, list) or not shape or not all(isinstance(n, int) and n > 0 for n in shape):
+        raise ValueError(f"{key}: expected {{ csv = 'file name', shape = [numbers above 0] }}, got {dict(reference)}")
+    if Path(file).name != file or not file.endswith(".csv"):
+        raise ValueError(f"{key}: csv = '{file}' must be the name of a .csv file in the folder of the specification, without a folder")
+    try:
+        lines = (folder / file).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise ValueError(f"{key}: the table {folder / file} is missing; copy it together with the specification") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{key}: the table {folder / file} is not readable as text: {error}") from error
+    rows = [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    if len(rows) != shape[0]:
+        raise ValueError(f"{key}: {file} has {len(rows)} lines of numbers, but shape = {shape} needs {shape[0]}")
+    each = prod(shape[1:])
+    table: list[Nested] = []
+    for number, words in rows:
+        if len(words) != each:
+            raise ValueError(f"{key}: {file}, line {number} has {len(words)} numbers, but shape = {shape} needs {each}")
+        try:
+            values = [_number(word) for word in words]
+        except ValueError as error:
+            raise ValueError(f"{key}: {file}, line {number}: {error}; give numbers with commas between them") from None
+        table.append(_folded(values, shape[1:]))
+    return table
+
+
+def _number(word: str) -> int | float:
+    try:
+        return int(word)
+    except ValueError:
+        return float(word)
+
+
+def _folded(values: Sequence[int | float], shape: Sequence[int]) -> Nested:
+    """Numbers (last index fastest) as nested lists of a shape; the only number itself for no dimension."""
+    if not shape:
+        return values[0]
+    each = prod(shape[1:])
+    return [_folded(values[each * k : each * (k + 1)], shape[1:]) for k in range(shape[0])]
+
+
+def _flat(value: Nested) -> list[int | float]:
+    return [number for part in value for number in _flat(part)] if isinstance(value, list | tuple) else [value]
+
+
+def _shape(value: object) -> tuple[int, ...] | None:
+    """Shape of evenly nested lists of numbers, () of a number, None of anything else."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return ()
+    if not isinstance(value, list | tuple):
+        return None
+    shapes = {_shape(part) for part in value}
+    inner = shapes.pop() if len(shapes) == 1 else None
+    return None if inner is None else (len(value), *inner)

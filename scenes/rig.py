@@ -9,7 +9,7 @@ class RigSpec(Section):
     """One sensor on one robot before one plate; calibrated from labelled frames (``twin calibrate contact``).
 
     Directions: the *approach* is the robot axis along which the sensor looks at the object, *across* a robot axis at right
-    angles to it (robot x; y where the approach is x). See ``twin.kinematics`` for the equations.
+    angles to it (robot x; y where the approach is x). See ``twin.rig.kinematics`` for the equations.
 
     Attributes
     ----------

@@ -13,11 +13,11 @@ from training.simulated import is_pins_only, is_simulated, open_simulated, touch
 from training.targets import DEPTH_PER_MOVE, Targets, choose_targets
 from twin.cache import cached_arrays
 from twin.errors import FrameError
-from twin.kinematics import rig_of
 from twin.preprocess import Pipeline, make_graph, make_reference, nominal_reference
 from twin.preprocess.batch import UNMEASURED, recording_reference
 from twin.preprocess.reference import Reference
 from twin.recordings import Recording, open_recording
+from twin.rig.kinematics import rig_of
 from twin.types import Form
 
 HELD_OUT = 5  # one row in five is the validation part

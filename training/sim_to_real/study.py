@@ -15,14 +15,13 @@ from training.dataset import Dataset, joined, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_slope, predict_rows_of
 from training.recipes import TrainingError, recipe_of
-from training.recorded_contact import read_arm_labels
 from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors, write_text
 from training.sim_to_real.discrepancy import Discrepancy
 from training.simulated import config_of, is_pins_only, open_simulated
 from training.validation.model import MeasuredFrames
-from twin.kinematics import ArmLabel
 from twin.recordings import open_recording
+from twin.rig.labels import ArmLabel, read_arm_labels
 
 TWIN_EPOCHS = 60  # on thousands of simulated states: more change nothing
 MANY = 500  # labelled frames: a morning's work with the rig

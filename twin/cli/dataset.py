@@ -90,8 +90,8 @@ def dataset(
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation import GenerationConfig, generate
     from twin.cli.progress import rate_bar
-    from twin.kinematics import rig_of
     from twin.preprocess.forms import frame_size
+    from twin.rig.kinematics import rig_of
 
     spec, plan = load_sensor(sensor), load_experiment(experiment)
     touched = load_object(object_ or plan.object)

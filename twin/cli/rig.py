@@ -21,9 +21,9 @@ from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
 from twin.cache import cached_arrays
 from twin.errors import RenderError
-from twin.mounting import Mounting
 from twin.optics.preview import Preview, Shading
 from twin.optics.render import Renderer
+from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 
 TWIN = "twin"

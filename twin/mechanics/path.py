@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import SensorSpec, SkinSpec
 from twin.errors import ContactError
 
 _LARGEST_TILT_DEG = 60.0
@@ -125,7 +125,7 @@ def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
     T[:3, :3] = turn_y @ turn_x
     T[:3, 3] = [*pose.offset_mm, radius]
     lowest_z = spec.skin.rim_z_mm / radius
-    directions = dome_directions(spec, _DOME_POINTS)
+    directions = dome_directions(spec.skin, _DOME_POINTS)
     height, nearest = _bring_down(stimulus, T, radius * directions, _START_MM, radius - spec.skin.rim_z_mm)
     # around the nearest point the sampling is refined 30 times
     spread = 3 / np.sqrt(_DOME_POINTS)
@@ -146,10 +146,10 @@ def plan_path(spec: SensorSpec, stimulus, pose: ContactPose) -> ContactPath:
     return ContactPath(np.stack(poses))
 
 
-def dome_directions(spec: SensorSpec, count: int) -> np.ndarray:
+def dome_directions(skin: SkinSpec, count: int) -> np.ndarray:
     """(k, 3) unit vectors evenly over the dome, about ``count`` on the whole sphere."""
     directions = _sphere_points(count)
-    return directions[directions[:, 2] >= spec.skin.rim_z_mm / spec.skin.outer_radius_mm]
+    return directions[directions[:, 2] >= skin.rim_z_mm / skin.outer_radius_mm]
 
 
 def _check(spec: SensorSpec, pose: ContactPose) -> None:

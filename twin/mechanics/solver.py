@@ -17,6 +17,7 @@ from twin.geometry.view import NodeView
 from twin.mechanics.balance import Body, Friction
 from twin.mechanics.contact import contact_points
 from twin.mechanics.elements import Elements
+from twin.mechanics.law import ContactLaw
 from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
@@ -61,12 +62,13 @@ class SkinSolver:
         stimulus: Stimulus | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
+        law: ContactLaw | None = None,
         friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
         progress: Callable[[float, ContactState], None] | None = None,
     ) -> ContactState:
         """The state at the end of a contact; arguments and errors as ``path``."""
-        for at, state in self.path(stimulus, pose, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
+        for at, state in self.path(stimulus, pose, law=law, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
             if progress is not None:
                 progress(at, state)
         return state
@@ -76,9 +78,9 @@ class SkinSolver:
         stimulus: Stimulus | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
+        law: ContactLaw | None = None,
         friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
-        given_way: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
         release: bool = False,
         step_mm: float = _STEP_MM,
     ) -> Iterator[tuple[float, ContactState]]:
@@ -87,12 +89,11 @@ class SkinSolver:
         Parameters
         ----------
         stimulus : Stimulus or ObjectSpec
-            With a bare ``Stimulus``, friction and compliance default to 0.
+        law : ContactLaw, optional
+            By default the object's own friction and compliance (``ContactLaw.of_object``), and none of a bare ``Stimulus``. For a
+            contact that an arm makes it comes from ``twin.rig.contact``. ``law.given_way`` is told the force of the load step before.
         friction, compliance_mm_per_n : optional
-            Override the object's.
-        given_way : callable, optional
-            What else the force does to the object's pose: from the path's ``T_sensor_object`` (4, 4) and the force on the object
-            (3,), N, after the load step before, to the pose that is taken.
+            Override the law's.
         release : bool
             Afterwards lift the object off again, the way it came.
         step_mm : float
@@ -112,8 +113,9 @@ class SkinSolver:
         """
         spec = stimulus if isinstance(stimulus, ObjectSpec) else None
         field = build_stimulus(spec) if spec else stimulus
-        law = friction_of(spec, friction)
-        compliance = compliance_mm_per_n if compliance_mm_per_n is not None else (spec.compliance_mm_per_n if spec else 0.0)
+        if law is None:
+            law = ContactLaw.of_object(spec) if spec else ContactLaw()
+        law = law.override(friction=friction, compliance_mm_per_n=compliance_mm_per_n)
         plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec, field, pose)
         if release:
             plan = plan.there_and_back()
@@ -121,12 +123,12 @@ class SkinSolver:
             yield 1.0, self.rest(T_sensor_object=plan.at(1.0))
             return
         reached = self._reached(field, plan)
-        contact = self.begin(field, law, compliance, reached, plan.at(0.0), focus=_focus(reached))
+        contact = self.begin(field, law, reached, plan.at(0.0), focus=_focus(reached))
         stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
         force_n = np.zeros(3)
 
         def pose_at(progress: float) -> np.ndarray:
-            return plan.at(progress) if given_way is None else given_way(plan.at(progress), force_n)
+            return law.pose(plan.at(progress), force_n)
 
         for number, (start, stop) in enumerate(pairwise(stops), 1):
             where = f"load step {number} of {len(stops) - 1} ({stop / stops[-1]:.0%} of the path)"
@@ -134,9 +136,7 @@ class SkinSolver:
                 force_n = state.force_n
                 yield float(at / stops[-1]), state
 
-    def begin(
-        self, field: Stimulus, law: Friction, compliance: float, reached: np.ndarray, T: np.ndarray, *, focus: Focus
-    ) -> OngoingContact:
+    def begin(self, field: Stimulus, law: ContactLaw, reached: np.ndarray, T: np.ndarray, *, focus: Focus) -> OngoingContact:
         """A contact at its start, the object at ``T`` and free of the skin.
 
         Parameters
@@ -147,14 +147,14 @@ class SkinSolver:
         with self._one_thread():
             setting = self._setting(focus)
         contact = OngoingContact(self.spec, setting, T, self._one_thread)
-        self.reach(contact, field, law, compliance, reached)
+        self.reach(contact, field, law, reached)
         return contact
 
-    def reach(self, contact: OngoingContact, field: Stimulus, law: Friction, compliance: float, reached: np.ndarray) -> None:
+    def reach(self, contact: OngoingContact, field: Stimulus, law: ContactLaw, reached: np.ndarray) -> None:
         """Let the contact go on where the object presses other directions (k, 3) of the dome than before."""
         with self._one_thread():
             frontal = self._frontal(contact.setting, reached)
-            contact.stepper = LoadStepper(contact.setting.body, frontal, field, law, compliance)
+            contact.stepper = LoadStepper(contact.setting.body, frontal, field, law.friction, law.compliance_mm_per_n)
 
     def _one_thread(self):
         """BLAS on one thread: the matrices are small, and the result must not depend on the number of cores."""
@@ -185,7 +185,7 @@ class SkinSolver:
     def _reached(self, field: Stimulus, plan: ContactPath) -> np.ndarray:
         """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""
         radius = self.spec.skin.outer_radius_mm
-        directions = dome_directions(self.spec, _FOCUS_POINTS)
+        directions = dome_directions(self.spec.skin, _FOCUS_POINTS)
         deepest = np.full(len(directions), np.inf)
         limit = deepest_mm(self.spec)
         for at in _stops(plan, directions, radius, _LOOK_MM):
@@ -200,18 +200,6 @@ class SkinSolver:
             deepest = np.minimum(deepest, gap)
         pressed = deepest < 0
         return directions[pressed] if pressed.any() else directions[[deepest.argmin()]]
-
-
-def friction_of(spec: ObjectSpec | None, override: float | Friction | None = None) -> Friction:
-    """An object's friction, or what is given instead; none for a bare field."""
-    if isinstance(override, Friction):
-        return override
-    if override is not None:
-        return Friction(override, override)
-    if spec is None:
-        return Friction(0.0, 0.0)
-    kinetic = spec.friction if spec.kinetic_friction is None else spec.kinetic_friction
-    return Friction(spec.friction, kinetic, spec.slip_weakening_mm, spec.shear_strength_mpa or np.inf)
 
 
 def _focus(reached: np.ndarray) -> Focus:

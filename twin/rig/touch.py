@@ -13,7 +13,7 @@ import numpy as np
 
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 from twin.stimulus import build_stimulus
 
 

@@ -1,19 +1,23 @@
-"""How a sensor sits on an arm's tool, and what its labels call zero; from the sensor's rig and an experiment."""
+"""How a sensor sits on an arm's tool, and which labels mean zero depth and zero angle; from a rig and an experiment."""
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from scenes.experiment import ExperimentSpec
+from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
-from twin.kinematics import TURNING, rig_of
+from twin.rig.kinematics import TURNING, rig_of
 
-_DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # approach, and across it
+Number = TypeVar("Number", float, np.ndarray)
+_DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # the approach, and across it
+_SENSOR_AXIS = np.array([0.0, 0.0, 1.0])  # in the sensor frame
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """A sensor on a tool. Following happens in the plane of ``axis`` and ``across``.
+    """A sensor on a tool. The servo follows a surface in the plane of ``axis`` and ``across``.
 
     Attributes
     ----------
@@ -28,9 +32,9 @@ class Mounting:
     radius_mm : float
         Of the dome.
     depth_label, angle_label : str
-        The labels that tell how deep, and how far from the surface's normal the tool is.
+        The labels that tell how deep the tool is, and how far it is turned from the surface's normal.
     zero_mm, zero_deg : float
-        Indentation where the depth's label is 0, and the angle's label where the sensor stands normal to the surface.
+        Indentation at which the depth's label is 0, and the angle's label at which the sensor stands normal to the surface.
     angle_sign : int
         -1 where the label grows as the tool turns from the axis towards ``across``.
     """
@@ -54,12 +58,32 @@ class Mounting:
     @property
     def apex_mm(self) -> np.ndarray:
         """(3,) the dome's apex in the tool frame."""
-        return self.centre_mm + self.radius_mm * self.axis
+        apex: np.ndarray = self.centre_mm + self.radius_mm * self.axis
+        return apex
+
+    @property
+    def across_in_sensor(self) -> np.ndarray:
+        """(3,) ``across`` in the sensor frame."""
+        return np.array([np.cos(np.radians(self.image_turn_deg)), np.sin(np.radians(self.image_turn_deg)), 0.0])
+
+    @property
+    def tool_point_mm(self) -> np.ndarray:
+        """(3,) the tool point in the sensor frame."""
+        return -(self.centre_mm @ self.across) * self.across_in_sensor - (self.centre_mm @ self.axis) * _SENSOR_AXIS
+
+    @property
+    def label_turn(self) -> np.ndarray:
+        """(3,) axis in the sensor frame about which the tool turns, right-handed, while the angle's label grows."""
+        return self.angle_sign * np.cross(self.across_in_sensor, _SENSOR_AXIS)
 
     @classmethod
     def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Mounting":
-        """The mounting that the sensor's rig describes, with the experiment's approach and zero."""
-        rig = rig_of(sensor)
+        """The mounting of a sensor on its own rig."""
+        return cls.on(rig_of(sensor), experiment, sensor.skin.outer_radius_mm)
+
+    @classmethod
+    def on(cls, rig: RigSpec, experiment: ExperimentSpec, radius_mm: float) -> "Mounting":
+        """The mounting of a dome of a radius that a rig describes, with the experiment's approach and zero."""
         axis, across = (np.array(direction, float) for direction in _DIRECTIONS[experiment.approach])
         turn = np.cross(across, axis)
         about = TURNING[experiment.approach] - 3
@@ -69,7 +93,7 @@ class Mounting:
             across,
             rig.image_turn_deg,
             rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across,
-            sensor.skin.outer_radius_mm,
+            radius_mm,
             f"pose_{experiment.axis + 1}",
             f"pose_{about + 4}",
             experiment.zero_mm + rig.contact_offset_mm,
@@ -77,14 +101,14 @@ class Mounting:
             sign,
         )
 
-    def depth_mm(self, label: float) -> float:
+    def depth_mm(self, label: Number) -> Number:
         """Depth beyond first touch that a label stands for."""
         return label + self.zero_mm
 
-    def angle_deg(self, label: float) -> float:
+    def angle_deg(self, label: Number) -> Number:
         """Angle from the surface's normal that a label stands for."""
         return self.angle_sign * (label - self.zero_deg)
 
-    def labels(self, depth_mm: float, angle_deg: float) -> tuple[float, float]:
+    def labels(self, depth_mm: Number, angle_deg: Number) -> tuple[Number, Number]:
         """The depth's and the angle's label that a depth and an angle would have."""
         return depth_mm - self.zero_mm, self.zero_deg + self.angle_sign * angle_deg

@@ -1,8 +1,9 @@
 """Which labels a model learns: columns of a recording's table, as published and corrected.
 
 Corrected: in the published Tac-VGNN recordings the shear move had not been executed in about a third of the frames when
-the frame was taken. There both shears are zero, the angle is ``pose_6 - move_6``, and, as the plate is slightly tilted, the
-depth is ``pose_2 + c move_1``; on the way of a tap at ``pose_1`` it is ``pose_2 - c pose_1``: what it would be before the middle.
+the frame was taken. In those frames both shears are zero and the angle is ``pose_6 - move_6``. The plate is slightly tilted, so the
+depth is ``pose_2 + c move_1``. A tap at ``pose_1`` has the depth ``pose_2 - c pose_1``, which it would have before the plate's middle.
+c is the rig's ``label_depth_per_move`` for recordings, and the slope of its plate for simulated contacts.
 """
 
 from dataclasses import dataclass, replace
@@ -21,10 +22,6 @@ PRESETS = {
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
 }
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")  # of pose_1..6 and move_1..6
-# c above, mm/mm, fitted to the Tac-VGNN recordings (Apache-2.0). It governs the corrected labels of recordings, by which every model of
-# them was trained and judged. Where the twin has its contacts, and so the labels of simulated ones, is governed by the rig's
-# plate_tilt_deg, fitted to the same plate by other means (its tangents: -0.0123 and 0.0131; apart by 0.024 mm at the largest move).
-DEPTH_PER_MOVE = {"mg400-331": -0.0075, "mg400-127": 0.0151}
 
 
 @dataclass(frozen=True)

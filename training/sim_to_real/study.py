@@ -13,7 +13,7 @@ from training.assemble import intervals, kernel_inputs
 from training.cokriging import fit_cokriging
 from training.dataset import Dataset, joined, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
-from training.evaluate import judge, leak_slope, predict_rows_of
+from training.evaluate import judge, leak_check, predict_rows_of
 from training.recipes import TrainingError, recipe_of
 from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors, write_text
@@ -215,4 +215,4 @@ def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) 
     for kind in ("corrected", "raw"):
         errors = np.abs(made - getattr(targets, kind)).mean(axis=0)
         row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}
-    return row | {"leak_slope": leak_slope(made, targets)}
+    return row | {"leak_slope": leak_check(made, targets).slope}

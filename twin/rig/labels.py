@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scenes.rig import RigSpec
 from twin.errors import FrameError
 from twin.recordings import Recording
 
@@ -63,6 +64,16 @@ def read_arm_labels(recording: Recording) -> list[ArmLabel]:
     executed = read_executed(Path(recording.path), recording.problems)
     done = [executed.get(name, 1.0) > 0.5 for name in recording.names]
     return [ArmLabel(*row) for row in zip(values["pose"], values["move"], done, strict=True)]
+
+
+def plate_slope(rig: RigSpec | None) -> float:
+    """Depth gained for each mm across on the twin's plate, mm/mm; 0 without a rig. It holds for labels of simulated contacts."""
+    return float(np.tan(np.radians(rig.plate_tilt_deg))) if rig else 0.0
+
+
+def label_slope(rig: RigSpec | None) -> float:
+    """The same for labels of recordings: what was measured (``RigSpec.label_depth_per_move``), or else the plate's slope."""
+    return plate_slope(rig) if rig is None or rig.label_depth_per_move is None else rig.label_depth_per_move
 
 
 def read_executed(folder: Path, problems: list[str]) -> dict[str, float]:

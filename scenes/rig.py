@@ -20,7 +20,10 @@ class RigSpec(Section):
         From the tool point, about which the arm turns, to the dome's centre along the approach. It is negative where the tool
         point lies in front of the centre; minus the dome's radius is a tool point at the tip.
     tcp_lateral_mm : float
-        The same across the approach.
+        The same along the direction across.
+    tcp_aside_mm : float
+        The same along approach x across (the cross product). It matters only where
+        the sensor is turned out of the plane of approach and across.
     turn_offset_deg : three numbers
         Added to ``pose_4..6``.
     turn_sign : 1 or -1
@@ -54,6 +57,7 @@ class RigSpec(Section):
     contact_offset_mm: float = 0.0
     tcp_to_dome_mm: float
     tcp_lateral_mm: float = 0.0
+    tcp_aside_mm: float = 0.0
     turn_offset_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_sign: Literal[1, -1] = 1
     plate_tilt_deg: float = 0.0

@@ -24,7 +24,13 @@ RADIUS_MM = 20.0
 SURFACE = load_experiment(EXPERIMENT)
 PLAIN = RigSpec(tcp_to_dome_mm=-RADIUS_MM)
 TRUE = RigSpec(
-    contact_offset_mm=0.4, tcp_to_dome_mm=-17.0, tcp_lateral_mm=0.5, image_turn_deg=97.0, turn_offset_deg=(1.2, -0.8, 0.0), turn_sign=-1
+    contact_offset_mm=0.4,
+    tcp_to_dome_mm=-17.0,
+    tcp_lateral_mm=0.5,
+    tcp_aside_mm=-0.3,
+    image_turn_deg=97.0,
+    turn_offset_deg=(1.2, -0.8, 0.0),
+    turn_sign=-1,
 )
 SAME_CONTACT = 1e-4  # mm, and of the unit normal
 PENETRATION_MM = 0.02  # twice what the solver allows

@@ -1,8 +1,8 @@
 """Contacts from labels alone: the arm's rig fitted to a part of the frames, the twin's contact model for all of them.
 
-A label leads to a contact by the rig's kinematics (``twin.rig``). Six numbers of the rig are fitted, for the rig of a recording
-that was never calibrated: contact offset, tool point along and across the approach, the image's turn, and the offsets of the two
-turns that tilt the sensor. The robot's handedness (``turn_sign``) is tried both ways.
+A label leads to a contact by the rig's kinematics (``twin.rig``). Seven numbers of the rig are fitted, as the rig of a recording may
+never have been calibrated: contact offset, tool point in three directions, the image's turn, and the offsets of the two turns that
+tilt the sensor. The robot's handedness (``turn_sign``) is tried both ways.
 
 The pins of a tap depend smoothly on the indentation and the plate's normal in the sensor frame. While the rig is fitted, a cubic
 polynomial through simulated taps stands for them. A second round takes into account what the polynomial misses at the first
@@ -34,7 +34,7 @@ BANK_MARGIN_DEG = 3.0  # beyond the labelled tilts
 DEGREE = 3  # of the polynomial
 TURNS_DEG = (0.0, 90.0, 180.0, 270.0)  # of the image, added to the rig's, from which the fit starts
 FEWEST = 2  # frames to fit to
-PARAMETERS = 6
+PARAMETERS = 7
 
 
 def label_columns(experiment: ExperimentSpec) -> tuple[str, ...]:
@@ -107,7 +107,8 @@ class TapBank:
 
     def pins_px(self, contacts: np.ndarray) -> np.ndarray:
         """(m, N, 2) px of contacts (m, 3)."""
-        return (self._terms(contacts) @ self._coefficients).reshape(len(contacts), -1, 2)
+        pins_px: np.ndarray = (self._terms(contacts) @ self._coefficients).reshape(len(contacts), -1, 2)
+        return pins_px
 
     def _terms(self, contacts: np.ndarray) -> np.ndarray:
         powers = [p for p in product(range(DEGREE + 1), repeat=3) if sum(p) <= DEGREE]
@@ -171,9 +172,11 @@ def fit_rig(
     def solve(rig: RigSpec, wanted_px: np.ndarray) -> OptimizeResult:
         def missed(x: np.ndarray) -> np.ndarray:
             contacts = contacts_of(_moved(rig, experiment, x), experiment, labels, radius_mm)
-            return (bank.pins_px(contacts) - wanted_px)[seen]
+            left_px: np.ndarray = (bank.pins_px(contacts) - wanted_px)[seen]
+            return left_px
 
-        return least_squares(missed, np.zeros(PARAMETERS))
+        found: OptimizeResult = least_squares(missed, np.zeros(PARAMETERS))
+        return found
 
     tries = [
         start.model_copy(update={"turn_sign": sign, "image_turn_deg": start.image_turn_deg + turn})
@@ -191,13 +194,14 @@ def fit_rig(
 def _moved(rig: RigSpec, experiment: ExperimentSpec, x: np.ndarray) -> RigSpec:
     """The rig with its fitted numbers moved by (PARAMETERS,), each in a unit that makes it of order 1."""
     offsets = np.array(rig.turn_offset_deg)
-    offsets[np.array(tilts_of(experiment)) - 3] += 10 * x[4:]
+    offsets[np.array(tilts_of(experiment)) - 3] += 10 * x[5:]
     return rig.model_copy(
         update={
             "contact_offset_mm": rig.contact_offset_mm + float(x[0]),
             "tcp_to_dome_mm": rig.tcp_to_dome_mm + 10 * float(x[1]),
             "tcp_lateral_mm": rig.tcp_lateral_mm + float(x[2]),
-            "image_turn_deg": rig.image_turn_deg + 90 * float(x[3]),
+            "tcp_aside_mm": rig.tcp_aside_mm + float(x[3]),
+            "image_turn_deg": rig.image_turn_deg + 90 * float(x[4]),
             "turn_offset_deg": tuple(offsets.tolist()),
         }
     )

@@ -1,10 +1,10 @@
 """From a label in robot coordinates to the object's way as the sensor sees it.
 
 Work frame of the robot: x, y, z. The sensor, unturned, looks along the approach a0. b0 is the direction across: robot x, or robot y
-where the approach is x. It appears in the image at the azimuth ``image_turn``. With R the static xyz rotation by
+where the approach is x. It appears in the image at the azimuth ``image_turn``. c0 is a0 x b0. With R the static xyz rotation by
 ``turn_sign (pose_4..6 + turn_offset)`` and p = ``pose_1..3``,
 
-    centre of the dome = p + R (tcp_to_dome a0 + tcp_lateral b0)
+    centre of the dome = p + R (tcp_to_dome a0 + tcp_lateral b0 + tcp_aside c0)
 
 The object's frame has z along the approach and leans by ``plate_tilt``. The object stands where an unturned sensor at the robot's
 origin indents it by ``zero + contact_offset``. An arm taps along a0, then makes the move in one straight line.
@@ -73,9 +73,9 @@ def rig_of(sensor: SensorSpec) -> RigSpec:
 def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, radius_mm: float) -> np.ndarray:
     """``T_sensor_object`` (4, 4) with the arm at a pose (6,), mm and deg."""
     unturned = _UNTURNED[experiment.approach]
-    across, approach = unturned[:, 0], unturned[:, 2]
+    approach = unturned[:, 2]
     turn = Rotation.from_euler("xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True).as_matrix()
-    centre = pose[:3] + turn @ (rig.tcp_to_dome_mm * approach + rig.tcp_lateral_mm * across)
+    centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm]
     surface = (radius_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * approach
     sensor = turn @ unturned
     T = np.eye(4)

@@ -69,12 +69,16 @@ class Mounting:
     @property
     def tool_point_mm(self) -> np.ndarray:
         """(3,) the tool point in the sensor frame."""
-        return -(self.centre_mm @ self.across) * self.across_in_sensor - (self.centre_mm @ self.axis) * _SENSOR_AXIS
+        frame = np.stack([self.axis, self.across, np.cross(self.axis, self.across)])
+        here = np.stack([_SENSOR_AXIS, self.across_in_sensor, np.cross(_SENSOR_AXIS, self.across_in_sensor)])
+        point: np.ndarray = -(frame @ self.centre_mm) @ here
+        return point
 
     @property
     def label_turn(self) -> np.ndarray:
         """(3,) axis in the sensor frame about which the tool turns, right-handed, while the angle's label grows."""
-        return self.angle_sign * np.cross(self.across_in_sensor, _SENSOR_AXIS)
+        axis: np.ndarray = self.angle_sign * np.cross(self.across_in_sensor, _SENSOR_AXIS)
+        return axis
 
     @classmethod
     def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Mounting":
@@ -92,7 +96,7 @@ class Mounting:
             axis,
             across,
             rig.image_turn_deg,
-            rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across,
+            rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across + rig.tcp_aside_mm * np.cross(axis, across),
             radius_mm,
             f"pose_{experiment.axis + 1}",
             f"pose_{about + 4}",

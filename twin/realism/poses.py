@@ -201,7 +201,7 @@ def _moved(rig: RigSpec, experiment: ExperimentSpec, x: np.ndarray) -> RigSpec:
             "tcp_to_dome_mm": rig.tcp_to_dome_mm + 10 * float(x[1]),
             "tcp_lateral_mm": rig.tcp_lateral_mm + float(x[2]),
             "tcp_aside_mm": rig.tcp_aside_mm + float(x[3]),
-            "image_turn_deg": rig.image_turn_deg + 90 * float(x[4]),
+            "image_turn_deg": (rig.image_turn_deg + 90 * float(x[4])) % 360,
             "turn_offset_deg": tuple(offsets.tolist()),
         }
     )

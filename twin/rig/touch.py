@@ -1,7 +1,8 @@
 """What a rigid sensor would touch: depth and angle against the surface, the same for objects of any shape.
 
-The surface is replaced by a flat plate: through its place nearest to the dome's centre, with its normal there. With g the distance of the dome's centre from the surface, w the angle of the tool's axis from the normal, and
-``tcp``, ``lateral`` the dome's centre from the tool point along the axis and across it,
+The surface is replaced by a flat plate: through its place nearest to the dome's centre, with its normal there. With g the
+distance of the dome's centre from the surface, w the angle of the tool's axis from the normal, and ``tcp``, ``lateral`` the dome's
+centre from the tool point along the axis and across it,
 
     indentation = radius - g,   depth of the tool = radius + tcp - (g + tcp cos w + lateral sin w)
 """

@@ -20,7 +20,7 @@ from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
 from hardware.timing import Spread, Timing
 from scenes.servo import ServoSpec
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 from twin.types import Frame
 
 MOST_PIECES, NEAR_MM = 200, 0.5

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from scenes.object import ObjectSpec
 from scenes.servo import PlacementSpec
-from twin.mounting import Mounting
-from twin.touch import Surface, Touch
+from twin.rig.mounting import Mounting
+from twin.rig.touch import Surface, Touch
 
 OUTLINE_STEP_MM = 0.5
 LONGEST_OUTLINE_MM = 2000.0

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hardware.rig_geometry import matrix_of, pose_of
 from scenes.servo import ServoSpec
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 
 
 @dataclass(frozen=True)

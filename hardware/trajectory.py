@@ -9,7 +9,7 @@ import numpy as np
 from hardware.rig_geometry import PlacedObject, matrix_of
 from hardware.servo import Reading, tangent_of
 from hardware.step import StepRecord
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 from twin.store import text_file
 
 LOCAL_N = 9  # points in a window of the local smoothness

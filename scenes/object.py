@@ -83,6 +83,9 @@ class ObjectSpec(Section):
 
     ``friction`` is the static coefficient; ``kinetic_friction`` (default: the same) is what it falls to once a
     point has slid by some ``slip_weakening_mm``. ``shear_strength_mpa`` bounds the friction stress (default: no bound).
+    All four count for contacts that no arm makes and for sensors without a rig; where a sensor has a rig, that rig's
+    friction counts instead (see ``RigSpec``). ``compliance_mm_per_n`` is how far the object gives way along the sensor's axis; it adds
+    to the rig's.
     """
 
     name: str

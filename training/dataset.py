@@ -9,13 +9,13 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.simulated import is_pins_only, is_simulated, open_simulated, touched_labels
-from training.targets import DEPTH_PER_MOVE, Targets, choose_targets
+from training.targets import Targets, choose_targets
 from twin.errors import FrameError
-from twin.kinematics import rig_of
 from twin.preprocess import Pipeline, make_graph, make_reference, nominal_reference
 from twin.preprocess.batch import UNMEASURED, recording_reference
 from twin.preprocess.reference import Reference
 from twin.recordings import Recording, open_recording
+from twin.rig.labels import label_slope, plate_slope
 from twin.store import cached_arrays
 from twin.types import Form
 
@@ -154,7 +154,7 @@ def load_dataset(
     """
     problems: list[str] = []
     simulated = is_simulated(Path(folder))
-    depth_per_move = np.tan(np.radians(rig_of(spec).plate_tilt_deg)) if simulated else DEPTH_PER_MOVE.get(spec.name, 0.0)
+    depth_per_move = plate_slope(spec.rig) if simulated else label_slope(spec.rig)
     if is_pins_only(Path(folder)):
         recording, truth = open_simulated(Path(folder), spec)
         pins = simulated_table(recording, spec, truth, progress=progress)

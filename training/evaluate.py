@@ -1,6 +1,7 @@
 """How good a trained model is on a recording: errors, intervals, leaks, as numbers, a table and pictures."""
 
 import csv
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
@@ -13,7 +14,9 @@ from training.estimator import PoseEstimator
 from training.inputs import image_inputs
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
+from training.targets import Targets
 from twin.recordings import open_recording
+from twin.rig.labels import EXECUTED_FILES
 from twin.store import made_by, text_file, write_json
 from twin.views.plots import new_figure
 
@@ -22,6 +25,8 @@ ANGLE_EDGES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 SHEAR_EDGES_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 LARGE_MOVE = 1.0  # mm or deg: smaller moves leave the same picture executed or not
 TIMED_FRAMES = 100
+LEAK_LABEL, LEAK_MOVE = "pose_6", "move_6"  # the angle of the recordings in which moves were not executed, and its move
+LEAK_FRAMES = 3  # fewest to lay a line through
 
 
 def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndarray:
@@ -71,23 +76,45 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
             for k, name in enumerate(targets.names)
         }
         found[kind]["bins"] = _bins(error, targets)
-    found["leak_slope"] = leak_slope(made.mean, targets)
+    leak = leak_check(made.mean, targets)
+    found["leak_slope"], found["leak_not_checked"] = leak.slope, leak.reason
     known = np.isfinite(targets.executed) & np.isfinite(made.executed) & (np.abs(targets.move).max(axis=1) > LARGE_MOVE)
     if known.any():
         found["executed_agreement"] = float(((made.executed > 0.5) == (targets.executed > 0.5))[known].mean())
     return found
 
 
-def leak_slope(mean: np.ndarray, targets) -> float | None:
-    """Slope of (angle predicted - corrected) on ``move_6`` over frames whose move was not executed; None where there are none.
+@dataclass(frozen=True)
+class Leak:
+    """Whether a model reads the time at which a frame was taken, by which a recording's rows are sorted, instead of the contact.
 
-    A model that reads the contact has 0; one that reads the time of the frame, by which the rows are sorted, has not.
+    Attributes
+    ----------
+    slope : float or None
+        Of (angle predicted - corrected) on ``move_6``, over frames whose move was not executed. A model that reads the contact
+        has 0. None where the check can't be made.
+    reason : str
+        Why it can't be made; empty where it is.
     """
-    undone = targets.executed < 0.5
-    if "pose_6" not in targets.names or undone.sum() < 3:
-        return None
-    k = targets.names.index("pose_6")
-    return float(np.polyfit(targets.move[undone, 1], (mean - targets.corrected)[undone, k], 1)[0])
+
+    slope: float | None
+    reason: str = ""
+
+
+def leak_check(mean: np.ndarray, targets: Targets) -> Leak:
+    """The check on predicted labels (M, K) of targets of M frames."""
+    if LEAK_LABEL not in targets.names:
+        return Leak(None, f"it needs the angle label {LEAK_LABEL} and its {LEAK_MOVE}; the labels are {', '.join(targets.names)}")
+    if not np.isfinite(targets.executed).any():
+        return Leak(None, f"no file beside the table tells which moves were executed ({', '.join(EXECUTED_FILES)}; 'twin audit' makes one)")
+    k = targets.names.index(LEAK_LABEL)
+    turn, error = targets.move[:, 1], (mean - targets.corrected)[:, k]
+    usable = (targets.executed < 0.5) & np.isfinite(turn) & np.isfinite(error)
+    if usable.sum() < LEAK_FRAMES:
+        return Leak(None, f"{usable.sum()} frames with a prediction and a move that was not executed; {LEAK_FRAMES} are needed")
+    if np.ptp(turn[usable]) == 0:
+        return Leak(None, f"{LEAK_MOVE} is the same in all frames whose move was not executed")
+    return Leak(float(np.polyfit(turn[usable], error[usable], 1)[0]))
 
 
 def _bins(error: np.ndarray, targets) -> dict:

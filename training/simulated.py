@@ -11,13 +11,13 @@ from training.generation.config import GenerationConfig
 from training.generation.store import CONFIG, DRAWS
 from training.generation.truth_file import TRUTH
 from twin.errors import FrameError
-from twin.kinematics import object_pose, rig_of
-from twin.mounting import Mounting
 from twin.preprocess.forms import frame_size
 from twin.recordings import Recording
 from twin.recordings.folders import image_folders
 from twin.recordings.tables import order_by_table, read_table
-from twin.touch import Surface, surface_labels
+from twin.rig.kinematics import object_pose, rig_of
+from twin.rig.mounting import Mounting
+from twin.rig.touch import Surface, surface_labels
 from twin.types import Form
 
 TABLE = "targets.csv"
@@ -63,7 +63,7 @@ def config_of(folder: Path) -> GenerationConfig:
 
 
 def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
-    """Depth and angle of the surface that was touched, whatever its shape, as labels: see ``twin.touch.surface_labels``.
+    """Depth and angle of the surface that was touched, whatever its shape, as labels: see ``twin.rig.touch.surface_labels``.
 
     Where the object stood is where the arm was sent, by the rig's numbers that were drawn for each contact, less what the object
     gave way, so that the flat plate's are the table's own, with moves that were not executed taken out.

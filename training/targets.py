@@ -1,18 +1,18 @@
 """Which labels a model learns: columns of a recording's table, as published and corrected.
 
 Corrected: in the published Tac-VGNN recordings the shear move had not been executed in about a third of the frames when
-the frame was taken. There both shears are zero, the angle is ``pose_6 - move_6``, and, as the plate is slightly tilted, the
-depth is ``pose_2 + c move_1``; on the way of a tap at ``pose_1`` it is ``pose_2 - c pose_1``: what it would be before the middle.
+the frame was taken. In those frames both shears are zero and the angle is ``pose_6 - move_6``. The plate is slightly tilted, so the
+depth is ``pose_2 + c move_1``. A tap at ``pose_1`` has the depth ``pose_2 - c pose_1``, which it would have before the plate's middle.
+c is the rig's ``label_depth_per_move`` for recordings, and the slope of its plate for simulated contacts.
 """
 
-import csv
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from twin.errors import FrameError
 from twin.recordings import Recording
+from twin.rig.labels import read_executed
 
 PRESETS = {
     "surface-2d": ("pose_2", "pose_6"),
@@ -22,12 +22,6 @@ PRESETS = {
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
 }
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")  # of pose_1..6 and move_1..6
-# c above, mm/mm, fitted to the Tac-VGNN recordings (Apache-2.0). It governs the corrected labels of recordings, by which every model of
-# them was trained and judged. Where the twin has its contacts, and so the labels of simulated ones, is governed by the rig's
-# plate_tilt_deg, fitted to the same plate by other means (its tangents: -0.0123 and 0.0131; apart by 0.024 mm at the largest move).
-DEPTH_PER_MOVE = {"mg400-331": -0.0075, "mg400-127": 0.0151}
-EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")
-EXECUTED_COLUMNS = ("executed", "executed_estimate")
 
 
 @dataclass(frozen=True)
@@ -135,27 +129,6 @@ def corrected(
         elif name in ("move_1", "move_6"):
             out[:, k] *= 1 - undone
     return out
-
-
-def read_executed(folder: Path, problems: list) -> dict[str, float]:
-    """Whether each frame's move was executed, by image name, from the file that an audit left beside the table."""
-    for name in EXECUTED_FILES:
-        path = folder / name
-        if not path.is_file():
-            continue
-        with path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            column = next((c for c in EXECUTED_COLUMNS if c in (reader.fieldnames or ())), None)
-            if column is None or "image_name" not in reader.fieldnames:
-                problems.append(f"{name}: no columns image_name and {EXECUTED_COLUMNS[0]}; not used")
-                continue
-            found = {}
-            for row in reader:
-                value = _number(row[column])
-                if 0 <= value <= 1:
-                    found[row["image_name"]] = value
-            return found
-    return {}
 
 
 def _numbers(cells: np.ndarray, name: str, problems: list) -> np.ndarray:

@@ -17,6 +17,7 @@ from twin.mechanics.follow import Follower
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
 from twin.preprocess.forms import frame_size
+from twin.rig.contact import contact_law
 from twin.types import ContactState, Form, Frame
 
 PoseSource = Callable[[], ArmState]
@@ -76,7 +77,8 @@ class TwinCamera(LiveSource):
         if self._preview is None:
             self._preview = preview_of(self._spec, self.form)
         if self._follower is None:
-            self._follower = Follower(SkinSolver(self._spec), self._placed.spec)
+            law = contact_law(self._spec.rig, self._placed.mounting, self._placed.spec)
+            self._follower = Follower(SkinSolver(self._spec), self._placed.spec, law)
             self._follower.warm_up()
 
     def _close(self) -> None:

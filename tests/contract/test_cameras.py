@@ -24,8 +24,8 @@ from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionWriter
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from twin.cli import check
-from twin.mounting import Mounting
 from twin.recordings.images import write_image
+from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 
 COUNT = 6  # frames of the recorded sources

@@ -24,7 +24,7 @@ from hardware.step import LoopSettings
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.cli.endings import signals_as_ctrl_c
 from twin.cli.rig import Rig, servo_loop
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 from twin.types import Form
 
 AWAY = np.array([300.0, 60, -10, 0, 0, 30])

@@ -18,7 +18,7 @@ from hardware.session import SessionSource, SessionWriter, read_steps
 from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of, write_csv
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 
 SPEED = 20.0  # of the simulated arm, times real
 ALLOCATOR_BYTES = 4_000_000  # that it may take at a time

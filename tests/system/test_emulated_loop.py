@@ -23,8 +23,8 @@ from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.cli.rig import Rig, servo_loop
-from twin.mounting import Mounting
 from twin.preprocess import Pipeline
+from twin.rig.mounting import Mounting
 from twin.types import Form
 
 sys.path.append(str(Path(__file__).parents[1] / "contract"))

@@ -38,10 +38,10 @@ from twin.cli import app, servo_run
 from twin.cli.emulate import run_until_told
 from twin.cli.rig import _no_full_turn, build_rig, steps_round
 from twin.errors import TwinError
-from twin.mounting import Mounting
 from twin.preprocess import Pipeline
 from twin.recordings import open_recording
 from twin.recordings.images import write_image
+from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 
 sys.path += [str(Path(__file__).parents[1] / folder) for folder in ("contract", "unit")]

@@ -1,11 +1,11 @@
 """Real recordings, every frame (make validate): pins found, in order, and the twin beside them."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from scenes import load_object, load_sensor
-from training.displacement import displacement_by_depth
-from training.labels import read_surface_labels
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline, nominal_reference
@@ -15,6 +15,7 @@ from twin.preprocess.legacy import LegacyPipeline
 from twin.projection import project
 from twin.realism.images import compare_images
 from twin.recordings import open_recording
+from twin.rig.labels import read_arm_labels
 from twin.simulator import Simulator
 from twin.types import Form
 
@@ -23,7 +24,9 @@ pytestmark = [pytest.mark.real, pytest.mark.slow]
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}
 MOST_LOST = 0.001  # of all pins of all frames
 SMOOTH_PX = 1.5  # left of a pin's displacement after the set's own smooth modes; a swapped pin leaves a pitch (11 px or more)
+DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)  # of pose_2
 DEPTH_MIDDLES_MM = (1.5, 2.5, 3.5, 4.5)  # indentation, about pose_2 + 5 mm, in the middle of the four bins
+PURE = {"angle_deg": 3.0, "shear_mm": 1.0, "shear_deg": 1.0}  # contacts with less of each count as straight presses
 LEAST_SSIM = 0.6  # of two thresholded frames; caps half a pixel off cost a rim of black and white each
 ORDER_OF_MAGNITUDE = (0.7, 1.3)  # simulated to measured displacement; nothing is fitted to the table
 
@@ -68,11 +71,23 @@ def test_legacy_throws_away_what_the_release_does(real_dir):
     assert sum(not pipeline(frame).valid for frame in recording) == 101
 
 
+def displacement_by_depth(labels, pins_px, rest_px):
+    """Mean displacement of the pins (M, N, 2) px from no contact in the bins of ``DEPTH_EDGES_MM``, over straight presses."""
+    done = np.array([label.executed for label in labels])
+    pose, move = (np.array([getattr(label, kind) for label in labels]) for kind in ("pose", "move"))
+    sizes = {"angle_deg": pose[:, 5] - ~done * move[:, 5], "shear_mm": done * move[:, 0], "shear_deg": done * move[:, 5]}
+    pure = np.all([np.abs(sizes[key]) < limit for key, limit in PURE.items()], axis=0)
+    moved = np.nanmean(np.linalg.norm(pins_px - rest_px, axis=-1), axis=1)
+    inside = [pure & (pose[:, 1] >= low) & (pose[:, 1] < high) for low, high in pairwise(DEPTH_EDGES_MM)]
+    return np.array([moved[rows].mean() for rows in inside])
+
+
 @pytest.mark.parametrize("folder", ["tac-vgnn-331", "tac-vgnn-127"])
 def test_displacement_by_depth_beside_the_simulated_one(real_dir, folder):
     spec, reference, names, seen = observe(real_dir, folder)
-    labels = read_surface_labels(real_dir / folder)
-    assert np.array_equal(labels.image_name, names)
+    recording = open_recording(real_dir / folder, spec)
+    labels = read_arm_labels(recording)
+    assert np.array_equal(recording.names, names)
     raw_px = recording_to_raw(spec, np.stack([o.pins_px for o in seen]))
     measured = displacement_by_depth(labels, raw_px, recording_to_raw(spec, reference.pins_px))
     solver = SkinSolver(spec)

@@ -152,7 +152,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
 
 
 def test_an_audit_writes_labels_that_training_reads(recording, tmp_path):
-    from training.targets import read_executed
+    from twin.rig.labels import read_executed
 
     said = twin("audit", recording, "--sensor", "mg400-127", "--out", tmp_path)
     assert "70 frames" in said

@@ -7,7 +7,7 @@ from hardware.approach import way_around
 from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject, matrix_of, moved
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 
 SAMPLES = 200  # along each straight piece
 

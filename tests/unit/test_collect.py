@@ -13,8 +13,8 @@ from hardware.collect import COLUMNS, Collection, WorkFrame, collect, draw_conta
 from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject, matrix_of
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
-from twin.mounting import Mounting
 from twin.recordings import open_recording, read_image
+from twin.rig.mounting import Mounting
 from twin.types import Form
 
 LATE_S = 0.15  # of the late camera: a frame arrives so long after its exposure

@@ -7,7 +7,7 @@ import pytest
 from small_generation import small_config
 
 from training.validation.model import ContactModel
-from twin.kinematics import ArmLabel, arm_path
+from twin.rig.labels import ArmLabel
 from twin.types import Form
 
 ACROSS = 8
@@ -25,9 +25,8 @@ def model_of(config, **rig):
 
 
 def force_across_n(model, label):
-    way = arm_path(model.rig, model.experiment, model.spec, model.stimulus, label)
-    state = list(model.solver.path(model.stimulus, way.path, friction=model.rig.friction, **model.yields))[-1][1]
-    return float(state.T_sensor_object[:3, 0] @ state.force_n), float(state.force_n[2])
+    state = model.contact.end(label)
+    return float(model.contact.law.given_way.across @ state.force_n if model.contact.law.given_way else 0.0), float(state.force_n[2])
 
 
 def test_turned_by_the_force_across(config):

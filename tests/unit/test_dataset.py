@@ -9,9 +9,10 @@ from drawn_frames import drawn_frame, smooth_warp
 
 from scenes import load_sensor
 from training.dataset import load_dataset, split_rows
-from training.targets import DEPTH_PER_MOVE, corrected, unit_of
+from training.targets import corrected, unit_of
 from twin.errors import FrameError
 from twin.preprocess import make_reference, nominal_reference
+from twin.rig.labels import label_slope, plate_slope
 from twin.types import Form
 
 SENSOR = "mg400-127"
@@ -119,8 +120,20 @@ def test_copies_of_a_row_stay_together(tmp_path):
     assert not set(both.group[train]) & set(both.group[held])
 
 
-def test_the_plates_tilt_of_labels_and_twin_is_the_same_plates():
+@pytest.mark.parametrize("name", ["mg400-331", "mg400-127"])
+def test_the_plates_tilt_of_labels_and_twin_is_the_same_plates(name):
     """Two fits of one plate: what labels are corrected by, and where the twin has the plate."""
-    for name, depth_per_move in DEPTH_PER_MOVE.items():
-        twins = np.tan(np.radians(load_sensor(name).rig.plate_tilt_deg))
-        assert abs(LARGEST_MOVE_MM * (twins - depth_per_move)) < SAME_PLATE_MM
+    rig = load_sensor(name).rig
+    assert label_slope(rig) == rig.label_depth_per_move != plate_slope(rig)
+    assert abs(LARGEST_MOVE_MM * (plate_slope(rig) - label_slope(rig))) < SAME_PLATE_MM
+
+
+def test_a_recordings_depth_is_corrected_by_its_sensors_rig(tmp_path):
+    """By what the specification says, whatever the sensor is called; without that number by the tilt of its plate."""
+    rows = ["f_0.png,-1,5,4,2", "f_1.png,-2,5,-3,2"]
+    spec = write_recording(tmp_path / "r", rows, ["f_0.png", "f_1.png"])
+    (tmp_path / "r" / "move_executed.csv").write_text("image_name,executed\nf_0.png,0\nf_1.png,1\n")
+    for number, slope in ((0.02, 0.02), (None, np.tan(np.radians(spec.rig.plate_tilt_deg)))):
+        rig = spec.rig.model_copy(update={"label_depth_per_move": number})
+        own = spec.model_copy(update={"name": "mine", "rig": rig})
+        assert load_dataset(tmp_path / "r", own).targets.corrected[:, 0].tolist() == pytest.approx([-1 + 4 * slope, -2])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from training.sim_to_real.discrepancy import FEWEST, FRICTIONS, Discrepancy, Residuals, _likeliest, label_axes
-from twin.kinematics import ArmLabel
+from twin.rig.labels import ArmLabel
 
 PINS = 30
 RECOVERED = 0.25  # of what was missing may be left, on labels between those that were learnt from

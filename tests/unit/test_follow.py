@@ -7,11 +7,13 @@ from scenes import load_object, load_sensor
 from twin.errors import ContactError
 from twin.geometry.solid import Resolution
 from twin.mechanics.follow import Follower
+from twin.mechanics.law import ContactLaw
 from twin.mechanics.path import ContactPath
 from twin.mechanics.solver import SkinSolver
 
 SAME_N = 2e-3  # the solvers choose their load steps differently; friction remembers the way there
 COARSE = Resolution(across=8)
+OWN = ContactLaw.of_object(load_object("plane")).override(compliance_mm_per_n=0.068)
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +30,10 @@ def plate(indent_mm: float, along_mm: float = 0.0, *, radius_mm: float = 20.0) -
 def test_pose_by_pose_it_is_what_the_path_gives(solver):
     plane = load_object("plane")
     stops = [plate(-0.5), plate(1.0), plate(2.0), plate(2.0, 1.0)]
-    follower = Follower(solver, plane)
+    follower = Follower(solver, plane, OWN)
     for k, stop in enumerate(stops):
         followed = follower.move(stop, float(k))
-    *_, (_, wanted) = solver.path(plane, ContactPath(np.stack(stops)), compliance_mm_per_n=solver.spec.rig.compliance_mm_per_n)
+    *_, (_, wanted) = solver.path(plane, ContactPath(np.stack(stops)), law=OWN)
     assert followed.force_n[2] > 0.1 and abs(followed.force_n[0]) > 0.02
     np.testing.assert_allclose(followed.force_n, wanted.force_n, atol=0.02 * np.linalg.norm(wanted.force_n))
     np.testing.assert_allclose(followed.caps_mm, wanted.caps_mm, atol=0.02)
@@ -40,7 +42,7 @@ def test_pose_by_pose_it_is_what_the_path_gives(solver):
 def test_the_way_there_is_remembered(solver):
     """Pressed and then dragged is another state than dragged in the air and then pressed."""
     plane = load_object("plane")
-    pressed_first, dragged_first = Follower(solver, plane), Follower(solver, plane)
+    pressed_first, dragged_first = Follower(solver, plane, OWN), Follower(solver, plane, OWN)
     for k, T in enumerate([plate(-0.5), plate(2.0), plate(2.0, 1.5)]):
         one = pressed_first.move(T, float(k))
     for k, T in enumerate([plate(-0.5), plate(-0.5, 1.5), plate(2.0, 1.5)]):
@@ -50,7 +52,7 @@ def test_the_way_there_is_remembered(solver):
 
 
 def test_it_lets_go_and_begins_again(solver):
-    follower = Follower(solver, load_object("plane"))
+    follower = Follower(solver, load_object("plane"), OWN)
     follower.move(plate(-1.0), 0.0)
     first = follower.move(plate(1.5), 1.0)
     follower.move(plate(1.5, 2.0), 2.0)
@@ -64,20 +66,20 @@ def test_it_lets_go_and_begins_again(solver):
 
 
 def test_a_pose_that_stays_costs_and_changes_nothing(solver):
-    follower = Follower(solver, load_object("plane"))
+    follower = Follower(solver, load_object("plane"), OWN)
     follower.move(plate(-1.0), 0.0)
     state = follower.move(plate(1.0), 1.0)
     assert follower.move(plate(1.0), 2.0) is state
 
 
 def test_it_may_begin_in_contact(solver):
-    follower = Follower(solver, load_object("plane"))
+    follower = Follower(solver, load_object("plane"), OWN)
     state = follower.move(plate(1.0), 0.0)
     assert state.force_n[2] > 0
 
 
 def test_too_deep_is_an_error_and_coming_back_is_not(solver):
-    follower = Follower(solver, load_object("plane"))
+    follower = Follower(solver, load_object("plane"), OWN)
     follower.move(plate(-1.0), 0.0)
     with pytest.raises(ContactError, match="inside the dome"):
         follower.move(plate(15.0), 1.0)
@@ -86,7 +88,7 @@ def test_too_deep_is_an_error_and_coming_back_is_not(solver):
 
 def test_a_long_way_around_a_can_does_not_wear_it_out(solver):
     """Slid along a curved surface at one depth, the force settles."""
-    follower = Follower(solver, load_object("can"))
+    follower = Follower(solver, load_object("can"), ContactLaw.of_object(load_object("can")))
     forces = []
     for k in range(45):
         turn = -max(0, k - 4) / 33.0
@@ -103,7 +105,7 @@ def test_a_long_way_around_a_can_does_not_wear_it_out(solver):
 
 def test_warmed_up_it_is_as_new(solver):
     plane = load_object("plane")
-    warm, cold = Follower(solver, plane), Follower(solver, plane)
+    warm, cold = Follower(solver, plane, OWN), Follower(solver, plane, OWN)
     warm.warm_up()
     for k, stop in enumerate([plate(-0.5), plate(1.5)]):
         one, other = warm.move(stop, float(k)), cold.move(stop, float(k))
@@ -113,7 +115,7 @@ def test_warmed_up_it_is_as_new(solver):
 def test_skin_is_not_carried_past_wires():
     """Load steps stay below a wire's radius: farther, skin ends up beneath a wire and hooks; the mesh drags far less than it is pressed."""
     can = load_object("mesh-can")
-    follower = Follower(SkinSolver(load_sensor("mg400-331")), can)
+    follower = Follower(SkinSolver(load_sensor("mg400-331")), can, ContactLaw.of_object(can))
     for k, T in enumerate([plate(-2.0), plate(2.0)]):
         follower.move(T, float(k))
     for k in range(6):

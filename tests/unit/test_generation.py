@@ -15,18 +15,18 @@ from scenes import load_sensor
 from training.dataset import load_dataset, split_rows
 from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
-from training.recorded_contact import read_arm_labels
 from training.run import fold_rows
 from training.sim_to_real.study import arm_labels, with_missing
-from training.targets import corrected, read_executed
+from training.targets import corrected
 from twin.errors import ContactError, RenderError, StoreError
 from twin.geometry.solid import Resolution
-from twin.kinematics import arm_path, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import nominal_reference
 from twin.preprocess.forms import raw_to_recording
 from twin.projection import project
-from twin.stimulus import build_field
+from twin.rig.contact import RigContact
+from twin.rig.kinematics import rig_of
+from twin.rig.labels import read_arm_labels, read_executed
 from twin.store import atomic, locked
 from twin.types import Form
 
@@ -101,13 +101,12 @@ def test_a_state_on_the_way_is_the_end_of_its_own_label(tmp_path):
     truth = zarr.open_group(tmp_path / "set" / "truth.zarr", mode="r")
     labels = read_arm_labels(_recording(tmp_path / "set", config))
     path_of, fraction = truth["path_id"][:], truth["fraction"][:]
-    solver, stimulus = SkinSolver(config.sensor, resolution=Resolution(config.across)), build_field(config.object)
+    contact = RigContact(SkinSolver(config.sensor, resolution=Resolution(config.across)), config.experiment, config.object)
     for path in range(2):
         rows = np.flatnonzero(path_of == path)
         assert (np.diff(fraction[rows]) > 0).all() and fraction[rows[-1]] == 1
         for row in rows[[1, -2]]:
-            way = arm_path(rig_of(config.sensor), config.experiment, config.sensor, stimulus, labels[row])
-            state = solver.press(stimulus, way.path, friction=0.0)
+            state = contact.end(labels[row], friction=0.0)
             assert np.abs(state.T_sensor_object - truth["T_sensor_object"][row]).max() < ARC_MM
             px = raw_to_recording(config.sensor, project(config.sensor.view, state.caps_mm))
             assert np.abs(px - truth["caps_px"][row]).max() < SAME_STATE_PX

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
-from scenes import RigSpec, load_experiment, load_sensor
+from scenes import RigSpec, load_experiment, load_object, load_sensor
 from twin.errors import ContactError
-from twin.kinematics import TURNING, ArmLabel, arm_path, arm_turning, object_pose, rig_of
+from twin.rig.contact import contact_law
+from twin.rig.kinematics import TURNING, arm_path, object_pose, rig_of
+from twin.rig.labels import ArmLabel
+from twin.rig.mounting import Mounting
 from twin.stimulus.analytic import Plane
 
 EXACT_MM = 1e-9
@@ -22,7 +25,7 @@ def label(depth, angle, move_mm, move_deg, executed=True):
 
 
 def way(rig, *numbers):
-    return arm_path(rig, SURFACE, SENSOR, Plane(), label(*numbers))
+    return arm_path(rig, SURFACE, SENSOR.skin, Plane(), label(*numbers))
 
 
 def carried(path, start, stop, points):
@@ -133,19 +136,22 @@ def test_an_edge_lies_where_its_label_says():
 def test_every_label_of_the_recordings_leads_somewhere(name):
     generator, sensor = np.random.default_rng(0), load_sensor(name)
     for numbers in generator.uniform([-4, -20, -5, -5], [0, 20, 5, 5], (20, 4)):
-        made = arm_path(rig_of(sensor), SURFACE, sensor, Plane(), label(*numbers))
+        made = arm_path(rig_of(sensor), SURFACE, sensor.skin, Plane(), label(*numbers))
         assert made.touches and 0.5 < indentation_mm(made.path.poses[1]) < 7.5
 
 
 @pytest.mark.parametrize(("approach", "sign"), [("x", 1), ("y", 1), ("y", -1), ("z", -1)])
 def test_an_arm_that_turns_under_a_force_is_where_a_larger_angle_would_have_sent_it(approach, sign):
     plan = load_experiment("surface-2d").model_copy(update={"approach": approach})
-    rig = RigSpec(tcp_to_dome_mm=-17.0, tcp_lateral_mm=0.7, turn_sign=sign, image_turn_deg=80.0, plate_tilt_deg=-1.0)
+    rig = RigSpec(tcp_to_dome_mm=-17.0, tcp_lateral_mm=0.7, tcp_aside_mm=0.4, turn_sign=sign, image_turn_deg=80.0, plate_tilt_deg=-1.0)
     pose, further = np.zeros(6), np.zeros(6)
     pose[TURNING[approach]] = 12.0
     further[TURNING[approach]] = 12.0 + 0.6
     sent = object_pose(rig, plan, pose, 20.0)
-    assert arm_turning(rig, plan) is None
-    turned = arm_turning(rig.model_copy(update={"turn_compliance_deg_per_n": 0.3}), plan)
-    assert np.allclose(turned(sent, 2.0 * sent[:3, 0] + 5.0 * sent[:3, 2]), object_pose(rig, plan, further, 20.0), atol=1e-9)
-    assert np.allclose(turned(sent, 5.0 * sent[:3, 2]), sent)
+    mounting, plane = Mounting.on(rig, plan, 20.0), load_object("plane")
+    assert contact_law(rig, mounting, plane).given_way is None
+    turning = contact_law(rig.model_copy(update={"turn_compliance_deg_per_n": 0.3}), mounting, plane).pose
+    across, aside = mounting.across_in_sensor, np.cross([0.0, 0.0, 1.0], mounting.across_in_sensor)
+    force_n = 2.0 * across + 5.0 * np.array([0.0, 0.0, 1.0]) + 3.0 * aside
+    assert np.allclose(turning(sent, force_n), object_pose(rig, plan, further, 20.0), atol=1e-9)
+    assert np.allclose(turning(sent, force_n - 2.0 * across), sent)

@@ -7,7 +7,7 @@ from hardware.rig_geometry import PlacedObject, matrix_of, moved, pose_of
 from hardware.servo import Memory, Reading, reading_at, servo_step, tangent_of
 from hardware.trajectory import jerk, local_smoothness, lost_contacts, smoothness, way_along
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 
 EXACT_MM = 1e-9
 SERVO = load_servo("surface")

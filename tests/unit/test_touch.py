@@ -5,7 +5,6 @@ import pytest
 from drawn_frames import drawn_frame
 
 from scenes import load_object, load_sensor
-from training.labels import read_surface_labels
 from twin.errors import FrameError
 from twin.geometry.pins import rest_pins
 from twin.geometry.solid import Resolution
@@ -16,6 +15,7 @@ from twin.preprocess.forms import from_raw
 from twin.preprocess.touch import MOST_DENT, dent_of
 from twin.projection import project
 from twin.recordings import open_recording
+from twin.rig.labels import read_arm_labels
 from twin.robustness.condition import revised
 from twin.types import Form
 
@@ -119,7 +119,6 @@ def test_a_real_contact_is_told(real_dir, folder, name):
     print(f"\n{folder} in contact: {dents.min():.4f} to {dents.max():.4f}, {told.mean():.0%} told")
     assert told.mean() > LEAST_TOLD
     if name.startswith("mg400"):
-        labels = read_surface_labels(real_dir / folder)
-        depth_of = dict(zip(labels.image_name, labels.depth_mm + 5.0, strict=True))  # about
-        deep = np.array([depth_of[recording.names[row]] for row in rows]) > TOLD_MM
+        labels = read_arm_labels(recording)
+        deep = np.array([labels[row].pose[1] + 5.0 for row in rows]) > TOLD_MM  # taps of 5 mm
         assert told[deep].all()

@@ -1,6 +1,6 @@
 """What training on several objects is worth on an object that was never touched, beside training on the first of them alone.
 
-All contacts are simulated, pins alone. Labels mean the same on every object (``twin.touch``). Both models learn from as many
+All contacts are simulated, pins alone. Labels mean the same on every object (``twin.rig.touch``). Both models learn from as many
 contacts; every object's errors are those on contacts of its own that no model has seen.
 """
 

@@ -22,7 +22,7 @@ from training.contact_calibration.parameters import changed, values_of
 from training.contact_calibration.simulate import Setup
 from training.validation.model import MeasuredFrames
 from twin.errors import FrameError
-from twin.kinematics import rig_of
+from twin.rig.kinematics import rig_of
 
 INDEPENDENT = 6.0  # n above: modes of the displacement that carry nearly all of it
 ROUNDS = 3

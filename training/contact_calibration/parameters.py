@@ -7,7 +7,7 @@ import numpy as np
 
 from scenes.experiment import ExperimentSpec
 from scenes.sensor import SensorSpec
-from twin.kinematics import TURNING, rig_of
+from twin.rig.kinematics import TURNING, rig_of
 
 LEAST = 1e-3  # of a number whose logarithm is fitted
 

@@ -7,7 +7,7 @@ import numpy as np
 from training.contact_calibration.fit import INDEPENDENT, ContactFit
 from training.contact_calibration.simulate import Setup
 from training.validation.model import MeasuredFrames
-from twin.kinematics import rig_of
+from twin.rig.kinematics import rig_of
 from twin.store import made_by, write_json, write_text
 from twin.views.page import render_page
 from twin.views.plots import draw_displacement, new_figure

@@ -14,7 +14,7 @@ from training.contact_calibration.parameters import PARAMETERS
 from training.contact_calibration.report import summary_of, write_calibration
 from training.contact_calibration.simulate import Setup
 from training.validation.model import MeasuredFrames, measure_frames
-from twin.kinematics import rig_of
+from twin.rig.kinematics import rig_of
 from twin.types import FINE, Form
 
 MOST_HELD_OUT = 20

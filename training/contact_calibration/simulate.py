@@ -16,7 +16,7 @@ from training.contact_calibration.parameters import PARAMETERS, changed
 from training.generation.work import outcomes
 from training.validation.model import ContactModel
 from twin.errors import ContactError
-from twin.kinematics import ArmLabel
+from twin.rig.labels import ArmLabel
 from twin.store import Item, find_arrays, inputs_digest, keep_arrays
 from twin.types import Form
 

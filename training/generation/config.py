@@ -13,7 +13,8 @@ from scenes.object import ObjectSpec
 from scenes.randomisation import FrictionSpread, RandomisationSpec, number_type
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError, TwinError
-from twin.kinematics import ArmLabel, rig_of
+from twin.rig.kinematics import rig_of
+from twin.rig.labels import ArmLabel
 from twin.types import FINE, Form
 
 

@@ -9,12 +9,12 @@ import numpy as np
 from training.generation.config import DatasetError, Draw, GenerationConfig, draw_contact
 from twin.errors import ContactError, MeshError
 from twin.geometry.solid import Resolution
-from twin.kinematics import ArmLabel, arm_path, giving_way, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.optics.variant import one_thread
 from twin.preprocess.forms import gray_levels
+from twin.rig.contact import RigContact
+from twin.rig.labels import ArmLabel
 from twin.simulator import Simulator
-from twin.stimulus import build_field
 from twin.truth import cap_truth
 from twin.types import ContactState
 
@@ -75,11 +75,9 @@ def make_contact(text: str, index: int) -> Outcome:
 
 def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
     simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, keep=False)
-    stimulus = build_field(config.object)
-    rig = rig_of(draw.sensor)
-    way = arm_path(rig, config.experiment, draw.sensor, stimulus, draw.label)
-    yields = giving_way(rig, config.experiment, config.object)
-    found = list(simulator.solver.path(stimulus, way.path, friction=draw.friction, **yields))
+    contact = RigContact(simulator.solver, config.experiment, config.object)
+    way = contact.way(draw.label)
+    found = list(contact.along(way, friction=draw.friction))
     labels = [way.label(fraction) for fraction, _ in found[:-1]] + [draw.label]
     kept = range(len(found)) if config.states == "all" else [len(found) - 1]
     images, rows = [], []

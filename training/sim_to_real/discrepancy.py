@@ -25,7 +25,8 @@ from training.contact_calibration.parameters import PARAMETERS
 from training.contact_calibration.simulate import Setup
 from training.recipes import TrainingError
 from training.validation.model import MeasuredFrames
-from twin.kinematics import ArmLabel, rig_of
+from twin.rig.kinematics import rig_of
+from twin.rig.labels import ArmLabel
 
 FRICTION = next(parameter for parameter in PARAMETERS if parameter.name == "rig.friction")
 FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)  # of a frame, between which it is sought; the last is stick

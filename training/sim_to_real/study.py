@@ -13,16 +13,15 @@ from training.assemble import intervals, kernel_inputs
 from training.cokriging import fit_cokriging
 from training.dataset import Dataset, joined, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
-from training.evaluate import judge, leak_slope, predict_rows_of
+from training.evaluate import judge, leak_check, predict_rows_of
 from training.recipes import TrainingError, recipe_of
-from training.recorded_contact import read_arm_labels
 from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors
 from training.sim_to_real.discrepancy import Discrepancy
 from training.simulated import config_of, is_pins_only, open_simulated
 from training.validation.model import MeasuredFrames
-from twin.kinematics import ArmLabel
 from twin.recordings import open_recording
+from twin.rig.labels import ArmLabel, read_arm_labels
 from twin.store import write_text
 
 TWIN_EPOCHS = 60  # on thousands of simulated states: more change nothing
@@ -217,4 +216,4 @@ def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) 
     for kind in ("corrected", "raw"):
         errors = np.abs(made - getattr(targets, kind)).mean(axis=0)
         row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}
-    return row | {"leak_slope": leak_slope(made, targets)}
+    return row | {"leak_slope": leak_check(made, targets).slope}

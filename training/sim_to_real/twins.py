@@ -12,7 +12,7 @@ from scenes.sensor import SensorSpec
 from training.dataset import Dataset
 from training.generation import GenerationConfig
 from training.sim_to_real.discrepancy import FRICTIONS
-from twin.kinematics import rig_of
+from twin.rig.kinematics import rig_of
 
 COARSE = 12  # elements across
 FEW = 0.2  # of the contacts

@@ -13,17 +13,17 @@ import numpy as np
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from training.recorded_contact import read_arm_labels
 from twin.errors import FrameError
 from twin.geometry.solid import Resolution
-from twin.kinematics import ArmLabel, arm_path, giving_way, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline
 from twin.preprocess.batch import recording_reference
 from twin.preprocess.forms import from_raw
 from twin.projection import project
 from twin.recordings import open_recording
-from twin.stimulus import build_field
+from twin.rig.contact import RigContact
+from twin.rig.kinematics import rig_of
+from twin.rig.labels import ArmLabel, read_arm_labels
 from twin.types import FINE, Form
 
 _SAME = 1e-9  # of the way: fractions that mean the same pose
@@ -106,9 +106,9 @@ class ContactModel:
 
     def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
         self.spec, self.experiment, self.form = spec, experiment, form
-        self.rig, self.stimulus = rig_of(spec), build_field(touched)
-        self.yields = giving_way(self.rig, experiment, touched)
+        self.rig = rig_of(spec)
         self.solver = SkinSolver(spec, resolution=Resolution(across), keep=False)
+        self.contact = RigContact(self.solver, experiment, touched)
         self.rest_px = self._pixels(self.solver.rest().caps_mm)
 
     def displacement_px(self, label: ArmLabel, friction: float | None = None) -> np.ndarray:
@@ -123,13 +123,12 @@ class ContactModel:
 
     def displacements_px(self, label: ArmLabel, friction: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The same after the tap, and at the end: after the move, if it was executed."""
-        way = arm_path(self.rig, self.experiment, self.spec, self.stimulus, label)
+        way = self.contact.way(label)
         if not way.touches and not label.executed:
             return np.zeros_like(self.rest_px), np.zeros_like(self.rest_px)
         tap_ends = 1 / (len(way.labels) - 1) if way.touches else 0.0
         tapped_mm = self.solver.rest().caps_mm
-        friction = self.rig.friction if friction is None else friction
-        for fraction, state in self.solver.path(self.stimulus, way.path, friction=friction, **self.yields):
+        for fraction, state in self.contact.along(way, friction=friction):
             if fraction <= tap_ends + _SAME:
                 tapped_mm = state.caps_mm
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px

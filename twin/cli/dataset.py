@@ -92,8 +92,8 @@ def dataset(
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation import GenerationConfig, generate
     from twin.cli.progress import rate_bar
-    from twin.kinematics import rig_of
     from twin.preprocess.forms import frame_size
+    from twin.rig.contact import friction_between
 
     spec, plan = load_sensor(sensor), load_experiment(experiment)
     touched = load_object(object_ or plan.object)
@@ -102,7 +102,7 @@ def dataset(
         object=touched,
         experiment=plan,
         randomisation=load_randomisation(randomise) if randomise else None,
-        friction=rig_of(spec).friction if object_ is None and spec.rig else touched.friction,
+        friction=friction_between(spec.rig, touched).static,
         seed=plan.seed if seed is None else seed,
         images=images.value,
         states=states.value,

@@ -35,7 +35,7 @@ def camera(
     from hardware.rig_geometry import PlacedObject
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from twin.cli.rig import twin_camera
-    from twin.mounting import Mounting
+    from twin.rig.mounting import Mounting
     from twin.types import Form
 
     list_faults(fault, FAULTS)

@@ -62,6 +62,8 @@ def evaluate(
         )
     if metrics["leak_slope"] is not None:
         print(f"slope of the angle's error on move_6 where it was not executed: {metrics['leak_slope']:+.3f}")
+    else:
+        print(f"leak check not made: {metrics['leak_not_checked']}")
     ms = metrics["ms_per_frame"]
     print(f"{len(chosen)} frames" + ("" if ms is None else f", {ms:.1f} ms per frame (median, one thread)"))
     written = write_evaluation(out, made, found, chosen, metrics, labels)

@@ -20,9 +20,9 @@ from hardware.step import Estimator, LoopSettings
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
 from twin.errors import RenderError
-from twin.mounting import Mounting
 from twin.optics.preview import Preview, Shading
 from twin.optics.render import Renderer
+from twin.rig.mounting import Mounting
 from twin.store import cached_arrays
 from twin.types import Form, Frame
 

@@ -2,7 +2,8 @@
 
 from twin.mechanics.balance import Friction
 from twin.mechanics.batch import ContactJob, ContactOutcome, press_many
+from twin.mechanics.law import ContactLaw
 from twin.mechanics.path import ContactPath, ContactPose
 from twin.mechanics.solver import SkinSolver
 
-__all__ = ["ContactJob", "ContactOutcome", "ContactPath", "ContactPose", "Friction", "SkinSolver", "press_many"]
+__all__ = ["ContactJob", "ContactLaw", "ContactOutcome", "ContactPath", "ContactPose", "Friction", "SkinSolver", "press_many"]

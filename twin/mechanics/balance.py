@@ -31,6 +31,19 @@ class Body:
     free: np.ndarray
     sealed: bool
 
+    @property
+    def volume_force_n_per_mm3(self) -> float:
+        """Force that stands for 1 mm^3 of the gel's volume gained or lost, so that both can be measured in N; 0 for an open gel.
+
+        It is mu A / V with the gel's shear modulus mu (at small strain) and rest volume V and the skin's area A: what a stress mu
+        on the whole skin is for the whole volume. The ratio is the same in any unit of length.
+        """
+        if not self.sealed:
+            return 0.0
+        gel = self.kinds[1:]
+        shear_modulus_mpa = 2 * float(gel[0].law[0] + gel[0].law[1])
+        return shear_modulus_mpa * float(self.points.area_mm2.sum()) / sum(kind.rest_volume_mm3 for kind in gel)
+
 
 @dataclass(frozen=True)
 class Friction:
@@ -97,6 +110,8 @@ class Balance:
         Sum of the contact forces.
     elastic_nmm : float
         Energy stored in the body.
+    volume_force_n_per_mm3 : float
+        See ``Body``.
     """
 
     elastic: np.ndarray
@@ -106,11 +121,13 @@ class Balance:
     point_force_n: np.ndarray
     scale_n: float
     elastic_nmm: float
+    volume_force_n_per_mm3: float
 
     @property
     def absolute(self) -> float:
-        """Norm of the residual in N."""
-        return float(np.hypot(np.linalg.norm(self.residual), np.linalg.norm(self.border_residual)))
+        """Norm of the residual in N, the gel's change of volume counted as a force."""
+        yielding_n, volume_mm3 = self.border_residual
+        return float(np.linalg.norm([np.linalg.norm(self.residual), yielding_n, self.volume_force_n_per_mm3 * volume_mm3]))
 
     @property
     def relative(self) -> float:
@@ -128,6 +145,7 @@ class Problem:
 
     def __init__(self, body: Body, stimulus, law: Friction, compliance: float, state: LoadState, anchor_mm, looked, penalty, T, given):
         self.body, self.compliance, self._stimulus = body, compliance, stimulus
+        self.volume_force_n_per_mm3 = body.volume_force_n_per_mm3
         self._given, self.T = given, T
         self.looked, self.penalty = looked, penalty
         points = body.points
@@ -162,7 +180,9 @@ class Problem:
             border_residual[1] = self.volume(control, np.zeros_like(control))
             elastic_nmm -= border[1] * border_residual[1]
         scale = max(float(np.linalg.norm(force, axis=1).sum()), FORCE_FLOOR_N)
-        return Balance(elastic, residual[body.free].ravel(), border_residual, contact, force, scale, elastic_nmm)
+        return Balance(
+            elastic, residual[body.free].ravel(), border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3
+        )
 
     def stiffness(self, control, border, blocks) -> None:
         """The elements' tangents into ``blocks``."""

@@ -103,7 +103,9 @@ class Near:
 class SmallContact:
     """Contact against the eliminated body: unknowns are the touched controls' moves, the object's yield and the gel's pressure.
 
-    S dz + v dp + r = forces of contact,   (w + dw) / c + sum f_z = 0,   v . dz + q dp + g = 0
+    S dz + v dp + r = forces of contact,   (w + dw) / c + sum f_z = 0,   k (v . dz + q dp + g) = 0
+
+    k turns a volume into a force (``Body.volume_force_n_per_mm3``), so that all residuals are in N and have one norm.
     """
 
     def __init__(
@@ -186,7 +188,7 @@ class SmallContact:
         if problem.compliance:
             out[-2] = border[0] / problem.compliance + force_z
         if problem.body.sealed:
-            out[-1] = self._g + self._v @ y[:-2] + self._q * y[-1]
+            out[-1] = problem.volume_force_n_per_mm3 * (self._g + self._v @ y[:-2] + self._q * y[-1])
         return out, contact
 
     def _factorise(self, contact: ContactForces, soften: float) -> None:
@@ -205,8 +207,9 @@ class SmallContact:
             matrix[:count, count], matrix[count, :count] = column[:-1].ravel(), row[:-1].ravel()
             matrix[count, count] = 1 / problem.compliance + stiffness[:, 2, 2].sum()
         if problem.body.sealed:
-            matrix[:count, count + 1] = matrix[count + 1, :count] = self._v
-            matrix[count + 1, count + 1] = self._q
+            matrix[:count, count + 1] = self._v
+            matrix[count + 1, :count] = problem.volume_force_n_per_mm3 * self._v
+            matrix[count + 1, count + 1] = problem.volume_force_n_per_mm3 * self._q
         factors, pivots, _ = lapack.sgetrf(matrix, overwrite_a=1)
         self._near.solved = soften, factors, pivots
 

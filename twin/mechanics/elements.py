@@ -70,6 +70,11 @@ class Elements:
             cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), np.zeros(0), control_mm, np.zeros((0, 8, 3, 3)), 1.0, out
         )
 
+    @property
+    def rest_volume_mm3(self) -> float:
+        """Volume at rest, in the unit of ``add_volume``."""
+        return float(self.cells.weights_mm3.sum())
+
     def distortion_stress(self, control_mm: FloatArray) -> FloatArray:
         """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa."""
         cells = self.cells

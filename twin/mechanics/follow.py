@@ -1,44 +1,52 @@
-"""The sensor's state while an object is moved about it, pose by pose, as it comes: with a memory, and without an end."""
+"""The sensor's state while an object is moved about it, pose by pose, as the poses come: with a memory, and without an end."""
+
+from itertools import pairwise
 
 import numpy as np
 
 from scenes.object import ObjectSpec
 from twin.errors import ContactError
 from twin.geometry.chart import Focus
+from twin.mechanics.law import ContactLaw
 from twin.mechanics.ongoing import OngoingContact
 from twin.mechanics.path import ContactPath, carried, deepest_mm, dome_directions
-from twin.mechanics.solver import SkinSolver, friction_of
+from twin.mechanics.solver import SkinSolver
 from twin.stimulus import build_field
 from twin.types import ContactState
 
 STEP_MM = 1.2  # largest motion across the contact in one load step
-FINE_STEP_MM = 0.6  # beside features as fine as wires: a longer one carries skin past a wire's middle, where it then hooks
-LARGEST_MOVE_MM = 30.0  # from one pose to the next in contact: farther, the way between them isn't known
-_DIRECTIONS = 2000  # on the sphere, to see where the object presses
-_KNOWN_RAD = np.radians(7.0)  # a pressed direction is provided for if one this near was
-_BACK_MM = 1.0  # stride when a free pose is looked for
+FINE_STEP_MM = 0.6  # the same beside wires: a longer step carries skin past a wire's middle, where it then hooks
+LARGEST_MOVE_MM = 30.0  # largest motion between two poses in contact; beyond it the way between them is unknown
+SETTLED_MM = 0.005  # most that the dome still has to move where the arm has given way: 0.02 px in the shipped cameras
+_MOST_SETTLING = 8  # load steps until an arm that gives way stands; one or two are usual
+_DIRECTIONS = 2000  # directions on the whole sphere, in which the object is looked for
+_KNOWN_RAD = np.radians(7.0)  # the solver is ready for a pressed direction this near to one that was pressed before
+_BACK_MM = 1.0  # stride of the search for a free pose
+_WHERE = "following the object"  # what an error names
 
 
 class Follower:
     """Follows one object with one sensor.
 
-    Where the object comes to press the skin a contact begins; it goes on, with all that friction remembers, until the
-    object has left the undeformed dome. A contact that can't be carried on is begun anew from the object's retreat along
-    the sensor's axis (``restarts`` counts these).
+    A contact begins where the object comes to press the skin. It goes on, with all that friction remembers, until the object has
+    left the undeformed dome. A contact that cannot be carried on is begun anew from the object's retreat along the sensor's axis
+    (``restarts`` counts these).
+
+    Poses are those commanded. Where the law lets the arm give way, each move ends where force and giving way balance.
 
     Parameters
     ----------
     solver : SkinSolver
-    stimulus : ObjectSpec
+    touched : ObjectSpec
+    law : ContactLaw
+        How the two rub and give way: of an arm from ``twin.rig.contact.contact_law``.
     step_mm : float, optional
         Largest motion across the contact in one load step; by default what the object's features allow.
     """
 
-    def __init__(self, solver: SkinSolver, stimulus: ObjectSpec, *, step_mm: float | None = None):
-        self._solver, self._step_mm = solver, step_mm or _step_of(stimulus)
-        self._field = build_field(stimulus)
-        rig = solver.spec.rig
-        self._law, self._compliance = friction_of(stimulus), stimulus.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
+    def __init__(self, solver: SkinSolver, touched: ObjectSpec, law: ContactLaw, *, step_mm: float | None = None) -> None:
+        self._solver, self._law, self._step_mm = solver, law, step_mm or _step_of(touched)
+        self._field = build_field(touched)
         self._radius_mm = solver.spec.skin.outer_radius_mm
         self._dome_mm = self._radius_mm * dome_directions(solver.spec.skin, _DIRECTIONS)
         self._rest = solver.rest()
@@ -96,14 +104,15 @@ class Follower:
         limit = deepest_mm(self._solver.spec.geometry)
         if (deep := -self.gap_mm(T)) > limit:
             raise ContactError(f"the object is {deep:.1f} mm inside the dome, more than {limit:.1f} (half the gel's depth); move away")
-        near = self._T is not None and np.linalg.norm(carried(self._dome_mm, self._T, T), axis=1).max() < LARGEST_MOVE_MM
-        if near and (self._contact is not None or self.gap_mm(self._T) > 0):
+        last = self._T
+        near = last is not None and np.linalg.norm(carried(self._dome_mm, last, T), axis=1).max() < LARGEST_MOVE_MM
+        if last is not None and near and (self._contact is not None or self.gap_mm(last) > 0):
             try:
-                self._go(self._T, T, self._time_s, time_s)
+                self._go(last, T, self._time_s, time_s)
                 return
             except ContactError:
                 self.restarts += 1
-        self._contact = None
+        self._contact, self._state = None, self._rest
         self._go(self._retreat(T), T, time_s - 1.0, time_s)
 
     def _retreat(self, T: np.ndarray) -> np.ndarray:
@@ -120,22 +129,37 @@ class Follower:
         pressed = self._gaps(stop) < 0
         if self._contact is None:
             self._reached = self._dome_mm[pressed] / self._radius_mm
-            self._contact = self._solver.begin(self._field, self._law, self._compliance, self._reached, start, focus=Focus())
+            self._contact = self._solver.begin(self._field, self._law, self._reached, start, focus=Focus())
         elif not self._provided(self._dome_mm[pressed]):
             self._reached = self._dome_mm[pressed] / self._radius_mm
-            self._solver.reach(self._contact, self._field, self._law, self._compliance, self._reached)
+            self._solver.reach(self._contact, self._field, self._law, self._reached)
         moved = np.linalg.norm(carried(self._dome_mm[pressed], start, stop), axis=1).max()
         count = max(1, int(np.ceil(moved / self._step_mm)))
-        stops = np.linspace(0, 1, count + 1)
-        for before, after in zip(stops[:-1], stops[1:], strict=True):
-            for _, state in self._contact.advance(way.at, before, after, way.time_s, "following the object"):
+
+        def pose_at(progress: float) -> np.ndarray:
+            return self._law.pose(way.at(progress), self._state.force_n)
+
+        for before, after in pairwise(np.linspace(0, 1, count + 1)):
+            for _, state in self._contact.advance(pose_at, before, after, way.time_s, _WHERE):
                 self._state = state
+        self._settle(self._contact, stop)
+
+    def _settle(self, contact: OngoingContact, T: np.ndarray) -> None:
+        """Take the pose that the last force gives, until that force no longer changes it; ``T`` (4, 4) is the commanded pose."""
+        for _ in range(_MOST_SETTLING):
+            there = self._law.pose(T, self._state.force_n)
+            if np.linalg.norm(carried(self._dome_mm, contact.load.T, there), axis=1).max() <= SETTLED_MM:
+                return
+            way = ContactPath(np.stack([contact.load.T, there]))
+            for _, state in contact.advance(way.at, 0.0, 1.0, lambda progress: 0.0, _WHERE):
+                self._state = state
+        raise ContactError("the arm gives way without an end under the contact's force; use less turn_compliance_deg_per_n or indentation")
 
     def _provided(self, pressed_mm: np.ndarray) -> bool:
         return bool((((pressed_mm / self._radius_mm) @ self._reached.T).max(axis=1) > np.cos(_KNOWN_RAD)).all())
 
 
-def _step_of(stimulus: ObjectSpec) -> float:
-    if stimulus.texture is not None:
-        return FINE_STEP_MM * min(1.0, stimulus.texture.wire_diameter_mm)
-    return FINE_STEP_MM if stimulus.shape.kind == "mesh" else STEP_MM
+def _step_of(touched: ObjectSpec) -> float:
+    if touched.texture is not None:
+        return FINE_STEP_MM * min(1.0, touched.texture.wire_diameter_mm)
+    return FINE_STEP_MM if touched.shape.kind == "mesh" else STEP_MM

@@ -18,6 +18,7 @@ from twin.geometry.view import NodeView
 from twin.mechanics.balance import Body, Friction
 from twin.mechanics.contact import contact_points
 from twin.mechanics.elements import Elements
+from twin.mechanics.law import ContactLaw
 from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
@@ -71,12 +72,13 @@ class SkinSolver:
         touched: ObjectField | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
+        law: ContactLaw | None = None,
         friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
         progress: Callable[[float, ContactState], object] | None = None,
     ) -> ContactState:
         """The state at the end of a contact; arguments and errors as ``path``."""
-        for at, state in self.path(touched, pose, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
+        for at, state in self.path(touched, pose, law=law, friction=friction, compliance_mm_per_n=compliance_mm_per_n):
             if progress is not None:
                 progress(at, state)
         return state
@@ -86,9 +88,9 @@ class SkinSolver:
         touched: ObjectField | ObjectSpec,
         pose: ContactPose | ContactPath,
         *,
+        law: ContactLaw | None = None,
         friction: float | Friction | None = None,
         compliance_mm_per_n: float | None = None,
-        given_way: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
         release: bool = False,
         step_mm: float = _STEP_MM,
     ) -> Iterator[tuple[float, ContactState]]:
@@ -97,12 +99,11 @@ class SkinSolver:
         Parameters
         ----------
         touched : ObjectField or ObjectSpec
-            With a bare ``ObjectField``, friction and compliance default to 0.
+        law : ContactLaw, optional
+            By default the object's own friction and compliance (``ContactLaw.of_object``), and none of a bare ``ObjectField``. For a
+            contact that an arm makes it comes from ``twin.rig.contact``. ``law.given_way`` gets the force of the load step before.
         friction, compliance_mm_per_n : optional
-            Override the object's.
-        given_way : callable, optional
-            How an arm that gives way changes the pose. It gets the path's ``T_sensor_object`` (4, 4) and the force on the object (3,)
-            in N that the load step before ended with, and returns the pose that is taken instead.
+            Override the law's.
         release : bool
             Afterwards lift the object off again, the way it came.
         step_mm : float
@@ -121,8 +122,9 @@ class SkinSolver:
             step and the residual.
         """
         spec, field = (touched, build_field(touched)) if isinstance(touched, ObjectSpec) else (None, touched)
-        law = friction_of(spec, friction)
-        compliance = compliance_mm_per_n if compliance_mm_per_n is not None else (spec.compliance_mm_per_n if spec else 0.0)
+        if law is None:
+            law = ContactLaw.of_object(spec) if spec else ContactLaw()
+        law = law.override(friction=friction, compliance_mm_per_n=compliance_mm_per_n)
         plan = pose if isinstance(pose, ContactPath) else plan_path(self.spec.geometry, field, pose)
         if release:
             plan = plan.there_and_back()
@@ -130,12 +132,12 @@ class SkinSolver:
             yield 1.0, self.rest(T_sensor_object=plan.at(1.0))
             return
         reached = self._reached(field, plan)
-        contact = self.begin(field, law, compliance, reached, plan.at(0.0), focus=_focus(reached))
+        contact = self.begin(field, law, reached, plan.at(0.0), focus=_focus(reached))
         stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
         force_n: FloatArray = np.zeros(3)
 
         def pose_at(progress: float) -> FloatArray:
-            return plan.at(progress) if given_way is None else given_way(plan.at(progress), force_n)
+            return law.pose(plan.at(progress), force_n)
 
         for number, (start, stop) in enumerate(pairwise(stops), 1):
             where = f"load step {number} of {len(stops) - 1} ({stop / stops[-1]:.0%} of the path)"
@@ -143,9 +145,7 @@ class SkinSolver:
                 force_n = state.force_n
                 yield float(at / stops[-1]), state
 
-    def begin(
-        self, field: ObjectField, law: Friction, compliance: float, reached: FloatArray, T: FloatArray, *, focus: Focus
-    ) -> OngoingContact:
+    def begin(self, field: ObjectField, law: ContactLaw, reached: FloatArray, T: FloatArray, *, focus: Focus) -> OngoingContact:
         """A contact at its start, the object at ``T`` and free of the skin.
 
         Parameters
@@ -156,14 +156,14 @@ class SkinSolver:
         with self._one_thread():
             setting = self._setting(focus)
         contact = OngoingContact(setting, T, self._one_thread)
-        self.reach(contact, field, law, compliance, reached)
+        self.reach(contact, field, law, reached)
         return contact
 
-    def reach(self, contact: OngoingContact, field: ObjectField, law: Friction, compliance: float, reached: FloatArray) -> None:
+    def reach(self, contact: OngoingContact, field: ObjectField, law: ContactLaw, reached: FloatArray) -> None:
         """Prepare the contact for an object that comes to press other directions (k, 3) of the dome than before."""
         with self._one_thread():
             frontal = self._frontal(contact.setting, reached)
-            contact.stepper = LoadStepper(contact.setting.body, frontal, field, law, compliance)
+            contact.stepper = LoadStepper(contact.setting.body, frontal, field, law.friction, law.compliance_mm_per_n)
 
     def _one_thread(self) -> AbstractContextManager[object]:
         """BLAS on one thread: the matrices are small, and the result must not depend on the number of cores."""
@@ -211,18 +211,6 @@ class SkinSolver:
             deepest = np.minimum(deepest, gap)
         pressed = deepest < 0
         return directions[pressed] if pressed.any() else directions[[deepest.argmin()]]
-
-
-def friction_of(spec: ObjectSpec | None, override: float | Friction | None = None) -> Friction:
-    """An object's friction, or what is given instead; none for a bare field."""
-    if isinstance(override, Friction):
-        return override
-    if override is not None:
-        return Friction(override, override)
-    if spec is None:
-        return Friction(0.0, 0.0)
-    kinetic = spec.friction if spec.kinetic_friction is None else spec.kinetic_friction
-    return Friction(spec.friction, kinetic, spec.slip_weakening_mm, spec.shear_strength_mpa or np.inf)
 
 
 def _focus(reached: FloatArray) -> Focus:

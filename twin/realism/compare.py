@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scenes import load_experiment
+from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
 from twin.camera import expose
 from twin.geometry.skin_fit import SkinFit
@@ -16,8 +18,19 @@ from twin.projection import project
 from twin.realism.disc import Disc
 from twin.realism.frames import RealFrame
 from twin.realism.images import ImageFigures, compare_images
-from twin.realism.poses import TapBank, TapMap, fit_taps, halves, mean_pin_error_px, tap, tap_labels
+from twin.realism.poses import (
+    EXPERIMENT,
+    PlateTaps,
+    TapBank,
+    bank_labels,
+    contacts_of,
+    fit_rig,
+    halves,
+    labels_of_rows,
+    mean_pin_error_px,
+)
 from twin.realism.statistics import Statistics, compare_statistics, measure_frame
+from twin.rig.kinematics import rig_of
 from twin.types import Form
 
 Bar = Callable  # bar(title) is a context manager that yields progress(done, total)
@@ -52,15 +65,16 @@ class PoseAligned:
 
     Attributes
     ----------
-    tap_map : TapMap
+    rig : RigSpec
+        As fitted.
     fitted : (M,) bool
-        The frames that the map was fitted to.
+        The frames that it was fitted to.
     contacts : (M, 3) float
         Indentation in mm, n_x and n_y of each.
     pairs : list of Pair
     """
 
-    tap_map: TapMap
+    rig: RigSpec
     fitted: np.ndarray
     contacts: np.ndarray
     pairs: list[Pair]
@@ -77,35 +91,32 @@ def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, qualit
 
 
 def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: str, bar: Bar) -> PoseAligned:
-    """The whole twin from each frame's label: the arm's kinematics fitted to one half of the frames.
+    """The whole twin from each frame's label: the arm's rig fitted to one half of the frames.
 
     Raises
     ------
     FrameError
         The frames have no labels, or are too few.
     """
-    labels, fitted = tap_labels([real.label for real in frames]), halves(len(frames))
-    solver = SkinSolver(spec)
-    with bar("simulate taps to fit the arm's kinematics") as progress:
-        bank = TapBank(solver, labels, progress=progress)
-    with bar("fit the arm's kinematics") as progress:
-
-        def simulate(contacts: np.ndarray) -> np.ndarray:
-            pins = []
-            for contact in contacts:
-                pins.append(project(spec.view, tap(solver, contact).caps_mm))
-                progress(len(pins), len(contacts))
-            return np.array(pins)
-
-        tap_map = fit_taps(bank, labels[fitted], np.stack([real.pins_px for real in frames])[fitted], simulate=simulate)
-    contacts, shoot, pairs = tap_map.contact(labels), _Shooter(spec, disc, quality, mesh=solver.mesh), []
+    experiment, radius_mm = load_experiment(EXPERIMENT), spec.skin.outer_radius_mm
+    labels, fitted = labels_of_rows([real.label for real in frames], experiment), halves(len(frames))
+    learnt = [label for label, used in zip(labels, fitted, strict=True) if used]
+    solver, start = SkinSolver(spec), rig_of(spec)
+    taps = PlateTaps(solver, experiment)
+    with bar("simulate taps to fit the arm's rig") as progress:
+        spread = bank_labels(start, experiment, labels, radius_mm)
+        bank = TapBank(contacts_of(start, experiment, spread, radius_mm), taps.pins_px(start, spread, progress))
+    with bar("fit the arm's rig") as progress:
+        seen_px = np.stack([real.pins_px for real in frames])[fitted]
+        rig = fit_rig(bank, start, experiment, learnt, seen_px, radius_mm, simulate=lambda tried: taps.pins_px(tried, learnt, progress))
+    contact, shoot, pairs = taps.contact(rig), _Shooter(spec, disc, quality, mesh=solver.mesh), []
     with bar("press and render from the labels") as progress:
-        for number, (real, contact) in enumerate(zip(frames, contacts, strict=True)):
-            state = tap(solver, contact)
+        for number, (real, label) in enumerate(zip(frames, labels, strict=True)):
+            state = contact.end(label)
             error_px = mean_pin_error_px(project(spec.view, state.caps_mm), real.pins_px)
             pairs.append(shoot(real, state, float(error_px), seed=number))
             progress(number + 1, len(frames))
-    return PoseAligned(tap_map, fitted, contacts, pairs)
+    return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, radius_mm), pairs)
 
 
 def statistics(pairs: list[Pair], disc: Disc, *, progress) -> Statistics:

@@ -75,11 +75,11 @@ def statistics_summary(found: Statistics) -> dict:
 
 
 def pose_summary(found: PoseAligned) -> dict:
-    """The fitted kinematics, the pins' errors on both halves, and the image figures on the half not fitted to."""
+    """The fitted rig, the pins' errors on both halves, and the image figures on the half not fitted to."""
     error = np.array([pair.remainder_px for pair in found.pairs])
     test = [pair for pair, fitted in zip(found.pairs, found.fitted, strict=True) if not fitted]
     return {
-        "tap_map": vars(found.tap_map),
+        "rig": found.rig.model_dump(),
         "pin_error_px": {"fitted": error[found.fitted].mean(), "test": error[~found.fitted].mean(), "test_max": error[~found.fitted].max()},
         "test_images": image_summary(test),
     }

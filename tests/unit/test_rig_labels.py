@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from training.recorded_contact import read_arm_labels
 from twin.errors import FrameError
 from twin.recordings import open_recording
+from twin.rig.labels import read_arm_labels
 
 
 def recording(folder, table, names=("a.png", "b.png")):

@@ -1,8 +1,8 @@
 """What a rigid sensor would touch: depth and angle against the surface, the same for objects of any shape.
 
-The place of the surface that is nearest to the dome's centre, and its normal there, stand for a flat plate that would be
-touched alike. With g the distance of the dome's centre from the surface, w the angle of the tool's axis from the normal, and
-``tcp``, ``lateral`` the dome's centre from the tool point along the axis and across it,
+The surface is replaced by a flat plate: through its place nearest to the dome's centre, with its normal there. With g the
+distance of the dome's centre from the surface, w the angle of the tool's axis from the normal, and ``tcp``, ``lateral`` the dome's
+centre from the tool point along the axis and across it,
 
     indentation = radius - g,   depth of the tool = radius + tcp - (g + tcp cos w + lateral sin w)
 """
@@ -13,7 +13,7 @@ import numpy as np
 
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
-from twin.mounting import Mounting
+from twin.rig.mounting import Mounting
 from twin.stimulus import build_field
 
 
@@ -82,7 +82,8 @@ def surface_labels(experiment: ExperimentSpec, mounting: Mounting, surface: Surf
     Returns
     -------
     dict of str to (M,) float
-        By the table's columns; mm and deg. Empty if the experiment turns the tool about other axes too, where one angle doesn't tell.
+        By the table's columns; mm and deg. Empty if the experiment also turns the tool about other axes, as one angle then does not
+        describe the contact.
     """
     ranges = experiment.ranges()
     turned = {name for name in ("pose_4", "pose_5", "pose_6", "move_4", "move_5", "move_6") if ranges[name] != (0.0, 0.0)}

@@ -1,57 +1,42 @@
 """From a label in robot coordinates to the object's way as the sensor sees it.
 
-Work frame of the robot: x, y, z. The sensor, unturned, looks along the approach a0; b0 is the direction across (robot x, or
-y where the approach is x) and appears in the image at the azimuth ``image_turn``. With R the static xyz rotation by
+Work frame of the robot: x, y, z. The sensor, unturned, looks along the approach a0. b0 is the direction across: robot x, or robot y
+where the approach is x. It appears in the image at the azimuth ``image_turn``. c0 is a0 x b0. With R the static xyz rotation by
 ``turn_sign (pose_4..6 + turn_offset)`` and p = ``pose_1..3``,
 
-    centre of the dome = p + R (tcp_to_dome a0 + tcp_lateral b0)
+    centre of the dome = p + R (tcp_to_dome a0 + tcp_lateral b0 + tcp_aside c0)
 
-and the object, whose frame has z along the approach, leans by ``plate_tilt`` and stands such that an unturned sensor at the
-robot's origin indents it by ``zero + contact_offset``. Arms tap along a0, then make the move in one straight line.
+The object's frame has z along the approach and leans by ``plate_tilt``. The object stands where an unturned sensor at the robot's
+origin indents it by ``zero + contact_offset``. An arm taps along a0, then makes the move in one straight line.
+
+These are poses as commanded. What a force does to them is in ``twin.rig.contact``.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenes.experiment import ExperimentSpec
-from scenes.object import ObjectSpec
 from scenes.rig import RigSpec
-from scenes.sensor import SensorSpec
+from scenes.sensor import SensorSpec, SkinSpec
 from twin.errors import ContactError
 from twin.mechanics.path import ContactPath, dome_directions
+from twin.rig.labels import ArmLabel
+from twin.stimulus import ObjectField
 
-MOST_TURN_DEG = 1.0  # of a move between two poses of the path: what straight pieces miss of the arm's arc is then some um
-TOUCH_TOLERANCE_MM = 1e-6
-TOUCH_POINTS = 20_000  # on the sphere: the dome bulges by less than 2 um between them
-MOST_MARCHES = 400
-CLEAR_MM = 10.0  # before the tap: recorded taps of 5 mm begin up to 0.4 mm inside the object
+MOST_TURN_DEG = 1.0  # largest turn between two poses of the path; straight pieces then miss the arm's arc by a few um
+TOUCH_TOLERANCE_MM = 1e-6  # gap that counts as a touch
+TOUCH_POINTS = 20_000  # directions on the whole sphere; the dome bulges by less than 2 um between them
+MOST_MARCHES = 400  # strides of the search for the first touch; some ten are usual
+CLEAR_MM = 10.0  # how far before the tap the search begins; recorded taps of 5 mm begin up to 0.4 mm inside the object
 
-TURNING = {"x": 5, "y": 5, "z": 4}  # which of a pose's labels turns the tool in the plane of the approach and the direction across
-_UNTURNED = {  # columns: the sensor's x (across), y and z (approach) in the work frame
+TURNING = {"x": 5, "y": 5, "z": 4}  # by approach: index of the pose's label that turns the tool in the plane of approach and across
+_UNTURNED = {  # by approach; columns are the sensor's x (across), y and z (approach) in the work frame
     "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
     "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
     "z": np.eye(3),
 }
-
-
-@dataclass(frozen=True)
-class ArmLabel:
-    """One contact as the recordings' tables give it.
-
-    Attributes
-    ----------
-    pose, move : (6,) float
-        x, y, z in mm and Rx, Ry, Rz in deg; the pose is the one after the move.
-    executed : bool
-        Whether the move had been made when the frame was taken.
-    """
-
-    pose: np.ndarray
-    move: np.ndarray
-    executed: bool = True
 
 
 @dataclass(frozen=True)
@@ -68,7 +53,7 @@ class ArmPath:
     """
 
     path: ContactPath
-    labels: list
+    labels: list[ArmLabel]
     touches: bool
 
     def label(self, fraction: float) -> ArmLabel:
@@ -81,16 +66,16 @@ class ArmPath:
 
 
 def rig_of(sensor: SensorSpec) -> RigSpec:
-    """The sensor's rig, or the plainest one: the tool point is the tip."""
+    """The sensor's rig. A sensor without one gets the plainest: the tool point is the dome's tip, and nothing gives way."""
     return sensor.rig or RigSpec(tcp_to_dome_mm=-sensor.skin.outer_radius_mm)
 
 
 def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, radius_mm: float) -> np.ndarray:
     """``T_sensor_object`` (4, 4) with the arm at a pose (6,), mm and deg."""
     unturned = _UNTURNED[experiment.approach]
-    across, approach = unturned[:, 0], unturned[:, 2]
+    approach = unturned[:, 2]
     turn = Rotation.from_euler("xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True).as_matrix()
-    centre = pose[:3] + turn @ (rig.tcp_to_dome_mm * approach + rig.tcp_lateral_mm * across)
+    centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm]
     surface = (radius_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * approach
     sensor = turn @ unturned
     T = np.eye(4)
@@ -101,37 +86,7 @@ def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, radi
     return in_image @ T
 
 
-def arm_turning(rig: RigSpec, experiment: ExperimentSpec) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
-    """How an arm that gives way turns about its tool point; None for one that does not.
-
-    Returns
-    -------
-    callable
-        From ``T_sensor_object`` (4, 4) where the arm was sent, and the force on the object (3,), N, in the sensor frame, to the
-        pose where it then is.
-    """
-    if not rig.turn_compliance_deg_per_n:
-        return None
-    unturned, about = _UNTURNED[experiment.approach], np.eye(3)[TURNING[experiment.approach] - 3]
-    in_image = Rotation.from_euler("z", rig.image_turn_deg, degrees=True).as_matrix()
-    axis, tool_mm = in_image @ unturned.T @ about, -in_image @ [rig.tcp_lateral_mm, 0, rig.tcp_to_dome_mm]
-
-    def turned(T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
-        turn_deg = rig.turn_sign * rig.turn_compliance_deg_per_n * (T[:3, 0] @ force_n)
-        turn = Rotation.from_rotvec(-turn_deg * axis, degrees=True).as_matrix()
-        there = T.copy()
-        there[:3, :3], there[:3, 3] = turn @ T[:3, :3], tool_mm + turn @ (T[:3, 3] - tool_mm)
-        return there
-
-    return turned
-
-
-def giving_way(rig: RigSpec, experiment: ExperimentSpec, touched: ObjectSpec) -> dict:
-    """What ``SkinSolver.path`` is to know of how arm and object give way."""
-    return {"compliance_mm_per_n": touched.compliance_mm_per_n + rig.compliance_mm_per_n, "given_way": arm_turning(rig, experiment)}
-
-
-def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimulus, label: ArmLabel) -> ArmPath:
+def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, stimulus: ObjectField, label: ArmLabel) -> ArmPath:
     """The object's way relative to the sensor: first touch, tapped, and moved if the move was executed.
 
     Parameters
@@ -144,14 +99,14 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimu
     ContactError
         The sensor is inside the object long before the tap.
     """
-    radius_mm = sensor.skin.outer_radius_mm
+    radius_mm = skin.outer_radius_mm
 
-    def at(pose):
+    def at(pose: np.ndarray) -> np.ndarray:
         return object_pose(rig, experiment, pose, radius_mm)
 
     tap = np.asarray(experiment.tap) * (1 + CLEAR_MM / experiment.tap[experiment.axis])
     tapped = np.asarray(label.pose, float) - label.move
-    share, touches = _first_touch(stimulus, at(tapped - tap), at(tapped), radius_mm * dome_directions(sensor.skin, TOUCH_POINTS))
+    share, touches = _first_touch(stimulus, at(tapped - tap), at(tapped), radius_mm * dome_directions(skin, TOUCH_POINTS))
     still = np.zeros(6)
     labels = [ArmLabel(tapped - (1 - share) * tap, still), ArmLabel(tapped, still)]
     if label.executed:
@@ -162,15 +117,16 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, sensor: SensorSpec, stimu
     return ArmPath(ContactPath(np.stack([at(each.pose) for each in labels])), labels, touches)
 
 
-def _first_touch(stimulus, start: np.ndarray, stop: np.ndarray, dome_mm: np.ndarray) -> tuple[float, bool]:
-    """Share of the straight way from one pose to another at which the object touches the dome, and whether it does.
+def _first_touch(stimulus: ObjectField, start: np.ndarray, stop: np.ndarray, dome_mm: np.ndarray) -> tuple[float, bool]:
+    """Share of the straight way from one pose to another at which the object touches the dome, and whether it touches at all.
 
-    It goes on by its smallest distance to the dome, again and again, which never passes the first touch where distances are
-    exact (sphere tracing, Hart 1996).
+    The object advances by its smallest distance to the dome, again and again. Where distances are exact, that never passes the first
+    touch (sphere tracing, Hart 1996).
     """
     turn, way = start[:3, :3], stop[:3, 3] - start[:3, 3]
     length_mm = float(np.linalg.norm(way))
-    share, free = 0.0, None
+    share = 0.0
+    free: float | None = None  # the largest share known to be free of contact
     for _ in range(MOST_MARCHES):
         gap_mm = float(stimulus.distance((dome_mm - start[:3, 3] - share * way) @ turn).min())
         if abs(gap_mm) <= TOUCH_TOLERANCE_MM:
@@ -178,7 +134,7 @@ def _first_touch(stimulus, start: np.ndarray, stop: np.ndarray, dome_mm: np.ndar
         if gap_mm < 0:
             if free is None:
                 raise ContactError(f"the object is in the sensor's way {CLEAR_MM:g} mm before the tap; begin it elsewhere")
-            share = (share + free) / 2  # a distance was too large (wires, far from a mesh): back half way
+            share = (share + free) / 2  # far from wires or a mesh a distance can be too large: go half way back
             continue
         free = share
         share += gap_mm / length_mm

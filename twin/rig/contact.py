@@ -1,0 +1,127 @@
+"""The one contact model: for a pose that the arm is sent to, where the object is under its force, and how the pair rubs.
+
+Simulated data sets, the validation against labelled frames, the calibration of contacts, renders from labels and the twin that a
+servo follows a surface in all take their contacts from here.
+
+Three things happen where an arm presses a sensor against an object with the force F (on the object, sensor frame):
+
+- Friction. A rig's coefficient was fitted to frames of this sensor's skin, so it counts for every object that the rig's arm
+  touches. An object's own friction counts where the sensor has no rig. A caller who knows better gives the friction explicitly.
+- Both give way along the sensor's z by (object's + rig's ``compliance_mm_per_n``) F_z. The solver finds this with the contact.
+- The arm turns about its tool point, in the plane of its approach and the direction across, by
+  ``turn_compliance_deg_per_n`` times the force across. This is ``ArmTurning``.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
+from scenes.rig import RigSpec
+from twin.mechanics.balance import Friction
+from twin.mechanics.law import ContactLaw, friction_of
+from twin.mechanics.solver import SkinSolver
+from twin.rig.kinematics import ArmPath, arm_path, rig_of
+from twin.rig.labels import ArmLabel
+from twin.rig.mounting import Mounting
+from twin.stimulus import build_field
+from twin.types import ContactState
+
+
+@dataclass(frozen=True)
+class ArmTurning:
+    """How an arm turns about its tool point under the force across; a ``GivenWay`` of ``ContactLaw``. All in the sensor frame.
+
+    Attributes
+    ----------
+    across : (3,) float
+        Unit vector along which the force counts.
+    axis : (3,) float
+        Unit vector about which the tool turns as the angle's label grows.
+    tool_mm : (3,) float
+        The tool point.
+    deg_per_n : float
+    """
+
+    across: np.ndarray
+    axis: np.ndarray
+    tool_mm: np.ndarray
+    deg_per_n: float
+
+    def __call__(self, T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
+        """The object's pose (4, 4) under a force (3,), N: seen from the sensor it turns the other way about the tool point."""
+        turn = Rotation.from_rotvec(-self.deg_per_n * (self.across @ force_n) * self.axis, degrees=True).as_matrix()
+        there = T.copy()
+        there[:3, :3] = turn @ T[:3, :3]
+        there[:3, 3] = self.tool_mm + turn @ (T[:3, 3] - self.tool_mm)
+        return there
+
+
+def friction_between(rig: RigSpec | None, touched: ObjectSpec) -> Friction:
+    """The friction of a sensor's contacts with an object: the rig's single coefficient, or the object's own where there is no rig."""
+    return Friction(rig.friction, rig.friction) if rig else friction_of(touched)
+
+
+def contact_law(rig: RigSpec | None, mounting: Mounting, touched: ObjectSpec, *, friction: float | Friction | None = None) -> ContactLaw:
+    """How a mounted sensor and an object rub and give way.
+
+    Parameters
+    ----------
+    rig : RigSpec or None
+        The sensor's own; None for a sensor without one.
+    mounting : Mounting
+        By the same rig.
+    friction : optional
+        In place of the rig's or the object's (see ``friction_between``).
+    """
+    turning = None
+    if rig and rig.turn_compliance_deg_per_n:
+        turning = ArmTurning(mounting.across_in_sensor, mounting.label_turn, mounting.tool_point_mm, rig.turn_compliance_deg_per_n)
+    compliance = touched.compliance_mm_per_n + (rig.compliance_mm_per_n if rig else 0.0)
+    return ContactLaw(friction_between(rig, touched), compliance, turning).override(friction=friction)
+
+
+class RigContact:
+    """Contacts of one sensor, held by an arm, with one object, by the arm's labels.
+
+    Parameters
+    ----------
+    solver : SkinSolver
+        Of the sensor.
+    experiment : ExperimentSpec
+    touched : ObjectSpec
+    rig : RigSpec, optional
+        In place of the sensor's own, if it is to be another.
+
+    Attributes
+    ----------
+    law : ContactLaw
+    """
+
+    def __init__(self, solver: SkinSolver, experiment: ExperimentSpec, touched: ObjectSpec, *, rig: RigSpec | None = None) -> None:
+        self.solver, self.experiment = solver, experiment
+        self.rig = rig or rig_of(solver.spec)
+        self.stimulus = build_field(touched)
+        mounting = Mounting.on(self.rig, experiment, solver.spec.skin.outer_radius_mm)
+        self.law = contact_law(rig or solver.spec.rig, mounting, touched)
+
+    def way(self, label: ArmLabel) -> ArmPath:
+        """The object's way as commanded (see ``arm_path``, also for errors)."""
+        return arm_path(self.rig, self.experiment, self.solver.spec.skin, self.stimulus, label)
+
+    def along(self, way: ArmPath, *, friction: float | Friction | None = None) -> Iterator[tuple[float, ContactState]]:
+        """Every converged state on the way, with its fraction of the path; the law's friction unless another is given.
+
+        Raises
+        ------
+        ContactError
+            As ``SkinSolver.path``.
+        """
+        return self.solver.path(self.stimulus, way.path, law=self.law, friction=friction)
+
+    def end(self, label: ArmLabel, *, friction: float | Friction | None = None) -> ContactState:
+        """The state at the end of a label's way. Errors as ``along``."""
+        return self.solver.press(self.stimulus, self.way(label).path, law=self.law, friction=friction)

@@ -1,0 +1,118 @@
+"""How a sensor sits on an arm's tool, and which labels mean zero depth and zero angle; from a rig and an experiment."""
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from scenes.experiment import ExperimentSpec
+from scenes.rig import RigSpec
+from scenes.sensor import SensorSpec
+from twin.rig.kinematics import TURNING, rig_of
+
+Number = TypeVar("Number", float, np.ndarray)
+_DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # the approach, and across it
+_SENSOR_AXIS = np.array([0.0, 0.0, 1.0])  # in the sensor frame
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """A sensor on a tool. The servo follows a surface in the plane of ``axis`` and ``across``.
+
+    Attributes
+    ----------
+    axis : (3,) float
+        The sensor's z (out of the dome's apex) in the tool frame.
+    across : (3,) float
+        Direction of the tool frame, at right angles to the axis, along which the tool is fed.
+    image_turn_deg : float
+        Azimuth of ``across`` in the sensor frame, from image x towards image y.
+    centre_mm : (3,) float
+        The dome's centre in the tool frame.
+    radius_mm : float
+        Of the dome.
+    depth_label, angle_label : str
+        The labels that tell how deep the tool is, and how far it is turned from the surface's normal.
+    zero_mm, zero_deg : float
+        Indentation at which the depth's label is 0, and the angle's label at which the sensor stands normal to the surface.
+    angle_sign : int
+        -1 where the label grows as the tool turns from the axis towards ``across``.
+    """
+
+    axis: np.ndarray
+    across: np.ndarray
+    image_turn_deg: float
+    centre_mm: np.ndarray
+    radius_mm: float
+    depth_label: str
+    angle_label: str
+    zero_mm: float
+    zero_deg: float
+    angle_sign: int
+
+    @property
+    def out_of_plane(self) -> np.ndarray:
+        """(3,) axis of the tool frame about which a positive angle turns it: ``across`` towards ``axis``."""
+        return np.cross(self.across, self.axis)
+
+    @property
+    def apex_mm(self) -> np.ndarray:
+        """(3,) the dome's apex in the tool frame."""
+        apex: np.ndarray = self.centre_mm + self.radius_mm * self.axis
+        return apex
+
+    @property
+    def across_in_sensor(self) -> np.ndarray:
+        """(3,) ``across`` in the sensor frame."""
+        return np.array([np.cos(np.radians(self.image_turn_deg)), np.sin(np.radians(self.image_turn_deg)), 0.0])
+
+    @property
+    def tool_point_mm(self) -> np.ndarray:
+        """(3,) the tool point in the sensor frame."""
+        frame = np.stack([self.axis, self.across, np.cross(self.axis, self.across)])
+        here = np.stack([_SENSOR_AXIS, self.across_in_sensor, np.cross(_SENSOR_AXIS, self.across_in_sensor)])
+        point: np.ndarray = -(frame @ self.centre_mm) @ here
+        return point
+
+    @property
+    def label_turn(self) -> np.ndarray:
+        """(3,) axis in the sensor frame about which the tool turns, right-handed, while the angle's label grows."""
+        axis: np.ndarray = self.angle_sign * np.cross(self.across_in_sensor, _SENSOR_AXIS)
+        return axis
+
+    @classmethod
+    def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Mounting":
+        """The mounting of a sensor on its own rig."""
+        return cls.on(rig_of(sensor), experiment, sensor.skin.outer_radius_mm)
+
+    @classmethod
+    def on(cls, rig: RigSpec, experiment: ExperimentSpec, radius_mm: float) -> "Mounting":
+        """The mounting of a dome of a radius that a rig describes, with the experiment's approach and zero."""
+        axis, across = (np.array(direction, float) for direction in _DIRECTIONS[experiment.approach])
+        turn = np.cross(across, axis)
+        about = TURNING[experiment.approach] - 3
+        sign = int(np.sign(turn[about])) * rig.turn_sign
+        return cls(
+            axis,
+            across,
+            rig.image_turn_deg,
+            rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across + rig.tcp_aside_mm * np.cross(axis, across),
+            radius_mm,
+            f"pose_{experiment.axis + 1}",
+            f"pose_{about + 4}",
+            experiment.zero_mm + rig.contact_offset_mm,
+            sign * rig.plate_tilt_deg - rig.turn_offset_deg[about],
+            sign,
+        )
+
+    def depth_mm(self, label: Number) -> Number:
+        """Depth beyond first touch that a label stands for."""
+        return label + self.zero_mm
+
+    def angle_deg(self, label: Number) -> Number:
+        """Angle from the surface's normal that a label stands for."""
+        return self.angle_sign * (label - self.zero_deg)
+
+    def labels(self, depth_mm: Number, angle_deg: Number) -> tuple[Number, Number]:
+        """The depth's and the angle's label that a depth and an angle would have."""
+        return depth_mm - self.zero_mm, self.zero_deg + self.angle_sign * angle_deg

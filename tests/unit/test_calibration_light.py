@@ -9,7 +9,7 @@ from plain_sensor import plain
 from twin.calibration.aligned import Aligned, levels_slope, revised, to_levels, to_light
 from twin.calibration.caps import ORDERS, fit_caps, outline_steps
 from twin.calibration.photometry import fit_photometry
-from twin.calibration.response import apparent_mm, defocus_px, fit_aperture, fit_blur, fit_noise, fit_response, sharpness
+from twin.calibration.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_noise, fit_response, sharpness
 from twin.calibration.rim import fit_rim
 from twin.camera import expose
 from twin.geometry.pins import rest_pins
@@ -158,7 +158,7 @@ def test_aperture_and_focus_follow_from_edges_that_widen_with_distance(known):
     distance = np.linspace(48.0, 57.0, 5)
     real = np.sqrt(1.5**2 + (0.69 * defocus_px(known.camera.fx_px, 1.0, 58.0, distance)) ** 2)
     seen = replace(sharpness_of(distance), real_px=real)
-    found = fit_aperture(known, seen)
+    found = fit_focus(known, seen)
     grown = [
         0.69 * defocus_px(known.camera.fx_px, *pair, distance) for pair in ((1.0, 58.0), (found.camera.aperture_mm, found.camera.focus_mm))
     ]

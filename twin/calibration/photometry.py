@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.calibration.aligned import SATURATED, Aligned, levels_slope, revised, to_levels, to_light
+from twin.calibration.aligned import SATURATED, Aligned, levels_slope, require_cameras_own, revised, to_levels, to_light
 from twin.camera import blurred
 from twin.optics.light_model import Knobs, LightModel
 from twin.optics.render import Renderer
@@ -80,7 +80,14 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> Photome
     frames : list of Aligned
     progress : callable
         ``progress(done, total)``.
+
+    Raises
+    ------
+    FrameError
+        A frame does not have the camera's size and channels.
     """
+    for frame in frames:
+        require_cameras_own(frame.image, frame.name, spec.camera)
     rng = np.random.default_rng(0)
     renderer = Renderer(spec)
     samples = [sample_frame(spec, frame, renderer.static, rng) for frame in frames]

@@ -146,7 +146,7 @@ def fit_blur(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], r
     return spec
 
 
-def fit_aperture(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
+def fit_focus(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
     """Aperture and focus whose defocus explains how the edges' width changes with distance.
 
     The circle of confusion of a point at d with focus at d0 is ``f a |1/d - 1/d0|`` px; squares of widths add. Both

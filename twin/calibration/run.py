@@ -14,7 +14,7 @@ from twin.calibration.aligned import Aligned, read_frames, revised
 from twin.calibration.camera_pose import fit_camera
 from twin.calibration.caps import fit_caps
 from twin.calibration.photometry import fit_photometry
-from twin.calibration.response import fit_aperture, fit_blur, fit_noise, fit_response, sharpness
+from twin.calibration.response import fit_blur, fit_focus, fit_noise, fit_response, sharpness
 from twin.calibration.rim import fit_rim
 from twin.calibration.surroundings import fit_surroundings
 from twin.camera import expose
@@ -134,7 +134,7 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
 
     def defocus(spec):
         shots = studio.shots(spec, frames, "render for the sharpness")
-        return fit_aperture(spec, sharpness(spec, frames, shots))
+        return fit_focus(spec, sharpness(spec, frames, shots))
 
     def response(spec):
         light = studio.light(spec, frames, "render for the response")

@@ -1,6 +1,7 @@
 """Exact ground truth of a rendered contact: where every cap is, in space and in the frame."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numba
 import numpy as np
@@ -8,7 +9,17 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.preprocess.forms import frame_size, from_raw
 from twin.projection import pixel_rays, project
-from twin.types import ContactState, Form
+from twin.types import Form
+
+
+class PinPlaces(Protocol):
+    """Feet and cap centres of the pins, (N, 3) mm in the sensor frame: of a contact, or at rest."""
+
+    @property
+    def base_mm(self) -> np.ndarray: ...
+
+    @property
+    def caps_mm(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -31,7 +42,7 @@ class CapTruth:
     visible: np.ndarray
 
 
-def cap_truth(spec: SensorSpec, rest: ContactState, state: ContactState, form: Form) -> CapTruth:
+def cap_truth(spec: SensorSpec, rest: PinPlaces, state: PinPlaces, form: Form) -> CapTruth:
     """Ground truth of a contact for frames of the given form."""
     caps_px = from_raw(spec, form, project(spec, state.caps_mm))
     rest_px = from_raw(spec, form, project(spec, rest.caps_mm))
@@ -39,7 +50,7 @@ def cap_truth(spec: SensorSpec, rest: ContactState, state: ContactState, form: F
     return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec, state))
 
 
-def occluded(spec: SensorSpec, state: ContactState) -> np.ndarray:
+def occluded(spec: SensorSpec, state: PinPlaces) -> np.ndarray:
     """(N,) bool: the ray in the gel from the window to the cap's centre passes through another pin.
 
     Pins count as capsules of the cap's radius around the axis from foot to cap.

@@ -16,7 +16,7 @@ from twin.preprocess.forms import from_raw
 from twin.preprocess.touch import MOST_DENT, dent_of
 from twin.projection import project
 from twin.recordings import open_recording
-from twin.robustness.condition import revised
+from twin.robustness.condition import altered
 from twin.types import Form
 
 SENSORS = ("mg400-331", "mg400-127", "ur5-331")
@@ -52,7 +52,7 @@ def pins_at_rest(spec):
 def test_another_camera_or_pin_is_no_contact(name, change):
     spec = load_sensor(name)
     added = {section: {key: getattr(getattr(spec, section), key) + by for key, by in keys.items()} for section, keys in change.items()}
-    moved = pins_at_rest(revised(spec, **added))
+    moved = pins_at_rest(altered(spec, **added))
     assert np.linalg.norm(moved - pins_at_rest(spec), axis=1).max() > 0.05  # px: there is something to be told apart
     assert dent_of(moved, nominal_reference(spec, form_of(spec))) < MOST_DENT
 

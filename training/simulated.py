@@ -13,9 +13,9 @@ from training.generation.truth_file import TRUTH
 from twin.errors import FrameError
 from twin.kinematics import object_pose, rig_of
 from twin.mounting import Mounting
-from twin.preprocess.forms import frame_size
 from twin.recordings import Recording
 from twin.recordings.folders import image_folders
+from twin.recordings.forms import frame_size
 from twin.recordings.tables import order_by_table, read_table
 from twin.touch import Surface, surface_labels
 from twin.types import Form

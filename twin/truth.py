@@ -7,8 +7,8 @@ import numba
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.preprocess.forms import frame_size, from_raw
 from twin.projection import pixel_rays, project
+from twin.recordings.forms import frame_size, from_raw
 from twin.types import Form
 
 
@@ -44,8 +44,8 @@ class CapTruth:
 
 def cap_truth(spec: SensorSpec, rest: PinPlaces, state: PinPlaces, form: Form) -> CapTruth:
     """Ground truth of a contact for frames of the given form."""
-    caps_px = from_raw(spec, form, project(spec, state.caps_mm))
-    rest_px = from_raw(spec, form, project(spec, rest.caps_mm))
+    caps_px = from_raw(spec.recording, form, project(spec, state.caps_mm))
+    rest_px = from_raw(spec.recording, form, project(spec, rest.caps_mm))
     inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
     return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec, state))
 

@@ -15,11 +15,11 @@ from twin.camera import expose
 from twin.geometry.pins import rest_pins
 from twin.geometry.skin_fit import FittedPins
 from twin.optics.render import Renderer
-from twin.preprocess.forms import gray_levels
 from twin.projection import project
 from twin.realism.disc import lens_disc
 from twin.realism.spectra import noise_sd
 from twin.realism.statistics import bare_skin
+from twin.recordings.forms import gray_levels
 
 SPP = 64
 
@@ -173,9 +173,11 @@ def sharpness_of(distance):
 
 def test_caps_near_the_rim_are_nearer_to_the_pupil(known):
     caps = rest_pins(known).caps_mm
-    assert apparent_mm(known, caps[0, 2]) > apparent_mm(known, caps[-1, 2])
-    bare = revised(known, gel={"refractive_index": 1.0}, lens={"refractive_index": 1.0})
-    assert apparent_mm(bare, 5.0) == pytest.approx(5.0 + known.camera.distance_mm)
+    pupil_mm = known.camera.distance_mm
+    top, rim = (apparent_mm(caps[k, 2], pupil_mm, known.lens, known.gel.refractive_index) for k in (0, -1))
+    assert top > rim
+    no_window = known.lens.model_copy(update={"refractive_index": 1.0})
+    assert apparent_mm(np.array(5.0), pupil_mm, no_window, 1.0) == pytest.approx(5.0 + pupil_mm)
 
 
 def test_noise_is_recovered(known, light, frame):

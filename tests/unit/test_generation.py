@@ -23,8 +23,8 @@ from twin.geometry.solid import Resolution
 from twin.kinematics import arm_path, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import nominal_reference
-from twin.preprocess.forms import raw_to_recording
 from twin.projection import project
+from twin.recordings.forms import raw_to_recording
 from twin.stimulus import build_stimulus
 from twin.types import Form
 
@@ -107,7 +107,7 @@ def test_a_state_on_the_way_is_the_end_of_its_own_label(tmp_path):
             way = arm_path(rig_of(config.sensor), config.experiment, config.sensor, stimulus, labels[row])
             state = solver.press(stimulus, way.path, friction=0.0)
             assert np.abs(state.T_sensor_object - truth["T_sensor_object"][row]).max() < ARC_MM
-            px = raw_to_recording(config.sensor, project(config.sensor, state.caps_mm))
+            px = raw_to_recording(config.sensor.recording, project(config.sensor, state.caps_mm))
             assert np.abs(px - truth["caps_px"][row]).max() < SAME_STATE_PX
 
 

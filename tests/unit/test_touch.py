@@ -12,10 +12,10 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline, nominal_reference, require_untouched
-from twin.preprocess.forms import from_raw
-from twin.preprocess.touch import MOST_DENT, dent_of
+from twin.preprocess.pressed import MOST_DENT, dent_of
 from twin.projection import project
 from twin.recordings import open_recording
+from twin.recordings.forms import from_raw
 from twin.robustness.condition import altered
 from twin.types import Form
 
@@ -32,7 +32,7 @@ def form_of(spec):
 
 
 def pins_at_rest(spec):
-    return from_raw(spec, form_of(spec), project(spec, rest_pins(spec).caps_mm))
+    return from_raw(spec.recording, form_of(spec), project(spec, rest_pins(spec).caps_mm))
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -83,7 +83,7 @@ def test_a_turned_and_scaled_dent_is_the_same_dent():
 def test_a_pressed_sensor_is_refused(thing):
     spec = load_sensor("mg400-331")
     state = SkinSolver(spec, resolution=Resolution(across=12)).press(load_object(thing), ContactPose(indent_mm=2.5))
-    pressed_px = from_raw(spec, Form.RECORDING, project(spec, state.caps_mm))
+    pressed_px = from_raw(spec.recording, Form.RECORDING, project(spec, state.caps_mm))
     require_untouched(spec, Form.RECORDING, drawn_frame(spec, Form.RECORDING, pins_at_rest(spec)), REMEDY)
     with pytest.raises(FrameError, match="seems pressed.*dented by .*look"):
         require_untouched(spec, Form.RECORDING, drawn_frame(spec, Form.RECORDING, pressed_px), REMEDY)

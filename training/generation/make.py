@@ -12,7 +12,7 @@ from twin.geometry.solid import Resolution
 from twin.kinematics import ArmLabel, arm_path, giving_way, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.optics.variant import one_thread
-from twin.preprocess.forms import gray_levels
+from twin.recordings.forms import gray_levels
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
 from twin.truth import cap_truth

@@ -20,9 +20,9 @@ from twin.kinematics import ArmLabel, arm_path, giving_way, rig_of
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline
 from twin.preprocess.batch import recording_reference
-from twin.preprocess.forms import from_raw
 from twin.projection import project
 from twin.recordings import open_recording
+from twin.recordings.forms import from_raw
 from twin.stimulus import build_stimulus
 from twin.types import FINE, Form
 
@@ -135,4 +135,4 @@ class ContactModel:
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px
 
     def _pixels(self, caps_mm: np.ndarray) -> np.ndarray:
-        return from_raw(self.spec, self.form, project(self.spec, caps_mm))
+        return from_raw(self.spec.recording, self.form, project(self.spec, caps_mm))

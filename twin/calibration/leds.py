@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from scenes.sensor import LedRingSpec, SensorSpec
+from scenes.sensor import HousingSpec, LedRingSpec, ResponseSpec, SensorSpec
 from twin.calibration.aligned import revised, to_light
 from twin.calibration.misfit import fit_bounded, level_misfit, subpixel_offsets
 from twin.calibration.still import Still, sampled
@@ -57,7 +57,7 @@ def turn_leds(spec: SensorSpec, still: Still) -> SensorSpec:
     All LEDs are turned together first; then each goes to the middle of its own glow.
     """
     lit = lit_leds(spec.leds)
-    glow = _glow_by_degree(spec, still)
+    glow = _glow_by_degree(still, spec.housing, spec.camera.distance_mm, spec.response)
     degrees, azimuth_deg = np.arange(360) + 0.5, np.array(spec.leds.azimuth_deg)
     turns = np.array(sorted(range(-180, 180), key=abs))
     total = np.array([np.interp(azimuth_deg[lit] + turn, degrees, glow, period=360).sum() for turn in turns])
@@ -76,15 +76,14 @@ def lit_leds(leds: LedRingSpec) -> list[int]:
     return [k for k, share in enumerate(balance) if share > 0 and k not in leds.off]
 
 
-def _glow_by_degree(spec: SensorSpec, still: Still) -> np.ndarray:
-    """Mean light (360,) of the ring's innermost part in each degree of azimuth, smoothed."""
-    housing = spec.housing
-    out_mm = still.tangents * (housing.z_mm + spec.camera.distance_mm) - housing.center_mm
+def _glow_by_degree(still: Still, housing: HousingSpec, pupil_mm: float, response: ResponseSpec) -> np.ndarray:
+    """Mean light (360,) of the ring's innermost part in each degree of azimuth, smoothed; ``pupil_mm`` behind the dome's centre."""
+    out_mm = still.tangents * (housing.z_mm + pupil_mm) - housing.center_mm
     beyond_mm = np.linalg.norm(out_mm, axis=-1) - housing.aperture_radius_mm
     near = (beyond_mm > 0) & (beyond_mm < GLOW_SHARE * housing.aperture_radius_mm)
     azimuth = np.degrees(np.arctan2(out_mm[near][:, 1], out_mm[near][:, 0])) % 360
     degree = np.minimum(azimuth.astype(int), 359)  # the remainder of a tiny negative angle rounds to 360
-    sums = np.bincount(degree, to_light(still.gray[near], spec.response), minlength=360)
+    sums = np.bincount(degree, to_light(still.gray[near], response), minlength=360)
     glow = sums / np.maximum(np.bincount(degree, minlength=360), 1)
     return gaussian_filter1d(glow, GLOW_SMOOTH_DEG, mode="wrap")
 

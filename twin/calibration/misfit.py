@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scenes.sensor import ResponseSpec
 from twin.calibration.aligned import SATURATED
 
-# Residual, in gray levels, beyond which a pixel counts less (scale of the soft-L1 loss). Chosen: well above noise and rounding.
+# Residual, in gray levels, beyond which a pixel counts less (scale of the soft-L1 loss).
 ROBUST_LEVELS = 16.0
 # Step for slopes, as a share of a parameter's range. It is large because the models have small jumps at pixel borders.
 SLOPE_STEP = 0.01

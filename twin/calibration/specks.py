@@ -11,9 +11,9 @@ from twin.calibration.misfit import fit_bounded, level_misfit, subpixel_offsets
 from twin.calibration.still import Still, sampled
 from twin.camera import blurred
 from twin.optics.static_layer import reflections
-from twin.preprocess.forms import gray_levels
 from twin.realism.disc import lens_disc
 from twin.realism.spots import clear_of_pins, pin_spacing_px
+from twin.recordings.forms import gray_levels
 
 # Nothing is looked for this close to the disc's edge, px: the edge itself is blurred.
 RIM_PX = 3.0
@@ -152,7 +152,7 @@ def _measured_opacity(view: _WindowView, center_px: np.ndarray, response: Respon
         return np.nan
     column, row = np.rint(center_px).astype(int)
     before = np.median(to_light(view.gray[frames, row, column], response))
-    beside = [_neighbours(view.pins_px[frame], pin) for frame, pin in zip(frames, pins, strict=True)]
+    beside = [_neighbours(view.pins_px[frame], int(pin)) for frame, pin in zip(frames, pins, strict=True)]
     caps_px = np.rint(np.concatenate([view.pins_px[f, near] for f, near in zip(frames, beside, strict=True)])).astype(int)
     cap = np.median(to_light(view.gray[np.repeat(frames, list(map(len, beside))), caps_px[:, 1], caps_px[:, 0]], response))
     bare, clear = (to_light(level[row, column], response) for level in (view.ground, view.behind))

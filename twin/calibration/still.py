@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.preprocess.forms import gray_levels
 from twin.projection import pixel_rays
+from twin.recordings.forms import gray_levels
 
 
 @dataclass(frozen=True)

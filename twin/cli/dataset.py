@@ -91,7 +91,7 @@ def dataset(
     from training.generation import GenerationConfig, generate
     from twin.cli.progress import rate_bar
     from twin.kinematics import rig_of
-    from twin.preprocess.forms import frame_size
+    from twin.recordings.forms import frame_size
 
     spec, plan = load_sensor(sensor), load_experiment(experiment)
     touched = load_object(object_ or plan.object)

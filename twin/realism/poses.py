@@ -11,17 +11,19 @@ dome. The pins of a tap depend smoothly on indentation and normal: a cubic polyn
 them while the map is fitted; a second round takes what the polynomial misses at the first round's contacts into account.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import qmc
 
 from scenes import load_object
 from twin.errors import FrameError
 from twin.mechanics.path import ContactPath
 from twin.mechanics.solver import SkinSolver
+from twin.progress import Progress
 from twin.projection import project
 from twin.types import ContactState
 
@@ -57,7 +59,7 @@ class TapMap:
         return np.column_stack([along + self.lateral_mm[0] * x + self.lateral_mm[1] * y, x, y])
 
 
-def tap_labels(rows: list[dict]) -> np.ndarray:
+def tap_labels(rows: list[dict[str, float]]) -> np.ndarray:
     """(m, 3) depth in mm and two turns in deg of frames' labels.
 
     Raises
@@ -96,7 +98,7 @@ class TapBank:
         ``progress(done, total)``.
     """
 
-    def __init__(self, solver: SkinSolver, labels: np.ndarray, *, progress=None):
+    def __init__(self, solver: SkinSolver, labels: np.ndarray, *, progress: Progress | None = None):
         deepest = labels[:, 0].max() + BANK_MARGIN_MM[1]
         shallowest = max(labels[:, 0].min() - BANK_MARGIN_MM[0], LEAST_INDENT_MM)
         steepest = np.sin(np.radians(np.hypot(*labels[:, 1:].T).max() + BANK_MARGIN_DEG))
@@ -120,7 +122,9 @@ class TapBank:
         return np.prod((contacts / self._scale)[:, None] ** np.array(powers), axis=2)
 
 
-def fit_taps(bank: TapBank, labels: np.ndarray, pins_px: np.ndarray, *, simulate=None) -> TapMap:
+def fit_taps(
+    bank: TapBank, labels: np.ndarray, pins_px: np.ndarray, *, simulate: Callable[[np.ndarray], np.ndarray] | None = None
+) -> TapMap:
     """The map under which the pins (m, N, 2) px of labelled frames are best explained, by least squares.
 
     ``simulate`` gives the true pins (m, N, 2) px of contacts (m, 3): with it there is a second round.
@@ -134,29 +138,30 @@ def fit_taps(bank: TapBank, labels: np.ndarray, pins_px: np.ndarray, *, simulate
         raise FrameError(
             f"{len(labels)} labelled frames are too few to fit the arm's kinematics to; give at least {2 * FEWEST}, half are for the test"
         )
-    best, fitted = np.inf, None
+    best, values, best_mirrored = np.inf, np.zeros(PARAMETERS), False
     for turn, mirrored in product(TURNS_DEG, (False, True)):
         start = np.zeros(PARAMETERS)
         start[4] = turn / 90
         found = _least_squares(bank, labels, pins_px, start, mirrored)
         if found.cost < best:
-            best, fitted = found.cost, (found.x, mirrored)
+            best, values, best_mirrored = found.cost, found.x, mirrored
     if simulate is not None:
-        contacts = _tap_map(*fitted).contact(labels)
+        contacts = _tap_map(values, best_mirrored).contact(labels)
         missed_px = simulate(contacts) - bank.pins_px(contacts)
-        fitted = _least_squares(bank, labels, pins_px - missed_px, *fitted).x, fitted[1]
-    return _tap_map(*fitted)
+        values = _least_squares(bank, labels, pins_px - missed_px, values, best_mirrored).x
+    return _tap_map(values, best_mirrored)
 
 
-def _least_squares(bank: TapBank, labels: np.ndarray, pins_px: np.ndarray, start: np.ndarray, mirrored: bool):
+def _least_squares(bank: TapBank, labels: np.ndarray, pins_px: np.ndarray, start: np.ndarray, mirrored: bool) -> OptimizeResult:
+    """The fit of the map's parameters to pins (m, N, 2), NaN where lost."""
     seen = np.isfinite(pins_px)
     return least_squares(lambda x: (bank.pins_px(_tap_map(x, mirrored).contact(labels)) - pins_px)[seen], start)
 
 
 def _tap_map(x: np.ndarray, mirrored: bool) -> TapMap:
     """The map of parameters scaled to be of order 1."""
-    x = x.tolist()
-    return TapMap(x[0], 10 * x[1], (x[2], x[3]), 90 * x[4], (10 * x[5], 10 * x[6]), mirrored)
+    offset, lever, across_x, across_y, turn, tilt_x, tilt_y = x.tolist()
+    return TapMap(offset, 10 * lever, (across_x, across_y), 90 * turn, (10 * tilt_x, 10 * tilt_y), mirrored)
 
 
 def halves(count: int, seed: int = 0) -> np.ndarray:

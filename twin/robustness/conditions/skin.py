@@ -30,15 +30,11 @@ def cap_levels(spec: SensorSpec) -> np.ndarray:
     return np.array(spec.appearance.cap_levels) if spec.appearance.cap_levels else np.maximum(cap_albedo(spec)[:, k] / albedo[k], GONE)
 
 
-def with_levels(spec: SensorSpec, levels: np.ndarray) -> SensorSpec:
-    """The specification with cap levels (N,)."""
-    return altered(spec, appearance={"cap_levels": tuple(levels.tolist())})
-
-
 def missing(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     if not value:
         return spec
-    return with_levels(spec, np.where(chosen(spec.pins.count, value, rng), GONE, cap_levels(spec)))
+    levels = np.where(chosen(spec.pins.count, value, rng), GONE, cap_levels(spec))
+    return altered(spec, appearance={"cap_levels": tuple(levels.tolist())})
 
 
 def those_missing(value: float, view: View, rng: np.random.Generator) -> np.ndarray:
@@ -66,7 +62,8 @@ def faded(appearance: AppearanceSpec, value: float, rng: np.random.Generator) ->
 def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     if not value:
         return spec
-    return with_levels(spec, cap_levels(spec) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count))))
+    levels = cap_levels(spec) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count)))
+    return altered(spec, appearance={"cap_levels": tuple(levels.tolist())})
 
 
 def pale(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> AppearanceSpec:

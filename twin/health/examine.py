@@ -43,7 +43,7 @@ USUAL_CAP_PX = 8.0
 GLARE_CAPS = 2
 
 
-class Verdict(StrEnum):
+class Grade(StrEnum):
     """How good a finding is."""
 
     GOOD = "good"
@@ -58,7 +58,7 @@ class Finding:
     Attributes
     ----------
     name : str
-    verdict : Verdict
+    verdict : Grade
     value : float
         The figure that is compared with the check's limits; NaN where it cannot be told.
     text : str
@@ -68,7 +68,7 @@ class Finding:
     """
 
     name: str
-    verdict: Verdict
+    verdict: Grade
     value: float
     text: str
     remedy: str
@@ -107,18 +107,18 @@ def examine(
     return findings if form == Form.RECORDING else [*_light(frames, seen, promised_caps(spec), pipeline.mask), *findings]
 
 
-def _verdict(value: float, watch: float, bad: float) -> Verdict:
-    """Verdict on a value by two limits. If ``bad`` is above ``watch``, large values are bad; else small ones. NaN is bad."""
+def _verdict(value: float, watch: float, bad: float) -> Grade:
+    """Grade on a value by two limits. If ``bad`` is above ``watch``, large values are bad; else small ones. NaN is bad."""
     sign = 1 if bad > watch else -1
     if not np.isfinite(value) or sign * value > sign * bad:
-        return Verdict.BAD
-    return Verdict.WATCH if sign * value > sign * watch else Verdict.GOOD
+        return Grade.BAD
+    return Grade.WATCH if sign * value > sign * watch else Grade.GOOD
 
 
 def _finding(name: str, value: float, limits: tuple[float, float], text: str, remedy: str) -> Finding:
     """A finding with its verdict by the limits (watch, bad); the remedy is left out where all is good."""
     verdict = _verdict(value, *limits)
-    return Finding(name, verdict, float(value), text, "" if verdict is Verdict.GOOD else remedy)
+    return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
 
 
 def _pins(seen: list[Observation]) -> Finding:
@@ -156,9 +156,7 @@ def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
     found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost))]
     if not found:
         return [
-            Finding(
-                "place", Verdict.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first"
-            )
+            Finding("place", Grade.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first")
         ]
     found = sorted(found, key=lambda d: d.contact)[: max(round(LEAST_DEFORMED * len(found)), 1)]
     shift = np.median(np.stack([d.shift_px for d in found]), axis=0)

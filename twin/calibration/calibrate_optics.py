@@ -91,7 +91,9 @@ class Studio:
         return [expose(light, spec) for light in self.light(spec, frames, title)]
 
 
-def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES, no_contact: Path | None = None) -> Calibration:
+def calibrate_optics(
+    folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES, no_contact: Path | None = None
+) -> Calibration:
     """Fit a specification to raw frames of a sensor in contact.
 
     Parameters

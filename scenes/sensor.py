@@ -552,6 +552,8 @@ class SensorSpec(Section):
             raise ValueError(f"appearance.cap_shapes needs a_0 and the same number of pairs for each of the {pins.count} pins")
         if self.appearance.cap_levels and len(self.appearance.cap_levels) != pins.count:
             raise ValueError(f"appearance.cap_levels needs one number for each of the {pins.count} pins")
+        if self.appearance.cap_offsets and len(self.appearance.cap_offsets) != pins.count:
+            raise ValueError(f"appearance.cap_offsets needs one pair for each of the {pins.count} pins")
         if (self.recording is None) != (self.pipeline.recording is None):
             raise ValueError("recording and pipeline.recording go together: give both or neither")
         return self

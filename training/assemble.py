@@ -20,8 +20,8 @@ from training.kernel import KernelHead, fit_kernel
 from training.networks import build_network, predict_rows
 from training.registration import Registration, fit_registration
 from twin.preprocess import make_graph
-from twin.preprocess.forms import frame_size
 from twin.preprocess.reference import Reference
+from twin.recordings.forms import frame_size
 
 COVERAGE = 0.9
 SMALL_GROUP = 30  # rows, below which a quantile of their own says little

@@ -9,11 +9,11 @@ import torch
 from training.dataset import Dataset, PinTable
 from training.models.cnn import INPUT_PX
 from training.models.gcn import GraphRows, graph_rows
-from twin.preprocess.forms import gray_levels
 from twin.preprocess.graph import knn_edges
 from twin.preprocess.reference import Reference
 from twin.preprocess.voronoi import directed_edges, triangulate
 from twin.recordings import open_recording
+from twin.recordings.forms import gray_levels
 from twin.store import cached_arrays
 
 RELEASE_PX = 300.0  # side of the release's resized image, in whose px and px^2 its features are

@@ -19,7 +19,7 @@ from training.loop import Loop, Rows
 from training.networks import build_network, parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
 from training.run_files import write_curves, write_tensors
-from twin.preprocess.forms import blob_spec
+from twin.recordings.forms import blob_spec
 from twin.store import fingerprint, write_text
 
 FOLDS = 10  # each network of an ensemble watches another tenth of the training rows
@@ -158,7 +158,11 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
         "size": config.size,
         "rows": {"usable": len(data), "train": len(train)},
         "sensor": pins.sensor.model_dump(mode="json"),
-        "pipeline": {"form": str(pins.form), "graph": "voronoi", "detection": blob_spec(pins.sensor, pins.form).model_dump(mode="json")},
+        "pipeline": {
+            "form": str(pins.form),
+            "graph": "voronoi",
+            "detection": blob_spec(pins.sensor.pipeline, pins.form).model_dump(mode="json"),
+        },
         "data": ", ".join(map(str, data.folders)),
         "problems": data.problems,
         "code": fingerprint(__name__),

@@ -11,9 +11,9 @@ from training.generation.config import GenerationConfig
 from training.generation.store import CONFIG, DRAWS
 from training.generation.truth_file import TRUTH
 from twin.errors import FrameError
-from twin.preprocess.forms import frame_size
 from twin.recordings import Recording
 from twin.recordings.folders import image_folders
+from twin.recordings.forms import frame_size
 from twin.recordings.tables import order_by_table, read_table
 from twin.rig.kinematics import object_pose, rig_of
 from twin.rig.mounting import Mounting

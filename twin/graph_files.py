@@ -10,7 +10,6 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.preprocess.batch import recording_reference
-from twin.preprocess.forms import frame_size
 from twin.preprocess.graph import GraphKind, make_graph
 from twin.preprocess.legacy import LegacyPipeline
 from twin.preprocess.pipeline import Pipeline
@@ -21,8 +20,10 @@ from twin.types import Form, PinGraph
 from twin.views.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes, new_figure
 
 
-def read_pins(path: Path, spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Names (M,) and node positions (M, N, 2) of the valid frames of a ``pins.npz``; lost pins take their predicted place.
+def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Names (M,) and node positions (M, N, 2) of the valid frames of a ``pins.npz`` with ``count`` pins N.
+
+    Lost pins take their predicted place.
 
     Raises
     ------
@@ -39,8 +40,8 @@ def read_pins(path: Path, spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
     frames = names.shape[0] if names.ndim else 0
     if pins.ndim != 3 or pins.shape[2] != 2 or predicted.shape != pins.shape or valid.shape != (frames,) or len(pins) != frames:
         raise FrameError(f"{path}: its arrays do not fit each other; write it anew with 'twin preprocess'")
-    if pins.shape[1] != spec.pins.count:
-        raise FrameError(f"{path}: holds {pins.shape[1]} pins a frame, sensor '{spec.name}' has {spec.pins.count}; give the right --sensor")
+    if pins.shape[1] != count:
+        raise FrameError(f"{path}: holds {pins.shape[1]} pins a frame, the sensor has {count}; give the right --sensor")
     if not valid.any():
         raise FrameError(f"{path}: no valid frame in it; look at summary.json beside it for the reasons")
     nodes_px = np.where(np.isnan(pins), predicted, pins)[valid]
@@ -55,7 +56,7 @@ def form_of_pins(spec: SensorSpec, nodes_px: np.ndarray) -> Form:
         return Form.RAW
     center = np.median(nodes_px.reshape(-1, 2), axis=0)
     away = {form: np.linalg.norm(center - np.median(nominal_reference(spec, form).pins_px, axis=0)) for form in Form}
-    return min(away, key=away.get)
+    return min(away, key=lambda form: float(away[form]))
 
 
 def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) -> Path:
@@ -75,14 +76,16 @@ def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) ->
 
 
 def draw_graph_pictures(
-    out: Path, spec: SensorSpec, form: Form, graph: PinGraph, reference: Reference, image: np.ndarray | None
+    out: Path, title: str, size_px: tuple[int, int], graph: PinGraph, reference: Reference, image: np.ndarray | None
 ) -> list[Path]:
-    """``graph.png`` over the frame (or on black), and for a Voronoi graph ``surface.png`` against the reference."""
+    """``graph.png``, and for a Voronoi graph ``surface.png`` against the reference; the files.
+
+    The graph lies over the frame (H, W[, 3]), or on black of ``size_px`` (width, height) where there is none.
+    """
     if image is None:
-        width, height = frame_size(spec, form)
-        image = np.zeros((height, width), np.uint8)
+        image = np.zeros(size_px[::-1], np.uint8)
     figure, (ax,) = new_figure(1, panel_inch=8)
-    draw_frame(ax, image, f"{spec.name}: {graph.kind}, {len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
+    draw_frame(ax, image, f"{title}: {graph.kind}, {len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
     draw_graph(ax, graph)
     draw_nodes(ax, graph)
     written = [out / "graph.png"]
@@ -135,8 +138,10 @@ def graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: For
     recording = open_recording(path, spec, form)
     left_out: list[str] = []
     reference, _ = recording_reference(spec, recording, left_out)
-    pipeline = LegacyPipeline(spec) if legacy else Pipeline(spec, recording.form, reference, graph=kind)
-    names, graphs, first_image = [], [], None
+    pipeline = LegacyPipeline(spec.pins, spec.recording) if legacy else Pipeline(spec, recording.form, reference, graph=kind)
+    names: list[str] = []
+    graphs: list[PinGraph] = []
+    first_image: np.ndarray | None = None
     for frame in recording:
         observation = pipeline(frame)
         if observation.graph is None:
@@ -146,6 +151,6 @@ def graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: For
         graphs.append(observation.graph)
         first_image = frame.image if first_image is None else first_image
     left_out += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
-    if not graphs:
+    if first_image is None:
         raise FrameError(f"{path}: no frame has a graph; the first: {left_out[0] if left_out else 'no frame in it'}")
     return RecordingGraphs(names, graphs, recording.form, reference, first_image, left_out)

@@ -14,7 +14,7 @@ from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Quality, Renderer
-from twin.preprocess.forms import frame_size
+from twin.recordings.forms import frame_size
 from twin.truth import CapTruth, cap_truth
 from twin.types import ContactState, FloatArray, Form, Frame
 

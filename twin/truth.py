@@ -6,9 +6,9 @@ import numba
 import numpy as np
 
 from scenes.sensor import SensorSpec, ViewSpec
-from twin.preprocess.forms import frame_size, from_raw
 from twin.projection import pixel_rays, project
-from twin.types import BoolArray, ContactState, FloatArray, Form, PinState
+from twin.recordings.forms import frame_size, from_raw
+from twin.types import BoolArray, FloatArray, Form, PinState
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class CapTruth:
     visible: BoolArray
 
 
-def cap_truth(spec: SensorSpec, rest: ContactState, state: ContactState, form: Form) -> CapTruth:
+def cap_truth(spec: SensorSpec, rest: PinState, state: PinState, form: Form) -> CapTruth:
     """Ground truth of a contact for frames of the given form."""
-    caps_px = from_raw(spec, form, project(spec.view, state.caps_mm))
-    rest_px = from_raw(spec, form, project(spec.view, rest.caps_mm))
+    caps_px = from_raw(spec.recording, form, project(spec.view, state.caps_mm))
+    rest_px = from_raw(spec.recording, form, project(spec.view, rest.caps_mm))
     inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
     return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state))
 

@@ -5,7 +5,7 @@ import numpy as np
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
 from twin.camera import record
-from twin.preprocess.forms import frame_size, gray_levels
+from twin.recordings.forms import frame_size, gray_levels
 from twin.types import Form
 
 

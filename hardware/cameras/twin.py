@@ -16,7 +16,7 @@ from twin.errors import ContactError
 from twin.mechanics.follow import Follower
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
-from twin.preprocess.forms import frame_size
+from twin.recordings.forms import frame_size
 from twin.rig.contact import contact_law
 from twin.types import ContactState, Form, Frame
 

@@ -14,7 +14,7 @@ from training.dataset import PinTable
 from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features
 from training.study.efficiency import measure_training
 from twin.preprocess import make_graph, nominal_reference
-from twin.preprocess.forms import frame_size
+from twin.recordings.forms import frame_size
 from twin.types import Form
 
 PAPER_RATIO = {"gnn": 0.86 / 1.05, "tac-vgnn": 1.0, "cnn-v1": "about 10", "cnn-v2": "2 to 3"}

@@ -10,11 +10,11 @@ from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline, nominal_reference
 from twin.preprocess.batch import recording_reference
-from twin.preprocess.forms import recording_to_raw
 from twin.preprocess.legacy import LegacyPipeline
 from twin.projection import project
 from twin.realism.images import compare_images
 from twin.recordings import open_recording
+from twin.recordings.forms import recording_to_raw
 from twin.rig.labels import read_arm_labels
 from twin.simulator import Simulator
 from twin.types import Form
@@ -67,7 +67,7 @@ def test_legacy_throws_away_what_the_release_does(real_dir):
     recording = open_recording(real_dir / "tac-vgnn-331", spec)
     if len(recording) != 3763:
         pytest.skip(f"the figure is for the 3763 frames of the usual split, not for {len(recording)}")
-    pipeline = LegacyPipeline(spec)
+    pipeline = LegacyPipeline(spec.pins, spec.recording)
     assert sum(not pipeline(frame).valid for frame in recording) == 101
 
 
@@ -88,8 +88,8 @@ def test_displacement_by_depth_beside_the_simulated_one(real_dir, folder):
     recording = open_recording(real_dir / folder, spec)
     labels = read_arm_labels(recording)
     assert np.array_equal(recording.names, names)
-    raw_px = recording_to_raw(spec, np.stack([o.pins_px for o in seen]))
-    measured = displacement_by_depth(labels, raw_px, recording_to_raw(spec, reference.pins_px))
+    raw_px = recording_to_raw(spec.recording, np.stack([o.pins_px for o in seen]))
+    measured = displacement_by_depth(labels, raw_px, recording_to_raw(spec.recording, reference.pins_px))
     solver = SkinSolver(spec)
     rest_px = project(spec.view, solver.rest().caps_mm)
     states = [solver.press(load_object("plane"), ContactPose(indent_mm=d)) for d in DEPTH_MIDDLES_MM]

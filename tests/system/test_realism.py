@@ -11,7 +11,7 @@ import pytest
 
 from scenes import load_object, load_sensor
 from twin.mechanics import ContactPose
-from twin.realism.run import run_realism
+from twin.realism.pictures import run_realism
 from twin.simulator import Simulator
 
 SENSOR = "ur5-331"

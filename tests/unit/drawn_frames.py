@@ -5,7 +5,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.preprocess import nominal_reference
-from twin.preprocess.forms import frame_size
+from twin.recordings.forms import frame_size
 from twin.types import Form, Frame
 
 SUBPIXELS = 16  # per pixel and axis: places are drawn to 1/16 px or better

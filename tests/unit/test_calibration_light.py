@@ -9,17 +9,17 @@ from plain_sensor import plain
 from twin.calibration.aligned import Aligned, levels_slope, revised, to_levels, to_light
 from twin.calibration.caps import ORDERS, fit_caps, outline_steps
 from twin.calibration.photometry import fit_photometry
-from twin.calibration.response import apparent_mm, defocus_px, fit_aperture, fit_blur, fit_noise, fit_response, sharpness
+from twin.calibration.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_noise, fit_response, sharpness
 from twin.calibration.rim import fit_rim
 from twin.camera import expose
 from twin.geometry.pins import rest_pins
 from twin.geometry.skin_fit import FittedPins
 from twin.optics.render import Renderer
-from twin.preprocess.forms import gray_levels
 from twin.projection import project
 from twin.realism.disc import lens_disc
 from twin.realism.spectra import noise_sd
 from twin.realism.statistics import bare_skin
+from twin.recordings.forms import gray_levels
 
 SPP = 64
 
@@ -158,7 +158,7 @@ def test_aperture_and_focus_follow_from_edges_that_widen_with_distance(known):
     distance = np.linspace(48.0, 57.0, 5)
     real = np.sqrt(1.5**2 + (0.69 * defocus_px(known.camera.fx_px, 1.0, 58.0, distance)) ** 2)
     seen = replace(sharpness_of(distance), real_px=real)
-    found = fit_aperture(known, seen)
+    found = fit_focus(known, seen)
     grown = [
         0.69 * defocus_px(known.camera.fx_px, *pair, distance) for pair in ((1.0, 58.0), (found.camera.aperture_mm, found.camera.focus_mm))
     ]
@@ -173,9 +173,11 @@ def sharpness_of(distance):
 
 def test_caps_near_the_rim_are_nearer_to_the_pupil(known):
     caps = rest_pins(known.geometry).caps_mm
-    assert apparent_mm(known, caps[0, 2]) > apparent_mm(known, caps[-1, 2])
-    bare = revised(known, gel={"refractive_index": 1.0}, lens={"refractive_index": 1.0})
-    assert apparent_mm(bare, 5.0) == pytest.approx(5.0 + known.camera.distance_mm)
+    pupil_mm = known.camera.distance_mm
+    top, rim = (apparent_mm(caps[k, 2], pupil_mm, known.lens, known.gel.refractive_index) for k in (0, -1))
+    assert top > rim
+    no_window = known.lens.model_copy(update={"refractive_index": 1.0})
+    assert apparent_mm(np.array(5.0), pupil_mm, no_window, 1.0) == pytest.approx(5.0 + pupil_mm)
 
 
 def test_noise_is_recovered(known, light, frame):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
-from twin.calibration.aligned import revised
-from twin.calibration.surroundings import SATURATED, fit_surroundings
+from twin.calibration.aligned import SATURATED, revised
+from twin.calibration.surroundings import fit_surroundings
 from twin.camera import expose
 from twin.errors import FrameError
 from twin.geometry.pins import rest_pins

@@ -83,7 +83,7 @@ def test_frames_without_a_layout_are_refused(spec):
     black = Frame(np.zeros((480, 640), np.uint8), Form.RAW)
     with pytest.raises(FrameError, match="none of 1 frames shows 127 pins"):
         tune([black], spec)
-    assert see_layout(black.image, spec, binary=False) is None
+    assert see_layout(black.image, flat_layout(spec), spec.pins.rings, binary=False) is None
 
 
 def test_recordings_are_tuned_without_a_crop(spec):

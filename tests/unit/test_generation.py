@@ -22,8 +22,8 @@ from twin.errors import ContactError, RenderError, StoreError
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import nominal_reference
-from twin.preprocess.forms import raw_to_recording
 from twin.projection import project
+from twin.recordings.forms import raw_to_recording
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import read_arm_labels, read_executed
@@ -108,7 +108,7 @@ def test_a_state_on_the_way_is_the_end_of_its_own_label(tmp_path):
         for row in rows[[1, -2]]:
             state = contact.end(labels[row], friction=0.0)
             assert np.abs(state.T_sensor_object - truth["T_sensor_object"][row]).max() < ARC_MM
-            px = raw_to_recording(config.sensor, project(config.sensor.view, state.caps_mm))
+            px = raw_to_recording(config.sensor.recording, project(config.sensor.view, state.caps_mm))
             assert np.abs(px - truth["caps_px"][row]).max() < SAME_STATE_PX
 
 

@@ -8,7 +8,7 @@ from plain_sensor import changed, plain
 
 from scenes import load_sensor
 from twin.geometry.pins import rest_pins
-from twin.health import Verdict, examine
+from twin.health import Grade, examine
 from twin.health.drift import drift_of
 from twin.mechanics.path import ContactPose
 from twin.preprocess.reference import nominal_reference
@@ -36,7 +36,7 @@ def verdicts(shown):
 
 def test_a_well_sensor_is_well():
     found = verdicts(frames("noise", 0.0))
-    assert {f.verdict for f in found.values()} == {Verdict.GOOD}, found
+    assert {f.verdict for f in found.values()} == {Grade.GOOD}, found
     assert set(found) == {"brightness", "saturation", "focus", "glare", "pins", "specks", "shift", "turn", "scale"}
 
 
@@ -55,12 +55,12 @@ def test_a_well_sensor_is_well():
 )
 def test_a_planted_fault_is_named(name, severity, finding):
     found = verdicts(frames(name, severity))
-    assert found[finding].verdict is not Verdict.GOOD and found[finding].remedy, found
+    assert found[finding].verdict is not Grade.GOOD and found[finding].remedy, found
 
 
 def test_a_black_frame_is_bad_and_nothing_crashes():
     found = verdicts([Frame(np.zeros((480, 640), np.uint8), Form.RAW)])
-    assert found["pins"].verdict is Verdict.BAD and found["brightness"].verdict is Verdict.BAD and "place" in found
+    assert found["pins"].verdict is Grade.BAD and found["brightness"].verdict is Grade.BAD and "place" in found
 
 
 def test_drift_is_the_planted_similarity():

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial import Voronoi
 
 from twin.preprocess import features, make_graph, nominal_reference
-from twin.preprocess.forms import from_raw, recording_to_raw
 from twin.preprocess.legacy import LEGACY, legacy_graph
 from twin.preprocess.voronoi import directed_edges, triangulate, voronoi
+from twin.recordings.forms import from_raw, recording_to_raw
 from twin.types import Form
 
 TILING = 1e-9  # relative: rounding of some hundred polygon cuts
@@ -128,9 +128,9 @@ def test_forms_are_inverse(sensor):
     if sensor.recording is None:
         pytest.skip("has one form only")
     raw = np.random.default_rng(0).uniform(0, 400, (50, 2))
-    np.testing.assert_allclose(recording_to_raw(sensor, from_raw(sensor, Form.RECORDING, raw)), raw, atol=1e-9)
+    np.testing.assert_allclose(recording_to_raw(sensor.recording, from_raw(sensor.recording, Form.RECORDING, raw)), raw, atol=1e-9)
     x0, y0, x1, y1 = sensor.recording.crop_px
-    corners = from_raw(sensor, Form.RECORDING, np.array([[x0 - 0.5, y0 - 0.5], [x1 - 0.5, y1 - 0.5]]))
+    corners = from_raw(sensor.recording, Form.RECORDING, np.array([[x0 - 0.5, y0 - 0.5], [x1 - 0.5, y1 - 0.5]]))
     np.testing.assert_allclose(corners, [[-0.5, -0.5], [sensor.recording.width_px - 0.5, sensor.recording.height_px - 0.5]], atol=1e-9)
 
 

@@ -8,7 +8,7 @@ from drawn_frames import cap_radii_px, draw_discs, drawn_frame, smooth_warp
 from scenes import load_sensor
 from twin.camera import record
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, measure_reference, nominal_reference, raw_to_recording
+from twin.preprocess import Pipeline, measure_reference, nominal_reference
 from twin.preprocess.blobs import SPECK_LEVELS, despeckled, find_blobs
 from twin.preprocess.legacy import LegacyPipeline
 from twin.preprocess.mask import circular_mask
@@ -16,6 +16,7 @@ from twin.preprocess.matching import match, rematch
 from twin.preprocess.reference import folded_fraction
 from twin.preprocess.split import split_chains
 from twin.recordings import open_recording
+from twin.recordings.forms import raw_to_recording
 from twin.types import Form, Frame
 
 CENTROID_RAW_PX = 0.05  # rms on a drawn gray cap with noise: a tenth of what rendering is held to
@@ -278,7 +279,7 @@ def test_a_raw_frame_and_its_recording_show_the_same_pins():
     raw = drawn_frame(spec, Form.RAW, truth, noise_sd=1.0, rng=np.random.default_rng(1))
     observation = Pipeline(spec, Form.RECORDING)(Frame(record(raw.image, spec.recording), Form.RECORDING))
     assert observation.found == len(truth)
-    assert rms(errors_px(observation, raw_to_recording(spec, truth))) < CENTROID_BINARY_PX
+    assert rms(errors_px(observation, raw_to_recording(spec.recording, truth))) < CENTROID_BINARY_PX
 
 
 def test_no_blob_is_two_pins(pipeline):
@@ -361,10 +362,10 @@ def test_published_method_counts_drawn_pins():
         spec = load_sensor(name)
         rest = nominal_reference(spec, Form.RECORDING)
         frame = drawn_frame(spec, Form.RECORDING, rest.pins_px)
-        observation = LegacyPipeline(spec)(frame)
+        observation = LegacyPipeline(spec.pins, spec.recording)(frame)
         assert observation.valid and observation.found == spec.pins.count and len(observation.graph.edges) == edges
         one_less = drawn_frame(spec, Form.RECORDING, rest.pins_px[1:], radius_px=cap_radii_px(spec, Form.RECORDING)[1:])
-        assert not LegacyPipeline(spec)(one_less).valid
+        assert not LegacyPipeline(spec.pins, spec.recording)(one_less).valid
 
 
 def test_drawn_discs_have_their_centroid():
@@ -429,6 +430,6 @@ def test_a_damaged_frame_names_its_pins_as_the_whole_one(real_dir, name, folder)
 def test_published_method_throws_away_what_it_did(real_dir):
     spec = load_sensor("mg400-331")
     recording = open_recording(real_dir / "tac-vgnn-331", spec)
-    pipeline = LegacyPipeline(spec)
+    pipeline = LegacyPipeline(spec.pins, spec.recording)
     found = np.array([pipeline(recording.read(k)).found for k in range(0, len(recording), 10)])
     assert 0.01 < np.mean(found != spec.pins.count) < 0.055  # published: 0.032; three standard errors of the sample

@@ -15,12 +15,12 @@ from twin.preprocess.reference import nominal_reference
 from twin.robustness.condition import Case
 from twin.robustness.conditions import CONDITIONS
 from twin.robustness.envelope import Envelope, crossing, curves_of, envelopes_of, shares_of
-from twin.robustness.measures import MEASURES, judge
+from twin.robustness.measures import MEASURES, judge_shot
 from twin.robustness.plan import SweepPlan, load_plan
 from twin.robustness.real import consensus
 from twin.robustness.report import _share_row, compare
 from twin.robustness.run import check_pipelines, study
-from twin.robustness.shots import RealSource, Shot
+from twin.robustness.shots import DegradedShot, RealSource
 from twin.robustness.sweep import Plan, cells_of, run_sweep
 from twin.types import Form, Frame
 
@@ -46,7 +46,7 @@ def detector(spec):
 def shot_of(rest, gone=()):
     visible = np.ones(len(rest), bool)
     visible[list(gone)] = False
-    return Shot("planted", Frame(np.zeros((480, 640), np.uint8), Form.RAW), rest, visible)
+    return DegradedShot("planted", Frame(np.zeros((480, 640), np.uint8), Form.RAW), rest, visible)
 
 
 def found_of(detector, pins_px, extra=()):
@@ -55,7 +55,7 @@ def found_of(detector, pins_px, extra=()):
 
 
 def test_a_perfect_answer_is_perfect(detector, rest):
-    assert judge(detector, found_of(detector, rest), shot_of(rest)) == {
+    assert judge_shot(detector, found_of(detector, rest), shot_of(rest)) == {
         "valid": 1.0, "recall": 1.0, "precision": 1.0, "centroid_px": 0.0, "swaps": 0.0, "area_error": 0.0, "edges": 1.0,
     }  # fmt: skip
 
@@ -64,22 +64,22 @@ def test_planted_errors_are_counted(detector, rest):
     n = len(rest)
     pins = rest.copy()
     pins[:5] = np.nan
-    lost = judge(detector, found_of(detector, pins), shot_of(rest))
+    lost = judge_shot(detector, found_of(detector, pins), shot_of(rest))
     assert lost["recall"] == pytest.approx(1 - 5 / n) and lost["precision"] == 1 and np.isnan(lost["area_error"])
-    extra = judge(detector, found_of(detector, rest, extra=[[5.0, 5.0], [9.0, 400.0]]), shot_of(rest))
+    extra = judge_shot(detector, found_of(detector, rest, extra=[[5.0, 5.0], [9.0, 400.0]]), shot_of(rest))
     assert extra["precision"] == pytest.approx(n / (n + 2)) and extra["recall"] == 1
-    moved = judge(detector, found_of(detector, rest + [0.3, 0.4]), shot_of(rest))
+    moved = judge_shot(detector, found_of(detector, rest + [0.3, 0.4]), shot_of(rest))
     assert moved["centroid_px"] == pytest.approx(0.5) and moved["area_error"] < 1e-9
     pins = rest.copy()
     pins[[10, 11]] = pins[[11, 10]]
-    swapped = judge(detector, found_of(detector, pins), shot_of(rest))
+    swapped = judge_shot(detector, found_of(detector, pins), shot_of(rest))
     assert swapped["swaps"] == pytest.approx(2 / n) and swapped["recall"] == 1
 
 
 def test_a_pin_that_is_gone_is_not_missed(detector, rest):
     pins = rest.copy()
     pins[[3, 4]] = np.nan
-    measured = judge(detector, found_of(detector, pins), shot_of(rest, gone=[3, 4]))
+    measured = judge_shot(detector, found_of(detector, pins), shot_of(rest, gone=[3, 4]))
     assert measured["recall"] == 1 and measured["precision"] == 1
 
 

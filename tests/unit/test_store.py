@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from twin.calibration.calibrate_optics import _Log
 
 from scenes import load_sensor
 from training.generation.work import outcomes
-from twin.calibration.run import _Log
 from twin.errors import StoreError
 from twin.geometry.skin_fit import FittedPins
 from twin.mechanics.solver import SkinSolver
@@ -51,7 +51,7 @@ KEEPERS = (  # the module of every function whose results are kept between runs
     "training.estimator",
     "training.generation.make",
     "training.inputs",
-    "twin.calibration.run",
+    "twin.calibration.calibrate_optics",
     "twin.detectors.tune",
     "twin.geometry.skin_fit",
     "twin.geometry.solid",
@@ -329,7 +329,7 @@ def test_frames_of_the_same_stem_do_not_share_a_fitted_skin(tmp_path, monkeypatc
         def __call__(self, pins_px):
             return FittedPins(pins_px, pins_px, pins_px, *([np.zeros(1)] * (len(FittedPins.__dataclass_fields__) - 3)))
 
-    monkeypatch.setattr("twin.calibration.run.SkinFit", Fit)
+    monkeypatch.setattr("twin.calibration.calibrate_optics.SkinFit", Fit)
     image = np.zeros((4, 4), np.uint8)
     raw = [("frame.png", image, np.zeros((3, 2))), ("frame.jpg", image, np.ones((3, 2)))]
     frames = _Log(tmp_path, sensor, raw).aligned(sensor, raw, lambda *_: None)

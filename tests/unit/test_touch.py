@@ -11,12 +11,12 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline, nominal_reference, require_untouched
-from twin.preprocess.forms import from_raw
-from twin.preprocess.touch import MOST_DENT, dent_of
+from twin.preprocess.pressed import MOST_DENT, dent_of
 from twin.projection import project
 from twin.recordings import open_recording
+from twin.recordings.forms import from_raw
 from twin.rig.labels import read_arm_labels
-from twin.robustness.condition import revised
+from twin.robustness.condition import altered
 from twin.types import Form
 
 SENSORS = ("mg400-331", "mg400-127", "ur5-331")
@@ -32,7 +32,7 @@ def form_of(spec):
 
 
 def pins_at_rest(spec):
-    return from_raw(spec, form_of(spec), project(spec.view, rest_pins(spec.geometry).caps_mm))
+    return from_raw(spec.recording, form_of(spec), project(spec.view, rest_pins(spec.geometry).caps_mm))
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -52,7 +52,7 @@ def pins_at_rest(spec):
 def test_another_camera_or_pin_is_no_contact(name, change):
     spec = load_sensor(name)
     added = {section: {key: getattr(getattr(spec, section), key) + by for key, by in keys.items()} for section, keys in change.items()}
-    moved = pins_at_rest(revised(spec, **added))
+    moved = pins_at_rest(altered(spec, **added))
     assert np.linalg.norm(moved - pins_at_rest(spec), axis=1).max() > 0.05  # px: there is something to be told apart
     assert dent_of(moved, nominal_reference(spec, form_of(spec))) < MOST_DENT
 
@@ -83,7 +83,7 @@ def test_a_turned_and_scaled_dent_is_the_same_dent():
 def test_a_pressed_sensor_is_refused(thing):
     spec = load_sensor("mg400-331")
     state = SkinSolver(spec, resolution=Resolution(across=12)).press(load_object(thing), ContactPose(indent_mm=2.5))
-    pressed_px = from_raw(spec, Form.RECORDING, project(spec.view, state.caps_mm))
+    pressed_px = from_raw(spec.recording, Form.RECORDING, project(spec.view, state.caps_mm))
     require_untouched(spec, Form.RECORDING, drawn_frame(spec, Form.RECORDING, pins_at_rest(spec)), REMEDY)
     with pytest.raises(FrameError, match="seems pressed.*dented by .*look"):
         require_untouched(spec, Form.RECORDING, drawn_frame(spec, Form.RECORDING, pressed_px), REMEDY)

@@ -11,7 +11,7 @@ from twin.errors import ContactError, MeshError
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.optics.variant import one_thread
-from twin.preprocess.forms import gray_levels
+from twin.recordings.forms import gray_levels
 from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel
 from twin.simulator import Simulator

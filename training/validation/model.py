@@ -18,9 +18,9 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.preprocess import Pipeline
 from twin.preprocess.batch import recording_reference
-from twin.preprocess.forms import from_raw
 from twin.projection import project
 from twin.recordings import open_recording
+from twin.recordings.forms import from_raw
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, read_arm_labels
@@ -134,4 +134,4 @@ class ContactModel:
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px
 
     def _pixels(self, caps_mm: np.ndarray) -> np.ndarray:
-        return from_raw(self.spec, self.form, project(self.spec.view, caps_mm))
+        return from_raw(self.spec.recording, self.form, project(self.spec.view, caps_mm))

@@ -1,10 +1,12 @@
 """Camera and pin pattern from the pins of one no-contact frame, and which of their parameters such a frame cannot tell.
 
-A camera that looks down the axis of a dome sees rings, and little else than rings of given radii: a longer focal length, a
-greater distance, a wider pattern and a stronger distortion all change these alike. Only what the pins determine is fitted.
+A camera that looks along the axis of a dome sees rings of pins, and little but the rings' radii tells anything. A longer focal
+length, a greater distance, a wider pattern and a stronger distortion change these radii alike. Only what the pins determine is
+fitted.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares, linear_sum_assignment
@@ -16,19 +18,42 @@ from twin.errors import FrameError
 from twin.geometry.pins import rest_pins
 from twin.projection import project
 
-MODEL_PX = 0.4  # by which real pins at rest miss any dome and camera, all pins of a ring alike: what hides below it is not determined
-UNSURE = 1 / 3  # sd, as a share of the plausible range, above which a parameter is not determined
-CORRELATED = 0.99  # of two parameters: more, and only one of the two can be told
-ROBUST_PX = 1.0  # residual beyond which a pin counts less
-STEP = 1e-4  # of the plausible range, for slopes
-ROUNDS, MOST_STEPS = 6, 20  # of matching and fitting; of each fit
-TURNS_DEG = np.arange(-30.0, 30.0)  # layouts repeat every 60 deg
+# Rms distance, px, by which real pins at rest miss every dome and camera, all pins of a ring alike. A parameter that moves the pins
+# by less is not determined.
+MODEL_PX = 0.4
+# A parameter is not determined if its sd is larger than this share of its plausible range.
+UNSURE = 1 / 3
+# Only one of two parameters is determined if their correlation is larger than this.
+CORRELATED = 0.99
+# Residual, px, beyond which a pin counts less (soft L1).
+ROBUST_PX = 1.0
+# Step for slopes, as a share of the plausible range.
+STEP = 1e-4
+# Rounds of matching and fitting, and steps of each fit.
+ROUNDS, MOST_STEPS = 6, 20
+# Turns that are tried, deg: layouts repeat every 60 deg.
+TURNS_DEG = np.arange(-30.0, 30.0)
+# Fewest pins that a camera is fitted to.
 LEAST_PINS = 20
+# The pupil stays at least this far behind the window's back, mm.
+BEHIND_WINDOW_MM = 0.5
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """Where a parameter is kept, its plausible range (sd, in its unit or relative to its value), its bounds, what else would tell it."""
+class CameraParameter:
+    """A parameter that pins at rest may tell.
+
+    Attributes
+    ----------
+    section : str
+        Section of the specification that holds it.
+    plausible : float
+        Sd of its plausible values, in its own unit; relative to its value where ``relative``.
+    relative : bool
+    bounds : (float, float)
+    instead : str
+        What tells it where the pins do not.
+    """
 
     section: str
     plausible: float
@@ -41,16 +66,16 @@ CONTACT = "contact frames, or a fixed value"
 BOARD = "frames of a chequerboard without the tip, or a fixed value"
 # in the order in which they are held, where several cannot be told apart
 PARAMETERS = {
-    "max_polar_deg": Parameter("pins", 5.0, False, (10.0, 88.0), f"{CONTACT} from the tip's drawing"),
-    "distance_mm": Parameter("camera", 0.1, True, (1.0, 1000.0), f"{CONTACT} measured with a ruler"),
-    "k2": Parameter("camera", 0.1, False, (-2.0, 2.0), BOARD),
-    "tilt_x_deg": Parameter("camera", 3.0, False, (-30.0, 30.0), BOARD),
-    "tilt_y_deg": Parameter("camera", 3.0, False, (-30.0, 30.0), BOARD),
-    "k1": Parameter("camera", 0.2, False, (-2.0, 2.0), BOARD),
-    "fx_px": Parameter("camera", 0.1, True, (5.0, 20000.0), BOARD),
-    "cx_px": Parameter("camera", 10.0, False, (-1e4, 1e4), BOARD),
-    "cy_px": Parameter("camera", 10.0, False, (-1e4, 1e4), BOARD),
-    "phase_deg": Parameter("pins", 2.0, False, (-360.0, 360.0), "a frame with more pins found"),
+    "max_polar_deg": CameraParameter("pins", 5.0, False, (10.0, 88.0), f"{CONTACT} from the tip's drawing"),
+    "distance_mm": CameraParameter("camera", 0.1, True, (1.0, 1000.0), f"{CONTACT} measured with a ruler"),
+    "k2": CameraParameter("camera", 0.1, False, (-2.0, 2.0), BOARD),
+    "tilt_x_deg": CameraParameter("camera", 3.0, False, (-30.0, 30.0), BOARD),
+    "tilt_y_deg": CameraParameter("camera", 3.0, False, (-30.0, 30.0), BOARD),
+    "k1": CameraParameter("camera", 0.2, False, (-2.0, 2.0), BOARD),
+    "fx_px": CameraParameter("camera", 0.1, True, (5.0, 20000.0), BOARD),
+    "cx_px": CameraParameter("camera", 10.0, False, (-1e4, 1e4), BOARD),
+    "cy_px": CameraParameter("camera", 10.0, False, (-1e4, 1e4), BOARD),
+    "phase_deg": CameraParameter("pins", 2.0, False, (-360.0, 360.0), "a frame with more pins found"),
 }
 FREE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
 
@@ -68,7 +93,7 @@ class CameraReport:
     sd : dict of str to float
         Standard deviation of each fitted parameter, in its own unit, from the Jacobian and the residuals.
     held : dict of str to str
-        Parameters that were to be fitted but are not determined, kept at the specification's value: why, and what to give in addition.
+        Parameters that were asked for but are not determined: why, and what to give in addition. They keep the specification's value.
     """
 
     rms_px: float
@@ -112,8 +137,8 @@ def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] =
     for _ in range(len(free) + 1):
         found, order, residual, slopes = _fit(spec, pins_px, order, names)
         sd, correlation = _certainty(residual, slopes)
-        alike = np.sqrt(len(pins_px) / spec.pins.rings)  # as many pins share one error
-        doubtful = _undetermined(spec, names, sd * alike * max(MODEL_PX / _rms(residual), 1), correlation)
+        alike = np.sqrt(len(pins_px) / spec.pins.rings)  # the pins of a ring share one error
+        doubtful = _undetermined(_values(spec, names), sd * alike * max(MODEL_PX / _rms(residual), 1), correlation)
         if not doubtful:
             break
         name = next(name for name in names if name in doubtful)
@@ -129,16 +154,16 @@ def nearest_order(spec: SensorSpec, pins_px: np.ndarray) -> np.ndarray:
 
     The projected caps are laid over the pins by centre and size, turned until they fit best, and assigned.
     """
-    best = None
+    best_miss, best = np.inf, np.zeros((0, 2))
     for turn in sorted(TURNS_DEG, key=abs):
         ours = project(spec.view, rest_pins(_with(spec, {"phase_deg": spec.pins.phase_deg + turn}).geometry).caps_mm)
         middle, size = ours.mean(axis=0), np.sqrt(np.mean(np.sum((ours - ours.mean(axis=0)) ** 2, axis=1)))
         center = pins_px.mean(axis=0)
         laid = (ours - middle) / size * np.sqrt(np.mean(np.sum((pins_px - center) ** 2, axis=1))) + center
         miss = float(np.mean(cKDTree(laid).query(pins_px)[0]))
-        if best is None or miss < best[0] - 1e-9:
-            best = miss, laid
-    return _assigned(pins_px, best[1])
+        if miss < best_miss - 1e-9:
+            best_miss, best = miss, laid
+    return _assigned(pins_px, best)
 
 
 def _assigned(pins_px: np.ndarray, caps_px: np.ndarray) -> np.ndarray:
@@ -148,7 +173,7 @@ def _assigned(pins_px: np.ndarray, caps_px: np.ndarray) -> np.ndarray:
 
 def _with(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
     """A copy, not validated, with values of ``PARAMETERS``."""
-    sections = {"camera": {}, "pins": {}}
+    sections: dict[str, dict[str, Any]] = {"camera": {}, "pins": {}}
     for name, value in values.items():
         sections[PARAMETERS[name].section][name] = value
     if "fx_px" in values:
@@ -156,34 +181,42 @@ def _with(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
     return spec.model_copy(update={name: getattr(spec, name).model_copy(update=given) for name, given in sections.items()})
 
 
-def _range(spec: SensorSpec, name: str) -> float:
-    """Plausible range of a parameter, in its unit."""
+def _values(spec: SensorSpec, names: list[str]) -> dict[str, float]:
+    """The specification's values of ``PARAMETERS``."""
+    return {name: getattr(getattr(spec, PARAMETERS[name].section), name) for name in names}
+
+
+def _range(name: str, value: float) -> float:
+    """Plausible range of a parameter, in its unit, about the specification's value."""
     parameter = PARAMETERS[name]
-    return parameter.plausible * (getattr(getattr(spec, parameter.section), name) if parameter.relative else 1.0)
+    return parameter.plausible * (value if parameter.relative else 1.0)
 
 
-def _fit(spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str]) -> tuple:
+def _fit(
+    spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Values (p,), order (n,), residual (2 n,) px and its slopes (2 n, p) by the values, after matching and fitting in turn."""
-    start = np.array([getattr(getattr(spec, PARAMETERS[name].section), name) for name in names])
-    ranges = np.array([_range(spec, name) for name in names])
+    known = _values(spec, names)
+    start = np.array(list(known.values()))
+    ranges = np.array([_range(name, value) for name, value in known.items()])
     low, high = np.array([PARAMETERS[name].bounds for name in names]).T.copy()
     if "distance_mm" in names:
-        low[names.index("distance_mm")] = -spec.lens.back_mm + 0.5  # the pupil stays behind the window
+        low[names.index("distance_mm")] = -spec.lens.back_mm + BEHIND_WINDOW_MM
 
     def caps_px(values: np.ndarray) -> np.ndarray:
         trial = _with(spec, dict(zip(names, values.tolist(), strict=True)))
         return project(trial.view, rest_pins(trial.geometry).caps_mm)
 
+    def residual(values: np.ndarray, order: np.ndarray) -> np.ndarray:
+        return (caps_px(values)[order] - pins_px).ravel()
+
+    def slopes(values: np.ndarray, order: np.ndarray) -> np.ndarray:
+        steps = STEP * ranges * np.eye(len(ranges))
+        return np.column_stack([(residual(values + d, order) - residual(values - d, order)) / (2 * np.abs(d).max()) for d in steps])
+
     values = start
     for _ in range(ROUNDS):
-
-        def residual(values: np.ndarray, order=order) -> np.ndarray:
-            return (caps_px(values)[order] - pins_px).ravel()
-
-        def slopes(values: np.ndarray, residual=residual) -> np.ndarray:
-            steps = STEP * ranges * np.eye(len(ranges))
-            return np.column_stack([(residual(values + d) - residual(values - d)) / (2 * np.abs(d).max()) for d in steps])
-
+        before = order
         fit = least_squares(
             residual,
             np.clip(values, low, high),
@@ -193,16 +226,17 @@ def _fit(spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[s
             loss="soft_l1",
             f_scale=ROBUST_PX,
             max_nfev=MOST_STEPS,
+            args=(order,),
         )
-        values, before = fit.x, order
+        values = fit.x
         order = _assigned(pins_px, caps_px(values))
         if np.array_equal(order, before):
             break
-    return values, order, residual(values), slopes(values)
+    return values, order, residual(values, before), slopes(values, before)
 
 
 def _rms(residual: np.ndarray) -> float:
-    """Of the distances (n,) whose components (2 n,) are given."""
+    """Rms of the distances (n,) whose components (2 n,) are given."""
     return float(np.sqrt(2 * np.mean(residual**2)))
 
 
@@ -216,17 +250,18 @@ def _certainty(residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np
     return unit / np.maximum(scale, 1e-300) * np.sqrt(np.sum(residual**2) / freedom), covariance / np.outer(unit, unit)
 
 
-def _undetermined(spec: SensorSpec, names: list[str], sd: np.ndarray, correlation: np.ndarray) -> dict[str, str]:
-    """Parameters that the pins do not determine, and in words why."""
-    doubtful = {}
-    for k, name in enumerate(names):
+def _undetermined(known: dict[str, float], sd: np.ndarray, correlation: np.ndarray) -> dict[str, str]:
+    """Parameters that the pins do not determine, and in words why; ``known`` holds the specification's values."""
+    doubtful: dict[str, str] = {}
+    names = list(known)
+    for k, (name, value) in enumerate(known.items()):
+        plausible = _range(name, value)
         twins = [f"{names[j]} ({correlation[k, j]:+.3f})" for j in range(len(names)) if j != k and abs(correlation[k, j]) > CORRELATED]
-        unsure = sd[k] > UNSURE * _range(spec, name)
+        unsure = sd[k] > UNSURE * plausible
         if not twins and not unsure:
             continue
         why = [f"its effect is that of {', '.join(twins)} (correlation)"] if twins else []
-        why += [f"its standard deviation would be {sd[k]:.2g}, of a plausible range of {_range(spec, name):.2g}"] if unsure else []
-        value = getattr(getattr(spec, PARAMETERS[name].section), name)
+        why += [f"its standard deviation would be {sd[k]:.2g}, of a plausible range of {plausible:.2g}"] if unsure else []
         doubtful[name] = (
             f"{name} is not determined by this no-contact frame: {'; '.join(why)}. "
             f"Held at the specification's {value:g}; to find it give in addition {PARAMETERS[name].instead}"

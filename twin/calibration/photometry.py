@@ -1,8 +1,8 @@
 """Lights and colours from the gray levels of caps and skin, by Gauss-Newton on the differentiable renderer.
 
-Only products are seen: LED power times exposure times reflectance. The caps' largest reflectance is held at
-``CAP_ALBEDO`` (printed white) and the exposure as it is; the rest follows. What a cap has of its own stays out: residuals are
-weighted robustly, and ``caps`` finds it afterwards.
+Only the product of LED power, exposure and reflectance is seen. Therefore the caps' largest reflectance is held at ``CAP_ALBEDO``
+(printed white) and the exposure as it is; the power follows. Caps that differ from the others count less (robust weights);
+``caps`` finds their own reflectance afterwards.
 """
 
 from dataclasses import dataclass
@@ -10,22 +10,36 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from scenes.sensor import SensorSpec
-from twin.calibration.aligned import SATURATED, Aligned, levels_slope, revised, to_levels, to_light
+from scenes.sensor import BlobSpec, GelSpec, ResponseSpec, SensorSpec
+from twin.calibration.aligned import SATURATED, Aligned, levels_slope, require_cameras_own, revised, to_levels, to_light
 from twin.camera import blurred
 from twin.optics.light_model import Knobs, LightModel
 from twin.optics.render import Renderer
+from twin.progress import Progress
 from twin.realism.spots import clear_of_pins, pin_spacing_px
 
-CAP_ALBEDO = 0.8  # of the caps' brightest channel: white resin
-SKIN_SAMPLES = 250  # pixels of bare skin a frame
-SKIN_CLEARANCE = 0.6  # of the pins' spacing: bare skin is farther from every cap's middle
-DISC_SHARE = 0.9  # of the mask's radius: nearer to the rim other light comes in
+# Reflectance of the caps' brightest channel. Assumed: white printing resin.
+CAP_ALBEDO = 0.8
+# Pixels of bare skin that are taken from a frame.
+SKIN_SAMPLES = 250
+# Bare skin is farther from every cap's middle than this share of the pins' spacing.
+SKIN_CLEARANCE = 0.6
+# Pixels outside this share of the mask's radius are left out: light from the rim reaches them.
+DISC_SHARE = 0.9
+# Gauss-Newton steps.
 STEPS = 6
-SLOPES_EVERY = 2  # the light is nearly linear in the knobs
-ROBUST_LEVELS = 12.0  # residual beyond which an observation counts less (Cauchy)
-BALANCE_SD = 0.3  # of an LED's share, before the frames are seen
+# Slopes are computed anew at one step in this many: the light is nearly linear in the unknowns.
+SLOPES_EVERY = 2
+# Residual, gray levels, beyond which a sample counts less (Cauchy).
+ROBUST_LEVELS = 12.0
+# Sd of the logarithm of an LED's share before the frames are seen.
+BALANCE_SD = 0.3
+# Largest change of an unknown (a logarithm) in one step.
 LARGEST_STEP = 0.7
+# Damping of the normal equations, relative to their trace: keeps them solvable.
+DAMPING = 1e-9
+# Largest haze that is allowed.
+MOST_HAZE = 0.5
 
 
 @dataclass(frozen=True)
@@ -47,19 +61,33 @@ class PhotometryFit:
     skin_rms: tuple[float, float]
 
 
-def sample_frame(spec: SensorSpec, frame: Aligned, around: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> Samples:
+def sample_frame(
+    frame: Aligned, around: tuple[np.ndarray, np.ndarray], response: ResponseSpec, gel: GelSpec, blob: BlobSpec, rng: np.random.Generator
+) -> Samples:
     """Caps' middles and bare skin of a frame, each the mean of 3 x 3 px.
 
-    The veil is the frame's own light, blurred; where the static layer covers the gel, and saturates in the frame, it is
-    ``around``: the layer's light (H, W[, 3]) and the share (H, W) of the gel that it lets through.
+    The veil is the light that haze spreads: the frame's own light, blurred. Where the static layer covers the gel, the frame is often
+    saturated and the layer's own light is taken instead.
+
+    Parameters
+    ----------
+    frame : Aligned
+    around : (H, W[, 3]) float, (H, W) float
+        The static layer's light, and the share of the gel's light that it lets through.
+    response : ResponseSpec
+    gel : GelSpec
+        Its haze's width.
+    blob : BlobSpec
+        Its mask.
+    rng : numpy.random.Generator
+        Chooses the pixels of bare skin.
     """
     image = frame.image if frame.image.ndim == 3 else frame.image[..., None]
     mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)
     outside, through = around
-    light = np.where(through[..., None] > 0, to_light(image, spec.response), outside.reshape(image.shape)).astype(np.float32)
-    veil = blurred(light, spec.gel.haze_sigma_px).reshape(image.shape)
+    light = np.where(through[..., None] > 0, to_light(image, response), outside.reshape(image.shape)).astype(np.float32)
+    veil = blurred(light, gel.haze_sigma_px).reshape(image.shape)
     caps = np.rint(frame.pins_px[np.isfinite(frame.pins_px).all(axis=1)]).astype(int)
-    blob = spec.pipeline.raw
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     bare = np.hypot(x - blob.mask_center_px[0], y - blob.mask_center_px[1]) < DISC_SHARE * blob.mask_radius_px
     bare &= clear_of_pins(image.shape, caps, round(SKIN_CLEARANCE * pin_spacing_px(caps)))
@@ -70,7 +98,7 @@ def sample_frame(spec: SensorSpec, frame: Aligned, around: tuple[np.ndarray, np.
     return Samples(pixels, mean[at], veil[at], np.arange(len(pixels)) < len(caps))
 
 
-def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> PhotometryFit:
+def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Progress) -> PhotometryFit:
     """Recover LED powers, colours of caps and skin, and the gel's haze.
 
     Parameters
@@ -80,21 +108,29 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> Photome
     frames : list of Aligned
     progress : callable
         ``progress(done, total)``.
+
+    Raises
+    ------
+    FrameError
+        A frame does not have the camera's size and channels.
     """
+    for frame in frames:
+        require_cameras_own(frame.image, frame.name, spec.camera)
     rng = np.random.default_rng(0)
     renderer = Renderer(spec)
-    samples = [sample_frame(spec, frame, renderer.static, rng) for frame in frames]
+    samples = [sample_frame(frame, renderer.static, spec.response, spec.gel, spec.pipeline.raw, rng) for frame in frames]
     width = spec.camera.width_px
     models = [
         LightModel(renderer, f.state, s.pixels[:, 1] * width + s.pixels[:, 0], seed)
         for seed, (f, s) in enumerate(zip(frames, samples, strict=True))
     ]
     levels, veil, caps = (np.concatenate([getattr(s, name) for s in samples]) for name in ("levels", "veil", "caps"))
-    useful = (levels < SATURATED).all(axis=1)
+    useful = np.all(levels < SATURATED, axis=1)
     channels, leds = levels.shape[1], models[0].led_count
     layout = _Layout(leds, channels)
-    x = layout.start(spec, models, levels, caps & useful)
-    first = None
+    x = layout.start(models, to_light(levels[caps & useful], spec.response), caps & useful, spec.gel.haze)
+    slopes: dict[str, np.ndarray] = {}
+    rms: list[tuple[float, float]] = []
     for step in range(STEPS):
         light = np.concatenate([m.light(layout.knobs(x)) for m in models])
         if step % SLOPES_EVERY == 0:
@@ -108,13 +144,18 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress) -> Photome
         hessian = (a * weight.reshape(-1, 1)).T @ a
         prior = np.zeros(len(x))
         prior[:leds] = weight.sum() / len(frames) / leds * (1.0 / BALANCE_SD) ** 2
-        move = np.linalg.solve(hessian + np.diag(prior + 1e-9 * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
+        move = np.linalg.solve(hessian + np.diag(prior + DAMPING * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
         x = x + np.clip(move, -LARGEST_STEP, LARGEST_STEP)
-        x[-1] = np.clip(x[-1], 0, 0.5)
-        rms = tuple(float(np.sqrt(np.mean(residual[part & useful] ** 2))) for part in (caps, ~caps))
-        first = first or rms
+        x[-1] = np.clip(x[-1], 0, MOST_HAZE)
+        rms.append((_rms(residual[caps & useful]), _rms(residual[~caps & useful])))
         progress(step + 1, STEPS)
-    return PhotometryFit(layout.applied(spec, x), (first[0], rms[0]), (first[1], rms[1]))
+    first, last = rms[0], rms[-1]
+    return PhotometryFit(layout.applied(spec, x), (first[0], last[0]), (first[1], last[1]))
+
+
+def _rms(residual: np.ndarray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(residual**2)))
 
 
 class _Layout:
@@ -125,13 +166,13 @@ class _Layout:
         self.count = leds + 2 * channels + 1
         self.skin, self.caps = slice(leds, leds + channels), slice(leds + channels, leds + 2 * channels)
 
-    def start(self, spec: SensorSpec, models, levels: np.ndarray, caps: np.ndarray) -> np.ndarray:
-        """All neutral but for the caps' light, which is scaled to the frames' medians; the skin goes with it."""
+    def start(self, models: list[LightModel], cap_light: np.ndarray, caps: np.ndarray, haze: float) -> np.ndarray:
+        """Unknowns to start from: neutral, but caps (and skin alike) scaled to the median of the real ``cap_light`` (n, channels)."""
         x = np.zeros(self.count)
         light = np.concatenate([m.light(self.knobs(x)) for m in models])
-        ratio = np.median(to_light(levels[caps], spec.response), axis=0) / np.median(light[caps], axis=0)
+        ratio = np.median(cap_light, axis=0) / np.median(light[caps], axis=0)
         x[self.caps] = x[self.skin] = np.log(ratio)
-        x[-1] = spec.gel.haze
+        x[-1] = haze
         return x
 
     def knobs(self, x: np.ndarray) -> Knobs:
@@ -139,7 +180,7 @@ class _Layout:
         skin, caps = (np.broadcast_to(np.exp(x[part]), 3) for part in (self.skin, self.caps))
         return Knobs(np.exp(x[: self.leds]), 1.0, skin, caps, skin)
 
-    def jacobian(self, slopes: dict, light: np.ndarray, veil: np.ndarray, haze: float, curve: np.ndarray) -> np.ndarray:
+    def jacobian(self, slopes: dict[str, np.ndarray], light: np.ndarray, veil: np.ndarray, haze: float, curve: np.ndarray) -> np.ndarray:
         """Derivatives (n, channels, unknowns) of the gray levels."""
         result = np.zeros((*light.shape, self.count))
         for k in range(self.leds):

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from scenes.sensor import SensorSpec
-from twin.calibration.run import Calibration
+from twin.calibration.calibrate_optics import Calibration
 from twin.realism.images import difference_picture
 from twin.recordings.images import write_image
 from twin.views.page import render_page

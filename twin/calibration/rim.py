@@ -1,22 +1,26 @@
-"""The light at the edge of the disc that no formula has: measured, as a table of azimuth and radius."""
+"""The light at the edge of the disc that no formula describes (glue, burrs, glare): measured, as a table by azimuth and radius."""
 
 import numpy as np
 
-from scenes.sensor import RimSpec, SensorSpec
+from scenes.sensor import CameraSpec, HousingSpec, RimSpec, SensorSpec
 from twin.calibration.aligned import SATURATED, Aligned, revised, to_light
 from twin.camera import expose
 from twin.optics.lens import ray_table
 from twin.optics.static_layer import RIM_UNIT, rim_places, static_layer
 from twin.projection import sensor_to_camera
 
-INSIDE_MM, OUTSIDE_MM = 1.75, 0.4  # of the housing's opening: how far the table reaches; no pin comes so near
-AZIMUTHS, RADII = 240, 32  # the edge is steep along the radius
-ROUNDS = 3  # blur and sharpening lie between the table and the pixels
-GAIN = 0.9  # of a correction
+# How far the table reaches inwards and outwards from the edge of the housing's opening, mm: no pin comes so near to the edge.
+INSIDE_MM, OUTSIDE_MM = 1.75, 0.4
+# Entries of the table. The radius has many for its width, because the light changes steeply at the edge.
+AZIMUTHS, RADII = 240, 32
+# Rounds of correcting, and the share of what is missing that each adds. Blur and sharpening between table and pixels need several.
+ROUNDS, GAIN = 3, 0.9
 
 
 def fit_rim(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray]) -> SensorSpec:
-    """``housing.rim`` from what real frames show beyond rendered ones, mean of the frames; saturated pixels ask for no less.
+    """The specification with ``housing.rim``: what real frames show beyond rendered ones, mean of the frames.
+
+    A saturated pixel never lowers the light.
 
     Parameters
     ----------
@@ -28,7 +32,7 @@ def fit_rim(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray]) ->
     """
     ring = spec.housing
     inner, outer = ring.aperture_radius_mm - INSIDE_MM, ring.aperture_radius_mm + OUTSIDE_MM
-    cell, weight, pixels = _cells(spec, inner, outer)
+    cell, weight, pixels = _cells(spec.camera, ring, inner, outer)
     window = (0, 0, spec.camera.width_px, spec.camera.height_px)
     before = static_layer(spec, window)[0]
     table = np.zeros((AZIMUTHS, RADII, 3))
@@ -61,9 +65,8 @@ def _missing(spec: SensorSpec, frame: Aligned, light: np.ndarray) -> np.ndarray:
     return np.where((frame.image >= SATURATED) & (shown >= SATURATED), 0.0, lacking)
 
 
-def _cells(spec: SensorSpec, inner_mm: float, outer_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cells(camera: CameraSpec, ring: HousingSpec, inner_mm: float, outer_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The four table entries (n, 4) around each pixel of the band, their bilinear weights (n, 4), and the pixels' flat indices (n,)."""
-    camera, ring = spec.camera, spec.housing
     corners = ray_table(camera, (0, 0, camera.width_px, camera.height_px)) @ sensor_to_camera(camera)[:3, :3]
     rays = ((corners[:-1, :-1] + corners[1:, 1:]) / 2).reshape(-1, 3)
     turn, along = rim_places(ring, inner_mm, outer_mm, (AZIMUTHS, RADII), rays[:, :2] / rays[:, 2:] * (ring.z_mm + camera.distance_mm))

@@ -46,8 +46,8 @@ def optics(
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
 ) -> None:
     from scenes import load_sensor
+    from twin.calibration.calibrate_optics import calibrate_optics
     from twin.calibration.report import write_page
-    from twin.calibration.run import calibrate
     from twin.cli.progress import count_bar
     from twin.errors import FrameError
     from twin.sensor_file import write_sensor
@@ -57,7 +57,7 @@ def optics(
     spec = load_sensor(sensor)
     folder = out.with_name(f"{out.stem}-calibration")
     folder.mkdir(parents=True, exist_ok=True)
-    found = calibrate(frames, spec, folder, count_bar, limit=limit, no_contact=no_contact)
+    found = calibrate_optics(frames, spec, folder, count_bar, limit=limit, no_contact=no_contact)
     write_sensor(out, found.spec, f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {spec.name}.")
     page = write_page(folder, spec, found, frames.name)
     for note in found.notes:

@@ -38,7 +38,7 @@ def check(
     from twin.cli.progress import count_bar
     from twin.detectors import load_detector
     from twin.errors import FrameError
-    from twin.health import Verdict, examine
+    from twin.health import Grade, examine
 
     spec = load_sensor(sensor)
     detector = load_detector(pipeline) if pipeline else None
@@ -53,7 +53,7 @@ def check(
         print(f"{found.verdict.upper():5} {found.name:10} {found.text}")
         if found.remedy:
             print(f"      -> {found.remedy}")
-    if any(found.verdict is Verdict.BAD for found in findings):
+    if any(found.verdict is Grade.BAD for found in findings):
         raise SystemExit(2)
 
 

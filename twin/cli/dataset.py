@@ -92,7 +92,7 @@ def dataset(
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation import GenerationConfig, generate
     from twin.cli.progress import rate_bar
-    from twin.preprocess.forms import frame_size
+    from twin.recordings.forms import frame_size
     from twin.rig.contact import friction_between
 
     spec, plan = load_sensor(sensor), load_experiment(experiment)

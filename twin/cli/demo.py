@@ -10,7 +10,7 @@ from twin.cli.options import Out, writable_folder
 def demo(out: Out = Path("out/demo")) -> None:
     """Press, render, detect, graph: two sensors and more, as pictures and one page (index.html)."""
     from twin.cli.progress import step_bar
-    from twin.demo.run import run_demo
+    from twin.demo.make_demo import run_demo
 
     writable_folder(out)
     for path in run_demo(out, step_bar):

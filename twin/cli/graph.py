@@ -56,13 +56,14 @@ def graph(
         write_graphs,
     )
     from twin.preprocess.reference import nominal_reference
+    from twin.recordings.forms import frame_size
 
     spec = load_sensor(sensor)
     image = None
     if legacy and (kind is not Kind.VORONOI or path.suffix == ".npz"):
         raise TwinError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
     if path.suffix == ".npz":
-        names, nodes_px = read_pins(path, spec)
+        names, nodes_px = read_pins(path, spec.pins.count)
         form = form or form_of_pins(spec, nodes_px)
         reference = nominal_reference(spec, form)
         graphs = graphs_of_nodes(kind.value, nodes_px, reference)
@@ -74,6 +75,10 @@ def graph(
             print(f"skipped {reason}")
     writable_folder(out)
     print(f"{len(graphs)} graphs; the first has {len(graphs[0].nodes_px)} nodes and {len(graphs[0].edges)} directed edges")
-    pictures = draw_bare_graph(out, graphs[0]) if legacy else draw_graph_pictures(out, spec, form, graphs[0], reference, image)
+    pictures = (
+        draw_bare_graph(out, graphs[0])
+        if legacy
+        else draw_graph_pictures(out, spec.name, frame_size(spec, form), graphs[0], reference, image)
+    )
     for written in [write_graphs(out, names, graphs), *pictures]:
         print(f"wrote {written}")

@@ -55,7 +55,7 @@ def realism(
 ) -> None:
     from scenes import load_sensor
     from twin.cli.progress import count_bar
-    from twin.realism.run import run_realism
+    from twin.realism.pictures import run_realism
 
     spec = load_sensor(sensor)
     writable_folder(out)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,16 +12,21 @@ from twin.contact_files import look_at
 from twin.mechanics.path import ContactPose
 from twin.preprocess.graph import make_graph
 from twin.preprocess.reference import nominal_reference
+from twin.progress import FractionProgress
 from twin.projection import project
 from twin.simulator import Shot, Simulator
 from twin.types import ContactState, Form
 from twin.views.panel import Look
 
+Result = TypeVar("Result")
+
+# Contacts of the demo: sensor, object, pose, and the form in which the pins are found.
 CONTACTS = (
     ("ur5-331", "edge", ContactPose(indent_mm=3.5), Form.RAW),
     ("mg400-331", "plane", ContactPose(indent_mm=4.0, tilt_deg=(0.0, 8.0)), Form.RECORDING),
     ("mg400-127", "sphere", ContactPose(indent_mm=4.0, offset_mm=(3.0, -2.0)), Form.RECORDING),
 )
+# The three motions of the paper's figure 1(d).
 MOTIONS = (
     ("Z: pressed 4 mm", ContactPose(indent_mm=4.0)),
     ("X: then dragged 3 mm along x", ContactPose(indent_mm=4.0, shear_mm=(3.0, 0.0))),
@@ -29,6 +35,7 @@ MOTIONS = (
 # Mean pin displacement of pure presses in the Tac-VGNN release's recordings (Apache-2.0), px of the uncropped camera frame,
 # for pose_2 in four 1 mm bins from -4 to 0; the indentation is about pose_2 + 5 mm.
 MEASURED_DISPLACEMENT_PX = {"mg400-331": (1.9, 3.4, 5.0, 7.5), "mg400-127": (2.2, 3.8, 6.0, 8.9)}
+# The middles of these bins as indentations.
 TABLE_INDENTS_MM = (1.5, 2.5, 3.5, 4.5)
 
 
@@ -38,7 +45,7 @@ class Timed:
 
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def run(self, stage: str, work: Callable):
+    def run(self, stage: str, work: Callable[[], Result]) -> Result:
         """Call ``work()`` and add its time to the stage."""
         start = perf_counter()
         result = work()
@@ -59,7 +66,9 @@ class ContactResult:
     seconds: dict[str, float]
 
 
-def run_contact(simulator: Simulator, stimulus: str, pose: ContactPose, form: Form, *, progress=None) -> ContactResult:
+def run_contact(
+    simulator: Simulator, stimulus: str, pose: ContactPose, form: Form, *, progress: FractionProgress | None = None
+) -> ContactResult:
     """Press, render, capture, detect, build the graph: one contact beside no contact."""
     timed = Timed()
     state = timed.run("press", lambda: simulator.press(load_object(stimulus), pose, progress=progress))
@@ -81,7 +90,7 @@ class DepthRow:
     force_n: float
 
 
-def depth_table(sensor: str, *, progress=None) -> list[DepthRow]:
+def depth_table(sensor: str, *, progress: FractionProgress | None = None) -> list[DepthRow]:
     """Press a plane to the four depths of the recordings' table (true caps, no rendering)."""
     spec = load_sensor(sensor)
     simulator = Simulator(spec)

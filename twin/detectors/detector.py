@@ -1,4 +1,4 @@
-"""Any way to find pins as one call: frame in, claims, names and graph out."""
+"""Each way to find pins behind one call: a frame goes in; claimed places, pins by name and a graph come out."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -6,19 +6,22 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import QhullError, cKDTree
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import PinsSpec, RecordingSpec, SensorSpec
 from twin.camera import record
 from twin.detectors.finders import find
 from twin.detectors.spec import DetectorSpec
 from twin.errors import FrameError
-from twin.preprocess.forms import frame_size, from_raw, gray_levels, recording_to_raw
 from twin.preprocess.graph import make_graph
 from twin.preprocess.legacy import LegacyPipeline, legacy_graph
 from twin.preprocess.mask import circular_mask
 from twin.preprocess.matching import match
 from twin.preprocess.pipeline import MIN_FOUND, Pipeline
 from twin.preprocess.reference import Reference, make_reference, nominal_reference
+from twin.recordings.forms import frame_size, from_raw, gray_levels, recording_to_raw
 from twin.types import Form, Frame, PinGraph
+
+# A frame with more blobs than this for each pin is refused as clutter.
+MOST_BLOBS = 4
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,11 @@ class Found:
     Attributes
     ----------
     claims_px : (K, 2) float
-        Where it says that pins are, px of the frame, in any order.
+        Places where it claims pins, px of the frame, in any order.
     pins_px : (N, 2) float or None
-        The same by name, in the specification's order, NaN where lost; None if it gives no names.
+        The same places in the specification's pin order, NaN where lost; None if it does not tell which pin is which.
     graph : PinGraph or None
-        In the specification's order if there are names, else in the order of the claims. None if the frame is not valid.
+        In the order of ``pins_px`` if it is given, else of the claims. None if the frame is not valid.
     valid : bool
     reason : str
     """
@@ -58,7 +61,7 @@ class Detector(Protocol):
 def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bool = True) -> Detector:
     """A detector ready for frames.
 
-    ``second_look`` as `Pipeline` takes it: whoever judges thresholds by what they find wants none.
+    ``second_look`` as `Pipeline` takes it. Set it to False to judge thresholds: a second look hides what a threshold loses.
 
     Raises
     ------
@@ -70,13 +73,13 @@ def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bo
             f"'{detector.name}' was tuned for {len(detector.pins_px)} pins, {sensor.name} has {sensor.pins.count}: tune it for this sensor"
         )
     if detector.method == "legacy":
-        return LegacyDetector(sensor, detector)
+        return LegacyDetector(sensor.pins, sensor.recording, detector)
     reference = (
         make_reference(np.array(detector.pins_px), sensor.pins.rings) if detector.pins_px else nominal_reference(sensor, detector.form)
     )
     if detector.method == "twin":
         return TwinDetector(sensor, detector, reference, second_look=second_look)
-    return PlainDetector(sensor, detector, reference)
+    return PlainDetector(frame_size(sensor, detector.form), detector, reference)
 
 
 class TwinDetector:
@@ -96,24 +99,24 @@ class TwinDetector:
 
 
 class PlainDetector:
-    """A plain blob detector, whose blobs get their names from the same matching as ours: what differs is how blobs are found."""
+    """A plain blob detector. Its blobs are matched to the pins as the pipeline's are, so that only the way to find blobs differs."""
 
-    def __init__(self, sensor: SensorSpec, spec: DetectorSpec, reference: Reference) -> None:
+    def __init__(self, size_px: tuple[int, int], spec: DetectorSpec, reference: Reference) -> None:
         self.spec, self._reference = spec, reference
-        self._mask = circular_mask(frame_size(sensor, spec.form), spec.blob.mask_center_px, spec.blob.mask_radius_px)
+        self._mask = circular_mask(size_px, spec.blob.mask_center_px, spec.blob.mask_radius_px)
 
     def __call__(self, frame: Frame) -> Found:
         window = np.ascontiguousarray(gray_levels(np.ascontiguousarray(frame.image[self._mask.window])))
         px, area = find(window, self._mask, self.spec)
         count = len(self._reference.pins_px)
-        if len(px) > 4 * count:
+        if len(px) > MOST_BLOBS * count:
             return Found(px, np.full((count, 2), np.nan), None, False, f"too many blobs: {len(px)}")
         found = match(self._reference, px, area)
         paired = found.blob >= 0
         pins_px = np.full((count, 2), np.nan)
         pins_px[paired] = px[found.blob[paired]]
         nodes_px = np.where(paired[:, None], pins_px, found.predicted_px)
-        valid = paired.sum() >= MIN_FOUND * count and bool(np.isfinite(nodes_px).all())
+        valid = bool(paired.sum() >= MIN_FOUND * count) and bool(np.isfinite(nodes_px).all())
         reason = "" if valid else f"too few pins: {int(paired.sum())} of {count}"
         return Found(pins_px[paired], pins_px, self.graph_of(nodes_px) if valid else None, valid, reason)
 
@@ -124,28 +127,27 @@ class PlainDetector:
 class LegacyDetector:
     """The published method; raw frames go through the published recorder first."""
 
-    def __init__(self, sensor: SensorSpec, spec: DetectorSpec) -> None:
-        recording = spec.recording or sensor.recording
+    def __init__(self, pins: PinsSpec, recording: RecordingSpec | None, spec: DetectorSpec) -> None:
+        recording = spec.recording or recording
         if recording is None:
             raise FrameError(
-                f"'{spec.name}': the published method needs a recorder's crop and threshold, {sensor.name} has none;"
+                f"'{spec.name}': the published method needs a recorder's crop and threshold, the sensor has none;"
                 " run 'twin tune --method legacy'"
             )
-        self.spec = spec
-        self._sensor = sensor.model_copy(update={"recording": recording})
-        self._pipeline = LegacyPipeline(self._sensor)
+        self.spec, self._recording = spec, recording
+        self._pipeline = LegacyPipeline(pins, recording)
 
     def __call__(self, frame: Frame) -> Found:
         raw = frame.form == Form.RAW
         if raw:
-            frame = Frame(record(frame.image, self._sensor.recording), Form.RECORDING, frame.name)
+            frame = Frame(record(frame.image, self._recording), Form.RECORDING, frame.name)
         seen = self._pipeline(frame)
-        px = recording_to_raw(self._sensor, seen.nodes_px) if raw else seen.nodes_px
+        px = recording_to_raw(self._recording, seen.nodes_px) if raw else seen.nodes_px
         return Found(px, None, seen.graph, seen.valid, seen.reason)
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph | None:
         size = self._pipeline.parameters.size_px
-        recorded = from_raw(self._sensor, Form.RECORDING, nodes_px) if self.spec.form == Form.RAW else nodes_px
+        recorded = from_raw(self._recording, Form.RECORDING, nodes_px) if self.spec.form == Form.RAW else nodes_px
         nodes = (recorded + 0.5) * size / np.array(self._pipeline.size_px) - 0.5
         try:
             return legacy_graph(nodes - np.median(nodes), self._pipeline.parameters)

@@ -1,5 +1,6 @@
 """Where a layout of pins lies in a frame, from its count and rings alone."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -10,20 +11,30 @@ from scipy.spatial import cKDTree
 
 from scenes.sensor import SensorSpec
 from twin.geometry.pins import rest_pins
-from twin.preprocess.matching import match
+from twin.preprocess.matching import Match, match
 from twin.preprocess.reference import Reference, make_reference
 
-OFFSETS = (3.0, 6.0, 12.0, 20.0, 32.0)  # gray levels above the local mean
-BLOCKS = (1 / 40, 1 / 20, 1 / 10)  # of the frame's smaller side
-LEAST_AREA_PX2 = 4.0
-LEAST_FILL = 0.4  # of a blob's bounding box
-MOST_ASPECT = 3.0
-LINK = 1.7  # in median distances of nearest neighbours: blobs nearer than that belong together
-AREA_RATIO = 3.5  # to the median area, either way
-ENOUGH = 0.5  # of the pins: fewer blobs are no layout
-TURNS_DEG = (0.0, -6.0, 6.0, -12.0, 12.0, -18.0, 18.0, -24.0, 24.0, 30.0)  # a layout is the same after 60 deg
+# Thresholds that are tried: gray levels above the local mean, and the side over which that mean is taken, as a share of the frame's
+# smaller side.
+OFFSETS, BLOCKS = (3.0, 6.0, 12.0, 20.0, 32.0), (1 / 40, 1 / 20, 1 / 10)
+# Least area of a blob, px^2; least share of its bounding box that it fills; largest ratio of that box's sides.
+LEAST_AREA_PX2, LEAST_FILL, MOST_ASPECT = 4.0, 0.4, 3.0
+# Blobs nearer to each other than this many median distances of nearest neighbours belong together.
+LINK = 1.7
+# Largest ratio of a blob's area to the median, either way.
+AREA_RATIO = 3.5
+# Fewer blobs than this share of the pins are no layout.
+ENOUGH = 0.5
+# Sets of blobs that are tried, those nearest to the number of pins first.
+CANDIDATES = 3
+# Turns that are tried. A layout is the same after 60 deg.
+TURNS_DEG = (0.0, -6.0, 6.0, -12.0, 12.0, -18.0, 18.0, -24.0, 24.0, 30.0)
+# Sizes that are tried, relative to that of the circle around the blobs.
 SCALES = (1.0, 0.96, 1.05)
-HOPELESS = 0.4  # score per pin: below it no other size is tried
+# Score for each pin below which no other size is tried, and above which a fit, and a sighting, is good enough.
+HOPELESS, FITTED, SETTLED = 0.4, 0.93, 0.95
+# Blobs at the very rim are left out (glints stand there): those farther away than this quantile of the distances, by this ratio.
+RIM_QUANTILE, RIM_RATIO = 0.95, 1.08
 
 
 @dataclass(frozen=True)
@@ -52,7 +63,7 @@ class Sighting:
 
 
 def flat_layout(spec: SensorSpec) -> np.ndarray:
-    """Pins (N, 2) of the layout laid flat, the outermost at distance 1: neither dome nor camera goes in."""
+    """Pins (N, 2) of the layout laid flat, the outermost at distance 1. It depends on neither the dome nor the camera."""
     axis = rest_pins(spec.geometry).axis
     polar = np.arccos(np.clip(np.abs(axis[:, 2]), -1, 1))
     rho = np.linalg.norm(axis[:, :2], axis=1, keepdims=True)
@@ -60,21 +71,31 @@ def flat_layout(spec: SensorSpec) -> np.ndarray:
     return outward * (polar / polar.max())[:, None]
 
 
-def see_layout(gray: np.ndarray, spec: SensorSpec, *, binary: bool) -> Sighting | None:
-    """The layout in a gray frame (H, W) uint8, wherever it is and however large; None where nothing resembles it."""
-    flat, best = flat_layout(spec), None
-    for px, area, contrast in _candidates(gray, spec.pins.count, binary)[:3]:
+def see_layout(gray: np.ndarray, flat: np.ndarray, rings: int, *, binary: bool) -> Sighting | None:
+    """The layout in a gray frame, wherever it lies and however large it is; None where nothing resembles it.
+
+    Parameters
+    ----------
+    gray : (H, W) uint8
+    flat : (N, 2) float
+        As ``flat_layout`` gives it.
+    rings : int
+    binary : bool
+        The frame is thresholded.
+    """
+    best = None
+    for px, area, contrast in _candidates(gray, len(flat), binary)[:CANDIDATES]:
         for k in _outermost_first(px):
-            seen = _fit(flat, spec.pins.rings, px[k], area[k], contrast)
+            seen = _fit(flat, rings, px[k], area[k], contrast)
             if seen is not None and (best is None or seen.score > best.score):
                 best = seen
-        if best is not None and best.score > 0.95 * spec.pins.count:
+        if best is not None and best.score > SETTLED * len(flat):
             break
     return best
 
 
 def _candidates(gray: np.ndarray, count: int, binary: bool) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Clusters of like blobs, those nearest to the number of pins first: places (K, 2), areas (K,), contrast."""
+    """Clusters of blobs of like area, those whose number is nearest to the pins' first: places (K, 2), areas (K,), contrast."""
     found = []
     for bright in _bright(gray, binary):
         _, labels, stats, centroids = cv2.connectedComponentsWithStats(bright, connectivity=8)
@@ -94,7 +115,8 @@ def _candidates(gray: np.ndarray, count: int, binary: bool) -> list[tuple[np.nda
     return sorted(found, key=lambda entry: abs(len(entry[0]) - count))
 
 
-def _bright(gray: np.ndarray, binary: bool):
+def _bright(gray: np.ndarray, binary: bool) -> Iterator[np.ndarray]:
+    """Thresholded frames (H, W) uint8 of 0 and 255; one for a frame that is thresholded already."""
     if binary:
         yield cv2.threshold(gray, 127, 255, cv2.THRESH_BINARY)[1]
         return
@@ -124,19 +146,20 @@ def _largest_cluster(px: np.ndarray, area: np.ndarray) -> np.ndarray:
     return chosen
 
 
-def _outermost_first(px: np.ndarray):
-    """All blobs, then without those at the very rim, where glints stand."""
+def _outermost_first(px: np.ndarray) -> Iterator[np.ndarray]:
+    """Masks (K,): all blobs, then all but those at the very rim, where glints stand."""
     everything = np.ones(len(px), bool)
     yield everything
     away = np.linalg.norm(px - np.median(px, axis=0), axis=1)
-    yield away < 1.08 * np.quantile(away, 0.95)
+    yield away < RIM_RATIO * np.quantile(away, RIM_QUANTILE)
 
 
 def _fit(flat: np.ndarray, rings: int, px: np.ndarray, area: np.ndarray, contrast: float) -> Sighting | None:
+    """The layout fitted to blobs by size and turn, and matched; None where too few blobs fit."""
     if len(px) < ENOUGH * len(flat):
         return None
     (x, y), radius = cv2.minEnclosingCircle(px.astype(np.float32))
-    best = None
+    best: Match | None = None
     for scale in SCALES:
         if best is not None and best.score < HOPELESS * len(flat):
             return None
@@ -146,12 +169,13 @@ def _fit(flat: np.ndarray, rings: int, px: np.ndarray, area: np.ndarray, contras
             found = match(reference, px, area)
             if best is None or found.score > best.score:
                 best = found
-            if best.score > 0.93 * len(flat):
+            if best.score > FITTED * len(flat):
                 return _sighting(best, px, area, contrast)
-    return _sighting(best, px, area, contrast) if best.score > ENOUGH * len(flat) else None
+    return _sighting(best, px, area, contrast) if best is not None and best.score > ENOUGH * len(flat) else None
 
 
-def _sighting(found, px, area, contrast) -> Sighting:
+def _sighting(found: Match, px: np.ndarray, area: np.ndarray, contrast: float) -> Sighting:
+    """What a labelling of blobs says of the layout."""
     paired = found.blob >= 0
     pins_px = np.full((len(found.blob), 2), np.nan)
     pins_px[paired] = px[found.blob[paired]]
@@ -159,6 +183,6 @@ def _sighting(found, px, area, contrast) -> Sighting:
 
 
 def rest_of(sightings: list[Sighting], rings: int) -> Reference:
-    """The layout as most frames show it: the median of each pin's places, predictions where it was never seen."""
+    """The layout as most frames show it: the median of each pin's places. A predicted place stands for one that was not seen."""
     seen = np.stack([np.where(np.isfinite(s.pins_px), s.pins_px, s.predicted_px) for s in sightings])
     return make_reference(np.nanmedian(seen, axis=0), rings)

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from scenes.base import Fraction, Positive, Section
 from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
 from twin.errors import FrameError
-from twin.preprocess.forms import blob_spec
+from twin.recordings.forms import blob_spec
 from twin.store import write_text
 from twin.types import Form
 
@@ -77,7 +77,7 @@ class DetectorSpec(Section):
 
 def shipped_detector(spec: SensorSpec, form: Form, method: Method = "twin") -> DetectorSpec:
     """What a sensor's specification says: this program's pipeline, or the published method where the sensor has recordings."""
-    return DetectorSpec(name=method, method=method, form=form, blob=blob_spec(spec, form), recording=spec.recording)
+    return DetectorSpec(name=method, method=method, form=form, blob=blob_spec(spec.pipeline, form), recording=spec.recording)
 
 
 def load_detector(path: Path) -> DetectorSpec:

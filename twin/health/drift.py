@@ -4,8 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LEAST_RIM = 0.5  # of the outermost pins must be seen
-BULGE = 1.0  # growth of the rim by the pins' rms motion in its radii: 0.90, 0.98, 1.09 in recordings of three sensors, 0.7-1.4 in the twin
+# Least share of the outermost pins that must be seen.
+LEAST_RIM = 0.5
+# Relative growth of the rim for a contact that moves the pins by rms one radius of the rim. Measured: 0.90, 0.98 and 1.09 in recordings
+# of three sensors, 0.7 to 1.4 in the twin.
+BULGE = 1.0
 
 
 @dataclass(frozen=True)
@@ -15,12 +18,12 @@ class Drift:
     Attributes
     ----------
     shift_px : (2,) float
-        Of the rim's centre.
+        Shift of the rim's centre.
     turn_deg : float
         From x towards y.
     scale : float
     contact : float
-        Rms of the pins' motion that the similarity leaves, in the rim's mean radius: how much a contact deforms the skin.
+        Rms of the pins' motion without the similarity, in the rim's mean radius: how much a contact deforms the skin.
     """
 
     shift_px: np.ndarray
@@ -30,7 +33,7 @@ class Drift:
 
     @property
     def scale_at_rest(self) -> float:
-        """The scale without what the contact does to it: the gel hardly changes its volume, pressed in the middle it bulges at the rim."""
+        """The scale without the contact's part: the gel keeps its volume, so that it bulges at the rim when it is pressed in the middle."""
         return self.scale / (1 + BULGE * self.contact)
 
 

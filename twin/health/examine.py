@@ -1,6 +1,5 @@
 """Light, focus, pins, glare and place of a sensor's frames, against what its specification promises."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
@@ -14,23 +13,37 @@ from twin.camera import expose
 from twin.detectors import DetectorSpec, shipped_detector
 from twin.health.drift import drift_of
 from twin.optics.preview import Preview
-from twin.preprocess.forms import blob_spec, gray_levels
-from twin.preprocess.mask import circular_mask
+from twin.preprocess.mask import Mask
 from twin.preprocess.pipeline import Pipeline
-from twin.preprocess.reference import make_reference
+from twin.preprocess.reference import Reference, make_reference, nominal_reference
+from twin.progress import Progress
 from twin.realism.caps import Caps, measure_caps
+from twin.recordings.forms import gray_levels
 from twin.types import Form, Frame, Observation
 
+# Gray level from which on a pixel counts as white.
 SATURATED_LEVEL = 250
-STEADY = 0.5  # of the frames: a pin lost, or a spot seen, in so many is a fault of the sensor, not of a contact
-SAME_SPOT = 0.3  # pitches
-CAPS_MEASURED = 3  # frames at most, evenly spread: light and focus hardly differ between them
-LEAST_DEFORMED = 0.3  # of the frames, those with the least contact, tell the camera's place
-TOLD_BULGE = 0.002  # of the size: a smaller part of the contact in it is not mentioned
-LISTED = 8  # numbers of pins in a sentence
+# A pin that is lost, or a spot that is seen, in this share of the frames is a fault of the sensor, not of a contact.
+STEADY = 0.5
+# Spots nearer to each other than this many spacings are the same.
+SAME_SPOT = 0.3
+# Most frames in which caps are measured, evenly spread: light and focus hardly differ between frames.
+CAPS_MEASURED = 3
+# The camera's place is told from this share of the frames, those with the least contact.
+LEAST_DEFORMED = 0.3
+# A contact that changes the rim's size by less than this share is not mentioned.
+TOLD_BULGE = 0.002
+# Most numbers of pins in a sentence.
+LISTED = 8
+# Percentile of the disc's gray levels that stands for the caps where no pin is found.
+BRIGHT_PERCENTILE = 99
+# Diameter of a cap, px, where none can be measured.
+USUAL_CAP_PX = 8.0
+# A white patch larger than this many caps is glare.
+GLARE_CAPS = 2
 
 
-class Verdict(StrEnum):
+class Grade(StrEnum):
     """How good a finding is."""
 
     GOOD = "good"
@@ -45,24 +58,24 @@ class Finding:
     Attributes
     ----------
     name : str
-    verdict : Verdict
+    verdict : Grade
     value : float
-        What ``limits`` of its check are about; NaN where it can't be told.
+        The figure that is compared with the check's limits; NaN where it cannot be told.
     text : str
         What was seen, with the figure and what was expected.
     remedy : str
-        What to do, "" where nothing.
+        What to do; "" if nothing.
     """
 
     name: str
-    verdict: Verdict
+    verdict: Grade
     value: float
     text: str
     remedy: str
 
 
 def examine(
-    frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Callable | None = None
+    frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Progress | None = None
 ) -> list[Finding]:
     """Findings on frames of one form, with or without contact.
 
@@ -90,24 +103,26 @@ def examine(
         seen.append(pipeline(frame))
         if progress:
             progress(k + 1, len(frames))
-    findings = [_pins(seen), _spots(seen, pipeline), *_place(seen, spec, form)]
-    return findings if form == Form.RECORDING else [*_light(frames, seen, spec, tuned), *findings]
+    findings = [_pins(seen), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
+    return findings if form == Form.RECORDING else [*_light(frames, seen, promised_caps(spec), pipeline.mask), *findings]
 
 
-def _verdict(value: float, watch: float, bad: float) -> Verdict:
-    """By two limits; bad is beyond watch, above or below. What can't be told is bad."""
+def _verdict(value: float, watch: float, bad: float) -> Grade:
+    """Grade on a value by two limits. If ``bad`` is above ``watch``, large values are bad; else small ones. NaN is bad."""
     sign = 1 if bad > watch else -1
     if not np.isfinite(value) or sign * value > sign * bad:
-        return Verdict.BAD
-    return Verdict.WATCH if sign * value > sign * watch else Verdict.GOOD
+        return Grade.BAD
+    return Grade.WATCH if sign * value > sign * watch else Grade.GOOD
 
 
 def _finding(name: str, value: float, limits: tuple[float, float], text: str, remedy: str) -> Finding:
+    """A finding with its verdict by the limits (watch, bad); the remedy is left out where all is good."""
     verdict = _verdict(value, *limits)
-    return Finding(name, verdict, float(value), text, "" if verdict is Verdict.GOOD else remedy)
+    return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
 
 
 def _pins(seen: list[Observation]) -> Finding:
+    """Pins that are lost, and those lost in most frames."""
     lost = np.isnan(np.stack([o.pins_px[:, 0] for o in seen]))
     steady = np.flatnonzero(lost.mean(axis=0) >= STEADY)
     text = f"{100 * lost.mean():.2f} % of the pins lost; {sum(o.valid for o in seen)} of {len(seen)} frames can be used"
@@ -119,11 +134,11 @@ def _pins(seen: list[Observation]) -> Finding:
         if not unusable
         else f"{unusable}; run 'twin tune' on these frames"
     )
-    return _finding("pins", lost.mean(), (0.002, 0.05), text, remedy)
+    return _finding("pins", float(lost.mean()), (0.002, 0.05), text, remedy)
 
 
 def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
-    """Bright spots among the pins that are no pins and stay where they are."""
+    """Bright spots among the pins that are no pins and stay in place from frame to frame."""
     within = SAME_SPOT * float(np.mean(pipeline.reference.spacing_px))
     radius = np.linalg.norm(pipeline.reference.pins_px - pipeline.reference.pins_px[0], axis=1).max()
     places = [o.extra_px[np.linalg.norm(o.extra_px - pipeline.reference.pins_px[0], axis=1) < radius] for o in seen]
@@ -135,19 +150,16 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
     return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady bright spots among the pins", remedy)
 
 
-def _place(seen: list[Observation], spec: SensorSpec, form: Form) -> list[Finding]:
-    """Where the rim of pins is, against where the specification's camera would see it, in the frames that a contact deforms least."""
-    nominal = Pipeline(spec, form).reference
+def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
+    """Place of the rim of pins against the ``nominal`` one of the specification's camera, in the frames with the least contact."""
     pitch = float(np.mean(nominal.spacing_px))
     found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost))]
     if not found:
         return [
-            Finding(
-                "place", Verdict.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first"
-            )
+            Finding("place", Grade.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first")
         ]
     found = sorted(found, key=lambda d: d.contact)[: max(round(LEAST_DEFORMED * len(found)), 1)]
-    shift = np.median([d.shift_px for d in found], axis=0)
+    shift = np.median(np.stack([d.shift_px for d in found]), axis=0)
     turn, scale, seen_scale = (float(np.median([getattr(d, name) for d in found])) for name in ("turn_deg", "scale_at_rest", "scale"))
     bulge = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
     away = float(np.linalg.norm(shift))
@@ -159,21 +171,19 @@ def _place(seen: list[Observation], spec: SensorSpec, form: Form) -> list[Findin
     ]
 
 
-def _light(frames: list[Frame], seen: list[Observation], spec: SensorSpec, tuned: SensorSpec) -> list[Finding]:
-    """Brightness, evenness, focus and glare of raw frames, against the twin's own frame at rest."""
-    expected = promised_caps(spec)
+def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: Mask) -> list[Finding]:
+    """Brightness, saturation, focus and glare of raw frames inside the mask, against the ``expected`` caps."""
     looked = list(zip(frames, seen, strict=True))[:: -(-len(frames) // CAPS_MEASURED)]
     caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in looked if np.isfinite(o.pins_px).any()]
-    blob = blob_spec(tuned, Form.RAW)
-    mask = circular_mask((spec.camera.width_px, spec.camera.height_px), blob.mask_center_px, blob.mask_radius_px)
     windows = [gray_levels(np.ascontiguousarray(f.image[mask.window])) for f in frames]
-    brightest = float(np.median([np.percentile(w[mask.disc > 0], 99) for w in windows]))
+    brightest = float(np.median([np.percentile(w[mask.disc > 0], BRIGHT_PERCENTILE) for w in windows]))
     level, contrast, edge, diameter = (
         float(np.nanmedian([np.nanmedian(getattr(c, name)) for c in caps])) if caps else np.nan
         for name in ("level", "contrast", "edge_px", "diameter_px")
     )
     promised, sharp = float(np.nanmedian(expected.contrast)), float(np.nanmedian(expected.edge_px))
-    glare = float(np.median([_glare(w, mask.disc, np.pi / 4 * (diameter if np.isfinite(diameter) else 8.0) ** 2) for w in windows]))
+    cap_px2 = np.pi / 4 * (diameter if np.isfinite(diameter) else USUAL_CAP_PX) ** 2
+    glare = float(np.median([_glare(w, mask.disc, cap_px2) for w in windows]))
     dark = (
         f"caps {level:.0f} gray levels, {contrast:.0f} above the skin ({promised:.0f} expected)"
         if caps
@@ -206,12 +216,13 @@ def promised_caps(spec: SensorSpec) -> Caps:
     return measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)
 
 
-def _white(caps: list) -> float:
+def _white(caps: list[Caps]) -> float:
+    """Share of the caps that are saturated."""
     return float(np.mean(np.concatenate([c.level for c in caps]) >= SATURATED_LEVEL)) if caps else 0.0
 
 
 def _glare(window: np.ndarray, disc: np.ndarray, cap_px2: float) -> float:
-    """Share of the disc in saturated patches that are larger than two caps."""
+    """Share of the disc in saturated patches larger than ``GLARE_CAPS`` caps of ``cap_px2``."""
     white = ((window >= SATURATED_LEVEL) & (disc > 0)).astype(np.uint8)
     area = cv2.connectedComponentsWithStats(white)[2][1:, cv2.CC_STAT_AREA]
-    return float(area[area > 2 * cap_px2].sum() / (disc > 0).sum())
+    return float(area[area > GLARE_CAPS * cap_px2].sum() / (disc > 0).sum())

@@ -8,11 +8,12 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
-from twin.preprocess.forms import blob_spec
 from twin.preprocess.overlay import draw_overlay, overlay_name
 from twin.preprocess.pipeline import Pipeline, measure_reference
 from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import Recording, open_recording
+from twin.recordings.forms import blob_spec
+from twin.recordings.recording import BadFrame
 from twin.store import made_by, unwritten, write_bytes, write_json, write_npz
 from twin.types import Form, Observation
 
@@ -20,9 +21,9 @@ UNMEASURED = "specification"  # in place of a no-contact frame's name
 
 
 def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
-    """The recording's own no-contact layout and its frame's name; where there is none or it is no use, the specification's.
+    """The recording's own no-contact layout and its frame's name; without a usable no-contact frame the specification's layout.
 
-    Why a no-contact frame was no use is appended to ``problems``.
+    The reason why a no-contact frame cannot be used is added to ``problems``.
     """
     if recording.reference is not None:
         try:
@@ -32,15 +33,16 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
     return nominal_reference(spec, recording.form), UNMEASURED
 
 
-def _timing(observations: list[Observation]) -> dict:
+def _timing(observations: list[Observation]) -> dict[str, dict[str, float]]:
+    """Median, 95 and 99 % of the milliseconds of each stage, without the first frame, which also loads the compiled code."""
     if not observations:
         return {}
-    warm = observations[1:] or observations  # the first frame also loads the compiled code
+    warm = observations[1:] or observations
     stages = {stage: [o.ms[stage] for o in warm] for stage in observations[0].ms}
     return {s: dict(zip(("p50", "p95", "p99"), np.percentile(ms, (50, 95, 99)).round(4).tolist(), strict=True)) for s, ms in stages.items()}
 
 
-def _arrays(names: list[str], observations: list[Observation], n: int) -> dict:
+def _arrays(names: list[str], observations: list[Observation], n: int) -> dict[str, np.ndarray]:
     """What ``pins.npz`` holds of M frames with ``n`` pins."""
     none = np.full(n, np.nan)
     areas = [none if o.graph is None else o.graph.area_px2 for o in observations]
@@ -106,12 +108,15 @@ def preprocess_recording(
     notes: list[str] = []
     reference, reference_name = recording_reference(spec, recording, notes)
     pipeline = Pipeline(spec, recording.form, reference)
-    names, observations, failed, pictures = [], [], [], set()
+    names: list[str] = []
+    observations: list[Observation] = []
+    unfit: list[BadFrame] = []
+    pictures: set[str] = set()
     for frame in recording:
         try:
             observation = pipeline(frame)
         except FrameError as error:
-            failed.append({"image_name": frame.name, "reason": str(error).removeprefix(f"{frame.name}: ")})
+            unfit.append({"image_name": frame.name, "reason": str(error).removeprefix(f"{frame.name}: ")})
             continue
         names.append(frame.name)
         observations.append(observation)
@@ -120,7 +125,7 @@ def preprocess_recording(
             write_bytes(out_dir / "overlay" / overlay_name(frame.name, pictures), cv2.imencode(".png", picture)[1].tobytes())
         if progress:
             progress(frame.sequence + 1, len(recording))
-    failed = recording.failed + failed
+    failed = recording.failed + unfit
     arrays = _arrays(names, observations, spec.pins.count)
     all_found = arrays["valid"] & (arrays["found"] == spec.pins.count)
     summary = {
@@ -134,7 +139,7 @@ def preprocess_recording(
             "size_px": list(recording.size_px),
             "reference": reference_name,
             "graph": pipeline.graph,
-            "detection": blob_spec(spec, recording.form).model_dump(mode="json"),
+            "detection": blob_spec(spec.pipeline, recording.form).model_dump(mode="json"),
         },
         "invalid": [{"image_name": name, "reason": o.reason} for name, o in zip(names, observations, strict=True) if not o.valid],
         "failed": failed,

@@ -9,11 +9,20 @@ from numba import njit
 from scenes.sensor import BlobSpec
 from twin.preprocess.mask import Mask
 
-GROWTH_PX = 4  # at most, of a component over its box
-SPECK_LEVELS = 48  # gray levels from the median of its 3 x 3 pixels: a pixel further away is the chip's fault, not the scene's ...
-SPECK_USUAL, SPECK_RATIO = 0.8, 4.0  # ... but for noise: nor is one within so many times what that part of the pixels keeps to
-MOST_ABOVE = 98  # percentile of the levels above the local mean: brighter ones (glare, LEDs) count as that
-NOISE_SIGMA_PX = 0.7  # smoothing before an adaptive threshold: halves white noise, leaves a cap of 6 px its edge
+# A component is grown by at most this much beyond its bounding box, px.
+GROWTH_PX = 4
+# A pixel that differs from the median of its 3 x 3 neighbourhood by more gray levels than this is a fault of the chip.
+SPECK_LEVELS = 48
+# In a noisy frame that limit rises: this share of the pixels shows what difference is usual ...
+SPECK_USUAL = 0.8
+# ... and a fault differs by more than this many times the usual.
+SPECK_RATIO = 4.0
+# Percentile of the levels above the local mean to which brighter ones (glare, LEDs) are set before Otsu's method.
+MOST_ABOVE = 98
+# Sd of the smoothing before an adaptive threshold, px. It halves white noise and leaves a cap of 6 px its edge.
+NOISE_SIGMA_PX = 0.7
+# Least share of its bounding box that a cap fills. Arcs of the housing fill less.
+LEAST_FILL = 0.25
 
 
 @dataclass(frozen=True)
@@ -62,11 +71,11 @@ class Blobs:
 
 
 def despeckled(gray: np.ndarray) -> np.ndarray:
-    """Gray levels (h, w) uint8 with hot and dead pixels at the median of their neighbourhood; all others, and mere noise, as they are."""
+    """Gray levels (h, w) uint8 in which hot and dead pixels take the median of their neighbourhood. Other pixels, noisy ones too, stay."""
     median = cv2.medianBlur(gray, 3)
     away = cv2.absdiff(gray, median)
     usual = int(np.searchsorted(np.cumsum(cv2.calcHist([away], [0], None, [256], [0, 256])), SPECK_USUAL * gray.size))
-    odd = cv2.compare(away, float(max(SPECK_LEVELS, SPECK_RATIO * usual)), cv2.CMP_GT)
+    _, odd = cv2.threshold(away, float(max(SPECK_LEVELS, SPECK_RATIO * usual)), 255, cv2.THRESH_BINARY)
     return cv2.copyTo(median, odd, gray.copy())
 
 
@@ -90,10 +99,9 @@ def own_threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> float:
 
 
 def _smoothed(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
-    """A window as an adaptive threshold takes it.
+    """A window (h, w) ready for an adaptive threshold: smoothed, and without what lies outside the disc.
 
-    All that lies outside the disc (housing, LEDs) is set to the disc's median, so that light from there doesn't raise the
-    local mean near the rim.
+    Housing and LEDs are set to the median inside the disc. Otherwise their light would raise the local mean near the rim.
     """
     histogram = cv2.calcHist([gray], [0], disc, [256], [0, 256]).ravel()
     median = int(np.searchsorted(np.cumsum(histogram), histogram.sum() / 2))
@@ -103,8 +111,12 @@ def _smoothed(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _centroids(gray, labels, grown, ringed, bright, count):
-    """Background (mean of the ring around), then of each label the weight, its moments x and y, area, moments xx, xy, yy."""
+def _centroids(gray: np.ndarray, labels: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, count: int) -> np.ndarray:
+    """Sums (count, 7) over the pixels of each label: weight, weight x, weight y, bright pixels, weight xx, weight xy, weight yy.
+
+    A pixel's weight is its level above the mean of the ring around its label; negative weights are left out. ``grown`` is
+    overwritten: afterwards it also holds the labels themselves.
+    """
     height, width = gray.shape
     ring_sum, ring_n = np.zeros(count), np.zeros(count)
     for y in range(height):
@@ -136,8 +148,8 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     """Blobs of the window ``gray`` (h, w) uint8 between ``blob.min_area_px2`` and ``max_area_px2``.
 
     Components are those of the eroded bright image. A centroid weighs the pixels of the component, grown back over
-    the erosion and one pixel more, by their level above the mean of the ring around; for a two-level
-    image it is the plain centroid of the bright pixels.
+    the erosion and one pixel more, by their level above the mean of the ring around. In a two-level image it is
+    the plain centroid of the bright pixels.
     """
     bright = threshold(gray, mask.disc, blob)
     eroded = bright
@@ -150,9 +162,8 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     sums = _centroids(gray, labels, grown, ringed, bright, count)
     area = sums[:, 3]
     keep = np.flatnonzero((area >= blob.min_area_px2) & (area <= max_area_px2) & (sums[:, 0] > 0) & (np.arange(count) > 0))
-    # compact: a cap is never thinner than a quarter of its bounding box (arcs of the housing are)
     box = stats[keep, cv2.CC_STAT_WIDTH] * stats[keep, cv2.CC_STAT_HEIGHT].astype(float)
-    keep = keep[stats[keep, cv2.CC_STAT_AREA] >= 0.25 * box]
+    keep = keep[stats[keep, cv2.CC_STAT_AREA] >= LEAST_FILL * box]
     mean = sums[keep, 1:3] / sums[keep, :1]
     xx, xy, yy = (sums[keep, 4:] / sums[keep, :1] - np.stack([mean[:, 0] ** 2, mean[:, 0] * mean[:, 1], mean[:, 1] ** 2], axis=1)).T
     root = np.hypot(xx - yy, 2 * xy)

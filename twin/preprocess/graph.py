@@ -10,7 +10,8 @@ from twin.preprocess.voronoi import directed_edges, triangulate, voronoi
 from twin.types import PinGraph
 
 GraphKind = Literal["knn", "delaunay", "voronoi"]
-KNN = 6  # neighbours of the published kNN graph: 6 N directed edges
+# Neighbours of a node in the published kNN graph (Tac-VGNN, 2023): 6 N directed edges.
+KNN = 6
 
 
 def knn_edges(nodes_px: np.ndarray, k: int = KNN) -> np.ndarray:
@@ -21,7 +22,7 @@ def knn_edges(nodes_px: np.ndarray, k: int = KNN) -> np.ndarray:
         return np.zeros((0, 2), int)
     _, index = cKDTree(nodes_px).query(nodes_px, k=min(k + 1, n))
     others = index != np.arange(n)[:, None]
-    others[others.all(axis=1), -1] = False  # of coincident nodes a node's own entry may be missing
+    others[others.all(axis=1), -1] = False  # where nodes coincide, a node may not find itself: drop the last one instead
     return np.stack([np.repeat(np.arange(n), k), index[others].ravel()], axis=1)
 
 

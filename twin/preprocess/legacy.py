@@ -1,8 +1,8 @@
-"""The published method, step by step, as the Tac-VGNN release (Apache-2.0) does it: to compare with, not to use.
+"""The published method, step by step, as the Tac-VGNN release (Apache-2.0) does it. It is here to compare with.
 
-Kept on purpose: resizing to a fixed size, a mask about the image's centre, OpenCV's SimpleBlobDetector, centring by one scalar
-median over x and y together, hull vertices scaled about that origin, and throwing a frame away if the count is not
-exactly the sensor's. Nodes come in the detector's order.
+Its peculiarities are kept on purpose: resizing to a fixed size, a mask about the image's centre, OpenCV's SimpleBlobDetector,
+centring by one scalar median over x and y together, hull vertices scaled about that origin, and refusing a frame whose count is
+not exactly the sensor's. Nodes come in the detector's order.
 """
 
 from dataclasses import dataclass
@@ -12,18 +12,34 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, Voronoi
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import PinsSpec, RecordingSpec
 from twin.errors import FrameError
-from twin.preprocess.forms import frame_size, gray_levels
 from twin.preprocess.voronoi import directed_edges
+from twin.recordings.forms import gray_levels
 from twin.types import Form, Frame, PinGraph
 
+# The hull's vertices are scaled by this about the origin (release).
 HULL_SCALE = 1.1
 
 
 @dataclass(frozen=True)
 class LegacyParameters:
-    """The release's constants for one layout (px of its resized image)."""
+    """The release's constants for one layout; lengths in px of its resized image.
+
+    Attributes
+    ----------
+    size_px : int
+        Side of the square that a frame is resized to.
+    threshold : int
+        Gray level.
+    mask_offset_px : (int, int)
+        Of the mask's centre from the image's, x and y.
+    mask_margin_px : int
+        Between the mask and the image's border.
+    min_area_px2 : float
+    virtual_rotations_deg, virtual_scales : tuple of float
+        Turn and scale of the copies of the hull that fill a hexagon's inward-bowed sides.
+    """
 
     size_px: int
     threshold: int
@@ -64,12 +80,12 @@ class LegacyObservation:
     valid: bool
     reason: str
     graph: PinGraph | None
-    ms: dict
+    ms: dict[str, float]
 
 
 def legacy_detector(parameters: LegacyParameters) -> cv2.SimpleBlobDetector:
     """The release's blob detector."""
-    settings = cv2.SimpleBlobDetector_Params()
+    settings = cv2.SimpleBlobDetector.Params()
     settings.blobColor = 255
     settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 50, 220, 5
     settings.minDistBetweenBlobs, settings.minRepeatability = 3, 3
@@ -77,7 +93,7 @@ def legacy_detector(parameters: LegacyParameters) -> cv2.SimpleBlobDetector:
     settings.filterByCircularity, settings.minCircularity = True, 0.01
     settings.filterByConvexity, settings.minConvexity = True, 0.01
     settings.filterByInertia, settings.minInertiaRatio = True, 0.01
-    return cv2.SimpleBlobDetector_create(settings)
+    return cv2.SimpleBlobDetector.create(settings)
 
 
 def boundary_nodes(nodes: np.ndarray, parameters: LegacyParameters) -> np.ndarray:
@@ -115,12 +131,26 @@ def legacy_graph(nodes: np.ndarray, parameters: LegacyParameters) -> PinGraph:
 
 
 class LegacyPipeline:
-    """The published preprocessing of a sensor's recordings."""
+    """The published preprocessing of a sensor's recordings.
 
-    def __init__(self, spec: SensorSpec) -> None:
-        self.spec = spec
-        self.parameters = LEGACY[spec.pins.layout]
-        self.size_px = frame_size(spec, Form.RECORDING)
+    Parameters
+    ----------
+    pins : PinsSpec
+        The layout chooses the release's constants; the count is the number of blobs that it accepts.
+    recording : RecordingSpec or None
+
+    Raises
+    ------
+    FrameError
+        The sensor has no recording form.
+    """
+
+    def __init__(self, pins: PinsSpec, recording: RecordingSpec | None) -> None:
+        if recording is None:
+            raise FrameError("the published method takes recordings, and the sensor has no recording form ([recording])")
+        self.count = pins.count
+        self.parameters = LEGACY[pins.layout]
+        self.size_px = recording.width_px, recording.height_px
         self._detector = legacy_detector(self.parameters)
         size = self.parameters.size_px
         center = (size // 2 + self.parameters.mask_offset_px[0], size // 2 + self.parameters.mask_offset_px[1])
@@ -130,7 +160,7 @@ class LegacyPipeline:
         """Observe a recorded frame."""
         if frame.form != Form.RECORDING or frame.image.shape[1::-1] != self.size_px:
             raise FrameError(f"{frame.name or 'frame'}: the published method takes recordings of {self.size_px[0]}x{self.size_px[1]} only")
-        n, size = self.spec.pins.count, self.parameters.size_px
+        n, size = self.count, self.parameters.size_px
         started = perf_counter()
         gray = cv2.resize(gray_levels(frame.image), (size, size))
         _, binary = cv2.threshold(gray, self.parameters.threshold, 255, cv2.THRESH_BINARY)

@@ -1,13 +1,13 @@
 """Which blob is which pin: grow a consistent labelling over the rest layout from a seed, keep the best of several.
 
-The displacement of a pin may exceed the pitch, so the nearest blob proves nothing. But neighbours
-move alike: from one right pair the next pin's place is predicted by the local affine motion of those already
-paired, and the labelling grows over the layout. Growth from a wrong seed runs out of blobs or into large
-residuals; the seed that explains most blobs wins.
+A pin may move by more than the distance to its neighbour, so the nearest blob is not always the right one. But neighbours
+move alike. A labelling starts from one pair of pin and blob. The local affine motion of the pairs found so far predicts the
+place of the next pin, and the labelling grows over the layout. From a wrong pair it soon finds no blobs, or only blobs far
+from the prediction. The start that explains most blobs wins.
 
-One wrong labelling is nearly as smooth as the true one: every ring of pins turned on by one pin, a vortex with a still rim
-when the view itself is turned by some degrees. Only its centre gives it away: ring i of 6 i pins is turned by 60/i degrees,
-and the innermost rings fall apart. So every growth is unwound to where its rings turn most alike before it is judged.
+One wrong labelling is nearly as smooth as the true one: each ring of pins is shifted along itself by one pin. Ring i has
+6 i pins, so it is turned by 60 / i degrees, and only the innermost rings, which turn most, fall apart. Therefore each labelling
+is unwound: its rings are shifted back by the number of pins with which they turn most alike, before it is judged.
 """
 
 from collections.abc import Iterator
@@ -21,22 +21,53 @@ from scipy.optimize import linear_sum_assignment
 from twin.preprocess.motion import predict, predict_all
 from twin.preprocess.reference import Reference
 
-GROW_GATES = (0.30, 0.45)  # prediction to blob, in local spacings, while growing: strict first
-FINAL_GATE = 0.40  # prediction to blob, in local spacings, in the final assignment
-ADOPT_GATE = 0.7  # the same for a lost pin and a free blob that are each other's nearest ...
-ADOPT_AREA_RATIO = 2.0  # ... if the blob's area is within this ratio of its neighbours'
-SOFT_RESIDUAL = 0.15  # residual, in local spacings, at which a pair's weight is halved
-AREA_LOG_WEIGHT = 0.02  # cost of a log-area ratio of 1 against a squared residual in spacings
-MIN_AREA_RATIO = 0.2  # a blob smaller than this part of its neighbours' mean area is a speck, not a pin
-NEARLY_ALL = 0.985  # of the pins (or nearly so of the blobs, and this part of the pins) labelled by one growth ...
+# Distances are in local spacings: the distance of a pin at rest to its nearest neighbour. All limits were chosen, not derived.
+# Largest distance from a prediction to its blob while a labelling grows: strict first, then looser.
+GROW_GATES = (0.30, 0.45)
+# Largest distance from a prediction to its blob in the final assignment.
+FINAL_GATE = 0.40
+# Largest distance from the prediction of a lost pin to a free blob, if each is the other's nearest.
+ADOPT_GATE = 0.7
+# Largest ratio, either way, of such a blob's area to that of its neighbours.
+ADOPT_AREA_RATIO = 2.0
+# Largest share of the pins that may be lost for this to be tried.
+MOST_ADOPTED = 0.2
+# Distance of a pair from the prediction at which its weight is halved.
+SOFT_RESIDUAL = 0.15
+# Cost of a squared log ratio of areas of 1, against a squared distance in spacings.
+AREA_LOG_WEIGHT = 0.02
+# A blob smaller than this share of its neighbours' mean area is a speck, not a pin.
+MIN_AREA_RATIO = 0.2
+# Cost that stands for "no pair": far above any cost of a pair, so that pairing more pins always pays.
+NO_PAIR_COST = 10.0
+# Most rounds of predicting and assigning; they end when nothing changes.
+REFINE_ROUNDS = 4
+# No further start is tried if one labelling holds this share of the pins (or its square of the blobs and MIN_SETTLED of the pins) ...
+NEARLY_ALL = 0.985
 MIN_SETTLED = 0.7
-SETTLED = 0.94  # ... at a score of this part of their number: no further seed is tried
-TURN_WEIGHT = 1.5  # of the rings' mean turn (1 - its cosine) in the score, per pin
-MAX_WINDING = 3  # by so many pins either way may a growth's rings be turned on ...
-BROKEN_RINGS = 2  # ... but for the innermost, which don't hold together then
-EXTENT_MARGIN = 0.02  # of the points on each side; the rest's middle tells how far the whole view is displaced
-RIM_SEEDS = 12
-REFINED = 4  # growths that are refined when none settles
+# ... and its score is this share of their number.
+SETTLED = 0.94
+# Weight in the score, for each pin, of the rings' mean turn (1 minus its cosine).
+TURN_WEIGHT = 1.5
+# Rings may be shifted along themselves by this many pins either way.
+MAX_WINDING = 3
+# So many innermost rings are left out when the shift is found: they do not hold together in a shifted labelling.
+BROKEN_RINGS = 2
+# Share of the points on each side that is left out of an extent, whose middle tells how far the whole view is displaced.
+EXTENT_MARGIN = 0.02
+# Pins around the rim from which labellings start, and pins inside, at most about this many.
+RIM_SEEDS, INSIDE_SEEDS = 12, 6
+# Nearest blobs that are tried for each of these pins.
+SEED_RANKS = 3
+# Labellings that are refined where none settles.
+REFINED = 4
+# Neighbours around a lost pin whose labels are forgotten before they are grown anew; then all of its neighbours'.
+NEAR = 6
+# Share of the pins that must stay labelled for this, and largest share that may be lost.
+LEAST_KEPT, MOST_REGROWN = 0.5, 0.3
+
+# First blob of each square cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``).
+Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
 
 
 class Layout(NamedTuple):
@@ -62,7 +93,8 @@ class Match:
     predicted_px : (N, 2) float
         Each pin's place as its neighbours' motion predicts it.
     score : float
-        Pins paired, less their squared residuals relative to the gate, less what the rings turn.
+        Number of pins paired, minus their squared distances from the predictions relative to the gate, minus the cost of the rings'
+        turn. Larger is better.
     """
 
     blob: np.ndarray
@@ -71,7 +103,7 @@ class Match:
 
 
 @njit(cache=True)
-def _buckets(px, cell):
+def _buckets(px: np.ndarray, cell: float) -> Buckets:
     """Blobs by square cell: (first blob of each cell, next blob in the same cell, x0, y0, columns, rows)."""
     x0, y0 = px[:, 0].min(), px[:, 1].min()
     columns = int((px[:, 0].max() - x0) / cell) + 1
@@ -86,7 +118,7 @@ def _buckets(px, cell):
 
 
 @njit(cache=True)
-def _nearest(x, y, reach, px, taken, buckets, cell):
+def _nearest(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray, buckets: Buckets, cell: float) -> tuple[int, float]:
     """Nearest free blob within ``reach`` of (x, y): (index or -1, squared distance)."""
     head, following, x0, y0, columns, rows = buckets
     best, best_d2 = -1, reach * reach
@@ -103,7 +135,9 @@ def _nearest(x, y, reach, px, taken, buckets, cell):
 
 
 @njit(cache=True)
-def _grow(rest, neighbours, spacing, px, start, buckets, cell):
+def _grow(
+    rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, start: np.ndarray, buckets: Buckets, cell: float
+) -> np.ndarray:
     """Grow a labelling (N,), from ``start`` (N,) with at least one pair, round by round over the pins next to labelled ones."""
     n = len(rest)
     blob = start.copy()
@@ -120,7 +154,7 @@ def _grow(rest, neighbours, spacing, px, start, buckets, cell):
             labelled += 1
     claim = np.full(len(px), -1)
     claim_cost = np.zeros(len(px))
-    tried = np.full(n, -1)  # neighbours that had spoken when a pin was last tried
+    tried = np.full(n, -1)  # neighbours that counted when a pin was last tried
     for level in range(len(GROW_GATES)):
         tried[:] = -1
         least = 3 if level == 0 else 2
@@ -160,8 +194,8 @@ def _grow(rest, neighbours, spacing, px, start, buckets, cell):
 
 
 @njit(cache=True)
-def _ring_turns(rest, px, blob, ring_ends, winding):
-    """Turn of each ring (R,) as a unit complex number (0: unknown), its labels first put back by ``winding`` pins; number known."""
+def _ring_turns(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.ndarray, winding: int) -> tuple[np.ndarray, int]:
+    """Turn of each ring (R,) as a unit complex number (0: unknown) after its labels are shifted back by ``winding``; number known."""
     turns = np.zeros(len(ring_ends) - 1, np.complex128)
     known = 0
     for ring in range(len(turns)):
@@ -186,8 +220,11 @@ def _ring_turns(rest, px, blob, ring_ends, winding):
 
 
 @njit(cache=True)
-def _unwound(rest, px, blob, ring_ends):
-    """A labelling (N,) with each ring's labels put back by as many pins as makes the rings turn most alike, less what breaks by it."""
+def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.ndarray) -> np.ndarray:
+    """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
+
+    The innermost rings lose their labels where anything is shifted.
+    """
     best, most_alike = 0, abs(_ring_turns(rest, px, blob, ring_ends, 0)[0][BROKEN_RINGS:].sum())
     for winding in range(-MAX_WINDING, MAX_WINDING + 1):
         alike = abs(_ring_turns(rest, px, blob, ring_ends, winding)[0][BROKEN_RINGS:].sum())
@@ -204,8 +241,10 @@ def _unwound(rest, px, blob, ring_ends):
 
 
 @njit(cache=True)
-def _trust(rest, neighbours, spacing, px, blob):
-    """Weights (N,) of the pairs by their residual to the neighbours' motion; positions (N, 2)."""
+def _trust(
+    rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, blob: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 2) of the pairs, and their weights (N,): less the farther a pair is from where its neighbours predict it."""
     n = len(rest)
     moved, weight = np.zeros((n, 2)), np.zeros(n)
     for i in range(n):
@@ -223,10 +262,22 @@ def _trust(rest, neighbours, spacing, px, blob):
 
 
 @njit(cache=True)
-def _candidates(predicted, neighbours, spacing, px, area, blob, buckets, cell):
+def _candidates(
+    predicted: np.ndarray,
+    neighbours: np.ndarray,
+    spacing: np.ndarray,
+    px: np.ndarray,
+    area: np.ndarray,
+    blob: np.ndarray,
+    buckets: Buckets,
+    cell: float,
+) -> tuple[list[int], list[int], list[float], bool]:
     """Gated pairs: arrays of pin, blob, cost; and whether some pin or blob is in more than one."""
     n = len(predicted)
-    pins, blobs, costs = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)], [0.0 for _ in range(0)]
+    # empty lists of a known type, which numba needs
+    pins: list[int] = [0 for _ in range(0)]
+    blobs: list[int] = [0 for _ in range(0)]
+    costs: list[float] = [0.0 for _ in range(0)]
     head, following, x0, y0, columns, rows = buckets
     uses = np.zeros(len(px), np.int64)
     contested = False
@@ -259,10 +310,10 @@ def _candidates(predicted, neighbours, spacing, px, area, blob, buckets, cell):
     return pins, blobs, costs, contested
 
 
-def _assign(n: int, blob_count: int, pins: list, blobs: list, costs: list, contested: bool) -> np.ndarray:
+def _assign(n: int, blob_count: int, pins_list: list[int], blobs_list: list[int], costs_list: list[float], contested: bool) -> np.ndarray:
     """One-to-one assignment (N,) over the gated pairs: most pairs, then least cost."""
     blob = np.full(n, -1)
-    pins, blobs, costs = np.array(pins, int), np.array(blobs, int), np.array(costs, float)
+    pins, blobs, costs = np.array(pins_list, int), np.array(blobs_list, int), np.array(costs_list, float)
     if not contested:
         blob[pins] = blobs
         return blob
@@ -270,18 +321,18 @@ def _assign(n: int, blob_count: int, pins: list, blobs: list, costs: list, conte
     blob[pins[~open_pair]] = blobs[~open_pair]
     row_pin, row = np.unique(pins[open_pair], return_inverse=True)
     column_blob, column = np.unique(blobs[open_pair], return_inverse=True)
-    table = np.full((len(row_pin), len(column_blob)), 10.0)  # far above any gated cost: pairing more pins always pays
+    table = np.full((len(row_pin), len(column_blob)), NO_PAIR_COST)
     table[row, column] = costs[open_pair]
     for r, c in zip(*linear_sum_assignment(table), strict=True):
-        if table[r, c] < 10.0:
+        if table[r, c] < NO_PAIR_COST:
             blob[row_pin[r]] = column_blob[c]
     return blob
 
 
-def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: tuple, cell: float) -> Match:
+def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: Buckets, cell: float) -> Match:
     """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
     rest, neighbours, spacing, ring_ends = layout
-    for _ in range(4):
+    for _ in range(REFINE_ROUNDS):
         moved, weight = _trust(rest, neighbours, spacing, px, blob)
         predicted = predict_all(rest, neighbours, spacing, moved, weight)
         before = blob
@@ -297,17 +348,17 @@ def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, 
 
 
 def _adopt(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Give lost pins the free blobs of a cap's size a little outside the gate: at the rim the prediction is an extrapolation."""
+    """Give lost pins free blobs of a cap's size a little outside the gate: at the rim the prediction extrapolates and is less exact."""
     neighbours, spacing = layout.neighbours, layout.spacing
     lost = np.flatnonzero((blob < 0) & np.isfinite(predicted[:, 0]))
     free = np.setdiff1d(np.arange(len(px)), blob)
-    if not len(lost) or not len(free) or len(lost) > 0.2 * len(blob):
+    if not len(lost) or not len(free) or len(lost) > MOST_ADOPTED * len(blob):
         return blob
     distance = np.linalg.norm(px[free] - predicted[lost][:, None], axis=2) / spacing[lost][:, None]
     around = np.where(blob[neighbours[lost]] >= 0, area[blob[neighbours[lost]]], np.nan)
-    spoken = np.isfinite(around).any(axis=1)
+    known = np.isfinite(around).any(axis=1)
     expected = np.full(len(lost), np.nan)
-    expected[spoken] = np.nanmedian(around[spoken], axis=1)
+    expected[known] = np.nanmedian(around[known], axis=1)
     ratio = area[free] / expected[:, None]
     distance[~((ratio > 1 / ADOPT_AREA_RATIO) & (ratio < ADOPT_AREA_RATIO))] = np.inf
     blob = blob.copy()
@@ -318,7 +369,7 @@ def _adopt(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, p
 
 
 def _middle(px: np.ndarray) -> np.ndarray:
-    """Middle (2,) of the extent of points (K, 2), but for the outermost few."""
+    """Middle (2,) of the extent of points (K, 2), without the outermost few."""
     ordered = np.sort(px, axis=0)
     margin = int(EXTENT_MARGIN * len(px))
     return (ordered[margin] + ordered[-1 - margin]) / 2
@@ -327,11 +378,13 @@ def _middle(px: np.ndarray) -> np.ndarray:
 def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
     """Pairs to start from: pins around the rim, where motion is least, then inside, with their 1st, 2nd, 3rd nearest blobs."""
     rim, inside = reference.outmost, len(reference.pins_px) - len(reference.outmost)
-    pins = np.concatenate([rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], [*range(0, inside, max(inside // 6, 1))]])
+    pins = np.concatenate(
+        [rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], [*range(0, inside, max(inside // INSIDE_SEEDS, 1))]]
+    )
     extent = _middle(px) - _middle(reference.pins_px)
     median = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
-    seen = set()
-    for rank in range(3):
+    seen: set[tuple[int, int]] = set()
+    for rank in range(SEED_RANKS):
         for offset in (extent, np.zeros(2), median):
             for pin in pins.tolist():
                 distance2 = ((px - (reference.pins_px[pin] + offset)) ** 2).sum(axis=1)
@@ -341,15 +394,15 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
                     yield pair
 
 
-def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buckets: tuple, cell: float) -> Match:
+def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buckets: Buckets, cell: float) -> Match:
     """Forget the labels around the lost pins and grow them anew from the others."""
     rest, neighbours = layout.rest, layout.neighbours
-    for reach in (6, neighbours.shape[1]):
+    for reach in (NEAR, neighbours.shape[1]):
         doubtful = np.zeros(len(rest), bool)
         lost = found.blob < 0
         doubtful[neighbours[lost, :reach].ravel()] = True
         start = np.where(doubtful, -1, found.blob)
-        if (start >= 0).sum() < 0.5 * len(rest):
+        if (start >= 0).sum() < LEAST_KEPT * len(rest):
             break
         again = _refine(layout, px, area, _grow(*layout[:3], px, start, buckets, cell), buckets, cell)
         if again.score > found.score:
@@ -360,6 +413,7 @@ def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buc
 
 
 def _layout(reference: Reference) -> Layout:
+    """The reference's arrays, and where its rings end: the outermost ring has as many pins as ``outmost``, each inner one six fewer."""
     n, rings = len(reference.pins_px), len(reference.outmost) // 6
     ring = np.arange(rings + 1)
     ring_ends = n - 3 * (rings * (rings + 1) - ring * (ring + 1))
@@ -390,7 +444,7 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
     layout = _layout(reference)
     cell = float(np.median(reference.spacing_px))
     buckets = _buckets(px, cell)
-    grown = []
+    grown: list[tuple[float, np.ndarray, Match | None]] = []
     for pin, blob in _seeds(reference, px):
         start = np.full(n, -1)
         start[pin] = blob
@@ -407,11 +461,11 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         grown.append((count, labels, None))
     grown.sort(key=lambda entry: -entry[0])
     best = nothing
-    for _, labels, found in grown[:REFINED]:
-        found = found or _refine(layout, px, area_px2, labels, buckets, cell)
+    for _, labels, refined in grown[:REFINED]:
+        found = refined or _refine(layout, px, area_px2, labels, buckets, cell)
         best = max(best, found, key=lambda entry: entry.score)
     lost = int((best.blob < 0).sum())
-    if 0 < lost < 0.3 * n and len(px) > n - lost:
+    if 0 < lost < MOST_REGROWN * n and len(px) > n - lost:
         best = _regrown(layout, px, area_px2, best, buckets, cell)
     return best
 

@@ -3,15 +3,18 @@
 import numpy as np
 from numba import njit
 
-RIDGE = 0.25  # pull of the local gradient towards zero, in units of one neighbour at one spacing
+# Pull of the local gradient towards zero, as strong as this many neighbours at one spacing.
+RIDGE = 0.25
 
 
 @njit(cache=True)
-def predict(i, rest, neighbours, spacing, moved, weight):
-    """Displacement of pin ``i`` from its neighbours' only, and how many of them spoke.
+def predict(
+    i: int, rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray
+) -> tuple[float, float, int]:
+    """Displacement of pin ``i`` from that of its neighbours alone, and how many neighbours counted.
 
-    Weighted least squares of u(x) = a + G (x - x_i) over the neighbours with ``weight`` > 0, the gradient
-    G lightly pulled to zero so that one neighbour is enough.
+    Weighted least squares of u(x) = a + G (x - x_i) over the neighbours with ``weight`` > 0. The gradient
+    G is lightly pulled to zero, so that one neighbour is enough.
 
     Parameters
     ----------
@@ -67,8 +70,8 @@ def predict(i, rest, neighbours, spacing, moved, weight):
 
 
 @njit(cache=True)
-def predict_all(rest, neighbours, spacing, moved, weight):
-    """Each pin's position (N, 2) as its neighbours predict it (NaN where none speaks)."""
+def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Each pin's position (N, 2) as its neighbours predict it; NaN where no neighbour counts."""
     out = np.empty_like(rest)
     for i in range(len(rest)):
         ux, uy, count = predict(i, rest, neighbours, spacing, moved, weight)

@@ -6,10 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from twin.preprocess.forms import gray_levels
+from twin.recordings.forms import gray_levels
 from twin.types import Frame, Observation
 
+# Colours of edges, found pins, places of lost pins, and rejected blobs.
 EDGE_RGB, FOUND_RGB, LOST_RGB, EXTRA_RGB = (90, 110, 160), (60, 220, 60), (255, 60, 60), (255, 210, 0)
+# What is drawn is at most this far from the frame's origin, px: farther off, OpenCV's integers would overflow.
+FARTHEST_PX = 1e4
 
 
 def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
@@ -17,9 +20,9 @@ def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> n
     gray = cv2.resize(gray_levels(frame.image), None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
     canvas = cv2.cvtColor(gray // 2, cv2.COLOR_GRAY2RGB)
 
-    def place(px: np.ndarray) -> list:
+    def place(px: np.ndarray) -> list[list[int]]:
         px = px[np.isfinite(px).all(axis=1)]
-        return np.round((np.clip(px, -1e4, 1e4) + 0.5) * scale - 0.5).astype(int).tolist()
+        return np.round((np.clip(px, -FARTHEST_PX, FARTHEST_PX) + 0.5) * scale - 0.5).astype(int).tolist()
 
     if observation.graph is not None:
         nodes = place(observation.graph.nodes_px)

@@ -1,4 +1,4 @@
-"""From a frame to an observation: the one way, for rendered, recorded and live frames alike."""
+"""From a frame to an observation, in one way for rendered, recorded and live frames."""
 
 from time import perf_counter
 
@@ -7,28 +7,46 @@ import numpy as np
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
 from twin.preprocess.blobs import Blobs, despeckled, find_blobs, own_threshold
-from twin.preprocess.forms import blob_spec, frame_size, gray_levels
 from twin.preprocess.graph import GraphKind, make_graph
 from twin.preprocess.mask import Mask, circular_mask
 from twin.preprocess.matching import Match, match, rematch
 from twin.preprocess.motion import predict_all
 from twin.preprocess.reference import Reference, folded_fraction, make_reference, nominal_reference
 from twin.preprocess.split import split_chains, split_merged
+from twin.recordings.forms import blob_spec, frame_size, gray_levels
 from twin.types import Form, Frame, Observation
 
-MIN_FOUND = 0.8  # of the pins: fewer is not an observation
-MAX_EXTRA = 0.35  # further blobs among the pins, as a part of N, where pins are missing (N itself where none is)
+# Limits of an observation; they were chosen, not derived.
+# Least share of the pins that must be found.
+MIN_FOUND = 0.8
+# Most blobs among the pins that are no pins, as a share of the pins, where some pins are missing.
+MAX_EXTRA = 0.35
+# Share of the pins from which on none counts as missing; then there may be as many further blobs as pins.
 NEARLY_ALL = 0.97
-MAX_FOLDED = 0.02  # of the rest triangles turned over: more is a wrong labelling
-MAX_RIM_SCALE = 1.2  # of the clamped rim, to its size at rest; contact changes it by some percent
-MAX_SHIFT = 0.5  # of the layout's radius: a frame displaced further isn't this sensor's view
-MAX_BLOB_PITCHES2 = 3.0  # area of a component, in squared pitches: larger is housing or glare
+# Largest share of the reference's triangles that may be turned over: more is a wrong labelling.
+MAX_FOLDED = 0.02
+# Largest ratio of the rim's radius to that at rest, either way. The rim is clamped: contact changes it by some percent.
+MAX_RIM_SCALE = 1.2
+# Largest displacement of the layout, in its radii: a frame displaced further is not this sensor's view.
+MAX_SHIFT = 0.5
+# Largest area of a blob, in squared mean spacings: larger ones are housing or glare.
+MAX_BLOB_PITCHES2 = 3.0
+# Rounds of splitting caps that touch: each split corrects the predictions for the next.
 SPLIT_ROUNDS = 3
-ENOUGH = 0.985  # of the pins: where fewer are found, or MAX_EXTRA further blobs, the frame is looked at again ...
-OWN_SHARES = (1.0, 0.3)  # ... by thresholds half way between its caps and skin, and low enough for caps much darker than most
-EXTRA_COST = 0.05  # pins that a further blob costs, where looks are compared: noise and clutter make hundreds
-REMASK_PX = 2.0  # a frame displaced by more gets its mask displaced likewise ...
-MASK_MARGIN = 0.5  # ... when a pin is this close to the mask's edge, in spacings
+# Where a smaller share of the pins than this is found, or MAX_EXTRA further blobs, the frame is looked at again.
+ENOUGH = 0.985
+# The thresholds of these looks, in the frame's own threshold half way between caps and skin. The low one finds caps much darker than most.
+OWN_SHARES = (1.0, 0.3)
+# Pins that a further blob costs where looks are compared: noise and clutter make hundreds of blobs.
+EXTRA_COST = 0.05
+# Displacement of a frame, px, above which its mask is displaced, too ...
+REMASK_PX = 2.0
+# ... if a pin is this close to the mask's edge, in spacings.
+MASK_MARGIN = 0.5
+# Share of the pins above which a labelling is taken as a basis for further steps.
+PLAUSIBLE = 0.5
+# Weight of a pin that was itself predicted, where pins in a gap are predicted from the gap's edge inwards.
+PREDICTED_WEIGHT = 0.1
 
 
 class Pipeline:
@@ -43,7 +61,7 @@ class Pipeline:
         No-contact layout; by default the specification's own.
     graph : {"voronoi", "delaunay", "knn"}
     second_look : bool
-        Where an adaptive threshold loses pins, or finds much else, look again by those that the frame's own contrast gives.
+        Where an adaptive threshold loses pins, or finds much that is no pin, look again with thresholds from the frame's own contrast.
     """
 
     def __init__(
@@ -57,9 +75,9 @@ class Pipeline:
     ) -> None:
         self.spec, self.form, self.graph, self.second_look = spec, Form(form), graph, second_look
         self.size_px = frame_size(spec, self.form)
-        self.blob_spec = blob_spec(spec, self.form)
+        self.blob_spec = blob_spec(spec.pipeline, self.form)
         self.reference = nominal_reference(spec, self.form) if reference is None else reference
-        self._mask = circular_mask(self.size_px, self.blob_spec.mask_center_px, self.blob_spec.mask_radius_px)
+        self.mask = circular_mask(self.size_px, self.blob_spec.mask_center_px, self.blob_spec.mask_radius_px)
         pitch = float(np.mean(self.reference.spacing_px))
         self._max_area_px2 = MAX_BLOB_PITCHES2 * pitch**2
         self._center_px = np.median(self.reference.pins_px, axis=0)
@@ -113,7 +131,7 @@ class Pipeline:
     def _look(self, frame: Frame, blob: BlobSpec, ms: dict[str, float]) -> tuple[Blobs, Match]:
         """Blobs and their labelling, by one threshold; times of the stages go into ``ms``."""
         started = perf_counter()
-        blobs = self._detect(frame, self._mask, blob)
+        blobs = self._detect(frame, self.mask, blob)
         ms["detect"], now = _since(started)
         found = match(self.reference, blobs.px, blobs.area_px2)
         if self._plausible(found):
@@ -124,8 +142,8 @@ class Pipeline:
         return blobs, found
 
     def _with_own_threshold(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
-        """Look again by thresholds of this frame's own contrast, until all is clear; the best labelling of all looks."""
-        own = own_threshold(self._window(frame, self._mask), self._mask.disc, self.blob_spec)
+        """Look again with thresholds from this frame's own contrast until nearly all pins are found; the best labelling of all looks."""
+        own = own_threshold(self._window(frame, self.mask), self.mask.disc, self.blob_spec)
         best = blobs, found
         for share in OWN_SHARES:
             again = self._look(frame, self.blob_spec.model_copy(update={"threshold": share * own}), {})
@@ -135,22 +153,25 @@ class Pipeline:
         return best
 
     def _clear(self, blobs: Blobs, found: Match) -> bool:
-        """Nearly all pins are found, and little else."""
+        """Whether nearly all pins are found, and little else."""
         n = len(found.blob)
-        return (found.blob >= 0).sum() >= ENOUGH * n and _extra(blobs, found) <= MAX_EXTRA * n
+        return bool((found.blob >= 0).sum() >= ENOUGH * n) and _extra(blobs, found) <= MAX_EXTRA * n
 
     def _window(self, frame: Frame, mask: Mask) -> np.ndarray:
+        """Gray levels (h, w) of the mask's window, without hot and dead pixels where the threshold is adaptive."""
         window = gray_levels(np.ascontiguousarray(frame.image[mask.window]))
         return despeckled(window) if self.blob_spec.threshold_block_px else window
 
     def _detect(self, frame: Frame, mask: Mask, blob: BlobSpec) -> Blobs:
+        """Blobs in the mask's window, those that are several caps in a row split."""
         return split_chains(find_blobs(self._window(frame, mask), mask, blob, max_area_px2=self._max_area_px2))
 
     def _plausible(self, found: Match) -> bool:
-        return (found.blob >= 0).sum() > 0.5 * len(found.blob)
+        """Whether a labelling is good enough to be improved."""
+        return bool((found.blob >= 0).sum() > PLAUSIBLE * len(found.blob))
 
     def _with_displaced_mask(self, frame: Frame, blob: BlobSpec, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
-        """Look again where the whole view is displaced and its mask cuts into pins, or near them."""
+        """Look again with a displaced mask, if the whole view is displaced so far that the mask cuts pins off, or nearly."""
         paired = found.blob >= 0
         rim = self.reference.outmost[paired[self.reference.outmost]]
         away = np.linalg.norm(found.predicted_px - self.blob_spec.mask_center_px, axis=1)
@@ -165,7 +186,7 @@ class Pipeline:
         return (displaced, again) if again.score > found.score else (blobs, found)
 
     def _with_split_caps(self, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
-        """Split merged caps; each split corrects the predictions that the next is made by."""
+        """Split caps that touch. Each split corrects the predictions for the next."""
         for _ in range(SPLIT_ROUNDS):
             parts = split_merged(self.reference, blobs, found)
             if parts is blobs:
@@ -179,7 +200,7 @@ class Pipeline:
         return blobs, found
 
     def _complete(self, pins_px: np.ndarray) -> np.ndarray:
-        """Pins (N, 2) with the lost ones where their neighbours' motion puts them."""
+        """Pins (N, 2); a lost pin takes the place that its neighbours' motion predicts."""
         reference = self.reference
         found = np.isfinite(pins_px[:, 0])
         if found.all():
@@ -192,10 +213,11 @@ class Pipeline:
             if not new.any():
                 break
             nodes_px[new] = predicted[new]
-            known[new] = 0.1
+            known[new] = PREDICTED_WEIGHT
         return nodes_px
 
     def _reason(self, blobs: Blobs, found: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
+        """Why a frame is no valid observation; "" if it is one."""
         n = len(nodes_px)
         if len(blobs.px) < MIN_FOUND * n / 2:
             return f"no pins: {len(blobs.px)} blobs seen, {n} pins expected"
@@ -220,21 +242,23 @@ class Pipeline:
 
 
 def _extra(blobs: Blobs, found: Match) -> int:
-    """Blobs that are no pins."""
+    """Number of blobs that are no pins."""
     return len(blobs.px) - int((found.blob >= 0).sum())
 
 
 def _mean_radius(px: np.ndarray) -> float:
+    """Mean distance of points (n, 2) from their mean."""
     return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
 
 
 def _since(start: float) -> tuple[float, float]:
+    """Milliseconds since a time of ``perf_counter``, and the time now."""
     now = perf_counter()
     return 1e3 * (now - start), now
 
 
 def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
-    """The reference as a no-contact frame shows it; lost pins are filled in from their neighbours.
+    """The reference that a no-contact frame shows; lost pins are filled in from their neighbours.
 
     Raises
     ------
@@ -242,7 +266,7 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
         The layout can't be found in the frame.
     """
     observation = Pipeline(spec, form, graph="delaunay")(frame)
-    if not observation.valid:
+    if observation.graph is None:
         raise FrameError(
             f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout"
         )

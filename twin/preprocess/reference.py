@@ -1,4 +1,4 @@
-"""Where the pins of a sensor are in a frame without contact, and who neighbours whom there."""
+"""Where the pins of a sensor are in a frame without contact, and which pins are neighbours there."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,13 @@ from scipy.spatial import Delaunay, cKDTree
 
 from scenes.sensor import SensorSpec
 from twin.geometry.pins import rest_pins
-from twin.preprocess.forms import from_raw
 from twin.preprocess.voronoi import voronoi
 from twin.projection import project
+from twin.recordings.forms import from_raw
 from twin.types import Form
 
-NEIGHBOURS = 18  # two rings of a triangular lattice: enough for a local affine fit without the pin itself
+# Neighbours of a pin: two rings of a triangular lattice, enough for a local affine fit without the pin itself.
+NEIGHBOURS = 18
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Reference:
     spacing_px : (N,) float
         Distance to the nearest other pin.
     triangles : (t, 3) int
-        Delaunay triangles, all of the same orientation; none of outmost pins alone.
+        Delaunay triangles, all of the same orientation, without those of three outmost pins.
     outmost : (m,) int
         The outmost pins, in order around the layout.
     area_px2 : (N,) float
@@ -50,7 +51,7 @@ def make_reference(pins_px: np.ndarray, rings: int) -> Reference:
     triangles = Delaunay(pins_px).simplices.astype(np.int64)
     area = _double_areas(pins_px, triangles)
     triangles[area < 0] = triangles[area < 0][:, ::-1]
-    inner = (triangles < n - 6 * rings).any(axis=1)  # slivers between outmost pins turn over without meaning
+    inner = (triangles < n - 6 * rings).any(axis=1)  # thin triangles of outmost pins alone turn over without meaning
     triangles = triangles[inner]
     outmost = np.arange(n - 6 * rings, n)
     area_px2 = voronoi(pins_px, outmost=outmost).area_px2
@@ -59,14 +60,15 @@ def make_reference(pins_px: np.ndarray, rings: int) -> Reference:
 
 def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
     """Reference from the specification alone: rest caps projected by its camera."""
-    return make_reference(from_raw(spec, form, project(spec.view, rest_pins(spec.geometry).caps_mm)), spec.pins.rings)
+    return make_reference(from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm)), spec.pins.rings)
 
 
 def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Twice the signed area (t,) of triangles (t, 3) over points (N, 2)."""
     a, b, c = px[triangles[:, 0]], px[triangles[:, 1]], px[triangles[:, 2]]
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
 def folded_fraction(reference: Reference, nodes_px: np.ndarray) -> float:
-    """Part of the reference's triangles that are turned over by moving the pins to ``nodes_px`` (N, 2)."""
+    """Share of the reference's triangles that turn over when the pins move to ``nodes_px`` (N, 2)."""
     return float(np.mean(_double_areas(nodes_px, reference.triangles) <= 0))

@@ -1,4 +1,4 @@
-"""Caps that touch and merged into one component: one disc each, where the pixels allow."""
+"""Caps that touch and have merged into one component: split into one disc each, where the pixels allow it."""
 
 from dataclasses import replace
 
@@ -8,18 +8,33 @@ from twin.preprocess.blobs import Blobs
 from twin.preprocess.matching import Match
 from twin.preprocess.reference import Reference
 
-REACH = 0.4  # how far from a pin's predicted place a component may lie to be claimed, in spacings
-MIN_AREA_SHARE = 0.65  # of the areas expected of all claimants: less is one cap, not several
-MIN_SEPARATION = 0.6  # of two parts, in cap diameters
-MIN_PART = 0.4  # of the weight of the smallest part, to an equal share
+# All limits were chosen, not derived.
+# A component may be claimed by a pin whose predicted place is this near to it, in spacings.
+REACH = 0.4
+# Least area of a component, as a share of the areas expected of all its claimants: less is one cap, not several.
+MIN_AREA_SHARE = 0.65
+# Least distance of two parts, in cap diameters.
+MIN_SEPARATION = 0.6
+# Least weight of the smallest part, relative to an equal share.
+MIN_PART = 0.4
+# Rounds of k-means.
 ROUNDS = 12
-MANY, ROUNDS_OF_MANY = 24, 3  # parts of a net that scratches or glare make: it is large, and each round takes its time
-MIN_ELONGATION = 2.0  # of a chain: two touching discs have 5
-ODD_ELONGATION = 1.5  # of a chain, to the median of the blobs around: all caps near the rim are long
-MIN_CAPS, MAX_CAPS = 1.35, 5.0  # area of a chain, in median areas of its neighbours
-NECK = 0.7  # width of a neck to that of the narrower part beside it
-MIN_CAPS_NECKED = 1.0  # area of a necked chain, likewise
-AROUND = 13  # blobs that median is taken over
+# Parts from which on a component is a net made by scratches or glare. It is large and each round is slow, so there are fewer rounds.
+MANY, ROUNDS_OF_MANY = 24, 3
+# Shift of the parts' centres, px, below which k-means has settled.
+SETTLED_PX = 1e-3
+# Least elongation of a chain of caps. Two touching discs have 5.
+MIN_ELONGATION = 2.0
+# Least elongation of a chain, relative to the median of the blobs around it: near the rim all caps are long.
+ODD_ELONGATION = 1.5
+# Least and largest area of a chain, in median areas of the blobs around it.
+MIN_CAPS, MAX_CAPS = 1.35, 5.0
+# Largest width of a neck, relative to that of the narrower part beside it.
+NECK = 0.7
+# Least area of a chain with a neck, in median areas of the blobs around it.
+MIN_CAPS_NECKED = 1.0
+# Blobs over which these medians are taken, the chain itself included.
+AROUND = 13
 
 
 def _label_near(blobs: Blobs, px: np.ndarray, reach_px: float) -> int:
@@ -39,14 +54,17 @@ def _label_near(blobs: Blobs, px: np.ndarray, reach_px: float) -> int:
 
 
 def _weight(level: np.ndarray) -> np.ndarray:
+    """Weights (p,) of pixels: their levels above the darkest one; 1 where all are alike."""
     return level - float(level.min()) if np.ptp(level) else np.ones(len(level))
 
 
 def _neck(along: np.ndarray, weight: np.ndarray) -> float | None:
-    """Where along its axis a component is narrow between two wide parts, from its pixels' places (p,) along it; else None."""
+    """Place along a component's axis where it is narrow between two wide parts; None where there is no such neck.
+
+    ``along`` (p,): places of its pixels along the axis, px; ``weight`` (p,).
+    """
     low = np.floor(along.min())
-    width = np.bincount((along - low).astype(int), weight)
-    width = np.convolve(width, [0.25, 0.5, 0.25])[1:-1]
+    width = np.convolve(np.bincount((along - low).astype(int), weight), [0.25, 0.5, 0.25])[1:-1]  # by px along the axis, smoothed
     inner = np.arange(2, len(width) - 2)
     if not len(inner):
         return None
@@ -63,20 +81,21 @@ def _parts(blobs: Blobs, label: int, seeds_px: np.ndarray) -> tuple[np.ndarray, 
     middle = np.average(pixels, axis=0, weights=weight)
     pixels = pixels - middle
     centers = seeds_px - seeds_px.mean(axis=0)
-    share = np.zeros(len(centers))
+    share: np.ndarray = np.zeros(len(centers))
     for _ in range(ROUNDS if len(centers) < MANY else ROUNDS_OF_MANY):
         owner = ((centers**2).sum(axis=1) - 2 * pixels @ centers.T).argmin(axis=1)  # nearest; a large component has many of both
         share = np.bincount(owner, weight, len(centers))
         if (share <= 0).any():
             break
         moved = np.stack([np.bincount(owner, weight * pixels[:, axis], len(centers)) / share for axis in (0, 1)], axis=1)
-        if np.abs(moved - centers).max() < 1e-3:
+        if np.abs(moved - centers).max() < SETTLED_PX:
             break
         centers = moved
     return middle + centers, share / weight.sum()
 
 
-def _with_parts(blobs: Blobs, split: list[int], px: list, area_px2: list, label: list) -> Blobs:
+def _with_parts(blobs: Blobs, split: list[int], px: list[np.ndarray], area_px2: list[float], label: list[int]) -> Blobs:
+    """The blobs, with those of the labels ``split`` replaced by parts: places (2,), areas and labels."""
     rest = ~np.isin(blobs.label, split)
     return replace(
         blobs,
@@ -87,8 +106,14 @@ def _with_parts(blobs: Blobs, split: list[int], px: list, area_px2: list, label:
     )
 
 
+def _both_sides(pixels: np.ndarray, weight: np.ndarray, beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (2, 2) and shares of the weight (2,) of the pixels (p, 2) before and ``beyond`` (p,) a neck."""
+    share = np.array([weight[~beyond].sum(), weight[beyond].sum()]) / weight.sum()
+    return np.stack([np.average(pixels[part], axis=0, weights=weight[part]) for part in (~beyond, beyond)]), share
+
+
 def split_chains(blobs: Blobs) -> Blobs:
-    """The blobs, with each that is as long and large as two (or more) of its neighbours replaced by that many parts."""
+    """The blobs; each one that is as long and large as two or more of its neighbours is replaced by that many parts."""
     long = np.flatnonzero(blobs.elongation > MIN_ELONGATION)
     if not len(long) or len(blobs.px) < AROUND:
         return blobs
@@ -96,7 +121,10 @@ def split_chains(blobs: Blobs) -> Blobs:
     around = np.argpartition(distance2, AROUND - 1, axis=1)[:, :AROUND]
     odd = blobs.elongation[long] > ODD_ELONGATION * np.median(blobs.elongation[around], axis=1)
     caps_in = blobs.area_px2[long] / np.median(blobs.area_px2[around], axis=1)
-    split, px, part_area, part_label = [], [], [], []
+    split: list[int] = []
+    px: list[np.ndarray] = []
+    part_area: list[float] = []
+    part_label: list[int] = []
     for k, caps in zip(long[odd], caps_in[odd], strict=True):
         pixels, level = blobs.pixels(int(blobs.label[k]))
         weight = _weight(level)
@@ -108,9 +136,7 @@ def split_chains(blobs: Blobs) -> Blobs:
             continue
         count = 2 if neck is not None else max(int(np.round(caps)), 2)
         if neck is not None:
-            owner = along > neck
-            share = np.array([weight[~owner].sum(), weight[owner].sum()]) / weight.sum()
-            centers = [np.average(pixels[part], axis=0, weights=weight[part]) for part in (~owner, owner)]
+            centers, share = _both_sides(pixels, weight, along > neck)
         else:
             seeds = middle + np.outer(np.quantile(along, (np.arange(count) + 0.5) / count), axis)
             centers, share = _parts(blobs, int(blobs.label[k]), seeds)
@@ -123,10 +149,10 @@ def split_chains(blobs: Blobs) -> Blobs:
 
 
 def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
-    """The blobs, with each component that several pins claim replaced by as many parts.
+    """The blobs; each component that several pins claim is replaced by as many parts.
 
-    A component is claimed by the pins it, or part of it, was matched to and by lost pins predicted on it. It is split if it is large
-    enough for all claimants and falls into as many parts of a cap's size.
+    A pin claims a component if the component, or a part of it, was matched to the pin, or if the pin is lost and predicted there.
+    The component is split if it is large enough for all claimants and falls into as many parts of a cap's size.
     """
     labelled = found.blob >= 0
     claims: dict[int, list[int]] = {}
@@ -139,7 +165,10 @@ def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
     owned_label = np.where(labelled, blobs.label[found.blob], 0)
     area = np.full(len(found.blob), np.nan)
     area[labelled] = blobs.area_px2[found.blob[labelled]]
-    px, part_area, part_label, split = [], [], [], []
+    split: list[int] = []
+    px: list[np.ndarray] = []
+    part_area: list[float] = []
+    part_label: list[int] = []
     for label, pins in claims.items():
         pins += np.flatnonzero(owned_label == label).tolist()
         around = area[reference.neighbours[pins]]

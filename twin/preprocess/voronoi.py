@@ -16,7 +16,10 @@ import numpy as np
 from numba import njit
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
+# The outline is enlarged by this about its centroid: half way to the release's further sites, which stand at 1.1.
 BOUNDARY_SCALE = 1.05
+# Sides of the strip that stands for the hull of nodes on a line: its margin as a share of the length, and its least width, px.
+STRIP_SHARE, LEAST_STRIP_PX = 0.05, 1.0
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Tessellation:
     """
 
     area_px2: np.ndarray
-    cells: list
+    cells: list[np.ndarray]
     region_px: np.ndarray
 
 
@@ -49,7 +52,7 @@ def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
 
 
 @njit(cache=True)
-def directed_edges(triangles, n):
+def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
     """(E, 2) both directions of each triangle side of a triangulation of ``n`` nodes, sorted."""
     start = np.zeros(n + 1, np.int64)
     for t in range(len(triangles)):
@@ -78,8 +81,8 @@ def directed_edges(triangles, n):
 
 
 @njit(cache=True)
-def polygon_area(polygon, count):
-    """Signed area (shoelace) of the first ``count`` vertices, about the first one against cancellation."""
+def polygon_area(polygon: np.ndarray, count: int) -> float:
+    """Signed area (shoelace) of the first ``count`` vertices, about the first one: far from the origin digits would cancel."""
     total = 0.0
     x0, y0 = polygon[0, 0], polygon[0, 1]
     for k in range(1, count - 1):
@@ -88,7 +91,7 @@ def polygon_area(polygon, count):
 
 
 @njit(cache=True)
-def _cut(polygon, count, a, b, c, out):
+def _cut(polygon: np.ndarray, count: int, a: float, b: float, c: float, out: np.ndarray) -> int:
     """The part of a polygon with a x + b y <= c (Sutherland and Hodgman 1974); returns its vertex count."""
     kept = 0
     px, py = polygon[count - 1, 0], polygon[count - 1, 1]
@@ -110,7 +113,9 @@ def _cut(polygon, count, a, b, c, out):
 
 
 @njit(cache=True)
-def _cell(i, nodes, start, neighbours, count, here, there):
+def _cell(
+    i: int, nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, count: int, here: np.ndarray, there: np.ndarray
+) -> tuple[int, np.ndarray, np.ndarray]:
     """Cut the ``count`` vertices in ``here`` down to node i's cell; returns (count, the array they are in, the other)."""
     for e in range(start[i], start[i + 1]):
         j = neighbours[e]
@@ -124,7 +129,7 @@ def _cell(i, nodes, start, neighbours, count, here, there):
 
 
 @njit(cache=True)
-def _inner_radius2(region, x0, y0):
+def _inner_radius2(region: np.ndarray, x0: float, y0: float) -> float:
     """Squared distance of a point from the nearest of a polygon's sides."""
     least = np.inf
     for k in range(len(region)):
@@ -137,11 +142,11 @@ def _inner_radius2(region, x0, y0):
 
 
 @njit(cache=True)
-def _cells(nodes, start, neighbours, region):
+def _cells(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Area of every cell and its vertices, end to end.
 
-    Cutting starts from the region's bounding box; a cell that leaves the disc the region is known
-    to hold is cut again from the region itself.
+    Cutting starts from the region's bounding box. The region is known to hold a disc; a cell that leaves this disc is
+    cut again, from the region itself.
     """
     n, m = len(nodes), len(region)
     x0, y0 = region[:, 0].mean(), region[:, 1].mean()
@@ -201,7 +206,7 @@ def _hull_region(nodes: np.ndarray) -> np.ndarray:
         middle = hull.mean(axis=0)
         return np.ascontiguousarray(middle + BOUNDARY_SCALE * (hull - middle))
     along = spread @ axes[0]
-    margin = max(0.05 * np.ptp(along), 1.0) / 2
+    margin = max(STRIP_SHARE * np.ptp(along), LEAST_STRIP_PX) / 2
     low, high = along.min() - margin, along.max() + margin
     corners = np.array([[low, -margin], [high, -margin], [high, margin], [low, margin]])
     region = center + corners @ axes
@@ -209,6 +214,7 @@ def _hull_region(nodes: np.ndarray) -> np.ndarray:
 
 
 def _with_all_pairs(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Neighbours of each node where all others are: start (n + 1,) of each one's part, and the neighbours end to end."""
     n = len(nodes)
     other = np.broadcast_to(np.arange(n), (n, n))[~np.eye(n, dtype=bool)]
     return np.arange(n + 1) * (n - 1), np.ascontiguousarray(other)

@@ -10,14 +10,22 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-FINE = 4  # interpolated pixels per pixel
-REACH = 0.65  # of the distance to the nearest neighbour: half side of the patch
-SKIN_PERCENTILE = 20.0  # of the levels of a cell outside the cap: stems and neighbours are brighter
-HALF_ROUNDS = 3  # plateau and half level depend on each other
-PLATEAU = 0.5  # a pixel this deep in the cap, relative to its deepest one, belongs to the plateau
-EDGE_PX = 4.0  # the edge's profile reaches this far to both sides
-EDGE_BIN_PX = 0.25
-NEIGHBOURS = 7  # that bound a cap's cell
+# Interpolated pixels for each pixel, each way.
+FINE = 4
+# Half a side of a cap's patch, as a share of the distance to the nearest neighbour.
+REACH = 0.65
+# Percentile of a cell's levels outside the cap that stands for the skin: stems and neighbours are brighter.
+SKIN_PERCENTILE = 20.0
+# Rounds in which plateau and half level are found in turn: each depends on the other.
+HALF_ROUNDS = 3
+# A pixel at least this deep in the cap, relative to its deepest one, belongs to the plateau.
+PLATEAU = 0.5
+# Reach of the edge's profile to both sides, and width of its bins, px.
+EDGE_PX, EDGE_BIN_PX = 4.0, 0.25
+# Levels of the edge, as shares of the contrast, between which its width is measured.
+EDGE_LOW, EDGE_HIGH = 0.1, 0.9
+# Pins, a cap's own included, that bound its cell.
+NEIGHBOURS = 7
 
 
 @dataclass(frozen=True)
@@ -26,9 +34,8 @@ class Caps:
 
     Attributes
     ----------
-    level, contrast : gray levels
-        Of the plateau, and above the skin around.
-    skin : gray levels
+    level, contrast, skin : (N,) float
+        Gray levels: of the plateau, of the plateau above the skin around, and of that skin.
     diameter_px : float
         Of the disc with the area above half level.
     eccentricity : float
@@ -63,7 +70,8 @@ def measure_caps(gray: np.ndarray, pins_px: np.ndarray) -> Caps:
     return Caps(*values.T)
 
 
-def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int) -> tuple | None:
+def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int) -> tuple[float, ...] | None:
+    """The measures, in the order of ``MEASURES``, of a cap in a patch of ``half`` a side; None where there is none."""
     x, y = np.rint(pin_px).astype(int)
     if x < half or y < half or x + half >= gray.shape[1] or y + half >= gray.shape[0]:
         return None
@@ -75,7 +83,8 @@ def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int
     cell = np.ones(fine.shape, bool)
     for u, v in others - pin_px:  # nearer to the pin than to this neighbour
         cell &= (columns - corner[0]) * u + (rows - corner[1]) * v < (u * u + v * v) / 2
-    middle = tuple(np.rint(corner[::-1] * FINE).astype(int))
+    row, column = np.rint(corner[::-1] * FINE).astype(int).tolist()
+    middle = row, column
     skin, level = np.percentile(fine[cell], SKIN_PERCENTILE), fine[middle]
     for _ in range(HALF_ROUNDS):
         above = ((fine > (skin + level) / 2) & cell).astype(np.uint8)
@@ -107,11 +116,11 @@ def _edge_px(inwards_px: np.ndarray, share: np.ndarray) -> float:
     used = np.flatnonzero(count)
     at, profile = (used - reach) * EDGE_BIN_PX, total[used] / count[used]
     start = int(np.searchsorted(at, 0.0))
-    up = np.flatnonzero(profile[start:] >= 0.9)
-    down = np.flatnonzero(profile[:start] <= 0.1)
+    up = np.flatnonzero(profile[start:] >= EDGE_HIGH)
+    down = np.flatnonzero(profile[:start] <= EDGE_LOW)
     if not len(up) or not len(down) or up[0] + start == 0:
         return np.nan
     high, low = start + up[0], down[-1]
-    upper = np.interp(0.9, profile[high - 1 : high + 1], at[high - 1 : high + 1])
-    lower = np.interp(0.1, profile[low : low + 2], at[low : low + 2])
+    upper = np.interp(EDGE_HIGH, profile[high - 1 : high + 1], at[high - 1 : high + 1])
+    lower = np.interp(EDGE_LOW, profile[low : low + 2], at[low : low + 2])
     return float(upper - lower)

@@ -1,7 +1,7 @@
 """The comparison's order of work: read, align, render, measure."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -9,11 +9,12 @@ from scenes import load_experiment
 from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
 from twin.camera import expose
-from twin.geometry.skin_fit import SkinFit
+from twin.geometry.mesh import SensorMesh
+from twin.geometry.skin_fit import FittedPins, SkinFit
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Renderer
-from twin.preprocess.forms import gray_levels
 from twin.preprocess.pipeline import Pipeline
+from twin.progress import Bar, Progress
 from twin.projection import project
 from twin.realism.disc import Disc
 from twin.realism.frames import RealFrame
@@ -29,11 +30,12 @@ from twin.realism.poses import (
     labels_of_rows,
     mean_pin_error_px,
 )
-from twin.realism.statistics import Statistics, compare_statistics, measure_frame
+from twin.realism.statistics import FrameStatistics, Statistics, compare_statistics, measure_frame
+from twin.recordings.forms import gray_levels
 from twin.rig.kinematics import rig_of
-from twin.types import Form
+from twin.types import ContactState, Form
 
-Bar = Callable  # bar(title) is a context manager that yields progress(done, total)
+Quality = Literal["preview", "standard", "high"]
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,8 @@ class PoseAligned:
     pairs: list[Pair]
 
 
-def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: str, progress) -> list[Pair]:
-    """Fit the skin to each frame's pins, render it, capture it: the camera and the light on trial, not the mechanics."""
+def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, progress: Progress) -> list[Pair]:
+    """Fit the skin to each frame's pins, render and capture it: this tests camera and light, not the mechanics."""
     fit, shoot, pairs = SkinFit(spec), _Shooter(spec, disc, quality), []
     for number, real in enumerate(frames):
         pins = fit(real.pins_px)
@@ -90,8 +92,8 @@ def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, qualit
     return pairs
 
 
-def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: str, bar: Bar) -> PoseAligned:
-    """The whole twin from each frame's label: the arm's rig fitted to one half of the frames.
+def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, bar: Bar) -> PoseAligned:
+    """Render each frame from its label alone, mechanics included. The arm's rig is fitted to one half of the frames.
 
     Raises
     ------
@@ -119,9 +121,9 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, radius_mm), pairs)
 
 
-def statistics(pairs: list[Pair], disc: Disc, *, progress) -> Statistics:
+def statistics(pairs: list[Pair], disc: Disc, *, progress: Progress) -> Statistics:
     """Real against pin-aligned renders: caps, skin, noise, spectrum, spots."""
-    sets: tuple[list, list] = ([], [])
+    sets: tuple[list[FrameStatistics], list[FrameStatistics]] = ([], [])
     for number, pair in enumerate(pairs):
         for measured, image in zip(sets, (pair.real.frame.image, pair.image), strict=True):
             measured.append(measure_frame(gray_levels(image), pair.real.pins_px, disc))
@@ -132,12 +134,12 @@ def statistics(pairs: list[Pair], disc: Disc, *, progress) -> Statistics:
 class _Shooter:
     """Renders states beside real frames and compares them."""
 
-    def __init__(self, spec: SensorSpec, disc: Disc, quality: str, mesh=None):
+    def __init__(self, spec: SensorSpec, disc: Disc, quality: Quality, mesh: SensorMesh | None = None):
         self._spec, self._disc = spec, disc
         self._renderer = Renderer(spec, quality=quality, mesh=mesh)
         self._pipeline = Pipeline(spec, Form.RAW)
 
-    def __call__(self, real: RealFrame, state, remainder_px: float, *, seed: int) -> Pair:
+    def __call__(self, real: RealFrame, state: FittedPins | ContactState, remainder_px: float, *, seed: int) -> Pair:
         image = expose(self._renderer.render(state, seed=seed), self._spec.capture, np.random.default_rng(seed))
         seen = self._pipeline(replace(real.frame, image=image))
         exact = seen.valid and seen.found == len(seen.pins_px)

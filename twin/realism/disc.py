@@ -1,4 +1,4 @@
-"""The part of the raw frame that shows the gel: what the housing's aperture leaves free."""
+"""The part of the raw frame that shows the gel: the housing's aperture."""
 
 from dataclasses import dataclass
 
@@ -7,6 +7,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.projection import project
 
+# Corners of the polygon that stands for the aperture's rim.
 CORNERS = 360
 
 
@@ -27,7 +28,7 @@ class Disc:
     inside: np.ndarray
 
     def distance_px(self, points_px: np.ndarray) -> np.ndarray:
-        """(...,) px of points (..., 2) from the disc's centre."""
+        """Distance (...,) of points (..., 2) from the disc's centre, px."""
         return np.linalg.norm(np.asarray(points_px, float) - self.center_px, axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""Reading the real frames: raw, of one size, neither dark nor saturated, with every pin found."""
+"""Reading real frames. They must be raw, of one size, neither dark nor saturated, and show every pin."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,16 +7,18 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
-from twin.preprocess.forms import gray_levels
 from twin.preprocess.pipeline import Pipeline
+from twin.progress import Progress
 from twin.realism.disc import Disc
 from twin.recordings import open_recording
-from twin.types import Form, Frame
+from twin.recordings.forms import gray_levels
+from twin.recordings.recording import BadFrame
+from twin.types import Form, Frame, Observation
 
-DARK_LEVEL = 40.0  # the brightest percent of a lit frame's disc is brighter
-SATURATED_LEVEL = 250
-MOST_SATURATED = 0.1  # of the disc
-BRIGHT_PERCENTILE = 99.0
+# A lit frame is brighter than this gray level at this percentile of the disc.
+DARK_LEVEL, BRIGHT_PERCENTILE = 40.0, 99.0
+# Gray level from which on a pixel is saturated, and largest share of the disc that may be.
+SATURATED_LEVEL, MOST_SATURATED = 250, 0.1
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class RealFrame:
 
     frame: Frame
     pins_px: np.ndarray
-    label: dict
+    label: dict[str, float]
 
     @property
     def gray(self) -> np.ndarray:
@@ -47,10 +49,10 @@ class RealFrames:
     """The usable frames of a folder; ``refused``: ``image_name`` and ``reason`` of the others."""
 
     frames: list[RealFrame]
-    refused: list[dict] = field(default_factory=list)
+    refused: list[BadFrame] = field(default_factory=list)
 
 
-def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, progress=None) -> RealFrames:
+def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, progress: Progress | None = None) -> RealFrames:
     """Read raw frames, evenly spread over the recording if there are more than ``limit``.
 
     Raises
@@ -63,7 +65,8 @@ def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = N
         raise FrameError(f"{path}: these are thresholded recordings; realism is judged on raw camera frames, give a folder of those")
     pipeline, count = Pipeline(spec, Form.RAW), len(recording)
     chosen = np.unique(np.linspace(0, count - 1, min(limit or count, count)).round().astype(int)).tolist()
-    frames, refused = [], []
+    frames: list[RealFrame] = []
+    refused: list[BadFrame] = []
     for done, index in enumerate(chosen):
         name = recording.names[index]
         try:
@@ -82,7 +85,7 @@ def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = N
     return RealFrames(frames, refused)
 
 
-def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc):
+def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc) -> Observation:
     """The observation of a frame that is fit to be compared.
 
     Raises

@@ -1,8 +1,8 @@
 """A real frame against its render, pixel by pixel, over the lens disc.
 
-PSNR; SSIM (Wang et al. 2004), as scikit-image computes it; FLIP (Andersson et al. 2020), the difference that an eye sees when
-it flips between the two on a common screen (67 px per degree), 0 for none to 1. Outside the disc the render is replaced by the
-real frame, so that nothing from there reaches into the windows of SSIM and FLIP.
+The figures are PSNR, SSIM (Wang et al. 2004, as scikit-image computes it) and FLIP (Andersson et al. 2020): the difference, from 0 to 1,
+that an eye sees when the two alternate on a usual screen (67 px per degree). Outside the disc the real frame takes the render's place,
+so that nothing from there enters the windows of SSIM and FLIP.
 """
 
 from dataclasses import asdict, dataclass
@@ -12,10 +12,12 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from twin.errors import FrameError
-from twin.preprocess.forms import gray_levels
+from twin.recordings.forms import gray_levels
 
+# Range of 8-bit gray levels.
 LEVELS = 255.0
-CHANGE_GAIN = 2  # of the difference picture
+# Amplification of the difference picture.
+CHANGE_GAIN = 2
 
 
 @dataclass(frozen=True)

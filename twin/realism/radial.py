@@ -1,9 +1,10 @@
-"""Measures of caps against the distance from the disc's centre, real beside rendered."""
+"""Measures of caps by their distance from the disc's centre, real and rendered side by side."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+# Bins of the distance from the disc's centre.
 BINS = 8
 
 
@@ -29,13 +30,15 @@ def equal_count_edges(distance_px: np.ndarray, bins: int = BINS) -> np.ndarray:
 
 
 def bin_of(distance_px: np.ndarray, edges_px: np.ndarray) -> np.ndarray:
-    """Index of each distance's bin; what lies beyond the edges belongs to the outer bins, NaN to none (-1)."""
+    """Index of each distance's bin. A distance beyond the edges belongs to the outer bins; NaN to none (-1)."""
     index = np.clip(np.searchsorted(edges_px, distance_px, side="right") - 1, 0, len(edges_px) - 2)
     return np.where(np.isfinite(distance_px), index, -1)
 
 
-def radial_rows(measure: str, real: tuple, rendered: tuple, edges_px: np.ndarray) -> list[RadialRow]:
-    """A measure in every bin; ``real`` and ``rendered`` are (distances px, values), NaN values are left out."""
+def radial_rows(
+    measure: str, real: tuple[np.ndarray, np.ndarray], rendered: tuple[np.ndarray, np.ndarray], edges_px: np.ndarray
+) -> list[RadialRow]:
+    """A measure in every bin. ``real`` and ``rendered`` are distances, px, and values, (n,) each; NaN values are left out."""
     means = []
     for distance, values in (real, rendered):
         where = bin_of(distance, edges_px)

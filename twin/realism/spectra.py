@@ -3,18 +3,23 @@
 import cv2
 import numpy as np
 
+# Rings of the spectrum.
 SPECTRUM_BINS = 24
-LOWEST_CYCLES = 4.0  # per diameter of the disc: below, the window itself is seen
-GAUSSIAN_MAD = 1.4826  # sd of a Gaussian over its median absolute deviation
+# Lowest frequency, cycles for each diameter of the disc: below it the Hann window's own spectrum is seen.
+LOWEST_CYCLES = 4.0
+# Sd of a Gaussian relative to its median absolute deviation.
+GAUSSIAN_MAD = 1.4826
+# Rounds of leaving out what lies beyond three sd.
 CLIP_ROUNDS = 3
-NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6  # unit gain for white noise (Immerkaer 1996)
+# Kernel that leaves nothing of constant, linear and twisted surfaces and has unit gain for white noise (Immerkaer 1996).
+NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 
 
 def noise_sd(gray: np.ndarray, where: np.ndarray) -> float:
     """Sd of the noise in gray levels, over the pixels ``where`` (H, W) bool.
 
-    Immerkaer's kernel (1996) takes constant, linear and twisted surfaces away; edges are left out as what lies beyond
-    three sd, the first sd being that of the median absolute deviation.
+    Immerkaer's kernel (1996) takes constant, linear and twisted surfaces away. Edges are left out: residuals beyond three sd do not
+    count, and the first sd is that of the median absolute deviation.
     """
     residual = cv2.filter2D(gray.astype(np.float32), cv2.CV_32F, NOISE_KERNEL)[where]
     sd = GAUSSIAN_MAD * float(np.median(np.abs(residual)))
@@ -26,8 +31,8 @@ def noise_sd(gray: np.ndarray, where: np.ndarray) -> float:
 def radial_spectrum(gray: np.ndarray, center_px: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Power against spatial frequency inside a disc.
 
-    The disc's mean is taken away, a round Hann window laid over it, and the power of the discrete Fourier transform
-    averaged over rings of even width in log frequency; a white image of sd s has power s^2 everywhere.
+    The disc's mean is subtracted, a round Hann window is applied, and the power of the discrete Fourier transform is averaged over
+    rings of even width in log frequency. White noise of sd s has power s^2 everywhere.
 
     Returns
     -------

@@ -8,14 +8,18 @@ from scipy.optimize import linear_sum_assignment
 
 from twin.realism.disc import Disc
 
-GROUND_PX = 25  # median filter that a spot has to rise above
-RISE = 20.0  # gray levels
+# Side of the median filter, px, above which a spot rises; and gray levels by which it does.
+GROUND_PX, RISE = 25, 20.0
+# Least area of a spot.
 MIN_AREA_PX2 = 4
-RIM_PX = 4.0  # nothing is looked for this close to the disc's edge
-PIN_SHARE = 0.75  # of the pins' spacing: around each pin nothing is looked for
-STEADY_PX = 3.0  # by which a steady spot's place differs between frames at most ...
-STEADY_SHARE = 0.5  # ... of which it is seen in so many (pins hide it in others)
-MOST_APART_PX = 6.0  # of a real spot and the rendered one for it
+# Nothing is looked for this close to the disc's edge, px.
+RIM_PX = 4.0
+# Nothing is looked for within this share of the pins' spacing around a pin.
+PIN_SHARE = 0.75
+# Most by which the place of a steady spot differs between frames, px, and least share of the frames that show it: pins hide it in others.
+STEADY_PX, STEADY_SHARE = 3.0, 0.5
+# Largest distance of a real spot from its rendered counterpart, px.
+MOST_APART_PX = 6.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ def find_spots(gray: np.ndarray, disc: Disc, pins_px: np.ndarray, spacing_px: fl
 
 
 def steady_spots(frames: list[Spots], share: float = STEADY_SHARE) -> Spots:
-    """Spots that are in at least a share of the frames, each at its mean place; with their mean peaks."""
+    """Spots that at least a share of the frames show, each at its mean place and with its mean peak."""
     px, peak = np.concatenate([spots.px for spots in frames]), np.concatenate([spots.peak for spots in frames])
     of = np.repeat(np.arange(len(frames)), [len(spots.px) for spots in frames])
     places, peaks, left = [], [], np.ones(len(px), bool)
@@ -56,7 +60,7 @@ def steady_spots(frames: list[Spots], share: float = STEADY_SHARE) -> Spots:
     return Spots(np.array(places).reshape(-1, 2), np.array(peaks))
 
 
-def clear_of_pins(shape: tuple, pins_px: np.ndarray, radius_px: float) -> np.ndarray:
+def clear_of_pins(shape: tuple[int, ...], pins_px: np.ndarray, radius_px: float) -> np.ndarray:
     """(H, W) bool: pixels farther than ``radius_px`` from every pin."""
     blocked = np.zeros(shape[:2], np.uint8)
     for x, y in pins_px[np.isfinite(pins_px).all(axis=1)]:

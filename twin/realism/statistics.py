@@ -10,9 +10,12 @@ from twin.realism.radial import RadialRow, equal_count_edges, radial_rows
 from twin.realism.spectra import log_distance_db, noise_sd, radial_spectrum
 from twin.realism.spots import Spots, clear_of_pins, find_spots, pair_spots, pin_spacing_px, steady_spots
 
-CLEAR_SHARE = 0.55  # of the pins' spacing: skin farther from every pin is bare
+# Skin farther from every pin than this share of the pins' spacing is bare.
+CLEAR_SHARE = 0.55
+# Measures of caps that are compared by radius.
 RADIAL_MEASURES = ("level", "contrast", "skin", "diameter_px", "eccentricity", "edge_px")
-TARGET = 0.05  # relative difference in a bin, for level, diameter and edge width
+# Largest relative difference in any bin that is aimed at, and the measures that it holds for.
+TARGET = 0.05
 TARGET_MEASURES = ("level", "diameter_px", "edge_px")
 
 
@@ -91,7 +94,7 @@ def measure_frame(gray: np.ndarray, pins_px: np.ndarray, disc: Disc) -> FrameSta
     )
 
 
-def bare_skin(shape: tuple, pins_px: np.ndarray, disc: Disc) -> np.ndarray:
+def bare_skin(shape: tuple[int, ...], pins_px: np.ndarray, disc: Disc) -> np.ndarray:
     """(H, W) bool: pixels among the pins at (N, 2) px that show none of them."""
     places = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=2)
     among = disc.distance_px(places) < np.nanmax(disc.distance_px(pins_px))
@@ -99,17 +102,31 @@ def bare_skin(shape: tuple, pins_px: np.ndarray, disc: Disc) -> np.ndarray:
 
 
 def compare_statistics(real: list[FrameStatistics], rendered: list[FrameStatistics]) -> Statistics:
-    """All measures of two sets of frames, bins of equal count of the real caps."""
+    """All measures of two sets of frames; the bins hold equally many of the real caps."""
     edges = equal_count_edges(np.concatenate([f.distance_px for f in real]))
-    rows = []
+    rows: list[RadialRow] = []
     for measure in RADIAL_MEASURES:
-        sets = [
-            (np.concatenate([f.distance_px for f in frames]), np.concatenate([getattr(f.caps, measure) for f in frames]))
-            for frames in (real, rendered)
-        ]
-        rows += radial_rows(measure, *sets, edges)
-    powers = [np.mean([f.power for f in frames], axis=0) for frames in (real, rendered)]
-    spots = [steady_spots([f.spots for f in frames]) for frames in (real, rendered)]
-    names = ("skin_level", "noise_sd")
-    scalars = {name: tuple(float(np.nanmean([getattr(f, name) for f in frames])) for frames in (real, rendered)) for name in names}
-    return Statistics(rows, scalars, real[0].frequency, *powers, log_distance_db(*powers), *spots, pair_spots(*spots))
+        rows += radial_rows(measure, _by_distance(real, measure), _by_distance(rendered, measure), edges)
+    real_power, rendered_power = (np.mean([f.power for f in frames], axis=0) for frames in (real, rendered))
+    real_spots, rendered_spots = (steady_spots([f.spots for f in frames]) for frames in (real, rendered))
+    return Statistics(
+        radial=rows,
+        scalars={name: (_mean(real, name), _mean(rendered, name)) for name in ("skin_level", "noise_sd")},
+        frequency=real[0].frequency,
+        real_power=real_power,
+        rendered_power=rendered_power,
+        spectrum_db=log_distance_db(real_power, rendered_power),
+        real_spots=real_spots,
+        rendered_spots=rendered_spots,
+        spots_apart_px=pair_spots(real_spots, rendered_spots),
+    )
+
+
+def _by_distance(frames: list[FrameStatistics], measure: str) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (n,) px from the disc's centre and a measure (n,) of all frames' caps."""
+    return np.concatenate([f.distance_px for f in frames]), np.concatenate([getattr(f.caps, measure) for f in frames])
+
+
+def _mean(frames: list[FrameStatistics], name: str) -> float:
+    """Mean over the frames of a figure of each."""
+    return float(np.nanmean([getattr(f, name) for f in frames]))

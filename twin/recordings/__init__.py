@@ -1,13 +1,12 @@
 """Recorded frames from disk: a picture, a folder, a video, or a recording with its table and metadata.
 
-Understands the folder formats in use by the sensor's users: ``frames_bw/`` with ``init_0.png``, ``images/``, and
-``sensor_images/`` or ``processed_images/``, each with ``targets.csv`` and JSON metadata. Whatever is odd in them is
-listed, and what is readable is read.
+Understands the folder formats of the sensor's users: ``frames_bw/`` with ``init_0.png``, ``images/``, and ``sensor_images/`` or
+``processed_images/``, each with ``targets.csv`` and JSON metadata. Whatever is odd in them is listed, and what is readable is
+read.
 """
 
 from twin.recordings.folders import natural_key
-from twin.recordings.forms import is_two_level, tell_form
 from twin.recordings.images import read_image
 from twin.recordings.recording import Recording, open_recording
 
-__all__ = ["Recording", "is_two_level", "natural_key", "open_recording", "read_image", "tell_form"]
+__all__ = ["Recording", "natural_key", "open_recording", "read_image"]

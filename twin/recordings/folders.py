@@ -10,15 +10,16 @@ from twin.types import Form
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"})
 IMAGE_FOLDERS = ("frames_bw", "sensor_images", "images", "processed_images")
-SEARCH_DEPTH = 4  # folders down, when saying where pictures lie
+# Folders that are looked into, one inside the other, to say where pictures lie.
+SEARCH_DEPTH = 4
 
 
-def natural_key(name: str) -> list:
+def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key by which frame_2 comes before frame_10."""
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
-def _files(folder: Path, suffixes: frozenset) -> list[Path]:
+def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
     found = (p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith("."))
     return sorted(found, key=lambda p: natural_key(p.name))
 

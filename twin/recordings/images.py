@@ -11,7 +11,8 @@ from twin.recordings.quiet import quiet
 from twin.store import write_bytes
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
-DEPTHS = (8, 10, 12, 14, 16)  # bits that cameras deliver in 16-bit files
+# Bits that cameras deliver in 16-bit files.
+DEPTHS = (8, 10, 12, 14, 16)
 
 
 def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
@@ -73,7 +74,7 @@ def decode(path: Path) -> np.ndarray:
 
 
 def _png_fault(data: bytes) -> str:
-    """What keeps a PNG's chunks from being whole, "" if nothing; what follows its end doesn't matter."""
+    """What is wrong with the chunks of a PNG; "" if they are whole. Data after its end does not matter."""
     start = len(PNG_START)
     while start + 12 <= len(data):
         end = start + 12 + int.from_bytes(data[start : start + 4], "big")
@@ -90,7 +91,7 @@ def _png_fault(data: bytes) -> str:
 
 
 def bits_used(image: np.ndarray) -> int:
-    """Bit depth that the brightest level speaks for; 0 for 8-bit pictures."""
+    """Smallest usual bit depth that holds the brightest level; 0 for 8-bit pictures."""
     if image.dtype == np.uint8:
         return 0
     brightest = int(image.max())

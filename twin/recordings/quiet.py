@@ -1,10 +1,11 @@
-"""Silence for the libraries under OpenCV, which print their complaints to the process's stderr themselves."""
+"""Silence for the libraries below OpenCV: they print their messages to the process's stderr, where no Python code can catch them."""
 
 import contextlib
 import os
 import threading
 from collections.abc import Iterator
 
+# File descriptor of the process's stderr.
 STDERR = 2
 _lock = threading.Lock()
 _inside = 0
@@ -40,7 +41,7 @@ def _turn_back() -> None:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Drop what is printed to stderr inside, by any thread; for the length of one decoder call only."""
+    """Drop what any thread prints to stderr inside. Use it for the length of one decoder call only."""
     _turn_away()
     try:
         yield

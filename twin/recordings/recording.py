@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypedDict
 
 import cv2
 import numpy as np
@@ -10,18 +11,25 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.recordings.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, references_in, the_video_in
-from twin.recordings.forms import Kind, common_kind, form_of, times
+from twin.recordings.forms import FrameKind, KnownFrames, common_kind, form_of, known_frames, times
 from twin.recordings.images import read_image
 from twin.recordings.quiet import quiet
 from twin.recordings.tables import TABLES, order_by_table, read_metadata
 from twin.types import Form, Frame
 
 
+class BadFrame(TypedDict):
+    """A frame that could not be used, and why."""
+
+    image_name: str
+    reason: str
+
+
 @dataclass
 class Recording:
     """Recorded frames, read one at a time when asked for.
 
-    Iterating gives the readable frames in order; what can't be read is added to ``failed`` and skipped.
+    Iterating gives the readable frames in order. A frame that cannot be read is added to ``failed`` and skipped.
 
     Attributes
     ----------
@@ -32,30 +40,30 @@ class Recording:
     size_px : (int, int)
         Width and height every frame must have.
     labels : dict of str to (M,) array
-        The table's columns, row by row as ``names``; numbers where a column is all numbers. NaN or "" for frames without
-        a row. Empty without a table.
+        The table's columns, in the order of ``names``. A column is float if all its cells are numbers, else text. A frame without
+        a row has NaN or "". There are no columns without a table.
     metadata : dict of str to object
         Content of the JSON files, by file name.
     reference : Frame or None
         The no-contact frame (``init_*``).
     problems : list of str
         What was odd, one line each.
-    failed : list of dict
-        ``image_name`` and ``reason`` of each frame that couldn't be read so far.
+    failed : list of BadFrame
+        Each frame that could not be read so far, and why.
     """
 
     path: Path
     form: Form
-    names: list
-    size_px: tuple
-    labels: dict = field(default_factory=dict)
-    metadata: dict = field(default_factory=dict)
+    names: list[str]
+    size_px: tuple[int, int]
+    labels: dict[str, np.ndarray] = field(default_factory=dict)
+    metadata: dict[str, object] = field(default_factory=dict)
     reference: Frame | None = None
-    problems: list = field(default_factory=list)
-    failed: list = field(default_factory=list)
-    _files: list = field(default_factory=list, repr=False)
+    problems: list[str] = field(default_factory=list)
+    failed: list[BadFrame] = field(default_factory=list)
+    _files: list[Path] = field(default_factory=list, repr=False)
     _bits: int = field(default=0, repr=False)
-    _noted: set = field(default_factory=set, repr=False)
+    _noted: set[str] = field(default_factory=set, repr=False)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -161,24 +169,24 @@ def _count_frames(path: Path) -> tuple[int, int, np.ndarray]:
     return count, promised, first
 
 
-def _open_video(path: Path, spec: SensorSpec | None, form: Form | None) -> Recording:
+def _open_video(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
     count, promised, first = _count_frames(path)
-    problems = []
+    problems: list[str] = []
     if promised > count:
         problems.append(f"{path.name}: ends early, {count} of {promised} frames can be decoded")
     names = [f"{path.stem}_{k:06d}" for k in range(count)]
-    return Recording(path, form_of(first, path.name, spec, form), names, first.shape[1::-1], problems=problems)
+    return Recording(path, form_of(first, path.name, known, form), names, (first.shape[1], first.shape[0]), problems=problems)
 
 
 def _choose_folder(
-    path: Path, folders: list[Path], spec: SensorSpec | None, form: Form | None, problems: list
-) -> tuple[Path, list[Path], Kind]:
+    path: Path, folders: list[Path], known: KnownFrames | None, form: Form | None, problems: list[str]
+) -> tuple[Path, list[Path], FrameKind]:
     """The first folder with a usable frame, its frames and their kind."""
     reasons = []
     for folder in folders:
         files = frames_in(folder)
         try:
-            kind = common_kind(files, spec, form)
+            kind = common_kind(files, known, form)
         except FrameError as error:
             reasons.append((folder, error))
             continue
@@ -187,17 +195,17 @@ def _choose_folder(
             problems.append(f"{path.name}: read {folder.name}/, not {', '.join(others)}")
         problems += [f"{unusable.name}: {error}" for unusable, error in reasons]
         return folder, files, kind
-    unusable, error = reasons[0]
-    raise FrameError(f"{unusable}: {error}")
+    first, reason = reasons[0]
+    raise FrameError(f"{first}: {reason}")
 
 
-def _open_folder(path: Path, spec: SensorSpec | None, form: Form | None) -> Recording:
+def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
     if not any(path.iterdir()):
         raise FrameError(f"{path}: the folder is empty; give a folder of frames")
     problems: list[str] = []
     folders = image_folders(path, form)
     if folders:
-        folder, files, kind = _choose_folder(path, folders, spec, form, problems)
+        folder, files, kind = _choose_folder(path, folders, known, form, problems)
         # given the inner folder of a recording, its table and no-contact frame lie beside it
         inner = folder == path and path.name in IMAGE_FOLDERS
         homes = list(dict.fromkeys([path, folder] + ([path.parent] if inner else [])))
@@ -207,7 +215,7 @@ def _open_folder(path: Path, spec: SensorSpec | None, form: Form | None) -> Reco
         recording = Recording(path, kind.form, names, kind.size_px, labels, problems=problems, _files=files, _bits=kind.bits)
     else:
         homes = [path]
-        recording = _open_video(the_video_in(path), spec, form)
+        recording = _open_video(the_video_in(path), known, form)
     recording.take_metadata(homes)
     recording.take_reference([file for home in homes for file in references_in(home)])
     return recording
@@ -233,9 +241,10 @@ def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form 
     path = Path(path)
     if not path.exists():
         raise FrameError(f"{path}: no such file or folder; give a picture, a folder of frames, a recording or a video")
+    known = None if spec is None else known_frames(spec)
     if path.is_dir():
-        return _open_folder(path, spec, form)
+        return _open_folder(path, known, form)
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return _open_video(path, spec, form)
-    kind = common_kind([path], spec, form)
+        return _open_video(path, known, form)
+    kind = common_kind([path], known, form)
     return Recording(path, kind.form, [path.name], kind.size_px, _files=[path], _bits=kind.bits)

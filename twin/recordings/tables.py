@@ -1,8 +1,9 @@
-"""What lies beside the frames: the table with their labels, and JSON metadata."""
+"""What lies beside the frames: the table with their labels, and metadata in JSON."""
 
 import csv
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,9 +11,13 @@ import numpy as np
 
 from twin.recordings.folders import IMAGE_SUFFIXES
 
+# Names of a recording's table, the likelier first.
 TABLES = ("targets.csv", "targets_images.csv")
+# Names of the columns that hold pictures' names, in any case.
 NAME_COLUMNS = ("image_name", "sensor_image")
+# What may stand between the cells of a row; the one that is most frequent in the header counts.
 SEPARATORS = (",", ";", "\t")
+# Characters that are taken away around a cell.
 AROUND_CELLS = " \t\"'"
 
 
@@ -38,11 +43,11 @@ def _text(path: Path) -> str:
 
 @dataclass
 class Table:
-    """Columns of a table by header, and those of them that name pictures, as base names."""
+    """A table: its file's name, its cells by column, and the columns that name pictures, as base names."""
 
     name: str
-    columns: dict
-    name_lists: list
+    columns: dict[str, list[str]]
+    name_lists: list[list[str]]
 
 
 def _cells(path: Path) -> list[list[str]]:
@@ -50,9 +55,11 @@ def _cells(path: Path) -> list[list[str]]:
     separator = max(SEPARATORS, key=lines[0].count) if lines else ","
     rows = []
     for line in lines:
-        stray = line.count('"') % 2  # a quote that nothing closes would swallow the lines after it
-        quoting = csv.QUOTE_NONE if stray else csv.QUOTE_MINIMAL
-        (row,) = csv.reader([line], delimiter=separator, quoting=quoting, skipinitialspace=True)
+        unclosed = line.count('"') % 2 == 1  # read as quoted, such a line would take in the lines after it
+        if unclosed:
+            (row,) = csv.reader([line], delimiter=separator, quoting=csv.QUOTE_NONE, skipinitialspace=True)
+        else:
+            (row,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
         row = [cell.strip(AROUND_CELLS) for cell in row]
         if separator == ";":
             row = [re.sub(r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$", r"\1.\2", cell) for cell in row]
@@ -73,8 +80,8 @@ def _distinct(header: list[str]) -> list[str]:
     return distinct
 
 
-def read_table(path: Path, problems: list) -> Table | None:
-    """A table, or None, with the reason in ``problems``, if it names no pictures."""
+def read_table(path: Path, problems: list[str]) -> Table | None:
+    """A table; None, with the reason added to ``problems``, if it names no pictures."""
     try:
         rows = _cells(path)
     except (OSError, csv.Error) as error:
@@ -96,7 +103,7 @@ def read_table(path: Path, problems: list) -> Table | None:
     return Table(path.name, columns, [[base_name(row[k]) for row in rows] for k in name_columns])
 
 
-def counted(count: int, things: str, names: list) -> str:
+def counted(count: int, things: str, names: list[str]) -> str:
     """How many of what, with the first three named."""
     return f"{count} {things} ({', '.join(names[:3])}{', ...' if count > 3 else ''})"
 
@@ -115,10 +122,10 @@ class Pairing:
         Rows whose picture belongs to an earlier row; rows without a picture.
     """
 
-    files: dict
-    loose: list
-    doubled: list
-    missing: list
+    files: dict[int, Path]
+    loose: list[int]
+    doubled: list[int]
+    missing: list[int]
 
 
 def pair_rows(names: list[str], files: list[Path]) -> Pairing:
@@ -130,22 +137,22 @@ def pair_rows(names: list[str], files: list[Path]) -> Pairing:
         for file in files:
             if file not in taken:
                 free.setdefault(key(file.name), file)
-        missing = []
+        missing: list[int] = []
         for row in pairing.missing:
-            file = free.get(key(names[row]))
-            if file is None:
+            found = free.get(key(names[row]))
+            if found is None:
                 missing.append(row)
-            elif file in taken:
+            elif found in taken:
                 pairing.doubled.append(row)
             else:
-                pairing.files[row] = file
-                taken.add(file)
+                pairing.files[row] = found
+                taken.add(found)
                 pairing.loose += [row] * (key is not str)
         pairing.missing = missing
     return pairing
 
 
-def order_by_table(tables: list[Path], files: list[Path], problems: list) -> tuple[list[Path], dict]:
+def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -> tuple[list[Path], dict[str, np.ndarray]]:
     """Frames in the order of the table that names most of them, those it doesn't name last, and its columns in that order.
 
     Columns are empty for frames without a row. If no table names a frame, the order stays and there are no columns.
@@ -174,22 +181,25 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list) -> tup
     return [pairing.files[k] for k in rows] + unlisted, labels
 
 
-def _as_array(cells: list) -> np.ndarray:
-    """A column as float where every cell is a number (an empty one NaN), else as text."""
+def _as_array(cells: list[str]) -> np.ndarray:
+    """A column as float if every cell is a number (an empty cell is NaN), else as text."""
     try:
         return np.array([float(cell) if cell else np.nan for cell in cells])
     except ValueError:
         return np.array(cells, str)
 
 
-def read_metadata(path: Path, problems: list):
-    """Content of a JSON file, mended where Windows paths or non-finite numbers spoil it; None if it can't be."""
+def read_metadata(path: Path, problems: list[str]) -> object | None:
+    """Content of a JSON file; None, with the reason in ``problems``, if it cannot be read.
+
+    Files in use hold Windows paths with single backslashes, and NaN or Infinity: both are accepted and noted.
+    """
     try:
         text = _text(path)
     except OSError as error:
         problems.append(f"{path.name}: can't be read ({error.strerror}); ignored")
         return None
-    odd = set()
+    odd: set[str] = set()
 
     def constant(name: str) -> float:
         odd.add(name)
@@ -208,7 +218,8 @@ def read_metadata(path: Path, problems: list):
     return content
 
 
-def _parsed_or_mended(name: str, text: str, constant, problems: list):
+def _parsed_or_mended(name: str, text: str, constant: Callable[[str], float], problems: list[str]) -> object:
+    """Content of JSON text, if need be with its lone backslashes doubled; ``constant`` reads NaN and Infinity."""
     try:
         return json.loads(text, parse_constant=constant)
     except ValueError as error:

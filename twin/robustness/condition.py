@@ -1,17 +1,20 @@
 """A condition: one way in which a sensor degrades, as frozen data, and where in the chain it acts.
 
 The chain is specification, contact, light on the film, camera response, frame, and the pipeline's own settings. Every hook
-given the nominal value returns what it was given, bit for bit.
+returns its input unchanged, bit for bit, where the value is the nominal one.
 """
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scenes.base import Section
 from scenes.sensor import SensorSpec
+from twin.detectors import DetectorSpec
 from twin.geometry.pins import rest_pins
 from twin.projection import project
 from twin.realism.disc import lens_disc
@@ -58,17 +61,44 @@ class View:
         """Linear light that the camera shows as white."""
         return 1.0 / self.spec.response.exposure
 
-    def grid(self, shape: tuple) -> tuple[np.ndarray, np.ndarray]:
+    def grid(self, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """x and y (H, W) of a frame's pixels from the disc's centre, in its radius."""
         y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
         return (x - np.float32(self.center_px[0])) / self.radius_px, (y - np.float32(self.center_px[1])) / self.radius_px
+
+
+SpecChange = Callable[[SensorSpec, float, np.random.Generator], SensorSpec]
+ImageChange = Callable[[np.ndarray, float, View, np.random.Generator], np.ndarray]
+PointMove = Callable[[np.ndarray, float, View], np.ndarray]
+CapsGone = Callable[[float, View, np.random.Generator], np.ndarray]
+SettingChange = Callable[[DetectorSpec, float], DetectorSpec]
+
+
+S = TypeVar("S", bound=Section)
+
+
+class SectionChange(Protocol[S]):
+    """Degrades one section of a specification: ``change(section, value, rng)``."""
+
+    def __call__(self, section: S, value: float, rng: np.random.Generator, /) -> S: ...
+
+
+@dataclass(frozen=True)
+class OnSection(Generic[S]):
+    """A change of one section, as a change of the specification. (A class, not a closure: conditions travel between processes.)"""
+
+    section: str
+    change: SectionChange[S]
+
+    def __call__(self, spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
+        return spec.model_copy(update={self.section: self.change(getattr(spec, self.section), value, rng)})
 
 
 @dataclass(frozen=True)
 class Condition:
     """One way in which a sensor degrades.
 
-    Severity 0 is ``nominal``, 1 is ``severe``; in between the parameter goes evenly.
+    The parameter is ``nominal`` at severity 0 and ``severe`` at severity 1, and linear between them.
 
     Attributes
     ----------
@@ -77,7 +107,7 @@ class Condition:
         What ``nominal`` and ``severe`` are values of.
     nominal, severe : float
     spec : callable, optional
-        ``spec(spec, value, rng)``: the degraded specification, before anything is rendered.
+        ``spec(spec, value, rng)``: the degraded specification, before anything is rendered; ``OnSection`` where one section changes.
     solves : bool
         The specification's mechanics change: contacts are solved anew.
     light : callable, optional
@@ -85,13 +115,13 @@ class Condition:
     frame : callable, optional
         ``frame(image, value, view, rng)``: gray levels or RGB (uint8).
     moves : callable, optional
-        ``moves(px, value, view)``: where points (n, 2) of the picture go by ``light`` or ``frame``.
+        ``moves(px, value, view)``: where ``light`` or ``frame`` moves points (n, 2) of the picture.
     hides : callable, optional
         ``hides(value, view, rng)``: (N,) bool, caps that are gone.
     setting : callable, optional
         ``setting(detector, value)``: a `DetectorSpec` that is set wrongly.
     image_level : bool
-        Acts on a frame alone, so that a real frame can take its place.
+        Acts on a frame alone, so that a real frame can be degraded, too.
     """
 
     name: str
@@ -101,13 +131,13 @@ class Condition:
     unit: str
     severe: float
     nominal: float = 0.0
-    spec: Callable | None = field(default=None, repr=False)
+    spec: SpecChange | None = field(default=None, repr=False)
     solves: bool = False
-    light: Callable | None = field(default=None, repr=False)
-    frame: Callable | None = field(default=None, repr=False)
-    moves: Callable | None = field(default=None, repr=False)
-    hides: Callable | None = field(default=None, repr=False)
-    setting: Callable | None = field(default=None, repr=False)
+    light: ImageChange | None = field(default=None, repr=False)
+    frame: ImageChange | None = field(default=None, repr=False)
+    moves: PointMove | None = field(default=None, repr=False)
+    hides: CapsGone | None = field(default=None, repr=False)
+    setting: SettingChange | None = field(default=None, repr=False)
     image_level: bool = False
 
     def value(self, severity: float) -> float:
@@ -115,7 +145,7 @@ class Condition:
         return self.nominal + severity * (self.severe - self.nominal)
 
     def rng(self, draw: int = 0) -> np.random.Generator:
-        """The condition's own random numbers, the same at every severity: a degradation grows, it is not drawn anew."""
+        """The condition's own random numbers, the same at every severity, so that a degradation grows and does not move."""
         return np.random.default_rng([zlib.crc32(self.name.encode()), draw])
 
 
@@ -185,21 +215,21 @@ class Case:
                 gone |= c.hides(c.value(severity), view, c.rng())
         return gone
 
-    def on_setting(self, detector, severity: float):
-        """A `DetectorSpec` set wrongly."""
+    def on_setting(self, detector: DetectorSpec, severity: float) -> DetectorSpec:
+        """The detector with wrong settings."""
         for c in self.conditions:
             if c.setting is not None:
                 detector = c.setting(detector, c.value(severity))
         return detector
 
 
-def revised(spec: SensorSpec, **sections) -> SensorSpec:
-    """A copy of a specification with values changed, section by section; values are trusted to be in range."""
+def altered(spec: SensorSpec, **sections: Mapping[str, Any]) -> SensorSpec:
+    """A copy of a specification with values changed, section by section. Values are not validated: they are computed in range."""
     return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
 
 
 def chosen(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
-    """(count,) bool: a share of places, drawn so that a larger share holds the smaller one."""
+    """(count,) bool: a random share of the places. A larger share, drawn with the same numbers, holds the smaller one."""
     mask = np.zeros(count, bool)
     mask[rng.permutation(count)[: round(share * count)]] = True
     return mask

@@ -7,9 +7,12 @@ import numpy as np
 from twin.robustness.condition import Case
 from twin.robustness.measures import MEASURES, POSE_MEASURES, Measure
 
-DRAWS = 400  # of the bootstrap over the frames
-BAND = (5, 95)  # percentiles
-SHORT = 0.75  # of the rendered margin: less is a sensor that has lost some of it
+# Draws of the bootstrap over the frames.
+DRAWS = 400
+# Percentiles of these draws that bound the band: a 90 % interval.
+BAND = (5, 95)
+# A real sensor with less than this share of the rendered margin has lost some of it. Chosen.
+SHORT = 0.75
 
 
 @dataclass(frozen=True)
@@ -47,11 +50,11 @@ class Envelope:
     case : Case
     pipeline : str
     severity : float
-        At which the first measure crosses its limit; inf if none does up to the severest.
+        Severity at which the first measure crosses its limit; inf if none does up to the severest step.
     measure : str
-        That one; "" if none.
+        Name of that measure; "" if none.
     looked : float
-        The severest step.
+        Severity of the severest step.
     interval : (2,) float
         Severities at which the ends of that measure's 90 % band cross; inf where one does not.
     """
@@ -97,7 +100,7 @@ class Share:
 
     @property
     def short(self) -> bool:
-        """The real sensor lives on the bad side of the envelope."""
+        """Whether the real sensor has clearly less margin than the rendered one."""
         return self.value < SHORT
 
 
@@ -134,9 +137,9 @@ def envelopes_of(curves: list[Curve], cases: tuple[Case, ...]) -> list[Envelope]
         for pipeline in dict.fromkeys(c.pipeline for c in curves if c.case == case.name):
             first = min((c for c in curves if c.case == case.name and c.pipeline == pipeline), key=lambda c: c.crossing)
             reached = np.isfinite(first.crossing)
-            ends = sorted(crossing(first.measure, first.limit, first.severity, edge) for edge in (first.low, first.high))
+            sooner, later = sorted(crossing(first.measure, first.limit, first.severity, edge) for edge in (first.low, first.high))
             looked = float(first.severity.max())
-            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else "", looked, tuple(ends)))
+            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else "", looked, (sooner, later)))
     return found
 
 

@@ -7,10 +7,14 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from twin.detectors.detector import Detector, Found, named
-from twin.robustness.shots import Shot
+from twin.robustness.shots import DegradedShot
 from twin.types import PinGraph
 
-GATE = 0.35  # of the distance to the pin's nearest neighbour: a claim further from every pin is wrong
+# A claim that is farther from every pin than this share of the distance to that pin's nearest neighbour is wrong. Chosen: less than half,
+# so that no claim is near to two pins.
+GATE = 0.35
+# Cost of a pairing beyond the gate: far above any distance in a picture, px.
+OUT_OF_REACH = 1e6
 
 
 @dataclass(frozen=True)
@@ -21,7 +25,7 @@ class Measure:
     ----------
     name, title, unit : str
     limit : float
-        Of its mean over the contacts.
+        Limit of the mean over the contacts.
     least : bool
         The limit is a least value, not a largest one.
     in_pitches : bool
@@ -56,7 +60,7 @@ POSE_MEASURES = (
 )
 
 
-def judge(detector: Detector, found: Found, shot: Shot) -> dict[str, float]:
+def judge_shot(detector: Detector, found: Found, shot: DegradedShot) -> dict[str, float]:
     """The measures of one frame; NaN where one has no meaning (no names, no graph, nothing paired)."""
     truth_px = shot.caps_px
     known = np.isfinite(truth_px[:, 0])
@@ -65,7 +69,7 @@ def judge(detector: Detector, found: Found, shot: Shot) -> dict[str, float]:
     pin, claim = _pairs(found.claims_px, truth_px, GATE * spacing)
     right = shot.visible[pin]
     apart = np.linalg.norm(found.claims_px[claim[right]] - truth_px[pin[right]], axis=1)
-    doubtful = known & ~shot.visible  # hidden, but maybe seen in part: neither right nor wrong
+    doubtful = known & ~shot.visible  # a hidden cap may be seen in part: a claim there is neither right nor wrong
     claims = len(found.claims_px) - int(doubtful[pin].sum()) - _beside_unknown(found.claims_px, known)
     area, edges = _graph_errors(detector, found, shot)
     return {
@@ -80,7 +84,7 @@ def judge(detector: Detector, found: Found, shot: Shot) -> dict[str, float]:
 
 
 def _beside_unknown(claims_px: np.ndarray, known: np.ndarray) -> int:
-    """Claims that may be pins of unknown place: where truth is a consensus, it may lack some."""
+    """Number of claims that may be pins whose place is not known: a consensus of detectors may lack some pins."""
     return max(0, min(len(claims_px) - int(known.sum()), int((~known).sum())))
 
 
@@ -92,9 +96,9 @@ def _pairs(claims_px: np.ndarray, truth_px: np.ndarray, gate_px: np.ndarray) -> 
     distance = np.linalg.norm(truth_px[known][:, None] - claims_px, axis=2)
     near = distance < gate_px[known][:, None]
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    cost = np.where(near, distance, 1e6)[np.ix_(rows, columns)]
+    cost = np.where(near, distance, OUT_OF_REACH)[np.ix_(rows, columns)]
     r, c = linear_sum_assignment(cost)
-    good = cost[r, c] < 1e6
+    good = cost[r, c] < OUT_OF_REACH
     return known[rows[r[good]]], columns[c[good]]
 
 
@@ -111,7 +115,7 @@ def _swaps(found: Found, truth_px: np.ndarray, gate_px: np.ndarray) -> float:
     return float(np.mean((distance < gate_px[at]) & (at != seen)))
 
 
-def _graph_errors(detector: Detector, found: Found, shot: Shot) -> tuple[float, float]:
+def _graph_errors(detector: Detector, found: Found, shot: DegradedShot) -> tuple[float, float]:
     """Median relative error of the cells and share of edges in common, against the method's own graph of the true pins."""
     if found.graph is None or not np.isfinite(shot.caps_px).all():
         return np.nan, np.nan

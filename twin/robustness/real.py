@@ -1,4 +1,4 @@
-"""Real frames as a source: what several detectors agree on stands for the truth."""
+"""Real frames as a source: pins that several detectors agree on are taken as the truth."""
 
 import numpy as np
 
@@ -8,8 +8,12 @@ from twin.errors import FrameError
 from twin.robustness.shots import RealSource
 from twin.types import Frame
 
-AGREE = 0.15  # of the median distance of neighbours: detectors that are nearer than that agree
-LEAST_KNOWN = 0.97  # of the pins must be agreed on
+# Two detectors agree on a pin if their places differ by less than this share of the pins' median spacing. Chosen.
+AGREE = 0.15
+# Least share of the pins that must be agreed on: else the frame is refused.
+LEAST_KNOWN = 0.97
+# Detectors that must agree on a pin.
+LEAST_AGREEING = 2
 
 
 def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpec]) -> tuple[RealSource, list[str]]:
@@ -25,7 +29,7 @@ def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpe
     for frame in frames:
         seen = np.stack([found.pins_px for found in (find(frame) for find in finders) if found.pins_px is not None])
         middle, agreeing = _agreed(seen)
-        known = agreeing >= 2
+        known = agreeing >= LEAST_AGREEING
         if known.mean() < LEAST_KNOWN:
             refused.append(f"{frame.name}: the detectors agree on {int(known.sum())} of {len(known)} pins only")
             continue

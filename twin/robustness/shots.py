@@ -1,4 +1,4 @@
-"""Degraded frames with known truth: rendered ones, or real ones whose pins several detectors agree on."""
+"""Degraded frames with known pins: rendered frames, or real ones whose pins several detectors agree on."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -12,12 +12,13 @@ from twin.errors import ContactError
 from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
 from twin.optics.static_layer import static_layer
-from twin.robustness.condition import Case, View, revised
+from twin.robustness.condition import Case, View, altered
 from twin.robustness.contacts import Contact, PinState, pins_under
 from twin.truth import CapTruth, cap_truth
 from twin.types import Form, Frame
 
-NEUTRAL = {
+# A specification whose camera neither blurs, colours nor disturbs: a real frame has gone through a camera already.
+NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...]]] = {
     "response": {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "blur_sigma_px": 0.0, "brightness_drift": 0.0, "read_noise": 0.0,
         "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0, "chroma_columns": 1, "stream": "rgb", "jpeg_quality": 0,
@@ -28,7 +29,7 @@ NEUTRAL = {
 
 
 @dataclass(frozen=True)
-class Shot:
+class DegradedShot:
     """A degraded frame and where its pins truly are.
 
     Attributes
@@ -40,7 +41,7 @@ class Shot:
     visible : (N,) bool
         The cap is there, within the frame, and nothing stands before it.
     touched : bool
-        Something is in contact; taken for granted in real frames.
+        Something is in contact. Real frames are assumed to show a contact.
     """
 
     name: str
@@ -59,24 +60,26 @@ class RenderedSource:
 
     @property
     def form(self) -> Form:
-        """Of the frames."""
+        """Form of the frames."""
         return Form.RAW
 
     def names(self) -> list[str]:
-        """Of the frames."""
+        """Names of the frames."""
         return [contact.name for contact in self.contacts]
 
-    def shoot(self, case: Case, severity: float) -> list[Shot]:
+    def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
         """The frames under a case; contacts that can't be solved are left out."""
         spec = case.on_spec(self.spec, severity)
         view = View.of(spec, np.zeros((spec.pins.count, 2)))
         geometry = _with_light_of(self.spec, spec)
         shots = []
-        for film in _films(_with_response_of(self.spec, spec), geometry, geometry if case.solves else self.spec, self.contacts):
+        for film in _films(
+            spec.model_copy(update={"response": self.spec.response}), geometry, geometry if case.solves else self.spec, self.contacts
+        ):
             view = replace(view, caps_px=film.truth.caps_px)
             light = case.on_light(film.light, severity, view, film.draw)
             image = case.on_frame(expose(light, spec.capture, np.random.default_rng(film.draw)), severity, view, film.draw)
-            shot = _shot(film.contact.name, image, self.form, case, severity, view, film.truth.visible)
+            shot = _degraded(film.contact.name, image, self.form, case, severity, view, film.truth.visible)
             shots.append(replace(shot, touched=film.contact.pose.indent_mm > 0))
         return shots
 
@@ -90,7 +93,7 @@ class RealSource:
     spec : SensorSpec
     frames : tuple of Frame
     caps_px : (M, N, 2) float
-        Where nobody knows a pin: NaN.
+        NaN where no agreement tells a pin's place.
     """
 
     spec: SensorSpec
@@ -99,16 +102,16 @@ class RealSource:
 
     @property
     def form(self) -> Form:
-        """Of the frames."""
+        """Form of the frames."""
         return self.frames[0].form
 
     def names(self) -> list[str]:
-        """Of the frames."""
+        """Names of the frames."""
         return [frame.name for frame in self.frames]
 
-    def shoot(self, case: Case, severity: float) -> list[Shot]:
+    def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
         """The frames under a case, which must be `image_level`."""
-        neutral = revised(self.spec, **NEUTRAL)
+        neutral = altered(self.spec, **NEUTRAL)
         spec = case.on_spec(neutral, severity)
         in_light = severity > 0 and self.form == Form.RAW and any(c.spec is not None or c.light is not None for c in case.conditions)
         view = View.of(neutral, self.caps_px[0])
@@ -119,31 +122,26 @@ class RealSource:
                 light = to_light(image, neutral.response).astype(np.float32)
                 image = expose(case.on_light(light, severity, view, draw), spec.capture, np.random.default_rng(draw))
             image = case.on_frame(image, severity, view, draw)
-            shots.append(_shot(frame.name, image, self.form, case, severity, view, np.isfinite(caps_px[:, 0])))
+            shots.append(_degraded(frame.name, image, self.form, case, severity, view, np.isfinite(caps_px[:, 0])))
         return shots
 
 
-def _shot(name: str, image: np.ndarray, form: Form, case: Case, severity: float, view: View, visible: np.ndarray) -> Shot:
+def _degraded(name: str, image: np.ndarray, form: Form, case: Case, severity: float, view: View, visible: np.ndarray) -> DegradedShot:
     caps_px = case.on_points(view.caps_px, severity, view)
     inside = np.all((caps_px >= 0) & (caps_px <= np.array(image.shape[1::-1]) - 1), axis=1)
-    return Shot(name, Frame(image, form, name), caps_px, visible & inside & ~case.gone(severity, view))
+    return DegradedShot(name, Frame(image, form, name), caps_px, visible & inside & ~case.gone(severity, view))
 
 
 def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
-    """A specification with all that moves no pin on the film as ``base`` has it: equal to ``base`` under most conditions."""
+    """``spec`` with those values of ``base`` that move no pin in the picture. Under most conditions the result equals ``base``."""
     gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
-    alike = revised(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
+    alike = altered(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
     return alike.model_copy(update={name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
-
-
-def _with_response_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
-    """A specification with all that comes after the light on the film as ``base`` has it."""
-    return spec.model_copy(update={"response": base.response})
 
 
 @dataclass(frozen=True)
 class _Film:
-    """Linear light of one contact, before the camera's response, and where its pins are; ``draw`` seeds what is random in it."""
+    """Linear light of one contact before the camera's response, and its true pins; ``draw`` is the seed of its random numbers."""
 
     draw: int
     contact: Contact
@@ -153,9 +151,9 @@ class _Film:
 
 @lru_cache(maxsize=2)
 def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contacts: tuple[Contact, ...]) -> tuple[_Film, ...]:
-    """Contacts of the sensor ``mechanics``, seen by the camera of ``geometry``, lit as ``spec``: one for all conditions behind the film.
+    """Films of contacts of the sensor ``mechanics``, seen by the camera of ``geometry`` and lit as ``spec``.
 
-    Contacts that can't be solved are left out.
+    All conditions that act behind the film share these films. Contacts that cannot be solved are left out.
     """
     preview, films = Preview(spec, static=_static(spec)), []
     for draw, contact in enumerate(contacts):
@@ -176,15 +174,15 @@ def _pressed(spec: SensorSpec, mechanics: SensorSpec, contact: Contact) -> tuple
     return state, cap_truth(spec, rest_pins(spec.geometry), state, Form.RAW)
 
 
-def _static(spec: SensorSpec) -> tuple:
-    """The static layer of a specification; most conditions leave it alone."""
+def _static(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Light and cover of what contact does not change. Most conditions leave it alone, so it is kept."""
     plain = spec.model_copy(update={"gel": spec.gel.model_copy(update={"haze": 0.0, "absorption_per_mm": (0.0, 0.0, 0.0)})})
     bare = {"cap_albedo": (1.0, 1.0, 1.0), "cap_levels": (), "cap_shapes": (), "skin_albedo": (0.0, 0.0, 0.0)}
-    plain = revised(plain, appearance=bare, camera={"vignetting": 0.0}, response=NEUTRAL["response"])
+    plain = altered(plain, appearance=bare, camera={"vignetting": 0.0}, response=NEUTRAL["response"])
     return _static_layer(plain.model_dump_json())
 
 
 @lru_cache(maxsize=2)
-def _static_layer(spec_json: str) -> tuple:
+def _static_layer(spec_json: str) -> tuple[np.ndarray, np.ndarray]:
     spec = SensorSpec.model_validate_json(spec_json)
     return static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))

@@ -14,8 +14,8 @@ from scenes import load_object
 from twin.detectors import DetectorSpec, Found, make_detector
 from twin.errors import TwinError
 from twin.robustness.condition import Case, Condition
-from twin.robustness.measures import judge
-from twin.robustness.shots import RealSource, RenderedSource, Shot
+from twin.robustness.measures import judge_shot
+from twin.robustness.shots import DegradedShot, RealSource, RenderedSource
 from twin.store import Item, find_json, inputs_digest, keep_json, write_bytes
 
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
@@ -130,7 +130,7 @@ def _run(cell: Cell) -> None:
     for shot in plan.source.shoot(cell.case, cell.severity):
         for place, detector in enumerate(detectors):
             found = detector(shot.frame)
-            rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | judge(detector, found, shot))
+            rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | judge_shot(detector, found, shot))
             if place == 0 and (worst is None or rows[-1]["recall"] < worst[0]):
                 worst = rows[-1]["recall"], shot, found
         rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in _WORK["models"].items()]
@@ -140,12 +140,12 @@ def _run(cell: Cell) -> None:
     keep_json(folder / CELLS, cell.item, rows, default=float)
 
 
-def _pose(estimate, shot: Shot) -> dict:
+def _pose(estimate, shot: DegradedShot) -> dict:
     values, units, valid = estimate(shot.frame)
     return {"values": [float(v) for v in values], "units": list(units), "valid": bool(valid), "touched": shot.touched}
 
 
-def overlay(shot: Shot, found: Found) -> np.ndarray:
+def overlay(shot: DegradedShot, found: Found) -> np.ndarray:
     """The frame (H, W, 3) uint8 BGR: true pins that are seen in green, missed ones in red, claims as dots."""
     image = shot.frame.image
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])

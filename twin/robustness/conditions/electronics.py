@@ -1,30 +1,31 @@
-"""What goes wrong in chip, stream and recorder."""
+"""What goes wrong in the camera's chip, the stream and the recorder."""
 
 import cv2
 import numpy as np
 
+from scenes.sensor import ResponseSpec
 from twin.camera import compressed
-from twin.robustness.condition import Condition, View, chosen, revised
+from twin.robustness.condition import Condition, OnSection, View, chosen
 
 
-def darker(spec, value, rng):
-    return revised(spec, response={"exposure": spec.response.exposure * 2.0**-value})
+def darker(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    return response.model_copy(update={"exposure": response.exposure * 2.0**-value})
 
 
-def brighter(spec, value, rng):
-    return revised(spec, response={"exposure": spec.response.exposure * 2.0**value})
+def brighter(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    return response.model_copy(update={"exposure": response.exposure * 2.0**value})
 
 
-def noisier(spec, value, rng):
-    return revised(spec, response={"read_noise": float(np.hypot(spec.response.read_noise, value))}) if value else spec
+def noisier(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    return response.model_copy(update={"read_noise": float(np.hypot(response.read_noise, value))}) if value else response
 
 
-def jpeg(image, value, view: View, rng):
+def jpeg(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     return compressed(image, max(100 - round(value), 1)) if value else image
 
 
-def coarser(image, value, view: View, rng):
-    """Fewer pixels, drawn up again to the frame's size as a pipeline that expects it would."""
+def coarser(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """Fewer pixels, enlarged again to the frame's size because the pipeline expects that size."""
     if value == 1:
         return image
     height, width = image.shape[:2]
@@ -32,14 +33,14 @@ def coarser(image, value, view: View, rng):
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def rows_lost(image, value, view: View, rng):
-    """Lost rows show the last one that came."""
+def rows_lost(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """A lost row shows the last row that arrived before it."""
     lost = chosen(len(image), value, rng)
     last = np.maximum.accumulate(np.where(lost, 0, np.arange(len(image))))
     return image[last] if value else image
 
 
-def hot(image, value, view: View, rng):
+def hot(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     if not value:
         return image
     image = image.copy()
@@ -47,20 +48,46 @@ def hot(image, value, view: View, rng):
     return image
 
 
-def posterised(image, value, view: View, rng):
-    """The lowest bits lost, a fractional number of them by wider steps."""
+def posterised(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """The lowest bits are lost. A fraction of a bit makes the steps between levels wider by that power of two."""
     step = 2.0**value
     return np.clip(np.floor(image / step) * step, 0, 255).astype(np.uint8) if value else image
 
 
-_IMAGE = {"image_level": True}
 CONDITIONS = (
-    Condition("exposure-low", "exposure or gain too low", "electronics", "light lost", "stops", 9.0, spec=darker, **_IMAGE),
-    Condition("exposure-high", "exposure or gain too high", "electronics", "light gained", "stops", 9.0, spec=brighter, **_IMAGE),
-    Condition("noise", "sensor noise", "electronics", "sd of the light, in saturations", "", 0.4, spec=noisier, **_IMAGE),
-    Condition("jpeg", "JPEG compression", "electronics", "100 less the quality", "", 99.0, frame=jpeg, **_IMAGE),
-    Condition("resolution", "low resolution", "electronics", "pixels merged, each way", "px", 9.0, 1.0, frame=coarser, **_IMAGE),
-    Condition("rows-dropped", "dropped rows", "electronics", "share of the rows", "", 0.9, frame=rows_lost, **_IMAGE),
-    Condition("hot-pixels", "hot pixels", "electronics", "share of the pixels", "", 0.1, frame=hot, **_IMAGE),
-    Condition("posterised", "posterised levels", "electronics", "bits lost", "bit", 7.5, frame=posterised, **_IMAGE),
+    Condition(
+        "exposure-low",
+        "exposure or gain too low",
+        "electronics",
+        "light lost",
+        "stops",
+        9.0,
+        spec=OnSection("response", darker),
+        image_level=True,
+    ),
+    Condition(
+        "exposure-high",
+        "exposure or gain too high",
+        "electronics",
+        "light gained",
+        "stops",
+        9.0,
+        spec=OnSection("response", brighter),
+        image_level=True,
+    ),
+    Condition(
+        "noise",
+        "sensor noise",
+        "electronics",
+        "sd of the light, in saturations",
+        "",
+        0.4,
+        spec=OnSection("response", noisier),
+        image_level=True,
+    ),
+    Condition("jpeg", "JPEG compression", "electronics", "100 less the quality", "", 99.0, frame=jpeg, image_level=True),
+    Condition("resolution", "low resolution", "electronics", "pixels merged, each way", "px", 9.0, 1.0, frame=coarser, image_level=True),
+    Condition("rows-dropped", "dropped rows", "electronics", "share of the rows", "", 0.9, frame=rows_lost, image_level=True),
+    Condition("hot-pixels", "hot pixels", "electronics", "share of the pixels", "", 0.1, frame=hot, image_level=True),
+    Condition("posterised", "posterised levels", "electronics", "bits lost", "bit", 7.5, frame=posterised, image_level=True),
 )

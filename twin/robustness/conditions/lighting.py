@@ -1,33 +1,36 @@
-"""What goes wrong with the light: LEDs, and light that doesn't belong."""
+"""What goes wrong with the light: LEDs that fail, and light from outside."""
 
 import numpy as np
 
-from twin.robustness.condition import Condition, View, over_channels, revised
+from scenes.sensor import LedRingSpec
+from twin.robustness.condition import Condition, OnSection, View, over_channels
 
-GLARE = 3.0  # light of a glare's middle, in saturations: the camera shows it white well beyond its half width
-GLARE_AT = (0.35, -0.25)  # from the disc's centre, in its radius
+# Light in the middle of a glare, in saturations. It is large, so that the camera shows white well beyond the glare's half width.
+GLARE = 3.0
+# Place of the glare's middle, x and y from the disc's centre, in the disc's radius.
+GLARE_AT = (0.35, -0.25)
 
 
-def dimmed(spec, value, rng):
-    return revised(spec, leds={"power": spec.leds.power * (1 - value)}) if value else spec
+def dimmed(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
+    return leds.model_copy(update={"power": leds.power * (1 - value)}) if value else leds
 
 
-def dead(spec, value, rng):
+def dead(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
     """Lit LEDs go out one after the other around the ring."""
     if not value:
-        return spec
-    balance = np.array(spec.leds.balance or (1.0,) * len(spec.leds.azimuth_deg))
-    lit = np.setdiff1d(np.arange(len(balance)), spec.leds.off)
+        return leds
+    balance = np.array(leds.balance or (1.0,) * len(leds.azimuth_deg))
+    lit = np.setdiff1d(np.arange(len(balance)), leds.off)
     balance[lit] *= np.clip(1 - (value * len(lit) - np.arange(len(lit))), 0, 1)
-    return revised(spec, leds={"balance": tuple(balance.tolist())})
+    return leds.model_copy(update={"balance": tuple(balance.tolist())})
 
 
-def reddened(spec, value, rng):
-    red, green, blue = spec.leds.color
-    return revised(spec, leds={"color": (red, green * (1 - value), blue * (1 - value))})
+def reddened(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
+    red, green, blue = leds.color
+    return leds.model_copy(update={"color": (red, green * (1 - value), blue * (1 - value))})
 
 
-def room_light(light, value, view: View, rng):
+def room_light(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     """A veil that rises from one side of the disc to the other, over everything the camera sees."""
     if not value:
         return light
@@ -36,8 +39,8 @@ def room_light(light, value, view: View, rng):
     return light + over_channels(value * view.saturation * ramp, light)
 
 
-def glare(light, value, view: View, rng):
-    """A mirrored lamp: flat in the middle, falling off steeply."""
+def glare(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """The mirror image of a lamp: even in the middle, with a steep edge."""
     if not value:
         return light
     x, y = view.grid(light.shape)
@@ -47,9 +50,11 @@ def glare(light, value, view: View, rng):
 
 
 CONDITIONS = (
-    Condition("leds-dim", "LEDs grown dim", "light", "share of the LEDs' light lost", "", 0.995, spec=dimmed),
-    Condition("leds-dead", "LEDs dead, one after the other", "light", "share of the LEDs", "", 1.0, spec=dead),
-    Condition("leds-red", "LED colour shifted to red", "light", "share of green and blue lost", "", 0.995, spec=reddened),
+    Condition("leds-dim", "LEDs grown dim", "light", "share of the LEDs' light lost", "", 0.995, spec=OnSection("leds", dimmed)),
+    Condition("leds-dead", "LEDs dead, one after the other", "light", "share of the LEDs", "", 1.0, spec=OnSection("leds", dead)),
+    Condition(
+        "leds-red", "LED colour shifted to red", "light", "share of green and blue lost", "", 0.995, spec=OnSection("leds", reddened)
+    ),
     Condition(
         "room-light",
         "room light leaking in",

@@ -5,17 +5,26 @@ import numpy as np
 
 from twin.robustness.condition import Condition, View, over_channels
 
-SUBPIXELS = 8  # per pixel and axis, of a blur's kernel
+# Sub-pixels a pixel and axis, over which the kernel of a blur is averaged.
+SUBPIXELS = 8
+# Direction of the motion in the picture, from x towards y.
 MOTION_DEG = 30.0
-DIRT_SPACING_MM = 1.5  # sd of the smudges' size
+# Sd of the Gaussian that makes smudges out of noise, mm at the caps: their size. Chosen.
+DIRT_SPACING_MM = 1.5
+# Share of the light that a smudge holds back. Chosen.
 DIRT_OPACITY = 0.9
-DIRT_EDGE_MM = 0.5  # the lens is out of focus: a smudge's edge is soft
-SCRATCH_WIDTH_MM = 0.12
-SCRATCH_LIGHT = 0.25  # that a scratch scatters, in saturations
-FOCUS_STEPS = 6  # blurs between which a focus that varies is interpolated
+# Sd of a smudge's edge, mm at the caps. The edge is soft because the lens' own surface is out of focus.
+DIRT_EDGE_MM = 0.5
+# Width of a scratch, mm at the caps, and the light that it scatters, in saturations. Chosen.
+SCRATCH_WIDTH_MM, SCRATCH_LIGHT = 0.12, 0.25
+# Scratches whose places are drawn at once, so that more scratches keep the places of the first ones.
+MOST_SCRATCHES = 1000
+# Blurs between which a focus that varies over the picture is interpolated.
+FOCUS_STEPS = 6
 
 
-def blurred_by(light, kernel):
+def blurred_by(light: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """Light (H, W[, 3]) blurred by a kernel of sum 1; the picture goes on mirrored."""
     return cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REFLECT)
 
 
@@ -43,15 +52,15 @@ def line_kernel(length_px: float, degrees: float) -> np.ndarray:
     return (kernel[: 2 * half + 1, : 2 * half + 1] / kernel.sum()).astype(np.float32)
 
 
-def defocus(light, value, view: View, rng):
+def defocus(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     return blurred_by(light, disc_kernel(value * view.px_per_mm)) if value else light
 
 
-def motion(light, value, view: View, rng):
+def motion(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     return blurred_by(light, line_kernel(value * view.px_per_mm, MOTION_DEG)) if value else light
 
 
-def rolled_focus(light, value, view: View, rng):
+def rolled_focus(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     """The circle of confusion grows evenly from one rim of the disc to the other: a lens that sits askew."""
     if not value:
         return light
@@ -64,8 +73,8 @@ def rolled_focus(light, value, view: View, rng):
     return mixed
 
 
-def dirt(light, value, view: View, rng):
-    """Smudges that cover a share of the disc and hold most light back."""
+def dirt(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """Smudges that cover a share of the disc and hold most of the light back."""
     if not value:
         return light
     noise = rng.standard_normal(light.shape[:2], dtype=np.float32)
@@ -76,12 +85,12 @@ def dirt(light, value, view: View, rng):
     return light * over_channels(1 - np.float32(DIRT_OPACITY) * cover, light)
 
 
-def scratched(light, value, view: View, rng):
+def scratched(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
     """Straight scratches across the disc that scatter the LEDs' light."""
     if not value:
         return light
-    turn, away = rng.uniform(0, np.pi, 1000), rng.uniform(-0.9, 0.9, 1000)
-    bright = rng.uniform(0.3, 1.0, 1000)
+    turn, away = rng.uniform(0, np.pi, MOST_SCRATCHES), rng.uniform(-0.9, 0.9, MOST_SCRATCHES)
+    bright = rng.uniform(0.3, 1.0, MOST_SCRATCHES)
     x, y = view.grid(light.shape)
     half = max(0.5 * SCRATCH_WIDTH_MM * view.px_per_mm, 0.5) / view.radius_px
     added = np.zeros(light.shape[:2], np.float32)
@@ -93,9 +102,8 @@ def scratched(light, value, view: View, rng):
     return light + over_channels(added, light)
 
 
-_IMAGE = {"image_level": True}
 CONDITIONS = (
-    Condition("defocus", "camera out of focus", "optics", "circle of confusion at the caps", "mm", 4.0, light=defocus, **_IMAGE),
+    Condition("defocus", "camera out of focus", "optics", "circle of confusion at the caps", "mm", 4.0, light=defocus, image_level=True),
     Condition(
         "focus-rolled",
         "focus rolled off to one side",
@@ -104,9 +112,9 @@ CONDITIONS = (
         "mm",
         6.0,
         light=rolled_focus,
-        **_IMAGE,
+        image_level=True,
     ),
-    Condition("motion-blur", "motion blur", "optics", "path of the picture during the exposure", "mm", 5.0, light=motion, **_IMAGE),
-    Condition("lens-dirt", "dirt on the lens", "optics", "share of the disc under smudges", "", 0.9, light=dirt, **_IMAGE),
-    Condition("lens-scratches", "scratched lens", "optics", "scratches", "", 120.0, light=scratched, **_IMAGE),
+    Condition("motion-blur", "motion blur", "optics", "path of the picture during the exposure", "mm", 5.0, light=motion, image_level=True),
+    Condition("lens-dirt", "dirt on the lens", "optics", "share of the disc under smudges", "", 0.9, light=dirt, image_level=True),
+    Condition("lens-scratches", "scratched lens", "optics", "scratches", "", 120.0, light=scratched, image_level=True),
 )

@@ -2,16 +2,18 @@
 
 import numpy as np
 
+from twin.detectors import DetectorSpec
 from twin.robustness.condition import Condition, View
 
 
 def offset_px(value: float, view: View) -> tuple[int, int]:
+    """Displacement (x, y), whole px, by a share of the disc's radius."""
     by = value * view.radius_px
     return round(0.8 * by), round(-0.6 * by)
 
 
-def wrong_crop(image, value, view: View, rng):
-    """The camera's window read at another place: the picture is displaced, what is beyond it black."""
+def wrong_crop(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """The camera's window is read at another place: the picture is displaced, and black where nothing was read."""
     dx, dy = offset_px(value, view)
     if not (dx or dy):
         return image
@@ -23,15 +25,15 @@ def wrong_crop(image, value, view: View, rng):
     return out
 
 
-def displaced(px, value, view: View):
+def displaced(px: np.ndarray, value: float, view: View) -> np.ndarray:
     return px + np.array(offset_px(value, view))
 
 
-def too_strict(detector, value):
+def too_strict(detector: DetectorSpec, value: float) -> DetectorSpec:
     return detector.stricter(value)
 
 
-def too_lax(detector, value):
+def too_lax(detector: DetectorSpec, value: float) -> DetectorSpec:
     return detector.stricter(-value)
 
 

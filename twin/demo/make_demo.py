@@ -1,17 +1,19 @@
-"""The demo's order of work."""
+"""The demo: its stages in their order, and the page that shows them."""
 
 import os
 import platform
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from scenes import load_object, load_sensor
 from twin.demo.page import contact_figures, contact_pictures, embed, motion_figure, write_figure
-from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, depth_table, run_contact
-from twin.preprocess.forms import from_raw
+from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, DepthRow, depth_table, run_contact
+from twin.progress import FractionBar
 from twin.projection import project
+from twin.recordings.forms import from_raw
 from twin.simulator import Simulator
 from twin.stimulus import build_field
 from twin.types import Form
@@ -19,7 +21,7 @@ from twin.views.page import render_page
 from twin.views.skin3d import draw_contact_skin
 
 
-def run_demo(out: Path, bar) -> list[Path]:
+def run_demo(out: Path, bar: FractionBar) -> list[Path]:
     """Run the whole demo into a folder.
 
     Parameters
@@ -36,7 +38,9 @@ def run_demo(out: Path, bar) -> list[Path]:
     pictures = out / "pictures"
     pictures.mkdir(exist_ok=True)
     simulators: dict[str, Simulator] = {}
-    contacts, seconds, notes = [], {}, set()
+    contacts: list[dict[str, Any]] = []
+    seconds: dict[str, float] = {}
+    notes: set[str] = set()
     for sensor, stimulus, pose, form in CONTACTS:
         start = perf_counter()
         with bar(f"{sensor}: press the {stimulus}, render, detect") as progress:
@@ -86,12 +90,12 @@ def run_demo(out: Path, bar) -> list[Path]:
     return [page, *sorted(pictures.iterdir())]
 
 
-def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pictures: Path) -> dict:
+def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pictures: Path) -> dict[str, Any]:
     spec = simulator.spec
     written = contact_pictures(pictures, result)
     touched = result.state.contact_mm
     contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
-    contact_px = from_raw(spec, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
+    contact_px = from_raw(spec.recording, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
     return {
         "title": f"{spec.name} against {result.stimulus}",
@@ -107,7 +111,7 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
     }
 
 
-def _print_tables(tables: dict) -> None:
+def _print_tables(tables: dict[str, list[DepthRow]]) -> None:
     for sensor, rows in tables.items():
         print(f"{sensor}: mean pin displacement, px (measured on the Tac-VGNN recordings / simulated)")
         print("  indentation, mm  " + "".join(f"{row.indent_mm:8.1f}" for row in rows))

@@ -1,4 +1,4 @@
-"""Whether a frame that should show no contact shows one: what of the pins' motion no camera makes."""
+"""Whether the sensor is pressed in a frame that should show no contact: motion of the pins that no camera could make."""
 
 import numpy as np
 
@@ -8,17 +8,24 @@ from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import Reference
 from twin.types import Form, Frame
 
-# At rest 0.0026 to 0.0041 in three real sensors, 0.005 with a camera tilted by 2 deg; in real contacts at least 0.003 from about 1 mm on,
-# 0.009 from 2 mm, 0.012 from 3 mm. A lighter touch passes: it moves the pins less than cameras differ.
+# Largest dent, in the rim's mean radius, of a sensor at rest. Measured: 0.0026 to 0.0041 at rest in three real sensors, 0.005 with a camera
+# tilted by 2 deg; in real contacts at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A touch lighter than about 2 mm is
+# not noticed: it moves the pins less than cameras differ.
 MOST_DENT = 0.008
 
 
 def dent_of(pins_px: np.ndarray, reference: Reference) -> float:
-    """How much pins (N, 2), NaN where lost, are moved together otherwise than by a camera, in the rim's mean radius.
+    """Largest motion of neighbouring pins that another camera cannot explain, in the rim's mean radius.
 
-    What another place, tilt, focal length or radial distortion of the camera makes of the reference is, to first order,
-    ``u = t + G x + (h . x) x + k |x|^2 x``; it is taken out by least squares. Of what is left, the mean over a pin and its
-    neighbours counts, so that a print's own tolerances, which differ from pin to pin, do not; the largest is told.
+    Another place, tilt, focal length or radial distortion of the camera moves the reference, to first order, by
+    ``u = t + G x + (h . x) x + k |x|^2 x``. This motion is fitted by least squares and taken away. The rest is averaged over each
+    pin and its neighbours, because the tolerances of a print differ from pin to pin and shall not count.
+
+    Parameters
+    ----------
+    pins_px : (N, 2) float
+        NaN where lost.
+    reference : Reference
     """
     rim = reference.pins_px[reference.outmost]
     middle = rim.mean(axis=0)
@@ -36,7 +43,7 @@ def dent_of(pins_px: np.ndarray, reference: Reference) -> float:
 
 
 def require_untouched(spec: SensorSpec, form: Form, frame: Frame, remedy: str) -> None:
-    """Refuse a frame, meant to show no contact, whose pins say otherwise. One in which they can't be found tells nothing, and passes.
+    """Refuse a frame that is meant to show no contact if its pins show one. A frame in which the pins are not found passes.
 
     Raises
     ------

@@ -12,7 +12,7 @@ from twin.calibration.aligned import Aligned, read_frames, revised
 from twin.calibration.camera_pose import fit_camera
 from twin.calibration.caps import fit_caps
 from twin.calibration.photometry import fit_photometry
-from twin.calibration.response import fit_aperture, fit_blur, fit_noise, fit_response, sharpness
+from twin.calibration.response import fit_blur, fit_focus, fit_noise, fit_response, sharpness
 from twin.calibration.rim import fit_rim
 from twin.calibration.surroundings import fit_surroundings
 from twin.camera import expose
@@ -20,18 +20,21 @@ from twin.errors import FrameError
 from twin.geometry.skin_fit import FittedPins, SkinFit
 from twin.optics.render import Renderer
 from twin.preprocess.pipeline import Pipeline
+from twin.progress import Bar, Progress
 from twin.realism.disc import lens_disc
 from twin.realism.images import compare_images
 from twin.recordings.images import read_image
 from twin.store import Item, inputs_digest, kept_arrays, kept_json
 from twin.types import Form, Frame
 
-FRAMES = 6  # that are fitted, evenly spread over the folder
-SAMPLES = 16  # per pixel
+# Frames that are fitted, evenly spread over the folder.
+FRAMES = 6
+# Samples a pixel of the renders.
+SAMPLES = 16
+# Rounds of fitting caps and response in turn.
 CAP_ROUNDS = 2
-HAZE_SIGMA_PX = 40.0  # start of the haze, where the specification has none
-
-Bar = Callable  # bar(title) is a context manager that yields progress(done, total)
+# Width of the haze to start from, px, where the specification has none.
+HAZE_SIGMA_PX = 40.0
 
 
 @dataclass
@@ -51,8 +54,8 @@ class Calibration:
     """
 
     spec: SensorSpec
-    before: dict
-    after: dict
+    before: dict[str, float]
+    after: dict[str, float]
     notes: list[str] = field(default_factory=list)
     frames: list[Aligned] = field(default_factory=list)
     first: list[np.ndarray] = field(default_factory=list)
@@ -86,7 +89,9 @@ class Studio:
         return [expose(light, spec.capture) for light in self.light(spec, frames, title)]
 
 
-def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES, no_contact: Path | None = None) -> Calibration:
+def calibrate_optics(
+    folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES, no_contact: Path | None = None
+) -> Calibration:
     """Fit a specification to raw frames of a sensor in contact.
 
     Parameters
@@ -122,30 +127,30 @@ def calibrate(folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: in
     inside, studio = lens_disc(spec).inside, Studio(bar)
     first = studio.shots(spec, frames, "render the start")
 
-    def surroundings(spec):
+    def surroundings(spec: SensorSpec) -> SensorSpec:
         with bar("fit the ring, the reflections, the specks") as progress:
             found = fit_surroundings(spec, np.stack([f.image for f in frames]), np.stack([f.pins_px for f in frames]), progress=progress)
         return found if found.gel.haze else revised(found, gel={"haze_sigma_px": HAZE_SIGMA_PX})
 
-    def photometry(spec):
+    def photometry(spec: SensorSpec) -> SensorSpec:
         with bar("fit lights and colours") as progress:
             return fit_photometry(spec, frames, progress).spec
 
-    def defocus(spec):
+    def defocus(spec: SensorSpec) -> SensorSpec:
         shots = studio.shots(spec, frames, "render for the sharpness")
-        return fit_aperture(spec, sharpness(spec, frames, shots))
+        return fit_focus(spec, sharpness(spec, frames, shots))
 
-    def response(spec):
+    def response(spec: SensorSpec) -> SensorSpec:
         light = studio.light(spec, frames, "render for the response")
         return fit_blur(fit_response(spec, frames, light, inside), frames, light)
 
-    def caps(spec):
+    def caps(spec: SensorSpec) -> SensorSpec:
         return fit_caps(spec, frames, lambda s, f: studio.shots(s, f, "render for the caps"))
 
-    def rim(spec):
+    def rim(spec: SensorSpec) -> SensorSpec:
         return fit_rim(spec, frames, studio.light(spec, frames, "render for the rim"))
 
-    def noise(spec):
+    def noise(spec: SensorSpec) -> SensorSpec:
         return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"))
 
     stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim, noise]
@@ -174,7 +179,7 @@ class _Log:
     def __init__(self, work: Path, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
         self._folder, self._inputs = work, inputs_digest(spec, raw)
 
-    def aligned(self, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]], progress: Callable) -> list[Aligned]:
+    def aligned(self, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]], progress: Progress) -> list[Aligned]:
         """Frames with their fitted skin, from disk where they are there."""
         fit, frames = cache(lambda: SkinFit(spec)), []
         for done, (name, image, pins_px) in enumerate(raw):

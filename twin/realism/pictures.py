@@ -2,9 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.realism.compare import pin_aligned, pose_aligned, statistics
+from twin.progress import Bar, Progress
+from twin.realism.compare import Quality, pin_aligned, pose_aligned, statistics
 from twin.realism.disc import lens_disc
 from twin.realism.frames import read_real
 from twin.realism.report import (
@@ -18,20 +22,35 @@ from twin.realism.report import (
     write_tables,
 )
 
-Test = Callable  # test(real images, rendered images, inside, progress) gives an object with accuracy, low and high
+
+class TwoSample(Protocol):
+    """Outcome of a two-sample test: share of the images told right, and its interval."""
+
+    @property
+    def accuracy(self) -> float: ...
+
+    @property
+    def low(self) -> float: ...
+
+    @property
+    def high(self) -> float: ...
+
+
+# test(real images, rendered images, inside, progress)
+Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Progress], TwoSample]
 
 
 def run_realism(
     folder: Path,
     spec: SensorSpec,
     out: Path,
-    bar,
+    bar: Bar,
     *,
     with_poses: bool = False,
     limit: int | None = None,
-    quality: str = "standard",
+    quality: Quality = "standard",
     test: Test | None = None,
-) -> tuple[dict, list[Path]]:
+) -> tuple[dict[str, Any], list[Path]]:
     """Compare and write everything.
 
     Parameters

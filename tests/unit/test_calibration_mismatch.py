@@ -1,0 +1,93 @@
+"""Frames and pins that do not fit the specification are refused by name, with what to do, before anything is fitted."""
+
+import cv2
+import numpy as np
+import pytest
+from plain_sensor import plain
+
+from twin.calibration.aligned import Aligned, read_frames, require_cameras_own, revised
+from twin.calibration.photometry import fit_photometry
+from twin.calibration.surroundings import fit_surroundings
+from twin.camera import expose
+from twin.errors import FrameError
+from twin.geometry.pins import rest_pins
+from twin.geometry.skin_fit import FittedPins
+from twin.optics.preview import Preview
+from twin.projection import project
+from twin.realism.disc import lens_disc
+
+
+def quiet(*_):
+    pass
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """A small colour sensor and its frame at rest."""
+    shipped = plain()
+    camera = {name: 0.6 * getattr(shipped.camera, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    camera |= {name: round(0.6 * getattr(shipped.camera, name)) for name in ("width_px", "height_px")}
+    blob = shipped.pipeline.raw
+    center = tuple(0.6 * x for x in blob.mask_center_px)
+    raw = blob.model_copy(update={"mask_center_px": center, "mask_radius_px": 0.6 * blob.mask_radius_px})
+    spec = revised(shipped, camera=camera, pipeline={"raw": raw})
+    return spec, expose(Preview(spec).render(), spec.capture)
+
+
+def aligned(spec, image):
+    rest = rest_pins(spec.geometry)
+    state = FittedPins(rest.base_mm, rest.axis, rest.caps_mm, np.zeros(len(rest.caps_mm)), np.zeros(3))
+    return Aligned("seen.png", image, project(spec.view, rest.caps_mm), state)
+
+
+def test_a_mono_specification_refuses_colour_frames_by_name(drawn, tmp_path):
+    spec, image = drawn
+    mono = revised(spec, camera={"channels": "mono"})
+    cv2.imwrite(str(tmp_path / "seen.png"), image[..., ::-1])
+    assert len(read_frames(tmp_path, spec, 6, quiet)) == 1
+    with pytest.raises(FrameError, match=r'seen.png: a colour frame.*channels = "color"'):
+        read_frames(tmp_path, mono, 6, quiet)
+    with pytest.raises(FrameError, match=r'seen.png: a colour frame.*channels = "color"'):
+        fit_photometry(mono, [aligned(mono, image)], quiet)
+
+
+def test_a_colour_specification_refuses_gray_frames_by_name(drawn):
+    spec, image = drawn
+    with pytest.raises(FrameError, match=r'seen.png: a gray frame.*channels = "mono"'):
+        fit_photometry(spec, [aligned(spec, image[..., 1])], quiet)
+
+
+def test_frames_of_the_cameras_own_kind_pass(drawn):
+    spec, image = drawn
+    require_cameras_own(image, "seen.png", spec.camera)
+    require_cameras_own(image[..., 1], "seen.png", spec.camera.model_copy(update={"channels": "mono"}))
+    with pytest.raises(FrameError, match="seen.png: 192 x 144 px.*384 x 288"):
+        require_cameras_own(image[::2, ::2], "seen.png", spec.camera)
+
+
+@pytest.mark.parametrize("beside_px", [(-3.0, 0.0), (0.0, 1e4)])
+def test_pins_outside_the_picture_are_refused_by_number(drawn, beside_px):
+    spec, image = drawn
+    pins_px = np.tile(project(spec.view, rest_pins(spec.geometry).caps_mm), (4, 1, 1))
+    pins_px[2, 7] = beside_px
+    with pytest.raises(FrameError, match=r"frame 2, pin 7: lies at .* outside the 384 x 288 px picture; give the pins"):
+        fit_surroundings(spec, np.stack([image] * 4), pins_px)
+
+
+def test_frames_that_grow_brighter_to_their_border_have_no_ring(drawn):
+    """Where the brightest place is the last one that is looked at, nothing tells where a ring begins."""
+    spec, image = drawn
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    disc = lens_disc(spec)
+    beyond_px = np.hypot(x - disc.center_px[0], y - disc.center_px[1]) - 1.3 * disc.radius_px
+    slope = np.clip(240 * np.exp(beyond_px / 20), 1, 254).astype(np.uint8)
+    pins_px = project(spec.view, rest_pins(spec.geometry).caps_mm)[None]
+    with pytest.raises(FrameError, match="no bright ring"):
+        fit_surroundings(spec, np.repeat(slope[None, ..., None], 3, axis=3), pins_px)
+
+
+def test_a_cap_too_few_in_the_appearance_is_refused_where_it_enters(drawn):
+    """Offsets of another layout would otherwise end the fit of the caps in a broadcasting error."""
+    spec, _ = drawn
+    with pytest.raises(ValueError, match=f"cap_offsets needs one pair for each of the {spec.pins.count} pins"):
+        revised(spec, appearance={"cap_offsets": ((0.0, 0.0),) * (spec.pins.count - 1)})

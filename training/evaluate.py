@@ -8,10 +8,9 @@ from time import perf_counter
 import numpy as np
 import torch
 
-from training.assemble import Prediction
 from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
-from training.inputs import image_inputs
+from training.models.part import Prediction
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
 from twin.recordings import open_recording
@@ -47,10 +46,7 @@ def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndar
 
 def predict_rows_of(estimator: PoseEstimator, data: Dataset, rows: np.ndarray) -> Prediction:
     """The model's labels for some rows of a data set."""
-    estimator.check(data.pins.sensor, data.pins.form)
-    if estimator.model in ("cnn-v1", "cnn-v2"):
-        return estimator.ensemble(image_inputs(data), torch.from_numpy(rows))
-    return estimator.predict_table(data.pins.rows(rows))
+    return estimator.predict_rows(data, rows)
 
 
 def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:

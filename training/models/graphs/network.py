@@ -179,7 +179,3 @@ class Gcn(nn.Module):
             norm.running_mean.lerp_(mean, norm.momentum)
             norm.running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), norm.momentum)
         return out
-
-    def configuration(self) -> dict:
-        """What builds the same network again."""
-        return {"features": self.features, "outputs": self.outputs, "variant": self.variant}

@@ -136,9 +136,9 @@ def calibrate(
     shift, scale = scaling
     y = ((data.targets.corrected if labels == "corrected" else data.targets.raw) - shift) / scale
     k = y.shape[1]
-    main = [j for j, name in enumerate(data.targets.names) if name not in helpers]  # the processes' labels
+    main = np.array([j for j, name in enumerate(data.targets.names) if name not in helpers], int)  # the processes' labels
     content: dict = {"networks": [network["weights"] for network in networks], "kernels": [], "shift": shift, "scale": scale}
-    content |= {"blend": np.zeros(k), "quantile": np.ones(k), "raw_quantile": np.ones((2, k)), "kernel_labels": main}
+    content |= {"blend": np.zeros(k), "quantile": np.ones(k), "raw_quantile": np.ones((2, k)), "kernel_labels": main.tolist()}
     raw = (data.targets.raw - shift) / scale
     single = [Ensemble(model, data.pins.reference, content | {"networks": [weights]}, size) for weights in content["networks"]]
     left_out = np.full(y.shape, np.nan)

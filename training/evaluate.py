@@ -13,6 +13,7 @@ from training.estimator import PoseEstimator
 from training.models.part import Prediction
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
+from training.targets import Targets
 from twin.recordings import open_recording
 from twin.views.plots import new_figure
 
@@ -86,9 +87,9 @@ def leak_slope(mean: np.ndarray, targets) -> float | None:
     return float(np.polyfit(targets.move[undone, 1], (mean - targets.corrected)[undone, k], 1)[0])
 
 
-def _bins(error: np.ndarray, targets) -> dict:
+def _bins(error: np.ndarray, targets: Targets) -> dict[str, list[dict]]:
     """MAE of each label by depth, angle and shear, as ``{by: [{from, to, frames, label: mae, ...}]}``."""
-    found = {}
+    found: dict[str, list[dict]] = {}
     axes = {"depth_mm": ("pose_2", DEPTH_EDGES_MM, False), "angle_deg": ("pose_6", ANGLE_EDGES_DEG, True)}
     values = {
         key: (targets.corrected[:, targets.names.index(name)], edges, size)
@@ -150,7 +151,7 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
     return [path, out / "metrics.json", _draw(out / "errors.png", made, truth, targets, labels)]
 
 
-def _draw(path: Path, made: Prediction, truth: np.ndarray, targets, labels: str) -> Path:
+def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, labels: str) -> Path:
     """Prediction over truth, and its error, for every label: the paper's test figure."""
     count = len(targets.names)
     figure, axes = new_figure(count, 2, panel_inch=3.6)

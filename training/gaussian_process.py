@@ -16,7 +16,7 @@ written out below (eq. 5.9). What a row is predicted as when it is left out come
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -87,6 +87,14 @@ class Points:
         return Points(self.inputs[index], self.second[index])
 
 
+class Placed(NamedTuple):
+    """Rows in units of a kernel's lengths: ``rows`` (M, D), their squared sizes (M,), and which are of the second kind (M,)."""
+
+    rows: np.ndarray
+    squares: np.ndarray
+    second: np.ndarray
+
+
 @dataclass(frozen=True)
 class Kernel:
     """The covariance with all its numbers.
@@ -113,7 +121,21 @@ class Kernel:
 
     def __call__(self, a: Points, b: Points) -> np.ndarray:
         """(A, B) the covariance between rows, without noise."""
-        return self.between(_scaled(a, self.lengths), _scaled(b, self.lengths), a.second, b.second)
+        return self.between(self.placed(a), self.placed(b))
+
+    def placed(self, points: Points) -> Placed:
+        """Rows in units of the lengths."""
+        rows = points.inputs / self.lengths
+        return Placed(rows, (rows**2).sum(axis=1), points.second)
+
+    def between(self, a: Placed, b: Placed) -> np.ndarray:
+        """(A, B) the covariance between rows, without noise."""
+        inner, squared = _products(a, b)
+        found = np.zeros_like(inner)
+        for term, size in zip(self.terms, self.sizes, strict=True):
+            part = size**2 * self._shape(term, inner, squared)
+            found += part * np.outer(a.second, b.second) if term.second else part
+        return found
 
     def noisy(self, points: Points) -> np.ndarray:
         """(M, M) the covariance of the rows' labels, noise and ``JITTER`` included."""
@@ -146,8 +168,8 @@ class Kernel:
 
     def _gradient(self, points: Points, pull: np.ndarray) -> np.ndarray:
         """Derivatives with respect to ``logs`` of a number whose derivatives with respect to ``noisy(points)`` are ``pull`` (M, M)."""
-        a = _scaled(points, self.lengths)
-        inner, squared = _products(a, a)
+        here = self.placed(points)
+        a, (inner, squared) = here.rows, _products(here, here)
         of_inner, of_squared = np.zeros_like(inner), np.zeros_like(inner)
         sizes, reach = np.empty(len(self.terms)), 0.0
         for k, (term, size) in enumerate(zip(self.terms, self.sizes, strict=True)):
@@ -166,15 +188,6 @@ class Kernel:
         noise = 2 * self._noise_of(points) ** 2 * np.diag(pull)
         noises = [noise.sum()] if len(self.noises) == 1 else [(noise * (1 - points.second)).sum(), (noise * points.second).sum()]
         return np.concatenate([lengths, sizes, noises, [reach] if self._reaches else []])
-
-    def between(self, a: np.ndarray, b: np.ndarray, a_second: np.ndarray, b_second: np.ndarray) -> np.ndarray:
-        """(A, B) the covariance between rows (A, D) and (B, D) in units of the lengths."""
-        inner, squared = _products(a, b)
-        found = np.zeros_like(inner)
-        for term, size in zip(self.terms, self.sizes, strict=True):
-            part = size**2 * self._shape(term, inner, squared)
-            found += part * np.outer(a_second, b_second) if term.second else part
-        return found
 
     def _shape(self, term: Term, inner: np.ndarray, squared: np.ndarray) -> np.ndarray:
         if term.shape == "smooth":
@@ -279,13 +292,13 @@ class Processes:
 
     def __init__(self, kernels: list[Kernel], points: Points, weight: np.ndarray) -> None:
         self.kernels, self.points, self.weight = kernels, points, weight
-        self._scaled = [_scaled(points, kernel.lengths) for kernel in kernels]  # once, not for every frame
+        self._placed = [kernel.placed(points) for kernel in kernels]  # once, not for every frame
 
     def __call__(self, asked: Points) -> np.ndarray:
         """(B, K) for other rows."""
         found = [
-            kernel.between(_scaled(asked, kernel.lengths), scaled, asked.second, self.points.second) @ weight
-            for kernel, scaled, weight in zip(self.kernels, self._scaled, self.weight.T, strict=True)
+            kernel.between(kernel.placed(asked), placed) @ weight
+            for kernel, placed, weight in zip(self.kernels, self._placed, self.weight.T, strict=True)
         ]
         return np.stack(found, axis=1)
 
@@ -384,12 +397,7 @@ def _spread(inputs: np.ndarray) -> np.ndarray:
     return np.maximum(inputs.std(axis=0, ddof=1), LEAST_SPREAD)
 
 
-def _scaled(points: Points, lengths: np.ndarray) -> np.ndarray:
-    return points.inputs / lengths
-
-
-def _products(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(A, B) inner products and squared distances of rows (A, D) and (B, D)."""
-    inner = a @ b.T
-    squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * inner
-    return inner, np.maximum(squared, 0.0)
+def _products(a: Placed, b: Placed) -> tuple[np.ndarray, np.ndarray]:
+    """(A, B) inner products and squared distances of rows."""
+    inner = a.rows @ b.rows.T
+    return inner, np.maximum(a.squares[:, None] + b.squares - 2 * inner, 0.0)

@@ -75,6 +75,7 @@ class Loop:
         recipe = self.recipe
         parameters = list(self.network.parameters())
         self.device = device_of(self.network)
+        self.optimiser: torch.optim.Optimizer
         if recipe.decay:
             self.optimiser = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
         else:

@@ -1,6 +1,6 @@
 """Every model by name. A new model is a package beside this file and one line below."""
 
-from dataclasses import fields, replace
+from dataclasses import asdict, fields
 
 from training.models.cnn.model import CNN_V1, CNN_V2
 from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
@@ -76,7 +76,7 @@ def recipe_of(model: str, **changes: object) -> Recipe:
     known = {field.name for field in fields(Recipe)}
     if odd := set(changes) - known:
         raise TrainingError(f"no setting {', '.join(sorted(odd))}; there are {', '.join(sorted(known))}")
-    recipe = replace(chosen.recipe, **{key: value for key, value in changes.items() if value is not None})
+    recipe = Recipe(**asdict(chosen.recipe) | {key: value for key, value in changes.items() if value is not None})
     for key in ("epochs", "batch", "members"):
         if getattr(recipe, key) < 1:
             raise TrainingError(f"{key} must be at least 1, got {getattr(recipe, key)}")

@@ -272,7 +272,7 @@ class PinModel(Model):
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:
         """See ``Model``."""
         seen = trained.pipeline(frame)
-        if not seen.valid:
+        if not seen.valid or seen.graph is None:
             return Unseen(seen.reason)
         pins = PinTable(
             trained.sensor,

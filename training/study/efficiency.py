@@ -36,7 +36,7 @@ class PeakMemory:
         self.thread.start()
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.watching = False
         self.thread.join()
         if self.device == "cuda":

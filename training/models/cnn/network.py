@@ -34,7 +34,8 @@ class Cnn(nn.Module):
         layers: list[nn.Module] = []
         for k in range(LAYERS):
             layers += [nn.Conv2d(1 if k == 0 else filters, filters, 3), nn.MaxPool2d(2), nn.ELU()]
-        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)
+        self.convolutions = nn.Sequential(*layers)
+        self.convolutions.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # the stubs leave memory_format out
         with torch.no_grad():
             width = self.convolutions(torch.zeros(1, 1, INPUT_PX, INPUT_PX)).numel()
         head: list[nn.Module] = [nn.Dropout(DROPOUT)]
@@ -50,5 +51,5 @@ class Cnn(nn.Module):
 
     def penalty(self) -> torch.Tensor:
         """The regularisation of the hidden dense weights."""
-        weights = [layer.weight for layer in self.dense[:-1] if isinstance(layer, nn.Linear)]
+        weights = [layer.weight for layer in list(self.dense)[:-1] if isinstance(layer, nn.Linear)]
         return torch.stack([L1 * w.abs().sum() + L2 * w.square().sum() for w in weights]).sum()

@@ -13,6 +13,7 @@ logit that the shear move was executed.
 """
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -49,6 +50,15 @@ class Vgnn(nn.Module):
     outputs : int
         Labels K.
     """
+
+    adjacency: torch.Tensor  # (N, N) 1 where the column's pin is a neighbour of the row's
+    scale: torch.Tensor  # (FEATURES,) deviation of each feature
+    smoothing: torch.Tensor  # (N, N) mean over a pin and its neighbours
+    components: torch.Tensor  # (2 N, modes)
+    mode_mean: torch.Tensor  # (2 N,)
+    area_components: torch.Tensor  # (N, area_modes)
+    area_mean: torch.Tensor  # (N,)
+    waves: torch.Tensor  # (N, frequencies)
 
     def __init__(self, edges: np.ndarray, pins: int, outputs: int, size: VgnnSize | None = None) -> None:
         super().__init__()
@@ -166,7 +176,7 @@ class Vgnn(nn.Module):
             self._weights = weights.detach()
         return self._weights
 
-    def train(self, mode: bool = True) -> "Vgnn":
+    def train(self, mode: bool = True) -> Self:
         """Switch between training and evaluation."""
         self._weights = None
         return super().train(mode)

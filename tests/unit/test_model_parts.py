@@ -250,3 +250,14 @@ def test_a_run_with_processes_beside_its_networks_has_no_small_copy(data, tmp_pa
     train_run(config_of("vgnn", epochs=1, batch=16, members=1, kernel=True), data, tmp_path)
     with pytest.raises(TrainingError, match="has Gaussian processes beside its networks.*--no-kernel"):
         pack(tmp_path, tmp_path / "small")
+
+
+def test_a_run_whose_processes_are_kept_as_by_an_earlier_version_is_refused_with_advice(data, tmp_path):  # noqa: F811
+    train_run(config_of("vgnn", epochs=1, batch=16, members=1, kernel=True), data, tmp_path)
+    content = torch.load(tmp_path / "weights.pt", weights_only=True)
+    for kernel in content["kernels"]:
+        kernel |= {"smooth": kernel["sizes"][:, 0], "linear": kernel["sizes"][:, 1], "noise": kernel.pop("noises")[:, 0]}
+        del kernel["sizes"]
+    torch.save(content, tmp_path / "weights.pt")
+    with pytest.raises(TrainingError, match="not a run of this version.*train again"):
+        PoseEstimator.load(tmp_path)

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from pickle import UnpicklingError
 from time import perf_counter
@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from scenes.sensor import SensorSpec
-from training.assemble import Ensemble, Prediction, filled, pin_inputs
-from training.dataset import PinTable
-from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features, small_image
+from training.assemble import Ensemble
+from training.dataset import Dataset, PinTable
+from training.models import model_named
+from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.recipes import TrainingError
-from training.registration import Registration
 from twin.errors import FrameError
 from twin.preprocess import Pipeline, make_reference, measure_reference
 from twin.store import fingerprint
@@ -45,8 +45,8 @@ class PoseEstimate:
         Frame to pose.
     """
 
-    names: tuple
-    units: tuple
+    names: tuple[str, ...]
+    units: tuple[str, ...]
     value: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -63,19 +63,25 @@ class PoseEstimator:
     ----------
     config, content : dict
         What a run's ``config.json`` and ``weights.pt`` hold.
+
+    Raises
+    ------
+    TrainingError
+        The run is of a model that does not exist here.
     """
 
     def __init__(self, config: dict, content: dict) -> None:
         self.config = config
         self.model: str = config["model"]
+        self.part = model_named(self.model)
         self.sensor = SensorSpec.model_validate(config["sensor"])
         self.form = Form(config["pipeline"]["form"])
         self.names, self.units = tuple(config["columns"]), tuple(config["units"])
-        self.trained = make_reference(content["reference_px"].numpy(), self.sensor.pins.rings)
-        self.pipeline = Pipeline(self.sensor, self.form, self.trained, graph=config["pipeline"]["graph"])
-        self.ensemble = Ensemble(self.model, self.trained, content, config["size"])
-        aside = content["aside"]
-        self.registration = Registration(**{key: value.numpy() for key, value in aside["registration"].items()}) if aside else None
+        reference = make_reference(content["reference_px"].numpy(), self.sensor.pins.rings)
+        self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
+        self.ensemble = Ensemble(self.part, reference, content, config["size"])
+        learnt = {group: {key: value.numpy() for key, value in arrays.items()} for group, arrays in content["aside"].items()}
+        self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
 
     @classmethod
     def load(cls, run: str | Path) -> "PoseEstimator":
@@ -112,7 +118,7 @@ class PoseEstimator:
     @property
     def counts_from_rest(self) -> bool:
         """Whether a no-contact frame of the sensor in hand serves the model."""
-        return self.model == "vgnn"
+        return self.part.counts_from_rest
 
     def at_rest(self, frame: Frame) -> "PoseEstimator":
         """The same model for the sensor in hand, whose frame without contact is given: pins are counted from where it shows them.
@@ -123,10 +129,11 @@ class PoseEstimator:
             The layout can't be found in the frame, or the model knows no pins to count.
         """
         if not self.counts_from_rest:
-            raise FrameError(f"a no-contact frame serves vgnn only, this is a {self.model}; leave it out")
+            raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
         found = copy(self)
         reference = measure_reference(self.sensor, self.form, frame)
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
+        found._trained = replace(self._trained, pipeline=found.pipeline)
         return found
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
@@ -151,27 +158,23 @@ class PoseEstimator:
             The frame is not one of the model's sensor: wrong size, type or form.
         """
         started = perf_counter()
-        if self.model in ("cnn-v1", "cnn-v2"):
-            self.pipeline.check(frame)
-            made = self.ensemble(ImageInputs(small_image(frame.image)[None]), torch.zeros(1, dtype=torch.long))
-            return self._estimate(made, started)
-        seen = self.pipeline(frame)
-        if not seen.valid:
+        made = self.part.estimate_frame(self._trained, frame)
+        if isinstance(made, Unseen):
             none = np.full(len(self.names), np.nan)
-            return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, seen.reason, _ms(started))
-        lost = np.isnan(seen.pins_px[None, :, 0])
-        pins = PinTable(
-            self.sensor,
-            self.form,
-            self.pipeline.reference,
-            np.array([frame.name]),
-            seen.graph.nodes_px[None],
-            seen.graph.area_px2[None],
-            lost,
-            np.ones(1, bool),
-            measured=self.pipeline.reference is not self.trained,
-        )
-        return self._estimate(self._of_pins(pins, together=False), started)
+            return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started))
+        value, half = made.mean[0], made.half_width[0]
+        return PoseEstimate(self.names, self.units, value, value - half, value + half, float(made.executed[0]), True, "", _ms(started))
+
+    def predict_rows(self, data: Dataset, rows: np.ndarray) -> Prediction:
+        """Labels of some rows (B,) of a data set, whose frames are of one camera.
+
+        Raises
+        ------
+        FrameError
+            The frames are of another sensor or form.
+        """
+        self.check(data.pins.sensor, data.pins.form)
+        return self.part.estimate_rows(self._trained, data, rows)
 
     def predict_table(self, pins: PinTable) -> Prediction:
         """Labels of many valid frames of one camera at once.
@@ -183,27 +186,27 @@ class PoseEstimator:
         ------
         FrameError
             The frames are of another sensor or form.
+        TrainingError
+            The model does not estimate from pins.
         """
         self.check(pins.sensor, pins.form)
-        return self._of_pins(pins, together=not pins.measured)
+        return self._of_pins.estimate_pins(self._trained, pins)
 
-    def _of_pins(self, pins: PinTable, *, together: bool) -> Prediction:
-        return self.ensemble(*self.inputs_of(pins, together=together))
+    def inputs_of(self, pins: PinTable, *, together: bool) -> tuple[Inputs, torch.Tensor]:
+        """What the networks see of a table's frames, and the rows of all of them.
 
-    def inputs_of(self, pins: PinTable, *, together: bool) -> tuple:
-        """What the networks see of a table's frames, and the rows of all of them."""
-        rows = torch.arange(len(pins))
-        if self.model != "vgnn":
-            return graph_inputs(self.model, pins, self.pipeline.size_px[0]), rows
-        pins = pins.seen_from(self.trained) if pins.measured else pins
-        nodes_px, area_px2 = filled(self.registration, pins.nodes_px, pins.area_px2, pins.lost, self.trained)
-        if pins.measured:  # the no-contact frame told where the camera sits
-            return PinInputs(pin_features(nodes_px, area_px2, self.trained), pins.lost), rows
-        return pin_inputs(self.registration, nodes_px, area_px2, pins.lost, self.trained, together=together), rows
+        Raises
+        ------
+        TrainingError
+            The model does not estimate from pins.
+        """
+        return self._of_pins.inputs(pins, self._trained.learnt, self._trained.reference, together=together), torch.arange(len(pins))
 
-    def _estimate(self, made: Prediction, started: float) -> PoseEstimate:
-        value, half = made.mean[0], made.half_width[0]
-        return PoseEstimate(self.names, self.units, value, value - half, value + half, float(made.executed[0]), True, "", _ms(started))
+    @property
+    def _of_pins(self) -> PinModel:
+        if not isinstance(self.part, PinModel):
+            raise TrainingError(f"{self.model} estimates from pictures, not from pins; give the frames themselves")
+        return self.part
 
 
 def folder_of(run: str | Path) -> Path:

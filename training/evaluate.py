@@ -8,10 +8,9 @@ from time import perf_counter
 import numpy as np
 import torch
 
-from training.assemble import Prediction
 from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
-from training.inputs import image_inputs
+from training.models.part import Prediction
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
 from training.targets import Targets
@@ -52,10 +51,7 @@ def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndar
 
 def predict_rows_of(estimator: PoseEstimator, data: Dataset, rows: np.ndarray) -> Prediction:
     """The model's labels for some rows of a data set."""
-    estimator.check(data.pins.sensor, data.pins.form)
-    if estimator.model in ("cnn-v1", "cnn-v2"):
-        return estimator.ensemble(image_inputs(data), torch.from_numpy(rows))
-    return estimator.predict_table(data.pins.rows(rows))
+    return estimator.predict_rows(data, rows)
 
 
 def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
@@ -117,9 +113,9 @@ def leak_check(mean: np.ndarray, targets: Targets) -> Leak:
     return Leak(float(np.polyfit(turn[usable], error[usable], 1)[0]))
 
 
-def _bins(error: np.ndarray, targets) -> dict:
+def _bins(error: np.ndarray, targets: Targets) -> dict[str, list[dict]]:
     """MAE of each label by depth, angle and shear, as ``{by: [{from, to, frames, label: mae, ...}]}``."""
-    found = {}
+    found: dict[str, list[dict]] = {}
     axes = {"depth_mm": ("pose_2", DEPTH_EDGES_MM, False), "angle_deg": ("pose_6", ANGLE_EDGES_DEG, True)}
     values = {
         key: (targets.corrected[:, targets.names.index(name)], edges, size)
@@ -181,7 +177,7 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
     return [path, out / "metrics.json", _draw(out / "errors.png", made, truth, targets, labels)]
 
 
-def _draw(path: Path, made: Prediction, truth: np.ndarray, targets, labels: str) -> Path:
+def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, labels: str) -> Path:
     """Prediction over truth, and its error, for every label: the paper's test figure."""
     count = len(targets.names)
     figure, axes = new_figure(count, 2, panel_inch=3.6)

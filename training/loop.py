@@ -1,12 +1,14 @@
 """One network's training, epoch by epoch, in a state that can be kept and taken up again."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 
 import torch
 from torch import nn
 
+from training.models.part import Inputs
 from training.networks import device_of, predict_rows
 from training.recipes import Recipe
 
@@ -21,7 +23,7 @@ class Rows:
 
     Attributes
     ----------
-    inputs : PinInputs, GraphInputs or ImageInputs
+    inputs : Inputs
     labels : (M, K) float32
         Scaled.
     weight : (K,) float32
@@ -32,7 +34,7 @@ class Rows:
         Rows to learn from, and rows to watch.
     """
 
-    inputs: object
+    inputs: Inputs
     labels: torch.Tensor
     weight: torch.Tensor
     executed: torch.Tensor
@@ -40,23 +42,40 @@ class Rows:
     held: torch.Tensor
 
 
+def no_penalty(network: nn.Module) -> None:
+    """Nothing is added to the loss."""
+
+
 @dataclass
 class Loop:
-    """A network in training. ``epoch()`` runs one; ``state()`` and ``load()`` keep and restore everything that matters."""
+    """A network in training. ``epoch()`` runs one; ``state()`` and ``load()`` keep and restore everything that matters.
+
+    Parameters
+    ----------
+    network : nn.Module
+    recipe : Recipe
+    rows : Rows
+    seed : int
+        Of the rows' order.
+    penalty : callable, optional
+        A number that is added to the loss of every batch, of the network.
+    """
 
     network: nn.Module
     recipe: Recipe
     rows: Rows
     seed: int
+    penalty: Callable[[nn.Module], torch.Tensor | None] = no_penalty
     epochs_done: int = 0
     best: float = math.inf
     since_best: int = 0
-    curves: list = field(default_factory=list)
+    curves: list[dict] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         recipe = self.recipe
         parameters = list(self.network.parameters())
         self.device = device_of(self.network)
+        self.optimiser: torch.optim.Optimizer
         if recipe.decay:
             self.optimiser = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
         else:
@@ -138,8 +157,8 @@ class Loop:
             part.to(self.device) for part in (self.rows.labels[chosen], self.rows.executed[chosen], self.rows.weight)
         )
         loss = row_loss(out, labels, executed, weight, self.recipe.loss)
-        if hasattr(self.network, "penalty"):
-            loss = loss + self.network.penalty()
+        if (penalty := self.penalty(self.network)) is not None:
+            loss = loss + penalty
         self.optimiser.zero_grad()
         loss.backward()
         self.optimiser.step()

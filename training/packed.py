@@ -1,30 +1,30 @@
 """Small copies of runs, small enough to go with the package: ``config.json`` and ``weights.safetensors``.
 
-The file is in the safetensors format (https://github.com/huggingface/safetensors): 8 bytes with the length of a JSON
-header, the header with type, shape and place of each array, the arrays. Nothing in it can be run. Large arrays are kept in
-half precision, but for a Gaussian process, whose terms cancel; what the network's graph tells anyway, and attention between
-pins that are no neighbours, is left out.
+The arrays are in the safetensors format (https://github.com/huggingface/safetensors), nothing of which can be run. Large ones
+are kept in half precision; those of a Gaussian process are not, as its terms cancel. What a network's weights can do without is
+the model's own matter: see ``Model.pack``.
 """
 
 import json
-import struct
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
 
 from scenes.sensor import SensorSpec
-from training.networks import build_network
+from training.models import model_named
 from training.recipes import TrainingError
 from twin.preprocess import make_reference
 from twin.store import write_bytes, write_text
 
 WEIGHTS = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "weights"
-DERIVED = ("adjacency", "smoothing")  # not the waves: those of equal frequency are any basis, another on another machine
 LARGE = 1000  # numbers, from which an array is kept in half precision
-TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "I64": np.int64}
-PLAIN_KEYS = ("kernels", "kernel_labels", "parameters")  # no arrays, or none that are packed
+NETWORKS, BESIDE = "networks", "beside"  # groups of arrays in ``weights.pt``
+NOT_PACKED = ("kernels", "kernel_labels", "parameters")  # no arrays, or none that are packed
 
 
 def shipped_names() -> list[str]:
@@ -33,92 +33,64 @@ def shipped_names() -> list[str]:
 
 
 def pack(run: Path, out: Path) -> int:
-    """Write the small copy of a finished run of ``vgnn`` without kernel; returns its size in bytes.
+    """Write the small copy of a finished run without Gaussian processes beside its networks; returns its size in bytes.
 
     Raises
     ------
     TrainingError
-        The run is another one.
+        The run is a small copy already, has such processes, or is of a model that has no small copy.
     """
     if not (run / "weights.pt").is_file():
         raise TrainingError(f"{run}: a small copy already; give the run that it was made of")
     config = json.loads((run / "config.json").read_text())
     content = torch.load(run / "weights.pt", weights_only=True)
-    if config["model"] != "vgnn" or content["kernels"]:
-        raise TrainingError(f"{run}: only runs of vgnn with --no-kernel can be packed")
-    arrays = _flat({key: value for key, value in content.items() if key not in PLAIN_KEYS})
-    for key in [key for key in arrays if key.split(".")[-1] in DERIVED]:
-        if key.endswith("adjacency") and key.replace("adjacency", "attention") in arrays:
-            attention = key.replace("adjacency", "attention")
-            arrays[attention] = arrays[attention][arrays[key] > 0]
-        del arrays[key]
-    whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith("beside.")}
+    if content["kernels"]:
+        raise TrainingError(
+            f"{run}: has Gaussian processes beside its networks, which a small copy does not hold; only runs with --no-kernel can be packed"
+        )
+    model = model_named(config["model"])
+    kept = {key: value for key, value in content.items() if key not in NOT_PACKED}
+    kept[NETWORKS] = [model.pack(weights) for weights in content[NETWORKS]]
+    arrays = _flat(kept)
+    whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith(f"{BESIDE}.")}
     small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
-    small["reference_px"] = content["reference_px"].numpy()  # the graph is made from it
+    small["reference_px"] = content["reference_px"].numpy()  # whole: the graph is made from it
     out.mkdir(parents=True, exist_ok=True)
-    write_arrays(out / WEIGHTS, small)
-    kept = {key: value for key, value in config.items() if key not in ("data", "problems")}
-    write_text(out / "config.json", json.dumps(kept) + "\n")
+    write_bytes(out / WEIGHTS, save({key: np.ascontiguousarray(value) for key, value in small.items()}))
+    about = {key: value for key, value in config.items() if key not in ("data", "problems")}
+    write_text(out / "config.json", json.dumps(about) + "\n")
     return (out / WEIGHTS).stat().st_size
 
 
 def unpack(config: dict, path: Path) -> dict:
-    """The content of ``weights.pt`` from its small copy."""
-    content: dict = {"kernels": [], "kernel_labels": []}
-    for key, array in read_arrays(path).items():
-        *above, last = key.split(".", 2) if key.startswith("networks.") else key.split(".")
-        place = content
-        for part in above:
-            place = place.setdefault(part, {})
-        place[last] = torch.from_numpy(array.astype(np.float32 if key.startswith("networks.") else np.float64))
-    reference = make_reference(content["reference_px"].numpy(), SensorSpec.model_validate(config["sensor"]).pins.rings)
-    blank = build_network("vgnn", reference, len(content["shift"]), config["size"]).state_dict()
-    networks = []
-    for _, weights in sorted(content["networks"].items()):
-        if "attention" in weights:
-            attention = torch.zeros_like(blank["attention"])
-            attention[blank["adjacency"] > 0] = weights["attention"]
-            weights["attention"] = attention
-        networks.append(weights | {key: blank[key] for key in DERIVED if key in blank})
-    return content | {"networks": networks}
-
-
-def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write a safetensors file."""
-    codes = {np.dtype(kind): code for code, kind in TYPES.items()}
-    header, start = {}, 0
-    for key, array in sorted(arrays.items()):
-        header[key] = {"dtype": codes[array.dtype], "shape": list(array.shape), "data_offsets": [start, start + array.nbytes]}
-        start += array.nbytes
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 8)
-    data = b"".join(np.ascontiguousarray(arrays[key]).tobytes() for key in sorted(arrays))
-    write_bytes(path, struct.pack("<Q", len(text)) + text + data)
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read a safetensors file.
+    """The content of ``weights.pt`` from its small copy.
 
     Raises
     ------
     ValueError
-        It is damaged.
+        The file is damaged.
     """
-    data = path.read_bytes()
-    if len(data) < 8 or (begin := 8 + struct.unpack("<Q", data[:8])[0]) > len(data):
-        raise ValueError("cut off")
-    found = {}
-    for key, about in json.loads(data[8:begin]).items():
-        if key != "__metadata__":
-            first, last = about["data_offsets"]
-            if begin + last > len(data):
-                raise ValueError("cut off")
-            found[key] = np.frombuffer(data[begin + first : begin + last], TYPES[about["dtype"]]).reshape(about["shape"])
-    return found
+    try:
+        arrays = load_file(path)
+    except SafetensorError as error:
+        raise ValueError(f"{path.name}: {error}") from error
+    content: dict = {"kernels": [], "kernel_labels": [], "aside": {}, NETWORKS: {}}
+    for key, array in arrays.items():
+        of_network = key.startswith(f"{NETWORKS}.")
+        *above, last = key.split(".", 2) if of_network else key.split(".")
+        place = content
+        for part in above:
+            place = place.setdefault(part, {})
+        place[last] = torch.from_numpy(array.astype(np.float32 if of_network else np.float64))
+    reference = make_reference(content["reference_px"].numpy(), SensorSpec.model_validate(config["sensor"]).pins.rings)
+    model = model_named(config["model"])
+    blank = model.build(reference, len(content["shift"]), config["size"]).state_dict()
+    return content | {NETWORKS: [model.unpack(weights, blank) for _, weights in sorted(content[NETWORKS].items())]}
 
 
-def _flat(value, name: str = "") -> dict[str, np.ndarray]:
-    if isinstance(value, dict | list):
-        items = value.items() if isinstance(value, dict) else enumerate(value)
-        return {k: v for key, part in items for k, v in _flat(part, f"{name}.{key}" if name else str(key)).items()}
-    return {name: value.numpy()}
+def _flat(value: torch.Tensor | Mapping | list, name: str = "") -> dict[str, np.ndarray]:
+    """Nested arrays by the path to each: ``networks.0.enter.weight``."""
+    if isinstance(value, torch.Tensor):
+        return {name: value.numpy()}
+    items = value.items() if isinstance(value, Mapping) else enumerate(value)
+    return {k: v for key, part in items for k, v in _flat(part, f"{name}.{key}" if name else str(key)).items()}

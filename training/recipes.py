@@ -1,6 +1,6 @@
-"""How each model is trained unless told otherwise."""
+"""The settings of a training run; each model has its own (``training.models``)."""
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass
 
 from twin.errors import TwinError
 
@@ -15,8 +15,6 @@ class Recipe:
 
     Attributes
     ----------
-    inputs : {"pins", "graphs", "images"}
-        What the network sees of a frame.
     epochs, batch : int
     rate : float
         Adam's learning rate at the start.
@@ -35,10 +33,9 @@ class Recipe:
     members : int
         Networks of the ensemble; each holds out another fold.
     kernel : bool
-        Whether a Gaussian process on the network's modes is averaged in.
+        Whether a Gaussian process is averaged in, which needs a model that has modes.
     """
 
-    inputs: str = "pins"
     epochs: int = 100
     batch: int = 256
     rate: float = 2e-3
@@ -49,45 +46,9 @@ class Recipe:
     loss: str = "l1"
     scaling: str = "standard"
     members: int = 2
-    kernel: bool = True
+    kernel: bool = False
 
 
-# the release's settings; the same with more and smaller steps that end at a rate of 0, where the paper says nothing;
-# PoseNet's (Lepora 2020)
-_RELEASE = Recipe("graphs", 200, 512, 1.5e-3, "plateau", 30, 0.0, 0.0, "l1", "none", 1, False)
-_GRAPHS = Recipe("graphs", 150, 128, 2e-3, "cosine", 0, 0.0, 0.0, "l1", "none", 1, False)
-_POSENET = Recipe("images", 100, 16, 1e-4, "constant", 10, 0.0, 0.0, "l2", "unit", 1, False)
-
-RECIPES = {
-    "vgnn": Recipe(),
-    "gnn": _GRAPHS,
-    "tac-vgnn": _GRAPHS,
-    "tac-vgnn-release": _RELEASE,
-    "cnn-v1": _POSENET,
-    "cnn-v2": _POSENET,
-}
-
-
-def recipe_of(model: str, **changes) -> Recipe:
-    """The recipe of a model with some settings changed; None leaves a setting as it is.
-
-    Raises
-    ------
-    TrainingError
-        For a model or setting that does not exist.
-    """
-    if model not in RECIPES:
-        raise TrainingError(f"no model '{model}'; choose one of {', '.join(RECIPES)}")
-    known = {field.name for field in fields(Recipe)}
-    if odd := set(changes) - known:
-        raise TrainingError(f"no setting {', '.join(sorted(odd))}; there are {', '.join(sorted(known))}")
-    recipe = replace(RECIPES[model], **{key: value for key, value in changes.items() if value is not None})
-    for key in ("epochs", "batch", "members"):
-        if getattr(recipe, key) < 1:
-            raise TrainingError(f"{key} must be at least 1, got {getattr(recipe, key)}")
-    return recipe
-
-
-def as_dict(recipe: Recipe) -> dict:
+def as_dict(recipe: Recipe) -> dict[str, object]:
     """The settings as JSON holds them."""
     return asdict(recipe)

@@ -13,10 +13,12 @@ from time import monotonic
 import numpy as np
 import torch
 
-from training.assemble import calibrate, prepared_inputs
+from training.assemble import calibrate
 from training.dataset import Dataset, split_rows
 from training.loop import Loop, Rows
-from training.networks import build_network, parameter_count
+from training.models import model_named
+from training.models.part import Prepared
+from training.networks import parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
 from training.run_files import write_curves, write_tensors
 from twin.recordings.forms import blob_spec
@@ -43,7 +45,7 @@ class RunConfig:
     helpers : tuple of str
         Further label columns that are learnt beside the data set's own, with less weight.
     size : dict
-        Fields of ``VgnnSize``.
+        Sizes of the network that differ from the model's own.
     labelled : tuple of str
         Names of the real frames that what simulated pins miss was learnt from.
     """
@@ -53,9 +55,9 @@ class RunConfig:
     labels: str = "corrected"
     seed: int = 0
     split: int | None = 0
-    helpers: tuple = ()
-    size: dict = field(default_factory=dict)
-    labelled: tuple = ()
+    helpers: tuple[str, ...] = ()
+    size: dict[str, int] = field(default_factory=dict)
+    labelled: tuple[str, ...] = ()
 
 
 def train_run(
@@ -93,14 +95,14 @@ def train_run(
     train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
-    inputs, aside = prepared_inputs(config.model, data, train)
+    prepared = model_named(config.model).prepare(data, train)
     scaled, shift, scale = scaled_labels(data, config, train)
     done: list = state["done"] if state else []
     loop = None
     all_epochs = config.recipe.members * config.recipe.epochs
     while len(done) < config.recipe.members:
         member = len(done)
-        loop = _member(config, data, inputs, scaled, train, member, device)
+        loop = _member(config, data, prepared, scaled, train, member, device)
         if state and state["loop"] is not None:
             loop.load(state["loop"])
         state, kept = None, monotonic()
@@ -114,11 +116,11 @@ def train_run(
                 kept = monotonic()
             if out_of_time and not loop.finished:
                 networks = [*done, _finished(loop)]
-                _assemble(out, resolved, config, data, inputs, aside, train, networks, (shift, scale))
+                _assemble(out, resolved, config, data, prepared, train, networks, (shift, scale))
                 return False
         done.append(_finished(loop))
         _keep(out, resolved, done, None)
-    _assemble(out, resolved, config, data, inputs, aside, train, done, (shift, scale))
+    _assemble(out, resolved, config, data, prepared, train, done, (shift, scale))
     (out / "checkpoint.pt").unlink(missing_ok=True)
     return True
 
@@ -183,19 +185,20 @@ def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray) -> tuple[
     return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
 
 
-def _member(config: RunConfig, data: Dataset, inputs, scaled: torch.Tensor, train: np.ndarray, member: int, device: str) -> Loop:
-    seed = 1000 * config.seed + member
+def _member(
+    config: RunConfig, data: Dataset, prepared: Prepared, scaled: torch.Tensor, train: np.ndarray, member: int, device: str
+) -> Loop:
+    seed, model, views = 1000 * config.seed + member, model_named(config.model), prepared.views
     torch.manual_seed(seed)
-    network = build_network(config.model, data.pins.reference, scaled.shape[1], config.size)
+    network = model.build(data.pins.reference, scaled.shape[1], config.size)
     held, learnt = fold_rows(train, config.seed, member, data.group)
-    if hasattr(network, "prepare"):
-        network.prepare(inputs.x[torch.from_numpy(train)])
+    model.initialise(network, prepared.inputs, torch.from_numpy(train))
     network.to(device)
     weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
     executed = torch.from_numpy(data.targets.executed.astype(np.float32))
-    if config.model == "vgnn":  # each frame also as it is seen where the camera sits otherwise
-        scaled, executed, learnt = scaled.repeat(2, 1), executed.repeat(2), np.concatenate([learnt, len(data) + learnt])
-    return Loop(network, config.recipe, Rows(inputs, scaled, weight, executed, torch.from_numpy(learnt), torch.from_numpy(held)), seed)
+    learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # frames are watched as they are, in view 0 only
+    rows = Rows(prepared.inputs, scaled.repeat(views, 1), weight, executed.repeat(views), torch.from_numpy(learnt), torch.from_numpy(held))
+    return Loop(network, config.recipe, rows, seed, model.penalty)
 
 
 def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -217,11 +220,31 @@ def _finished(loop: Loop) -> dict:
 
 
 def _assemble(
-    out: Path, resolved: dict, config: RunConfig, data: Dataset, inputs, aside: dict, train, networks: list, scaling: tuple
+    out: Path,
+    resolved: dict,
+    config: RunConfig,
+    data: Dataset,
+    prepared: Prepared,
+    train: np.ndarray,
+    networks: list[dict],
+    scaling: tuple[np.ndarray, np.ndarray],
 ) -> None:
-    content = calibrate(config, data, inputs, train, networks, scaling)
-    content |= {"aside": aside, "reference_px": data.pins.reference.pins_px}
-    content["parameters"] = parameter_count(build_network(config.model, data.pins.reference, len(data.targets.names), config.size))
+    model = model_named(config.model)
+    content = calibrate(
+        model,
+        data,
+        prepared,
+        train,
+        networks,
+        scaling,
+        labels=config.labels,
+        helpers=config.helpers,
+        kernel=config.recipe.kernel,
+        size=config.size,
+        seed=config.seed,
+    )
+    content |= {"aside": dict(prepared.learnt), "reference_px": data.pins.reference.pins_px}
+    content["parameters"] = parameter_count(model.build(data.pins.reference, len(data.targets.names), config.size))
     write_tensors(out / "weights.pt", content)
     write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
     write_curves(out, [network["curves"] for network in networks])

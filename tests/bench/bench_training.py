@@ -11,10 +11,11 @@ import torch
 
 from scenes import load_sensor
 from training.dataset import PinTable
-from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features
+from training.models import model_named
+from training.models.cnn.inputs import ImageInputs
+from training.models.part import Inputs, PinModel
 from training.study.efficiency import measure_training
 from twin.preprocess import make_graph, nominal_reference
-from twin.recordings.forms import frame_size
 from twin.types import Form
 
 PAPER_RATIO = {"gnn": 0.86 / 1.05, "tac-vgnn": 1.0, "cnn-v1": "about 10", "cnn-v2": "2 to 3"}
@@ -34,13 +35,11 @@ def drawn_table(sensor: str, frames: int) -> PinTable:
     return PinTable(spec, Form.RECORDING, reference, take.astype(str), nodes[take], area[take], none, np.ones(frames, bool))
 
 
-def inputs_of(model: str, pins: PinTable):
-    if model == "vgnn":
-        features = pin_features(pins.nodes_px, pins.area_px2, pins.reference)
-        return PinInputs(np.concatenate([features, features]), np.concatenate([pins.lost, pins.lost]))  # it sees each frame in two ways
-    if model.startswith("cnn"):
-        return ImageInputs(np.random.default_rng(0).integers(0, 256, (len(pins), 128, 128), dtype=np.uint8))
-    return graph_inputs(model, pins, frame_size(pins.sensor, pins.form)[0])
+def inputs_of(name: str, pins: PinTable) -> Inputs:
+    model = model_named(name)
+    if isinstance(model, PinModel):
+        return model.prepare_pins(pins, np.arange(len(pins))).inputs
+    return ImageInputs(np.random.default_rng(0).integers(0, 256, (len(pins), 128, 128), dtype=np.uint8))
 
 
 def main() -> None:

@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from training.assemble import conformal_quantile, group_quantiles
-from training.inputs import frame_edges
-from training.kernel import fit_kernel
 from training.loop import row_loss
-from training.models.cnn import Cnn
-from training.models.gcn import CHANNELS, Gcn, graph_rows
-from training.models.vgnn import Vgnn, VgnnSize, mode_components
-from training.registration import fit_registration
+from training.models import MODELS
+from training.models.graphs.inputs import frame_edges
+from training.models.graphs.network import CHANNELS, Gcn, graph_rows
+from training.models.vgnn.network import Vgnn, VgnnSize, mode_components
+from training.models.vgnn.registration import fit_registration
 
 PINS, FRAMES = 40, 6
 
@@ -147,7 +146,8 @@ def test_layers_are_the_papers():
     count = {variant: sum(p.numel() for p in Gcn(3, 2, variant).parameters()) for variant in ("paper", "release")}
     assert count["release"] + sum(CHANNELS) == 37522  # as the release's network, less the biases that batch norm cancels
     assert count["paper"] < count["release"]
-    filters = [[m.out_channels for m in Cnn(name, 2).convolutions if hasattr(m, "out_channels")] for name in ("cnn-v1", "cnn-v2")]
+    networks = [MODELS[name].build(None, 2, {}) for name in ("cnn-v1", "cnn-v2")]
+    filters = [[m.out_channels for m in network.convolutions if hasattr(m, "out_channels")] for network in networks]
     assert filters == [[256] * 5, [48] * 5]
 
 
@@ -170,20 +170,6 @@ def test_intervals_of_two_kinds_of_frames_cover_both():
     assert all(abs(inside[group[2000:] == k].mean() - 0.9) < 0.03 for k in (0, 1))
     few = np.where(np.arange(2000) < 5, 1, 0)
     assert np.array_equal(group_quantiles(scores[:2000], few)[1], conformal_quantile(scores[:2000]))
-
-
-def test_the_kernel_head_leaves_rows_out_as_fitting_without_them_does():
-    rng = np.random.default_rng(6)
-    x = torch.from_numpy(rng.normal(size=(60, 3)))
-    y = torch.stack([x[:, 0] ** 2, x[:, 1]], dim=1) + 0.05 * torch.from_numpy(rng.normal(size=(60, 2)))
-    head, left_out = fit_kernel(x, y, seed=0)
-    assert float((head(x) - y).abs().mean()) < 0.1
-    keep = torch.arange(60) != 17
-    scaled = x / head.lengths[0]
-    kernel = head.smooth[0] ** 2 * torch.exp(-0.5 * torch.cdist(scaled, scaled) ** 2) + head.linear[0] ** 2 * scaled @ scaled.T
-    noisy = kernel[keep][:, keep] + (head.noise[0] ** 2 + 1e-6) * torch.eye(59)
-    without = kernel[17, keep] @ torch.linalg.solve(noisy, y[keep, 0])
-    assert torch.allclose(without, left_out[17, 0], atol=1e-6)
 
 
 def test_the_cameras_own_motion_is_taken_out_and_contact_is_left():

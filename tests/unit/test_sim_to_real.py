@@ -9,10 +9,10 @@ import pytest
 import torch
 from test_training import config_of, data  # noqa: F401  (a fixture)
 
-from training.cokriging import fit_cokriging
 from training.estimator import PoseEstimator
-from training.models import vgnn
-from training.packed import pack, read_arrays, shipped_names, write_arrays
+from training.gaussian_process import Points, fit_two_fidelities
+from training.models.vgnn import network as vgnn
+from training.packed import pack, shipped_names
 from training.recipes import TrainingError
 from training.run import train_run
 from training.run_files import write_tensors
@@ -53,10 +53,10 @@ def test_what_the_twin_misses_is_learnt_from_few_frames_and_told_honestly():
 
     truth = in_twin(real) + np.column_stack([0.5 + 0.3 * real[:, 0], 0.4 * real[:, 4]])
     few, rest = slice(0, 40), slice(40, None)
-    told, left_out = fit_cokriging(*(torch.from_numpy(part) for part in (simulated, in_twin(simulated), real[few], truth[few])), seed=0)
-    error = np.abs(told(torch.from_numpy(real[rest])).numpy() - truth[rest]).mean(axis=0)
+    told, left_out = fit_two_fidelities(simulated, in_twin(simulated), real[few], truth[few], seed=0)
+    error = np.abs(told(Points.of(real[rest], second=True)) - truth[rest]).mean(axis=0)
     assert (error < 0.3 * np.abs(in_twin(real[rest]) - truth[rest]).mean(axis=0)).all()
-    said = np.abs(left_out.numpy() - truth[few]).mean(axis=0)
+    said = np.abs(left_out - truth[few]).mean(axis=0)
     assert (said < 2 * error).all() and (said > 0.5 * error).all()
 
 
@@ -129,13 +129,6 @@ def test_a_small_copy_says_the_same_on_any_machine(data, run, tmp_path, monkeypa
     (tmp_path / "weights.safetensors").write_bytes(cut)
     with pytest.raises(TrainingError, match="damaged"):
         PoseEstimator.load(tmp_path)
-
-
-def test_arrays_come_back_as_they_were(tmp_path):
-    arrays = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array(3, np.int64), "c": np.zeros((0, 4), np.float16)}
-    write_arrays(tmp_path / "x", arrays)
-    found = read_arrays(tmp_path / "x")
-    assert all(found[key].dtype == value.dtype and np.array_equal(found[key], value) for key, value in arrays.items())
 
 
 def test_shipped_weights_load_by_name():

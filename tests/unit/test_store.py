@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from twin.calibration.calibrate_optics import _Log
 
 from scenes import load_sensor
 from training.generation.work import outcomes
+from twin.calibration.calibrate_optics import _Log
 from twin.errors import StoreError
 from twin.geometry.skin_fit import FittedPins
 from twin.mechanics.solver import SkinSolver
@@ -50,7 +50,7 @@ KEEPERS = (  # the module of every function whose results are kept between runs
     "training.dataset",
     "training.estimator",
     "training.generation.make",
-    "training.inputs",
+    "training.models.cnn.inputs",
     "twin.calibration.calibrate_optics",
     "twin.detectors.tune",
     "twin.geometry.skin_fit",

@@ -13,7 +13,9 @@ from scenes import load_sensor
 from training.dataset import Dataset, PinTable
 from training.estimator import PoseEstimator, digest_of, folder_of
 from training.evaluate import judge, leak_check, predict_rows_of, rows_to_judge, write_evaluation
-from training.recipes import TrainingError, recipe_of
+from training.models import recipe_of
+from training.models.part import Prediction
+from training.recipes import TrainingError
 from training.run import RunConfig, fold_rows, train_run
 from training.targets import Targets
 from twin.errors import FrameError
@@ -162,8 +164,6 @@ def test_each_network_watches_rows_of_its_own():
 
 
 def test_a_model_that_reads_the_clock_is_found_out(data):
-    from training.assemble import Prediction
-
     undone = data.targets.executed < 0.5
     honest = Prediction(data.targets.corrected, np.ones((FRAMES, 2)), np.ones((FRAMES, 2)), np.full(FRAMES, np.nan))
     clock = Prediction(data.targets.corrected + 0.5 * np.column_stack([np.zeros(FRAMES), data.targets.move[:, 1]]), *[None] * 3)

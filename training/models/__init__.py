@@ -1,0 +1,85 @@
+"""Every model by name. A new model is a package beside this file and one line below."""
+
+from dataclasses import asdict, fields
+
+from training.models.cnn.model import CNN_V1, CNN_V2
+from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
+from training.models.part import Model, Variant
+from training.models.vgnn.model import VGNN
+from training.recipes import Recipe, TrainingError
+
+MODELS: dict[str, Model] = {}
+WITHOUT = "-without-"  # between a model's name and the ingredient that is left out
+
+
+def register(model: Model) -> None:
+    """Make a model known by its name.
+
+    Raises
+    ------
+    ValueError
+        Another one has it.
+    """
+    if model.name in MODELS or WITHOUT in model.name:
+        raise ValueError(f"a model can't be registered as '{model.name}': another one is called so, or it holds '{WITHOUT}'")
+    MODELS[model.name] = model
+
+
+register(VGNN)
+register(GNN)
+register(TAC_VGNN)
+register(TAC_VGNN_RELEASE)
+register(CNN_V1)
+register(CNN_V2)
+
+
+def model_named(name: str) -> Model:
+    """The model of a name.
+
+    Raises
+    ------
+    TrainingError
+        There is none.
+    """
+    if name not in MODELS:
+        raise TrainingError(f"no model '{name}'; choose one of {', '.join(MODELS)}")
+    return MODELS[name]
+
+
+def variant_named(name: str) -> tuple[Model, Variant]:
+    """The model of a name, and what is changed of it: nothing, or as ``MODEL-without-PART`` says.
+
+    Raises
+    ------
+    TrainingError
+        There is no such model or part.
+    """
+    of_model, _, part = name.partition(WITHOUT)
+    model = model_named(of_model)
+    if not part:
+        return model, Variant()
+    if part not in model.variants:
+        can_be = f"can be trained without {', '.join(model.variants)}" if model.variants else "has no part that can be left out"
+        raise TrainingError(f"no model '{name}'; {model.name} {can_be}")
+    return model, model.variants[part]
+
+
+def recipe_of(model: str, **changes: object) -> Recipe:
+    """The recipe of a model with some settings changed; None leaves a setting as it is.
+
+    Raises
+    ------
+    TrainingError
+        For a model or setting that does not exist.
+    """
+    chosen = model_named(model)
+    known = {field.name for field in fields(Recipe)}
+    if odd := set(changes) - known:
+        raise TrainingError(f"no setting {', '.join(sorted(odd))}; there are {', '.join(sorted(known))}")
+    recipe = Recipe(**asdict(chosen.recipe) | {key: value for key, value in changes.items() if value is not None})
+    for key in ("epochs", "batch", "members"):
+        if getattr(recipe, key) < 1:
+            raise TrainingError(f"{key} must be at least 1, got {getattr(recipe, key)}")
+    if recipe.kernel and not chosen.has_modes:
+        raise TrainingError(f"{model} has no modes that a Gaussian process could see; train it with --no-kernel")
+    return recipe

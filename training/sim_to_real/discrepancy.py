@@ -10,19 +10,16 @@ executed. Drawn for simulated contacts, one function of the posterior for each, 
 miss, and how little it is to be trusted where the frames don't tell.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from scenes.randomisation import FrictionSpread
 from training.contact_calibration.fit import expect, mean_squared, simulate
 from training.contact_calibration.parameters import PARAMETERS
 from training.contact_calibration.simulate import Setup
+from training.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points, Posterior, likeliest
 from training.recipes import TrainingError
 from training.validation.model import MeasuredFrames
 from twin.rig.kinematics import rig_of
@@ -166,7 +163,7 @@ class Discrepancy:
     def mean_px(self, labels: list[ArmLabel], moved_px: np.ndarray) -> np.ndarray:
         """(S, N, 2) what S simulated displacements (S, N, 2) are expected to miss."""
         scaled = self._scaled(label_axes(labels))
-        amplitudes = np.stack([process.predict(scaled) for process in self.processes], axis=1)
+        amplitudes = np.stack([process.mean(Points.of(scaled)) for process in self.processes], axis=1)
         return self._fields(amplitudes, moved_px)
 
     def draw_px(self, labels: list[ArmLabel], moved_px: np.ndarray, contact: np.ndarray, seed: int) -> np.ndarray:
@@ -178,18 +175,15 @@ class Discrepancy:
             rows = np.flatnonzero(contact == number)
             rng = np.random.default_rng([seed, int(number)])
             for k, process in enumerate(self.processes):
-                mean, covariance = process.predict(scaled[rows], return_cov=True)
-                noise = process.kernel_.k2.noise_level
-                own = np.sqrt(noise) * rng.normal()  # of the frame, the same for all states of a contact
-                smooth = covariance - noise * np.eye(len(rows))
-                amplitudes[rows, k] = rng.multivariate_normal(mean, smooth, method="eigh") + own
+                own = process.kernel.noises[0] * rng.normal()  # of the frame, the same for all states of a contact
+                amplitudes[rows, k] = process.draw(Points.of(scaled[rows]), rng) + own
             shares[rows] = rng.normal(size=len(self.rest))
         return self._fields(amplitudes, moved_px, shares @ self.rest)
 
     def summary(self) -> list[dict]:
         """Of each mode: its share of the residuals, and of its variance the part that the label tells."""
         share = self.sizes**2 / ((self.sizes**2).sum() + (self.rest**2).sum())
-        noise = [process.kernel_.k2.noise_level for process in self.processes]
+        noise = [process.kernel.noises[0] ** 2 for process in self.processes]
         return [{"share": float(a), "told": float(max(0.0, 1 - n))} for a, n in zip(share, noise, strict=True)]
 
     def _scaled(self, axes: np.ndarray) -> np.ndarray:
@@ -200,12 +194,16 @@ class Discrepancy:
         return (relative * _rms_px(moved_px)[:, None]).reshape(moved_px.shape)
 
 
-def _process(axes: np.ndarray, amplitude: np.ndarray) -> GaussianProcessRegressor:
-    smooth = ConstantKernel(0.5, np.square(SIZES)) * RBF(np.full(axes.shape[1], 2.0), LENGTHS)
-    kernel = ConstantKernel(0.5, np.square(SIZES)) + smooth + WhiteKernel(0.3, NOISES)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # at a bound: an axis that doesn't matter, a mode without noise
-        return GaussianProcessRegressor(kernel).fit(axes, amplitude)
+def _process(axes: np.ndarray, amplitude: np.ndarray) -> Posterior:
+    """The likeliest process of an amplitude (K,) of labels (K, A), both of about unit size, within the bounds above."""
+
+    def kernel(length: float, size: float, variance: float) -> Kernel:
+        return Kernel(CONSTANT_AND_SMOOTH, np.full(axes.shape[1], length), np.full(2, size), np.sqrt([variance]))
+
+    points = Points.of(axes)
+    least, most = (kernel(LENGTHS[k], SIZES[k], NOISES[k]) for k in (0, 1))
+    found = likeliest(kernel(2.0, np.sqrt(0.5), 0.3), points, amplitude, least=least, most=most)
+    return Posterior(found, points, amplitude)
 
 
 def _rms_px(moved_px: np.ndarray) -> np.ndarray:

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 
 from scenes.object import ObjectSpec
-from training.assemble import intervals, kernel_inputs
-from training.cokriging import fit_cokriging
+from training.assemble import intervals
 from training.dataset import Dataset, joined, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_check, predict_rows_of
-from training.recipes import TrainingError, recipe_of
+from training.gaussian_process import fit_two_fidelities
+from training.models import recipe_of
+from training.recipes import TrainingError
 from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors
 from training.sim_to_real.discrepancy import Discrepancy
@@ -159,14 +160,13 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     ensemble, labels = estimator.ensemble, estimator.config["labels"]
     inputs, rows = estimator.inputs_of(labelled.pins, together=not labelled.pins.measured)
     mean, scale, executed = ensemble.outputs(inputs, rows)
-    seen = kernel_inputs(ensemble.networks[0], inputs, rows)
-    known = kernel_inputs(ensemble.networks[0], *estimator.inputs_of(simulated.pins, together=not simulated.pins.measured))
+    seen = ensemble.modes(inputs, rows).inputs
+    known = ensemble.modes(*estimator.inputs_of(simulated.pins, together=not simulated.pins.measured)).inputs
     truth, raw, told = (
         (values - ensemble.shift) / ensemble.scale
         for values in (getattr(labelled.targets, labels), labelled.targets.raw, getattr(simulated.targets, labels))
     )
-    process, left_out = fit_cokriging(known, torch.from_numpy(told), seen, torch.from_numpy(truth), seed=seed)
-    alone = left_out.numpy()
+    process, alone = fit_two_fidelities(known, told, seen, truth, seed=seed)
     content = torch.load(run / "weights.pt", weights_only=True)
     missed = [intervals(made, truth, raw, scale, executed) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}

@@ -10,10 +10,11 @@ import torch
 
 from training.dataset import PinTable
 from training.loop import Loop, Rows
-from training.networks import build_network, parameter_count
-from training.recipes import recipe_of
+from training.models import model_named, recipe_of
+from training.models.part import Inputs
+from training.networks import parameter_count
 
-STEPS = {"cnn-v1": 2, "cnn-v2": 4}  # batches that are timed, as whole epochs of these take many minutes on a CPU
+INITIAL_ROWS = 500  # from which a network takes what it needs before its first step: speed does not depend on it
 MIB = 2.0**20
 
 
@@ -35,7 +36,7 @@ class PeakMemory:
         self.thread.start()
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.watching = False
         self.thread.join()
         if self.device == "cuda":
@@ -52,14 +53,14 @@ class PeakMemory:
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / MIB
 
 
-def measure_training(model: str, pins: PinTable, inputs, batch: int, *, device: str = "cpu") -> dict:
+def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, device: str = "cpu") -> dict:
     """Train on a frame's inputs for a while and see what it costs.
 
     Parameters
     ----------
     pins : PinTable
         M frames.
-    inputs : PinInputs, GraphInputs or ImageInputs
+    inputs : Inputs
         Rows of an epoch: of the same frames, once or more often.
 
     Returns
@@ -69,14 +70,13 @@ def measure_training(model: str, pins: PinTable, inputs, batch: int, *, device: 
         ``s_per_epoch`` (None where only some batches were timed) and ``memory_mib``. A first pass, not timed, warms up.
     """
     torch.manual_seed(0)
-    network = build_network(model, pins.reference, 2)
-    if hasattr(network, "prepare"):
-        network.prepare(inputs.x[:500])
-    count = len(inputs)
-    timed = min(STEPS.get(model, count) * batch, count)
+    part, count = model_named(model), len(inputs)
+    network = part.build(pins.reference, 2, {})
+    part.initialise(network, inputs, torch.arange(min(INITIAL_ROWS, count)))
+    timed = count if part.timed_batches is None else min(part.timed_batches * batch, count)
     labels, executed, none = torch.randn(count, 2), torch.full((count,), torch.nan), torch.zeros(0, dtype=torch.long)
     rows = Rows(inputs, labels, torch.ones(2), executed, torch.arange(timed), none)
-    loop = Loop(network.to(device), recipe_of(model, batch=batch), rows, 0)
+    loop = Loop(network.to(device), recipe_of(model, batch=batch), rows, 0, part.penalty)
     with PeakMemory(device) as memory:
         loop.epoch()
         seconds = loop.epoch()["seconds"]

@@ -12,12 +12,8 @@ import numpy as np
 from training.dataset import Dataset
 from training.estimator import PoseEstimator
 from training.evaluate import judge, predict_rows_of, rows_to_judge
-from training.recipes import TrainingError, recipe_of
+from training.models import model_named, recipe_of, variant_named
 from training.run import RunConfig, is_finished, train_run
-
-# errors (mm, deg) of Table II, on depth [-2, 2] mm and angle [-30, 30] deg
-PAPER = {"cnn-v1": (0.06, 1.20), "cnn-v2": (0.07, 1.25), "gnn": (0.07, 1.16), "tac-vgnn": (0.05, 1.02), "tac-vgnn-release": (0.05, 1.02)}
-WITHOUT = {"graph": {"layers": 0}, "modes": {"modes": 0, "area_modes": 0}, "kernel": {}}  # what vgnn can be trained without
 
 SHOWN = (
     *("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters"),
@@ -32,7 +28,7 @@ class Plan:
     Attributes
     ----------
     name : str
-        A model, or ``vgnn-without-graph``, ``-without-modes``, ``-without-kernel``.
+        A model, or one with an ingredient left out, as ``vgnn-without-graph``.
     config : RunConfig
     """
 
@@ -53,11 +49,9 @@ def plan_run(name: str, *, labels: str, seed: int, split: int, epochs: int | Non
     TrainingError
         For a name that stands for nothing.
     """
-    model, _, part = name.partition("-without-")
-    if part and (model != "vgnn" or part not in WITHOUT):
-        raise TrainingError(f"no model '{name}'; vgnn can be trained without {', '.join(WITHOUT)}")
-    recipe = recipe_of(model, epochs=epochs, kernel=False if part in ("kernel", "modes") else None)  # the kernel sees the modes only
-    return Plan(name, RunConfig(model, recipe, labels, seed, split, size=WITHOUT.get(part, {})))
+    model, variant = variant_named(name)
+    recipe = recipe_of(model.name, epochs=epochs, **variant.recipe)
+    return Plan(name, RunConfig(model.name, recipe, labels, seed, split, size=dict(variant.size)))
 
 
 def train_all(
@@ -118,7 +112,8 @@ def table_row(plan: Plan, data: Dataset, out: Path, minutes: float | None) -> di
         for name in data.targets.names:
             row[f"{name}_{kind}"] = metrics[kind][name]["mae"]
             row[f"{name}_{kind}_inside_90"] = metrics[kind][name]["coverage_90"]
-    paper = PAPER.get(plan.config.model if plan.name == plan.config.model else "", (None, None))
+    model = model_named(plan.config.model)
+    paper = model.published_mm_deg if plan.name == model.name and model.published_mm_deg else (None, None)
     return row | {"paper_mm": paper[0], "paper_deg": paper[1]}
 
 

@@ -50,8 +50,8 @@ def study_tac_vgnn(
     import torch
 
     from scenes import load_sensor
-    from training.assemble import prepared_inputs
     from training.dataset import load_dataset
+    from training.models import model_named
     from training.networks import choose_device
     from training.recipes import TrainingError
     from training.study.contacts import recorded_contacts, twin_contacts
@@ -85,7 +85,7 @@ def study_tac_vgnn(
     written = [write_table(out / "models.csv", rows), write_table(out / "graphs.csv", graphs), draw_curves(out / "curves.png", plans, runs)]
     efficiency = []
     for model in dict.fromkeys(plan.config.model for plan in plans) if numbers["--batches"] else ():
-        inputs, _ = prepared_inputs(model, found, np.arange(len(found)))
+        inputs = model_named(model).prepare(found, np.arange(len(found))).inputs
         efficiency += [measure_training(model, found.pins, inputs, batch, device=device) for batch in numbers["--batches"]]
     if efficiency:
         written += [write_table(out / "efficiency.csv", efficiency), draw_efficiency(out / "efficiency.png", efficiency)]

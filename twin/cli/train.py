@@ -59,8 +59,9 @@ def train(
 
     from scenes import load_sensor
     from training.dataset import joined, load_dataset
+    from training.models import recipe_of
     from training.networks import choose_device
-    from training.recipes import TrainingError, recipe_of
+    from training.recipes import TrainingError
     from training.run import RunConfig, train_run
     from twin.cli.progress import count_bar, epoch_bar
 

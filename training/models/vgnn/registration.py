@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from training.models.vgnn.modes import spanned
+
 MODES, SQUARED = 40, 20  # modes taken linearly, and those of them whose products are taken too
 RIDGE = 0.1
-LEAST_SIZE = 1e-6  # of a mode, relative to the largest
 FILL_RIDGE, FILL_ROUNDS = 1e-3, 3
 MANY, COMMON = 30, 1.5  # frames whose median difference, if larger than that usual size, is their one camera's
 FREE, FULL = 6.0, 9.0  # differences, in their usual size, up to which nothing and from which everything is taken out
@@ -119,7 +120,7 @@ def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registr
     flat = aligned.reshape(len(aligned), -1)
     mean = flat.mean(axis=0)
     _, sizes, directions = np.linalg.svd(flat - mean, full_matrices=False)
-    keep = int((sizes[:MODES] > LEAST_SIZE * sizes[0]).sum())  # few frames span fewer: the last of their modes is no direction
+    keep = spanned(sizes, MODES)
     components = directions[:keep].T / np.maximum(sizes[:keep] / np.sqrt(len(flat)), 1e-9)
     terms = _terms((flat - mean) @ components)
     inverse = np.linalg.inv(terms.T @ terms + RIDGE * np.eye(terms.shape[1]))

@@ -7,6 +7,7 @@ dense units 96, 64, 2; the release's 128, 96, 2, the first two with batch norm.
 
 import warnings
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -52,7 +53,7 @@ class GraphRows:
             return torch.sparse_csr_tensor(crow, column, weight, size, check_invariants=False)
 
 
-def graph_rows(edges: list, nodes: int, *, transposed: bool = False) -> GraphRows:
+def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False) -> GraphRows:
     """Normalise the directed edges (E_k, 2), source and target, of graphs of ``nodes`` nodes each; every node gets a loop.
 
     A row holds the in-edges of a node, with ``1 / sqrt(d_i d_j)``, d the in-degrees with loop; transposed, its out-edges.
@@ -83,7 +84,29 @@ class GraphConvolution(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, matrix, transpose, h, weight, gain, offset, eps):
+    def forward(
+        ctx: Any,  # PyTorch declares no type that holds what is kept here
+        matrix: torch.Tensor,
+        transpose: torch.Tensor,
+        h: torch.Tensor,
+        weight: torch.Tensor,
+        gain: torch.Tensor,
+        offset: torch.Tensor,
+        eps: float,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Activations (V, D) of the nodes of all graphs, and mean and variance (D,) of what the norm saw.
+
+        Parameters
+        ----------
+        matrix, transpose : (V, V) sparse rows
+            A and its transpose.
+        h : (V, C) float
+        weight : (D, C) float
+        gain, offset : (D,) float
+            Of the norm.
+        eps : float
+            Added to the variance.
+        """
         around = _product(matrix, h)
         mean = around.mean(dim=0)
         around.sub_(mean)
@@ -99,7 +122,8 @@ class GraphConvolution(torch.autograd.Function):
         return out, mean, variance
 
     @staticmethod
-    def backward(ctx, gradient, *_):
+    def backward(ctx: Any, gradient: torch.Tensor, *_: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Derivatives with respect to the arguments of ``forward``, from those with respect to its activations (V, D)."""
         around, out, weight, gain, spread, inverse = ctx.saved_tensors
         size = gain * inverse
         of_norm = torch.ops.aten.leaky_relu_backward(gradient, out, SLOPE, True)  # of the norm's output
@@ -140,7 +164,7 @@ class Gcn(nn.Module):
         self.convolutions = nn.ModuleList([nn.Linear(a, b, bias=False) for a, b in zip(widths[:-1], widths[1:], strict=True)])
         self.norms = nn.ModuleList([nn.BatchNorm1d(c) for c in CHANNELS])
         for layer in self.convolutions:
-            nn.init.xavier_uniform_(layer.weight)
+            nn.init.xavier_uniform_(cast(nn.Linear, layer).weight)
         dense: list[nn.Module] = []
         width = CHANNELS[-1]
         for units in DENSE[variant]:
@@ -166,20 +190,20 @@ class Gcn(nn.Module):
         graphs, nodes = x.shape[:2]
         h = x.reshape(graphs * nodes, -1)
         for layer, norm in zip(self.convolutions, self.norms, strict=True):
-            h = self._convolved(h, matrix, transpose, layer.weight, norm)
+            h = self._convolved(h, matrix, transpose, cast(nn.Linear, layer).weight, cast(nn.BatchNorm1d, norm))
         return {"mean": self.dense(h.view(graphs, nodes, -1).mean(dim=1))}
 
-    def _convolved(self, h, matrix, transpose, weight, norm: nn.BatchNorm1d) -> torch.Tensor:
+    def _convolved(
+        self, h: torch.Tensor, matrix: torch.Tensor, transpose: torch.Tensor, weight: torch.Tensor, norm: nn.BatchNorm1d
+    ) -> torch.Tensor:
+        running_mean, running_var = cast(torch.Tensor, norm.running_mean), cast(torch.Tensor, norm.running_var)
         if not self.training:
-            size = norm.weight * (norm.running_var + norm.eps).rsqrt()
-            out = torch.addmm(norm.bias - size * norm.running_mean, matrix @ h, (size[:, None] * weight).T)
+            size = norm.weight * (running_var + norm.eps).rsqrt()
+            out = torch.addmm(norm.bias - size * running_mean, matrix @ h, (size[:, None] * weight).T)
             return nn.functional.leaky_relu_(out, SLOPE)
         out, mean, variance = GraphConvolution.apply(matrix, transpose, h, weight, norm.weight, norm.bias, norm.eps)
         with torch.no_grad():
-            norm.running_mean.lerp_(mean, norm.momentum)
-            norm.running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), norm.momentum)
+            momentum = cast(float, norm.momentum)
+            running_mean.lerp_(mean, momentum)
+            running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), momentum)
         return out
-
-    def configuration(self) -> dict:
-        """What builds the same network again."""
-        return {"features": self.features, "outputs": self.outputs, "variant": self.variant}

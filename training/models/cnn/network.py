@@ -12,8 +12,6 @@ from torch import nn
 
 INPUT_PX = 128
 DROPOUT = 0.06
-FILTERS = {"cnn-v1": 256, "cnn-v2": 48}
-DENSE = {"cnn-v1": (64,), "cnn-v2": (64, 64)}
 LAYERS = 5
 L1, L2 = 6e-4, 1e-3  # of the dense weights, as PoseNet
 
@@ -23,25 +21,28 @@ class Cnn(nn.Module):
 
     Parameters
     ----------
-    name : {"cnn-v1", "cnn-v2"}
+    filters : int
+        Of each convolution.
+    dense : tuple of int
+        Units of the dense layers before the last one.
     outputs : int
+        Labels K.
     """
 
-    def __init__(self, name: str, outputs: int) -> None:
+    def __init__(self, filters: int, dense: tuple[int, ...], outputs: int) -> None:
         super().__init__()
-        self.name, self.outputs = name, outputs
-        filters = FILTERS[name]
         layers: list[nn.Module] = []
         for k in range(LAYERS):
             layers += [nn.Conv2d(1 if k == 0 else filters, filters, 3), nn.MaxPool2d(2), nn.ELU()]
-        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)
+        self.convolutions = nn.Sequential(*layers)
+        self.convolutions.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # the stubs leave memory_format out
         with torch.no_grad():
             width = self.convolutions(torch.zeros(1, 1, INPUT_PX, INPUT_PX)).numel()
-        dense: list[nn.Module] = [nn.Dropout(DROPOUT)]
-        for units in DENSE[name]:
-            dense += [nn.Linear(width, units), nn.ELU(), nn.Dropout(DROPOUT)]
+        head: list[nn.Module] = [nn.Dropout(DROPOUT)]
+        for units in dense:
+            head += [nn.Linear(width, units), nn.ELU(), nn.Dropout(DROPOUT)]
             width = units
-        self.dense = nn.Sequential(*dense, nn.Linear(width, outputs))
+        self.dense = nn.Sequential(*head, nn.Linear(width, outputs))
 
     def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
         """Labels ``mean`` (B, K) from frames (B, 128, 128) uint8."""
@@ -50,9 +51,5 @@ class Cnn(nn.Module):
 
     def penalty(self) -> torch.Tensor:
         """The regularisation of the hidden dense weights."""
-        weights = [layer.weight for layer in self.dense[:-1] if isinstance(layer, nn.Linear)]
-        return sum(L1 * w.abs().sum() + L2 * w.square().sum() for w in weights)
-
-    def configuration(self) -> dict:
-        """What builds the same network again."""
-        return {"name": self.name, "outputs": self.outputs}
+        weights = [layer.weight for layer in list(self.dense)[:-1] if isinstance(layer, nn.Linear)]
+        return torch.stack([L1 * w.abs().sum() + L2 * w.square().sum() for w in weights]).sum()

@@ -12,15 +12,17 @@ A multi-layer perceptron with skip connections turns both into the labels, the l
 logit that the shear move was executed.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
 from torch import nn
 
+from training.models.vgnn.modes import spanned
+
 FEATURES = 3  # dx, dy, log area ratio
 FILL_RIDGE = 1e-3
-LEAST_SIZE = 1e-5  # of a mode, relative to the largest: of few rows the last mode is single precision's rounding, no direction
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,15 @@ class Vgnn(nn.Module):
     outputs : int
         Labels K.
     """
+
+    adjacency: torch.Tensor  # (N, N) 1 where the column's pin is a neighbour of the row's
+    scale: torch.Tensor  # (FEATURES,) deviation of each feature
+    smoothing: torch.Tensor  # (N, N) mean over a pin and its neighbours
+    components: torch.Tensor  # (2 N, modes)
+    mode_mean: torch.Tensor  # (2 N,)
+    area_components: torch.Tensor  # (N, area_modes)
+    area_mean: torch.Tensor  # (N,)
+    waves: torch.Tensor  # (N, frequencies)
 
     def __init__(self, edges: np.ndarray, pins: int, outputs: int, size: VgnnSize | None = None) -> None:
         super().__init__()
@@ -165,14 +176,10 @@ class Vgnn(nn.Module):
             self._weights = weights.detach()
         return self._weights
 
-    def train(self, mode: bool = True) -> "Vgnn":
+    def train(self, mode: bool = True) -> Self:
         """Switch between training and evaluation."""
         self._weights = None
         return super().train(mode)
-
-    def configuration(self) -> dict:
-        """What builds the same network again, beside its edges."""
-        return {"pins": self.pins, "outputs": self.outputs, "size": asdict(self.size)}
 
 
 def fill_lost(x: torch.Tensor, lost: torch.Tensor, adjacency: torch.Tensor) -> torch.Tensor:
@@ -195,7 +202,7 @@ def mode_components(centred: torch.Tensor, count: int) -> torch.Tensor:
     The square root keeps small modes, which carry the finer facts, within a network's reach. Missing modes are 0.
     """
     _, sizes, directions = torch.linalg.svd(centred.double(), full_matrices=False)
-    keep = min(count, int((sizes > LEAST_SIZE * sizes[0]).sum()))
+    keep = spanned(sizes.numpy(), count)
     deviation = sizes[:keep] / len(centred) ** 0.5
     found = torch.zeros(centred.shape[1], count)
     found[:, :keep] = (directions[:keep].T * (3 * (sizes[:keep] / sizes[0]).sqrt() / deviation)).float()

@@ -1,0 +1,403 @@
+"""Gaussian processes: one implementation for the labels beside the networks, for two fidelities, and for what a twin misses.
+
+With inputs a, b in units of the kernel's lengths (one length for every input), the covariance of two rows is a sum of terms,
+
+    smooth    s^2 exp(-|a - b|^2 / 2 r^2)     with r = 1 where the term has no reach of its own
+    linear    s^2 a.b
+    constant  s^2
+
+A row is of the first or the second kind. Some terms count only between two rows of the second kind: so two fidelities are
+described (Kennedy and O'Hagan 2000, eq. 1 with rho = 1), the first kind being simulated, the second real. Each kind has noise
+of its own.
+
+Lengths, sizes and noises maximise the log marginal likelihood (Rasmussen and Williams 2006, eq. 5.8), whose gradient is
+written out below (eq. 5.9). What a row is predicted as when it is left out comes in closed form (eq. 5.12).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.optimize import minimize
+
+JITTER = 1e-6  # variance that is added to every row, of labels of about unit variance: rounding must not spoil the factorisation
+FIT_ROWS = 1000  # rows, of each kind of data, on which the likelihood is maximised: more change nothing and cost their third power
+CLIMB_STEPS = 60  # of Adam: by then the likelihood of some hundred rows has settled
+CLIMB_RATE = 0.1  # of Adam, in the parameters' logarithms: a factor of 1.1 a step at most
+ADAM_DECAYS = (0.9, 0.999)  # of the means of gradient and squared gradient (Kingma and Ba 2015)
+ADAM_LEAST = 1e-8  # added to the root mean squared gradient (Kingma and Ba 2015)
+LEAST_SPREAD = 1e-9  # of an input, in its own unit: a constant input must not divide by 0
+
+
+@dataclass(frozen=True)
+class Term:
+    """One summand of a kernel.
+
+    Attributes
+    ----------
+    shape : {"smooth", "linear", "constant"}
+    second : bool
+        Whether it counts only between two rows of the second kind.
+    reaches : bool
+        Whether a smooth term has a reach r of its own, in units of the lengths.
+    """
+
+    shape: Literal["smooth", "linear", "constant"]
+    second: bool = False
+    reaches: bool = False
+
+
+SMOOTH_AND_LINEAR = (Term("smooth"), Term("linear"))
+TWO_FIDELITIES = (
+    *SMOOTH_AND_LINEAR,
+    Term("smooth", second=True, reaches=True),
+    Term("linear", second=True),
+    Term("constant", second=True),
+)
+CONSTANT_AND_SMOOTH = (Term("constant"), Term("smooth"))
+
+
+@dataclass(frozen=True)
+class Points:
+    """Rows that a process knows or is asked about.
+
+    Attributes
+    ----------
+    inputs : (M, D) float
+    second : (M,) float
+        1 for rows of the second kind, 0 for those of the first.
+    """
+
+    inputs: np.ndarray
+    second: np.ndarray
+
+    @classmethod
+    def of(cls, inputs: np.ndarray, *, second: bool = False) -> "Points":
+        """Rows (M, D) that are all of one kind."""
+        return cls(inputs, np.full(len(inputs), float(second)))
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def rows(self, index: np.ndarray) -> "Points":
+        """Only some rows."""
+        return Points(self.inputs[index], self.second[index])
+
+
+class Placed(NamedTuple):
+    """Rows in units of a kernel's lengths: ``rows`` (M, D), their squared sizes (M,), and which are of the second kind (M,)."""
+
+    rows: np.ndarray
+    squares: np.ndarray
+    second: np.ndarray
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """The covariance with all its numbers.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        T of them.
+    lengths : (D,) float
+        In the inputs' units.
+    sizes : (T,) float
+        s of each term, in the label's unit.
+    noises : (1,) or (2,) float
+        Standard deviation of the noise, of all rows or of each kind.
+    reach : float
+        r of the terms that have one.
+    """
+
+    terms: tuple[Term, ...]
+    lengths: np.ndarray
+    sizes: np.ndarray
+    noises: np.ndarray
+    reach: float = 1.0
+
+    def __call__(self, a: Points, b: Points) -> np.ndarray:
+        """(A, B) the covariance between rows, without noise."""
+        return self.between(self.placed(a), self.placed(b))
+
+    def placed(self, points: Points) -> Placed:
+        """Rows in units of the lengths."""
+        rows = points.inputs / self.lengths
+        return Placed(rows, (rows**2).sum(axis=1), points.second)
+
+    def between(self, a: Placed, b: Placed) -> np.ndarray:
+        """(A, B) the covariance between rows, without noise."""
+        inner, squared = _products(a, b)
+        found = np.zeros_like(inner)
+        for term, size in zip(self.terms, self.sizes, strict=True):
+            part = size**2 * self._shape(term, inner, squared)
+            found += part * np.outer(a.second, b.second) if term.second else part
+        return found
+
+    def noisy(self, points: Points) -> np.ndarray:
+        """(M, M) the covariance of the rows' labels, noise and ``JITTER`` included."""
+        return self(points, points) + np.diag(self._noise_of(points) ** 2 + JITTER)
+
+    def logs(self) -> np.ndarray:
+        """All numbers' logarithms in one row: lengths, sizes, noises, and the reach where a term has one."""
+        return np.log(np.concatenate([self.lengths, self.sizes, self.noises, [self.reach] if self._reaches else []]))
+
+    def with_logs(self, logs: np.ndarray) -> "Kernel":
+        """The same kernel with other numbers, in the order of ``logs``."""
+        values = np.exp(logs)
+        ends = np.cumsum([len(self.lengths), len(self.sizes), len(self.noises)])
+        reach = float(values[-1]) if self._reaches else self.reach
+        return replace(self, lengths=values[: ends[0]], sizes=values[ends[0] : ends[1]], noises=values[ends[1] : ends[2]], reach=reach)
+
+    def log_likelihood(self, points: Points, label: np.ndarray) -> tuple[float, np.ndarray]:
+        """Log marginal likelihood of a label (M,) with mean 0, and its gradient with respect to ``logs``.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            The rows' covariance is not positive definite, not even with ``JITTER``.
+        """
+        factor = cholesky(self.noisy(points), lower=True)
+        weight = cho_solve((factor, True), label)
+        value = -0.5 * label @ weight - np.log(np.diag(factor)).sum() - 0.5 * len(label) * np.log(2 * np.pi)
+        pull = 0.5 * (np.outer(weight, weight) - cho_solve((factor, True), np.eye(len(label))))  # of the value, on the covariance
+        return float(value), self._gradient(points, pull)
+
+    def _gradient(self, points: Points, pull: np.ndarray) -> np.ndarray:
+        """Derivatives with respect to ``logs`` of a number whose derivatives with respect to ``noisy(points)`` are ``pull`` (M, M)."""
+        here = self.placed(points)
+        a, (inner, squared) = here.rows, _products(here, here)
+        of_inner, of_squared = np.zeros_like(inner), np.zeros_like(inner)
+        sizes, reach = np.empty(len(self.terms)), 0.0
+        for k, (term, size) in enumerate(zip(self.terms, self.sizes, strict=True)):
+            part = pull * np.outer(points.second, points.second) if term.second else pull
+            shaped = size**2 * part * self._shape(term, inner, squared)
+            sizes[k] = 2 * shaped.sum()
+            if term.shape == "linear":
+                of_inner += size**2 * part
+            elif term.shape == "smooth":
+                of_squared -= 0.5 * shaped / self._reach_of(term) ** 2
+                if term.reaches:
+                    reach += (shaped * squared).sum() / self.reach**2
+        # a.b and |a - b|^2 fall with the square of each length: with columns x of a, sum_ij W_ij (x_i - x_j)^2 = 2 (w.x^2 - x.W x)
+        twice = 2 * (of_squared.sum(axis=1) @ a**2 - (a * (of_squared @ a)).sum(axis=0))
+        lengths = -2 * twice - 2 * (a * (of_inner @ a)).sum(axis=0)
+        noise = 2 * self._noise_of(points) ** 2 * np.diag(pull)
+        noises = [noise.sum()] if len(self.noises) == 1 else [(noise * (1 - points.second)).sum(), (noise * points.second).sum()]
+        return np.concatenate([lengths, sizes, noises, [reach] if self._reaches else []])
+
+    def _shape(self, term: Term, inner: np.ndarray, squared: np.ndarray) -> np.ndarray:
+        if term.shape == "smooth":
+            return np.exp(-0.5 * squared / self._reach_of(term) ** 2)
+        return inner if term.shape == "linear" else np.ones_like(inner)
+
+    def _reach_of(self, term: Term) -> float:
+        return self.reach if term.reaches else 1.0
+
+    def _noise_of(self, points: Points) -> np.ndarray:
+        return self.noises[points.second.astype(int) if len(self.noises) > 1 else np.zeros(len(points), int)]
+
+    @property
+    def _reaches(self) -> bool:
+        return any(term.reaches for term in self.terms)
+
+
+def climbed(start: Kernel, points: Points, label: np.ndarray) -> Kernel:
+    """The kernel after ``CLIMB_STEPS`` steps of Adam up the likelihood of a label (M,).
+
+    It stops before the top: with many lengths and few rows the top explains the rows to the last, and others worse.
+    """
+    logs, mean, square = start.logs(), np.zeros_like(start.logs()), np.zeros_like(start.logs())
+    first, second = ADAM_DECAYS
+    for step in range(1, CLIMB_STEPS + 1):
+        gradient = -start.with_logs(logs).log_likelihood(points, label)[1]
+        mean = first * mean + (1 - first) * gradient
+        square = second * square + (1 - second) * gradient**2
+        size = np.sqrt(square / (1 - second**step)) + ADAM_LEAST
+        logs = logs - CLIMB_RATE * mean / (1 - first**step) / size
+    return start.with_logs(logs)
+
+
+def likeliest(start: Kernel, points: Points, label: np.ndarray, *, least: Kernel, most: Kernel) -> Kernel:
+    """The kernel of the largest likelihood of a label (M,) whose numbers lie between those of ``least`` and ``most``.
+
+    Sought by L-BFGS-B (Byrd et al. 1995) from ``start``, in the logarithms of lengths and variances.
+    """
+    per_log = np.ones_like(start.logs())
+    per_log[len(start.lengths) : len(start.lengths) + len(start.sizes) + len(start.noises)] = 2.0  # variances
+
+    def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = start.with_logs(scaled / per_log).log_likelihood(points, label)
+        return -value, -gradient / per_log
+
+    bounds = np.column_stack([least.logs(), most.logs()]) * per_log[:, None]
+    found = minimize(objective, start.logs() * per_log, jac=True, method="L-BFGS-B", bounds=bounds)
+    return start.with_logs(found.x / per_log)
+
+
+class Posterior:
+    """What a process says of one label once it knows rows.
+
+    Parameters
+    ----------
+    kernel : Kernel
+    points : Points
+        M rows.
+    label : (M,) float
+        With mean 0.
+
+    Attributes
+    ----------
+    weight : (M,) float
+        Of each row in a prediction.
+    left_out : (M,) float
+        What each row is predicted as when it is left out.
+    """
+
+    def __init__(self, kernel: Kernel, points: Points, label: np.ndarray) -> None:
+        self.kernel, self.points = kernel, points
+        self._factor = cholesky(kernel.noisy(points), lower=True)
+        self.weight = cho_solve((self._factor, True), label)
+        columns = solve_triangular(self._factor, np.eye(len(points)), lower=True)
+        self.left_out = label - self.weight / (columns**2).sum(axis=0)
+
+    def mean(self, asked: Points) -> np.ndarray:
+        """(B,) the expected label of other rows."""
+        return self.kernel(asked, self.points) @ self.weight
+
+    def covariance(self, asked: Points) -> np.ndarray:
+        """(B, B) how uncertain the label of other rows is, without their noise."""
+        half = solve_triangular(self._factor, self.kernel(self.points, asked), lower=True)
+        return self.kernel(asked, asked) - half.T @ half
+
+    def draw(self, asked: Points, rng: np.random.Generator) -> np.ndarray:
+        """(B,) a label of other rows, drawn without their noise: one function of the posterior at all of them."""
+        return rng.multivariate_normal(self.mean(asked), self.covariance(asked), method="eigh")
+
+
+class Processes:
+    """The expected values of K labels, by a process for each that knows the same rows. Small enough to go into a file.
+
+    Parameters
+    ----------
+    kernels : list of Kernel
+        K of the same terms.
+    points : Points
+        M rows.
+    weight : (M, K) float
+    """
+
+    def __init__(self, kernels: list[Kernel], points: Points, weight: np.ndarray) -> None:
+        self.kernels, self.points, self.weight = kernels, points, weight
+        self._placed = [kernel.placed(points) for kernel in kernels]  # once, not for every frame
+
+    def __call__(self, asked: Points) -> np.ndarray:
+        """(B, K) for other rows."""
+        found = [
+            kernel.between(kernel.placed(asked), placed) @ weight
+            for kernel, placed, weight in zip(self.kernels, self._placed, self.weight.T, strict=True)
+        ]
+        return np.stack(found, axis=1)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that ``of_arrays`` needs beside the terms."""
+        stacked = {key: np.stack([getattr(kernel, key) for kernel in self.kernels]) for key in ("lengths", "sizes", "noises", "reach")}
+        return stacked | {"inputs": self.points.inputs, "second": self.points.second, "weight": self.weight}
+
+    @classmethod
+    def of_arrays(cls, terms: tuple[Term, ...], arrays: Mapping[str, np.ndarray | torch.Tensor]) -> "Processes":
+        """What ``arrays`` was taken from.
+
+        Raises
+        ------
+        KeyError
+            An array is missing.
+        """
+        found = {key: np.asarray(arrays[key], np.float64) for key in ("lengths", "sizes", "noises", "reach", "inputs", "second", "weight")}
+        each = zip(found["lengths"], found["sizes"], found["noises"], found["reach"], strict=True)
+        kernels = [Kernel(terms, lengths, sizes, noises, float(reach)) for lengths, sizes, noises, reach in each]
+        return cls(kernels, Points(found["inputs"], found["second"]), found["weight"])
+
+
+def fit_processes(inputs: np.ndarray, labels: np.ndarray, *, seed: int, progress: Callable | None = None) -> tuple[Processes, np.ndarray]:
+    """Smooth and linear processes of K standardised labels (M, K) on inputs (M, D).
+
+    Parameters
+    ----------
+    seed : int
+        Of the rows on which the likelihood is maximised; the solution then uses all.
+    progress : callable, optional
+        Called with (labels done, K).
+
+    Returns
+    -------
+    Processes
+    left_out : (M, K) float
+        What each row is predicted as when it is left out; lengths, sizes and noises have seen it.
+    """
+    points = Points.of(inputs)
+    start = Kernel(SMOOTH_AND_LINEAR, 5.0 * _spread(inputs), np.array([1.0, 0.3]), np.array([0.05]))
+    return _fitted(start, points, labels, drawn_rows(len(points), seed), progress)
+
+
+def fit_two_fidelities(
+    simulated: np.ndarray, simulated_labels: np.ndarray, real: np.ndarray, real_labels: np.ndarray, *, seed: int
+) -> tuple[Processes, np.ndarray]:
+    """Labels from S simulated states and n real frames together: a real label is the simulated one of such inputs plus a difference.
+
+    Both are processes (co-kriging, Kennedy and O'Hagan 2000).
+
+    Parameters
+    ----------
+    simulated, real : (S, D) and (n, D) float
+        Inputs.
+    simulated_labels, real_labels : (S, K) and (n, K) float
+        Standardised.
+    seed : int
+        Of the simulated states that are used: many change nothing, some hundreds tell how labels go with inputs.
+
+    Returns
+    -------
+    Processes
+    left_out : (n, K) float
+        What each real frame is predicted as when it is left out; lengths, sizes and noises have seen it.
+    """
+    chosen = drawn_rows(len(simulated), seed)
+    inputs, labels = np.concatenate([simulated[chosen], real]), np.concatenate([simulated_labels[chosen], real_labels])
+    points = Points(inputs, np.repeat([0.0, 1.0], [len(chosen), len(real)]))
+    start = Kernel(TWO_FIDELITIES, 5.0 * _spread(inputs), np.array([1.0, 0.3, 0.1, 0.1, 0.1]), np.array([0.05, 0.05]), 2.0)
+    processes, left_out = _fitted(start, points, labels, np.arange(len(points)), None)
+    return processes, left_out[len(chosen) :]
+
+
+def drawn_rows(count: int, seed: int) -> np.ndarray:
+    """At most ``FIT_ROWS`` of ``count`` rows, in random order.
+
+    PyTorch's generator draws them, as it always has: another one would give other rows, and so other models from the same seed.
+    """
+    return torch.randperm(count, generator=torch.Generator().manual_seed(seed))[:FIT_ROWS].numpy()
+
+
+def _fitted(start: Kernel, points: Points, labels: np.ndarray, rows: np.ndarray, progress: Callable | None) -> tuple[Processes, np.ndarray]:
+    kernels, weights, left_out = [], [], []
+    for k, label in enumerate(labels.T):
+        posterior = Posterior(climbed(start, points.rows(rows), label[rows]), points, label)
+        kernels.append(posterior.kernel)
+        weights.append(posterior.weight)
+        left_out.append(posterior.left_out)
+        if progress:
+            progress(k + 1, labels.shape[1])
+    return Processes(kernels, points, np.stack(weights, axis=1)), np.stack(left_out, axis=1)
+
+
+def _spread(inputs: np.ndarray) -> np.ndarray:
+    return np.maximum(inputs.std(axis=0, ddof=1), LEAST_SPREAD)
+
+
+def _products(a: Placed, b: Placed) -> tuple[np.ndarray, np.ndarray]:
+    """(A, B) inner products and squared distances of rows."""
+    inner = a.rows @ b.rows.T
+    return inner, np.maximum(a.squares[:, None] + b.squares - 2 * inner, 0.0)

@@ -1,0 +1,1 @@
+"""The convolutional baselines: see ``training.models.cnn.model``."""

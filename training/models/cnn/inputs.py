@@ -1,0 +1,53 @@
+"""What the convolutional networks see of frames: small grey images."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import torch
+
+from training.dataset import Dataset
+from training.models.cnn.network import INPUT_PX
+from twin.recordings import open_recording
+from twin.recordings.forms import gray_levels
+from twin.store import cached_arrays
+
+
+class ImageInputs:
+    """Frames of 128 x 128: ``batch`` gives (B, 128, 128) uint8.
+
+    Parameters
+    ----------
+    images : (M, 128, 128) uint8
+    """
+
+    def __init__(self, images: np.ndarray) -> None:
+        self.images = torch.from_numpy(images)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Arguments of the network for some rows."""
+        return (self.images[rows],)
+
+
+def small_image(image: np.ndarray) -> np.ndarray:
+    """A frame as the convolutional networks see it: (128, 128) uint8."""
+    return cv2.resize(gray_levels(image), (INPUT_PX, INPUT_PX), interpolation=cv2.INTER_AREA)
+
+
+def image_inputs(dataset: Dataset, progress: Callable | None = None) -> ImageInputs:
+    """The frames of a data set, small, in its order."""
+
+    def compute() -> dict[str, np.ndarray]:
+        recording = open_recording(dataset.folder, dataset.pins.sensor, dataset.pins.form)
+        images = {}
+        for frame in recording:
+            images[frame.name] = small_image(frame.image)
+            if progress:
+                progress(frame.sequence + 1, len(recording))
+        return {"images": np.stack([images[name] for name in dataset.pins.image_name])}
+
+    key = {"path": str(dataset.folder.resolve()), "names": dataset.pins.image_name.tolist(), "pins": dataset.pins.nodes_px.tobytes()}
+    return ImageInputs(cached_arrays("small-images", key | {"px": INPUT_PX}, compute)["images"])

@@ -1,0 +1,1 @@
+"""The paper's graph networks: see ``training.models.graphs.model``."""

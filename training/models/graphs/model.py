@@ -1,0 +1,72 @@
+"""The paper's graph networks as models: ``gnn``, ``tac-vgnn`` and ``tac-vgnn-release``."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from training.dataset import PinTable
+from training.models.graphs.inputs import GraphInputs, frame_edges, pixel_features
+from training.models.graphs.network import Gcn
+from training.models.part import Learnt, PinModel, refuse_sizes
+from training.recipes import Recipe
+from twin.preprocess.reference import Reference
+from twin.recordings.forms import frame_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphModel(PinModel):
+    """A graph network on a graph of its own for every frame.
+
+    Attributes
+    ----------
+    edges : {"knn", "delaunay"}
+        Nearest neighbours, with x and y at the nodes; or Delaunay's, with x, y and the Voronoi area.
+    dense : {"paper", "release"}
+        The dense layers, as the paper states them or as the published code has them.
+    """
+
+    edges: Literal["knn", "delaunay"]
+    dense: Literal["paper", "release"] = "paper"
+
+    def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Gcn:
+        """See ``Model``; there are no sizes."""
+        refuse_sizes(self, size)
+        return Gcn(3 if self._sees_areas else 2, outputs, self.dense)
+
+    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> GraphInputs:
+        """See ``PinModel``; nothing is learnt beforehand, and where the camera sits is not asked."""
+        width_px = frame_size(pins.sensor, pins.form)[0]
+        features = pixel_features(pins.nodes_px, pins.area_px2 if self._sees_areas else None, width_px)
+        edges = [frame_edges(self.edges, nodes_px) for nodes_px in pins.nodes_px]
+        return GraphInputs(features, edges, symmetric=self._sees_areas)
+
+    @property
+    def _sees_areas(self) -> bool:
+        return self.edges == "delaunay"
+
+
+# Where the paper says nothing: the release's settings with smaller batches, so more steps, that end at a rate of 0.
+PAPER_RECIPE = Recipe(epochs=150, batch=128, rate=2e-3, schedule="cosine", decay=0.0, average=0.0, scaling="none", members=1)
+RELEASE_RECIPE = replace(PAPER_RECIPE, epochs=200, batch=512, rate=1.5e-3, schedule="plateau", patience=30)
+
+GNN = GraphModel(
+    name="gnn",
+    description="the paper's graph network on nearest neighbours, without areas",
+    recipe=PAPER_RECIPE,
+    edges="knn",
+    published_mm_deg=(0.07, 1.16),
+)
+TAC_VGNN = GraphModel(
+    name="tac-vgnn",
+    description="the paper's network on Delaunay graphs with Voronoi areas",
+    recipe=PAPER_RECIPE,
+    edges="delaunay",
+    published_mm_deg=(0.05, 1.02),
+)
+TAC_VGNN_RELEASE = replace(
+    TAC_VGNN,
+    name="tac-vgnn-release",
+    description="the same with the dense layers of the published code",
+    recipe=RELEASE_RECIPE,
+    dense="release",
+)

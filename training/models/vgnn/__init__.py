@@ -1,0 +1,1 @@
+"""Our network: see ``training.models.vgnn.model``."""

@@ -1,0 +1,62 @@
+"""What ``vgnn`` sees of frames: every pin's displacement and area, the camera's own displacement taken out."""
+
+import numpy as np
+import torch
+
+from training.models.vgnn.registration import Registration
+from twin.preprocess import make_graph
+from twin.preprocess.reference import Reference
+
+
+class PinInputs:
+    """Dense features of every frame: ``batch`` gives (B, N, 3) and lost pins (B, N).
+
+    Parameters
+    ----------
+    features : (M, N, 3) float
+    lost : (M, N) bool
+    displaced : (M,) float, optional
+        Part of a frame's difference from the expected camera that was taken out, 0 to 1; none if left out.
+    """
+
+    def __init__(self, features: np.ndarray, lost: np.ndarray, displaced: np.ndarray | None = None) -> None:
+        self.x, self.lost = torch.from_numpy(features.astype(np.float32)), torch.from_numpy(lost)
+        self.displaced = torch.from_numpy(np.zeros(len(lost)) if displaced is None else displaced)
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Arguments of the network for some rows."""
+        return self.x[rows], self.lost[rows]
+
+
+def pin_features(nodes_px: np.ndarray, area_px2: np.ndarray, reference: Reference) -> np.ndarray:
+    """Features (M, N, 3) of matched pins: displacement from rest in mean rest spacings, logarithm of area over rest area."""
+    moved = (nodes_px - reference.pins_px) / reference.spacing_px.mean()
+    return np.concatenate([moved, np.log(area_px2 / reference.area_px2)[..., None]], axis=-1)
+
+
+def filled(
+    registration: Registration, nodes_px: np.ndarray, area_px2: np.ndarray, lost: np.ndarray, reference: Reference
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pins (M, N, 2) and areas (M, N) with lost pins (M, N) where the others' modes put them."""
+    nodes_px, area_px2 = nodes_px.copy(), area_px2.copy()
+    for k in np.flatnonzero(lost.any(axis=1)):
+        nodes_px[k] = registration.fill(nodes_px[k], lost[k])
+        area_px2[k] = make_graph("voronoi", nodes_px[k], outmost=reference.outmost).area_px2
+    return nodes_px, area_px2
+
+
+def seated_inputs(
+    registration: Registration,
+    nodes_px: np.ndarray,
+    area_px2: np.ndarray,
+    lost: np.ndarray,
+    reference: Reference,
+    *,
+    together: bool = False,
+) -> PinInputs:
+    """Inputs of frames (see ``filled``) whose camera displacement is taken out; ``together`` as in ``Registration``."""
+    nodes, area, _, share = registration(nodes_px, area_px2, together=together)
+    return PinInputs(pin_features(nodes, area, reference), lost, share)

@@ -1,0 +1,101 @@
+"""``vgnn``, our model: pins matched to the layout at rest, a graph network and pin modes, a Gaussian process beside them."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import cast
+
+import numpy as np
+import torch
+from torch import nn
+
+from training.dataset import PinTable
+from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Variant, Weights, refuse_sizes
+from training.models.vgnn.inputs import PinInputs, filled, pin_features, seated_inputs
+from training.models.vgnn.network import Vgnn, VgnnSize
+from training.models.vgnn.registration import Registration, fit_registration
+from training.recipes import Recipe
+from twin.preprocess.reference import Reference
+from twin.preprocess.voronoi import directed_edges, triangulate
+
+PROCESS_MODES = 30  # of the displacement, which the Gaussian process sees beside all modes of the areas: the finer ones are noise to it
+# Buffers that are made anew from the pins. The waves are not: those of equal frequency are any basis, and another linear algebra
+# library chooses another one.
+DERIVED = ("adjacency", "smoothing")
+
+
+class VgnnModel(PinModel):
+    """See the module."""
+
+    counts_from_rest = True
+    has_modes = True
+
+    def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Vgnn:
+        """See ``Model``; sizes are the fields of ``VgnnSize``."""
+        refuse_sizes(self, size, tuple(field.name for field in fields(VgnnSize)))
+        edges = directed_edges(triangulate(reference.pins_px), len(reference.pins_px))
+        return Vgnn(np.asarray(edges), len(reference.pins_px), outputs, VgnnSize(**size))
+
+    def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:
+        """See ``Model``: the camera's displacement is learnt from the training rows.
+
+        In view 1 all of a frame's difference from the expected camera is taken out, as if the camera sat elsewhere.
+        """
+        registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
+        nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
+        seated = seated_inputs(registration, nodes_px, area_px2, pins.lost, pins.reference)
+        taken = registration.difference(nodes_px)
+        taken[train] = left
+        displaced = pin_features(*registration.take_out(nodes_px, area_px2, taken), pins.reference)
+        both = np.concatenate([seated.x.numpy(), displaced])
+        inputs = PinInputs(both, np.concatenate([pins.lost, pins.lost]), np.repeat([0.0, 1.0], len(pins)))
+        return Prepared(inputs, {"registration": registration.arrays()}, views=2)
+
+    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> PinInputs:
+        """See ``PinModel``; where a no-contact frame told where the camera sits, nothing of it has to be guessed."""
+        registration = Registration(**learnt["registration"])
+        pins = pins.seen_from(reference) if pins.measured else pins
+        nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
+        if pins.measured:
+            return PinInputs(pin_features(nodes_px, area_px2, reference), pins.lost)
+        return seated_inputs(registration, nodes_px, area_px2, pins.lost, reference, together=together)
+
+    def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> None:
+        """See ``Model``: feature scales and pin modes."""
+        cast(Vgnn, network).prepare(cast(PinInputs, inputs).x[rows])
+
+    def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
+        """See ``Model``: the first modes of the displacement and those of the areas."""
+        vgnn, pins = cast(Vgnn, network), cast(PinInputs, inputs)
+        with torch.no_grad():
+            amplitudes = vgnn.amplitudes(vgnn.known(*pins.batch(rows))).double().numpy()
+        modes = vgnn.size.modes
+        seen = np.concatenate([amplitudes[:, : min(PROCESS_MODES, modes)], amplitudes[:, modes:]], axis=1)
+        return Modes(seen, pins.displaced[rows].numpy())
+
+    def pack(self, weights: Weights) -> Weights:
+        """See ``Model``: without what the pins' graph tells, and without attention between pins that are no neighbours."""
+        kept = {key: value for key, value in weights.items() if key not in DERIVED}
+        if "attention" in kept:
+            kept["attention"] = kept["attention"][weights["adjacency"] > 0]
+        return kept
+
+    def unpack(self, packed: Weights, blank: Weights) -> Weights:
+        """See ``Model``."""
+        weights = packed | {key: blank[key] for key in DERIVED}
+        if "attention" in packed:
+            attention = torch.zeros_like(blank["attention"])
+            attention[blank["adjacency"] > 0] = packed["attention"]
+            weights["attention"] = attention
+        return weights
+
+
+VGNN = VgnnModel(
+    name="vgnn",
+    description="ours: Voronoi graph network on matched pins, with pin modes, ensemble and calibrated intervals",
+    recipe=Recipe(kernel=True),
+    variants={
+        "graph": Variant(size={"layers": 0}),
+        "modes": Variant(size={"modes": 0, "area_modes": 0}, recipe={"kernel": False}),  # the process sees the modes only
+        "kernel": Variant(recipe={"kernel": False}),
+    },
+)

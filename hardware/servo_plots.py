@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hardware.trajectory import LOCAL_N, Measures, Trajectory, local_slopes
-from twin.views.plots import new_figure
+from twin.report.plots import new_figure
 
 ZOOM_MM = 12.0  # half the side of the zoom
 TOOL, FELT, TRUE = "#1668b0", "#d9480f", "#7a7a7a"

@@ -10,7 +10,7 @@ import numpy as np
 from training.audit import STORIES, Audit
 from training.dataset import Dataset
 from training.targets import corrected
-from twin.views.plots import new_figure
+from twin.report.plots import new_figure
 
 NAMES = ("pose_2", "pose_6", "move_1", "move_6")
 LARGE_MOVE = 1.0  # mm or deg: what smaller moves leave undecided changes nothing

@@ -11,9 +11,9 @@ import pyvista as pv
 from scenes import load_sensor
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
+from twin.report import skin3d
+from twin.report.plots import area_surface_figure, draw_area_change, new_figure
 from twin.stimulus import build_stimulus
-from twin.views import skin3d
-from twin.views.plots import area_surface_figure, draw_area_change, new_figure
 
 
 def test_a_dying_vtk_leaves_a_plain_picture_and_a_reason(tmp_path, monkeypatch):
@@ -29,7 +29,7 @@ def test_a_dying_vtk_leaves_a_plain_picture_and_a_reason(tmp_path, monkeypatch):
 
 
 def test_pictures_need_no_display(tmp_path):
-    code = "from twin.views.skin3d import probe_offscreen; print('reason:', probe_offscreen())"
+    code = "from twin.report.skin3d import probe_offscreen; print('reason:', probe_offscreen())"
     env = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
     assert done.returncode == 0 and "reason:" in done.stdout

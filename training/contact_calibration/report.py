@@ -9,8 +9,8 @@ from training.contact_calibration.fit import INDEPENDENT, ContactFit
 from training.contact_calibration.simulate import Setup
 from training.validation.model import MeasuredFrames
 from twin.kinematics import rig_of
-from twin.views.page import render_page
-from twin.views.plots import draw_displacement, new_figure
+from twin.report.page import render_page
+from twin.report.plots import draw_displacement, new_figure
 
 DPI = 110
 TOLD = 0.5  # share of the prior's variance that frames must remove before they count as telling a parameter

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from training.study.contacts import AreaChange, contacts_figure
 from training.study.models import Plan, error_columns, ordering, read_curves
-from twin.views.page import render_page
-from twin.views.plots import new_figure
+from twin.report.page import render_page
+from twin.report.plots import new_figure
 
 DPI = 110
 

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from scenes.sensor import SensorSpec
 from training.validation.compare import MEASURES, Comparison, table_of
-from twin.views.page import render_page
-from twin.views.plots import draw_displacement, new_figure
+from twin.report.page import render_page
+from twin.report.plots import draw_displacement, new_figure
 
 DPI = 110
 

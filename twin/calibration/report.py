@@ -6,7 +6,7 @@ from scenes.sensor import SensorSpec
 from twin.calibration.run import Calibration
 from twin.realism.images import difference_picture
 from twin.recordings.images import write_image
-from twin.views.page import render_page
+from twin.report.page import render_page
 
 LONGEST = 12  # numbers of a list that the page shows
 

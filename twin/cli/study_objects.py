@@ -55,8 +55,8 @@ def study_objects(
     from training.generation import generate
     from training.sim_to_real.study import train_in_twin
     from twin.cli.progress import count_bar, epoch_bar, rate_bar
-    from twin.views.page import render_page
-    from twin.views.table import write_table
+    from twin.report.page import render_page
+    from twin.report.table import write_table
 
     spec, judged = load_sensor(sensor), load_experiment(experiment)
     plan = objects.Plan(

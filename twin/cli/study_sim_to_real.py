@@ -91,8 +91,8 @@ def study_sim_to_real(
     )
     from training.sim_to_real.twins import Twin, as_mounted, without_one_ingredient
     from twin.cli.progress import count_bar, epoch_bar, rate_bar
-    from twin.views.page import render_page
-    from twin.views.table import write_table
+    from twin.report.page import render_page
+    from twin.report.table import write_table
 
     spec, plan = load_sensor(sensor), load_experiment(experiment)
     simulated_plan, touched = load_experiment(contacts or plan.wider or experiment), load_object(plan.object)

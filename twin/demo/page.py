@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from twin.demo.stages import ContactResult
 from twin.recordings.images import write_image
+from twin.report.panel import Look, area_change_at
+from twin.report.plots import area_surface_figure, draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins, new_figure
 from twin.types import Form
-from twin.views.panel import Look, area_change_at
-from twin.views.plots import area_surface_figure, draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins, new_figure
 
 DPI = 110
 

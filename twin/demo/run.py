@@ -12,11 +12,11 @@ from twin.demo.page import contact_figures, contact_pictures, embed, motion_figu
 from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, depth_table, run_contact
 from twin.preprocess.forms import from_raw
 from twin.projection import project
+from twin.report.page import render_page
+from twin.report.skin3d import draw_contact_skin
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
 from twin.types import Form
-from twin.views.page import render_page
-from twin.views.skin3d import draw_contact_skin
 
 
 def run_demo(out: Path, bar) -> list[Path]:

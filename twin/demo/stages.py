@@ -12,9 +12,9 @@ from twin.mechanics.path import ContactPose
 from twin.preprocess.graph import make_graph
 from twin.preprocess.reference import nominal_reference
 from twin.projection import project
+from twin.report.panel import Look
 from twin.simulator import Shot, Simulator
 from twin.types import ContactState, Form
-from twin.views.panel import Look
 
 CONTACTS = (
     ("ur5-331", "edge", ContactPose(indent_mm=3.5), Form.RAW),

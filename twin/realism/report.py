@@ -11,8 +11,8 @@ from twin.realism.compare import Pair, PoseAligned
 from twin.realism.images import difference_picture
 from twin.realism.statistics import RADIAL_MEASURES, TARGET, TARGET_MEASURES, Statistics
 from twin.recordings.images import write_image
-from twin.views.page import render_page
-from twin.views.table import write_rows
+from twin.report.page import render_page
+from twin.report.table import write_rows
 
 DPI = 110
 NAMES = {

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from twin.report.page import render_page
+from twin.report.table import write_rows
 from twin.robustness.envelope import SHORT, Curve, Envelope, Share, shares_of
 from twin.robustness.judgement import Judgement
 from twin.robustness.measures import MEASURES, POSE_MEASURES
 from twin.robustness.plots import TITLES, plot_case, plot_shares
 from twin.robustness.sweep import Cell, Plan, cells_of
-from twin.views.page import render_page
-from twin.views.table import write_rows
 
 TWICE = 2.0
 

@@ -97,7 +97,7 @@ def stimulus_surface(distance, T_sensor_object: np.ndarray, *, bounds_mm, sample
 
 
 def _run_child(folder: str, path: str) -> str:
-    command = [sys.executable, "-m", "twin.views.skin3d", folder, path]
+    command = [sys.executable, "-m", "twin.report.skin3d", folder, path]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=CHILD_TIMEOUT_S)
     except subprocess.TimeoutExpired:

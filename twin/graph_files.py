@@ -16,7 +16,8 @@ from twin.preprocess.legacy import LegacyPipeline
 from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import open_recording
-from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes, new_figure
+from twin.report.charts import new_figure
+from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
 from twin.types import Form, PinGraph
 
 

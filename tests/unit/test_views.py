@@ -12,7 +12,8 @@ from scenes import load_sensor
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.report import skin3d
-from twin.report.plots import area_surface_figure, draw_area_change, new_figure
+from twin.report.charts import new_figure
+from twin.report.plots import area_surface_figure, draw_area_change
 from twin.stimulus import build_stimulus
 
 

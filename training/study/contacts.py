@@ -15,7 +15,8 @@ from training.dataset import Dataset
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.preprocess import Pipeline, make_graph
-from twin.report.plots import draw_area_change, new_figure
+from twin.report.charts import new_figure
+from twin.report.plots import draw_area_change
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
 from twin.types import Form, PinGraph

@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from twin.report.plots import draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins, new_figure
+from twin.report.charts import new_figure
+from twin.report.plots import draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins
 from twin.types import Frame, Observation
 
 

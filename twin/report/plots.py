@@ -6,18 +6,12 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from scipy.interpolate import CloughTocher2DInterpolator
 
+from twin.report.charts import faint, new_figure, sequential
 from twin.types import Observation, PinGraph
 
 FOUND, LOST, EXTRA, EDGE = "#19d3a2", "#ff5c5c", "#ffb000", "#5ec8ff"
 FRAME_REACH = 0.6  # of the pins' extent, to each side of their middle: pins and the ring around them
 SURFACE_GRID = 80  # samples across an interpolated surface
-
-
-def new_figure(columns: int, rows: int = 1, *, panel_inch: float = 4.0, projection: str | None = None) -> tuple[Figure, np.ndarray]:
-    """A figure without any window, and its axes as a flat array."""
-    figure = Figure(figsize=(columns * panel_inch, rows * panel_inch), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": projection})
-    return figure, axes.ravel()
 
 
 def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.ndarray | None = None) -> None:
@@ -56,7 +50,7 @@ def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title
     """Voronoi cells coloured by their relative change of area against no contact (percent), up to ``limit`` (default: their own)."""
     change = 100 * (graph.area_px2 / rest_area_px2 - 1)
     limit = limit or max(5.0, float(np.nanpercentile(np.abs(change), 99)))
-    cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors="#00000030", linewidths=0.4)
+    cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors=faint(), linewidths=0.4)
     ax.add_collection(cells)
     _pixel_axes(ax, graph.nodes_px, title)
     ax.figure.colorbar(cells, ax=ax, shrink=0.8, label="cell area against no contact, %")
@@ -65,7 +59,7 @@ def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title
 def draw_displacement(ax: Axes, rest_px: np.ndarray, pins_px: np.ndarray, title: str) -> None:
     """Arrows from each pin's rest position to where it is now, to scale."""
     moved = pins_px - rest_px
-    arrows = ax.quiver(*rest_px.T, *moved.T, np.hypot(*moved.T), angles="xy", scale_units="xy", scale=1, cmap="viridis", width=0.004)
+    arrows = ax.quiver(*rest_px.T, *moved.T, np.hypot(*moved.T), angles="xy", scale_units="xy", scale=1, cmap=sequential(), width=0.004)
     _pixel_axes(ax, rest_px, title)
     ax.figure.colorbar(arrows, ax=ax, shrink=0.8, label="displacement, px")
 
@@ -75,7 +69,7 @@ def draw_area_surface(ax: Axes, nodes_px: np.ndarray, value: np.ndarray, title: 
     low, high = nodes_px.min(axis=0), nodes_px.max(axis=0)
     grid_x, grid_y = np.meshgrid(*[np.linspace(a, b, SURFACE_GRID) for a, b in zip(low, high, strict=True)])
     surface = CloughTocher2DInterpolator(nodes_px, value)(grid_x, grid_y)
-    ax.plot_surface(grid_x, grid_y, surface, cmap="viridis", rcount=SURFACE_GRID, ccount=SURFACE_GRID, linewidth=0)
+    ax.plot_surface(grid_x, grid_y, surface, cmap=sequential(), rcount=SURFACE_GRID, ccount=SURFACE_GRID, linewidth=0)
     ax.set(title=title, xlabel="x, px", ylabel="y, px")
     ax.invert_yaxis()
 

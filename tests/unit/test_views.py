@@ -13,7 +13,7 @@ from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.report import skin3d
 from twin.report.charts import new_figure
-from twin.report.plots import area_surface_figure, draw_area_change
+from twin.report.plots import ENLARGEMENTS, area_surface_figure, draw_area_change, draw_displacement, enlargement
 from twin.stimulus import build_stimulus
 
 
@@ -66,3 +66,14 @@ def test_area_pictures_take_any_graph():
     draw_area_change(ax, moved, rest.area_px2, "change")
     assert len(ax.collections[0].get_paths()) == 40
     assert len(area_surface_figure(rest, moved).axes) == 3
+
+
+def test_enlarged_arrows_stay_between_their_pins_and_say_so():
+    grid_px = 10.0 * np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), -1).reshape(-1, 2)
+    for moved_px, wanted in ((0.9, 10.0), (1.1, 5.0), (30.0, 1.0), (1e-6, ENLARGEMENTS[-1])):
+        assert enlargement(grid_px, grid_px + [moved_px, 0.0]) == wanted
+    figure, (ax,) = new_figure(1)
+    draw_displacement(ax, grid_px, grid_px + [0.9, 0.0], "pins", enlarged=10.0)
+    (arrows,) = [part for part in ax.collections if hasattr(part, "U")]
+    assert arrows.scale == 0.1 and np.allclose(arrows.get_array(), 0.9)
+    assert "arrows 10 times" in figure.axes[1].get_ylabel()

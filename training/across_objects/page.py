@@ -39,7 +39,7 @@ def write_page(
         As ``table`` and ``verdicts`` give them.
     """
     alone = plan.alone.name
-    judged = ", ".join(f"{name} {ranges[name][0]:g} to {ranges[name][1]:g} {unit_of(name)}".rstrip() for name in names)
+    judged = ", ".join(f"{name} {number(ranges[name][0])} to {number(ranges[name][1])} {unit_of(name)}".rstrip() for name in names)
     page = Page(f"Objects never seen: {plan.sensor.name}", "twin study objects", topic="TacTip twin: study")
     page.lead = (
         f"Two models from {number(plan.count * len(plan.train))} simulated contacts each, judged on {number(plan.tests)} other contacts of "
@@ -102,7 +102,7 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str], alone: str) -> 
 def _column(key: str, names: Sequence[str]) -> Column:
     for name in names:
         if key in (f"{name}_error", f"{name}_bias"):
-            return Column(key, key.replace("_", " "), unit_of(name), signed=key.endswith("bias"))
+            return Column(key, f"{name} {key.removeprefix(name)[1:]}", unit_of(name), digits=2, signed=key.endswith("bias"))
         if key == f"{name}_times":
             return Column(key, f"{name} times", decimals=2)
     return Column.of(key)

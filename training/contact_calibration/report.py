@@ -14,7 +14,7 @@ from twin.report.charts import new_figure, write_chart
 from twin.report.files import write_text
 from twin.report.numbers import number
 from twin.report.page import Page, Picture
-from twin.report.plots import draw_displacement
+from twin.report.plots import draw_displacement, enlargement
 from twin.report.table import Cell, Column
 
 TOLD = 0.5  # share of the prior's variance that frames must remove before they count as telling a parameter
@@ -143,10 +143,12 @@ def _parameters_section(page: Page, summary: dict) -> None:
 
 def _frame_figure(measured: MeasuredFrames, moved: np.ndarray, fit: ContactFit, k: int) -> Figure:
     seen = np.isfinite(measured.pins_px[k, :, 0])
+    real = measured.pins_px[k][seen]
+    stories = [(measured.no_contact_px + both[int(fit.executed[k] > 0.5), k])[seen] for both in moved]
+    enlarged = enlargement(real, stories[0])
     figure, axes = new_figure(2, panel_inch=5.0)
-    for ax, title, both, error in zip(axes, ("before", "after"), moved, (fit.before_px[k], fit.after_px[k]), strict=True):
-        story = both[int(fit.executed[k] > 0.5), k]
-        draw_displacement(ax, measured.pins_px[k][seen], (measured.no_contact_px + story)[seen], f"{title}: {error:.2f} px")
+    for ax, title, story, error in zip(axes, ("before", "after"), stories, (fit.before_px[k], fit.after_px[k]), strict=True):
+        draw_displacement(ax, real, story, f"{title}: {error:.2f} px", enlarged=enlarged)
     return figure
 
 

@@ -4,13 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import NullLocator
 
 from scenes.randomisation import FrictionSpread
 from training.targets import unit_of
-from twin.report.charts import muted, sized_figure, write_chart
+from twin.report.charts import muted, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, Picture
 from twin.report.table import Column
@@ -97,7 +96,7 @@ def write_page(
     page.table(rows, [_column(key, names) for key in columns], caption="The least error of each column is marked.")
     page.text(
         "Corrected labels have the shear moves that were never executed taken out; all models learnt these. The leak slope is that of the "
-        "angle's error on such moves: a model that reads the contact has 0. Inside 90: share of the frames whose label lies within the "
+        "angle's error on such moves: a model that reads the contact has 0. Inside 90 %: share of the frames whose label lies within the "
         "model's 90 % interval."
     )
     page.section("How it was made")
@@ -139,7 +138,10 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
         ax.set(
             title=f"{name} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}", xscale="log", yscale="log"
         )
-        _plain_ticks(ax, sorted({row["labelled_frames"] for row in rows if row["labelled_frames"]}))
+        counts = sorted({row["labelled_frames"] for row in rows if row["labelled_frames"]})
+        ax.set_xticks(counts, [number(count) for count in counts])
+        ax.xaxis.set_minor_locator(NullLocator())
+        plain_log(ax.yaxis)
     axes[0].legend()
     return figure
 
@@ -157,17 +159,6 @@ def ingredients_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
     return figure
 
 
-def _plain_ticks(ax: Axes, counts: Sequence[int]) -> None:
-    """The counts themselves along x, and plain numbers along y."""
-    plain = FuncFormatter(lambda value, _: number(value, 2))
-    ax.set_xticks(counts, [number(count) for count in counts])
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    ax.yaxis.set_major_formatter(plain)
-    low, high = ax.get_ylim()
-    if high < 30 * low:  # too few whole powers of ten for a scale
-        ax.yaxis.set_minor_formatter(FuncFormatter(lambda value, _: number(value, 1) if f"{value:.0e}"[0] in "235" else ""))
-
-
 def _of(rows: Sequence[Mapping], trained_on: str) -> list[Mapping]:
     return [row for row in rows if row["trained_on"] == trained_on]
 
@@ -175,10 +166,10 @@ def _of(rows: Sequence[Mapping], trained_on: str) -> list[Mapping]:
 def _column(key: str, names: Sequence[str]) -> Column:
     for name in names:
         if key in (f"{name}_corrected", f"{name}_raw"):
-            return Column(key, key.replace("_", " "), unit_of(name), best="least")
+            return Column(key, f"{name}, {key.removeprefix(name)[1:]}", unit_of(name), digits=2, best="least")
         if key == f"{name}_inside_90":
-            return Column(key, f"{name} inside 90", "%", decimals=0, scale=100)
-    return Column.of(key)
+            return Column(key, f"{name} inside 90 %", "%", decimals=0, scale=100)
+    return Column(key, "leak slope", digits=2, signed=True) if key == "leak_slope" else Column.of(key)
 
 
 def _percents(shares: Iterable[float]) -> str:

@@ -4,19 +4,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from training.dataset import Dataset
 from training.study.contacts import AreaChange, contacts_figure
 from training.study.models import Plan, error_columns, ordering, read_curves
 from training.targets import unit_of
-from twin.report.charts import new_figure, write_chart
+from twin.report.charts import new_figure, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, Picture
 from twin.report.table import Column
 from twin.report.themes import SERIES
 
+RUN = ("model", "seed", "state")  # columns of the table of models that name a run
+TRAINING = ("epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters")  # those that get a table of their own
 FEW = 5  # points of a curve that are marked, as a line of one or two would not be seen
-LINES = ("-", "--", ":", "-.")  # one after the other once the colours are used up
+LINES = ("-", "--", ":", "-.")  # of models, one after the other once the colours are used up; the seeds of a model look alike
 SCALINGS = {"none": "mm and deg", "standard": "standard deviations", "unit": "half ranges"}
 HEADINGS = {  # of the tables' columns, with their units; others are titled by their keys
     "epochs_allowed": ("epochs allowed", ""),
@@ -123,7 +126,10 @@ def _errors_section(page: Page, out: Path, data: Dataset, models: list[dict], no
         "each column is marked.",
     )
     errors = error_columns(data)
-    page.table(models, [_column(key, errors) for key in notes["columns"]])
+    shown = [key for key in notes["columns"] if key not in TRAINING]
+    shown.sort(key=lambda key: (key not in RUN, key not in errors))  # the run, its errors, the rest
+    page.table(models, [_column(key, errors) for key in shown])
+    page.table(models, [_column(key) for key in (*RUN, *TRAINING)], caption="What training took")
     for key in errors:
         if order := ordering(models, key):
             said = ", ".join(
@@ -139,36 +145,52 @@ def _errors_section(page: Page, out: Path, data: Dataset, models: list[dict], no
 
 def _column(key: str, errors: Sequence[str] = ()) -> Column:
     if key in errors:
-        return Column(key, key.replace("_", " "), unit_of(key.rpartition("_")[0]), best="least")
+        name, _, kind = key.rpartition("_")
+        return Column(key, f"{name}, {kind}", unit_of(name), digits=2, best="least")
+    if key == "leak_slope":
+        return Column(key, "leak slope", digits=2, signed=True)
     title, unit = HEADINGS.get(key, ("", ""))
-    return Column(key, title, unit) if title else Column.of(key)
+    return Column(key, title, unit, digits=2 if key.startswith("paper") else 3) if title else Column.of(key)
 
 
 def _efficiency_figure(rows: Sequence[Mapping]) -> Figure:
-    figure, (ax,) = new_figure(1, panel_inch=6)
+    figure, (ax,) = sized_figure((7.0, 4.6))
     for model in dict.fromkeys(row["model"] for row in rows):
         mine = [row for row in rows if row["model"] == model]
         batches, times = [row["batch"] for row in mine], [row["ms_per_frame"] for row in mine]
         (line,) = ax.plot(batches, times, linewidth=1)
         ax.scatter(batches, times, s=[max(row["memory_mib"] / 4, 4) for row in mine], color=line.get_color(), alpha=0.6, label=model)
     ax.set(xscale="log", yscale="log", xlabel="batch", ylabel="ms per frame in training", title="marker's area: memory")
+    batches = sorted({row["batch"] for row in rows})
+    ax.set_xticks(batches, [number(batch) for batch in batches])
+    ax.xaxis.set_minor_locator(NullLocator())
+    plain_log(ax.yaxis)
     ax.legend(markerscale=0.5)
     return figure
 
 
 def _curves_figure(plans: Sequence[Plan], folder: Path) -> Figure:
     figure, axes = new_figure(2, panel_inch=5)
-    for number_of, plan in enumerate(plans):
+    names = list(dict.fromkeys(plan.name for plan in plans))
+    labelled: set[str] = set()
+    for plan in plans:
         curve = [point for point in read_curves(folder / plan.folder) if point["network"] == 0]
         error, minutes, total = [point["held_out_error"] for point in curve], [], 0.0
         for point in curve:
             total += point["seconds"] / 60
             minutes.append(total)
-        look = {"linestyle": LINES[number_of // len(SERIES) % len(LINES)], "linewidth": 1.2, "marker": "." if len(curve) < FEW else None}
-        axes[0].plot(range(1, len(curve) + 1), error, label=f"{plan.folder} ({SCALINGS[plan.config.recipe.scaling]})", **look)
+        rank = names.index(plan.name)
+        look = {"color": SERIES[rank % len(SERIES)], "linestyle": LINES[rank // len(SERIES) % len(LINES)], "linewidth": 1.2}
+        look["marker"] = "." if len(curve) < FEW else None
+        label = None if plan.name in labelled else f"{plan.name} ({SCALINGS[plan.config.recipe.scaling]})"
+        labelled.add(plan.name)
+        axes[0].plot(range(1, len(curve) + 1), error, label=label, **look)
         axes[1].plot(minutes, error, **look)
     for ax, label in zip(axes, ("epoch", "minutes of training"), strict=True):
         ax.set(xlabel=label, ylabel="mean error of the scaled labels", xscale="log", yscale="log")
+        if plans:
+            plain_log(ax.xaxis)
+            plain_log(ax.yaxis)
     if plans:
         axes[0].legend(fontsize=7)
     return figure

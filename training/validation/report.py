@@ -15,7 +15,7 @@ from twin.report.charts import new_figure, write_chart
 from twin.report.files import write_text
 from twin.report.numbers import number
 from twin.report.page import Page, Picture
-from twin.report.plots import draw_displacement
+from twin.report.plots import draw_displacement, enlargement
 from twin.report.table import Column
 
 
@@ -72,7 +72,7 @@ def write_validation(out: Path, found: Comparison, spec: SensorSpec, summary: di
         page.section(
             "With one friction a frame",
             f"{own['frames']} frames with an executed move: {number(own['error_px'], decimals=2)} px, each with the friction that suits it "
-            f"best (median {number(own['median'])}); the same frames with the common friction: "
+            f"best (median {number(own['median'], 2)}); the same frames with the common friction: "
             f"{number(own['error_with_common_friction_px'], decimals=2)} px.",
         )
     page.section("Pin by pin")
@@ -125,5 +125,7 @@ def _draw_worst(found: Comparison) -> Figure:
     for ax, k, title in ((axes[0], order[len(order) // 2], "median frame"), (axes[1], order[-1], "worst frame")):
         measured, simulated = found.measured.pins_px[k], found.simulated_px[k]
         seen = np.isfinite(measured[:, 0])
-        draw_displacement(ax, measured[seen], simulated[seen], f"{title}: real pin to simulated\n{found.measured.names[k]}")
+        real, made = measured[seen], simulated[seen]
+        text = f"{title}: real pin to simulated\n{found.measured.names[k]}"
+        draw_displacement(ax, real, made, text, enlarged=enlargement(real, made))
     return figure

@@ -9,14 +9,18 @@ from pathlib import Path
 import numpy as np
 from cycler import cycler
 from matplotlib import colormaps, rc_context
+from matplotlib.axis import Axis
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from twin.report.files import write_bytes
+from twin.report.numbers import number
 from twin.report.themes import DARK, LIGHT, SERIES, Theme
 
 DPI = 140
 SHADES = 256  # of a colour map
+FEW_DECADES = 100.0  # largest over smallest value of an axis whose powers of ten alone make no scale
 
 _theme: ContextVar[Theme] = ContextVar("theme", default=LIGHT)
 
@@ -95,6 +99,17 @@ def sequential() -> ListedColormap:
     """Viridis without the end that the theme's background would swallow."""
     low, high = (0.0, 0.88) if _theme.get() == LIGHT else (0.2, 1.0)
     return ListedColormap(colormaps["viridis"](np.linspace(low, high, SHADES)))
+
+
+def plain_log(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers, and 2, 3 and 5 between the powers of ten where these are few."""
+
+    def between(value: float, _: int | None) -> str:
+        low, high = sorted(axis.get_view_interval())
+        return number(value, 1) if high < FEW_DECADES * low and f"{value:.0e}"[0] in "235" else ""
+
+    axis.set_major_formatter(FuncFormatter(lambda value, _: number(value, 1)))
+    axis.set_minor_formatter(FuncFormatter(between))
 
 
 def _style(theme: Theme) -> dict[str, object]:

@@ -11,7 +11,7 @@ from twin.robustness.condition import Case
 from twin.robustness.envelope import Curve, Share
 from twin.robustness.measures import MEASURES, POSE_MEASURES
 
-ACROSS = 6  # plots in a row
+ACROSS = 3  # plots in a row: beside the picture of a frame more would be too small to read
 SHOWN = ("valid", "recall", "precision", "centroid_px", "area_error", "edges", *(m.name for m in POSE_MEASURES))
 TITLES = {m.name: m.title + (f", {m.unit}" if m.unit else "") for m in (*MEASURES, *POSE_MEASURES)}
 

@@ -1,6 +1,7 @@
 """Page, figures and table of a contact calibration."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
         "sensor": setup.sensor.name,
         "experiment": setup.experiment.name,
         "parameters": parameters,
-        "turn_sign": {"start": rig_of(setup.sensor).turn_sign, "value": fit.sensor.rig.turn_sign},
+        "turn_sign": {"start": rig_of(setup.sensor).turn_sign, "value": rig_of(fit.sensor).turn_sign},
         "hardly_told_apart": pairs,
         "executed_share": fit.share,
         "fitted_px": {"before": float(np.nanmean(fit.before_px)), "after": float(np.nanmean(fit.after_px)), "frames": len(measured)},
@@ -86,7 +87,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
     page.section("Real pins to simulated ones")
     for k in chosen:
         name = Path(measured.names[k]).stem
-        chart = write_chart(folder / f"{name}.png", lambda k=k: _frame_figure(measured, moved, fit, k))
+        chart = write_chart(folder / f"{name}.png", partial(_frame_figure, measured, moved, fit, int(k)))
         page.figures(Picture(chart, f"Pin errors of {name} before and after the calibration", measured.names[k]))
     page.download(figures, "all figures of this page")
     return page.write(folder / "index.html")

@@ -43,11 +43,12 @@ class ContactContent:
 def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
     """Write the pictures of one contact; the skin's own picture is drawn elsewhere."""
     look, stem = result.look, f"{result.sensor}-{result.stimulus}"
+    graph, rest = look.graphs()
     written = {
         "raw": write_image(folder / f"{stem}-frame.png", result.raw.frame.image),
         "pins": write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
         "areas": write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
-        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: area_surface_figure(look.rest.graph, look.observation.graph)),
+        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: area_surface_figure(rest, graph)),
     }
     if look.frame.form is Form.RECORDING:
         written["recorded"] = write_image(folder / f"{stem}-recorded.png", look.frame.image)
@@ -58,7 +59,7 @@ def motion_figure(motions: list[tuple[str, Look]]) -> Figure:
     """Displacement (top) and area change (bottom) for each motion, as in the paper's figure 1(d)."""
     figure, axes = new_figure(len(motions), 2, panel_inch=4.2)
     for column, (title, look) in enumerate(motions):
-        rest, graph = look.rest.graph, look.observation.graph
+        graph, rest = look.graphs()
         draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
         draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
     return figure
@@ -71,7 +72,7 @@ def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple
     parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
     return [
         ("pins found", f"{observation.found} of {len(observation.pins_px)}"),
-        ("directed edges (Delaunay)", number(len(observation.graph.edges))),
+        ("directed edges (Delaunay)", number(len(look.graphs()[0].edges))),
         ("force on the object, N", f"({parts})"),
         ("contact area, mm²", number(float(result.state.area_mm2), decimals=1)),
         ("cell area at the contact against no contact", f"{number(area_change_at(look, contact_px, count=12), decimals=1, signed=True)} %"),
@@ -142,8 +143,8 @@ def write_page(
         page.table([vars(row) for row in rows], columns, caption=sensor)
     page.section("Time")
     total = {"stage": "all", "seconds": sum(seconds.values())}
-    rows = [{"stage": name, "seconds": value} for name, value in seconds.items()]
-    page.table([*rows, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
+    stages = [{"stage": name, "seconds": value} for name, value in seconds.items()]
+    page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
     return page.write(path, embed=True)
 
 
@@ -177,13 +178,15 @@ def _contact_section(page: Page, contact: ContactContent) -> None:
 
 def _graph_figure(look: Look) -> Figure:
     figure, (ax,) = new_figure(1, panel_inch=6)
-    draw_frame(ax, look.frame.image, around_px=look.rest.graph.nodes_px)
-    draw_graph(ax, look.observation.graph)
+    graph, rest = look.graphs()
+    draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
+    draw_graph(ax, graph)
     draw_pins(ax, look.observation)
     return figure
 
 
 def _areas_figure(look: Look) -> Figure:
     figure, (ax,) = new_figure(1, panel_inch=6)
-    draw_area_change(ax, look.observation.graph, look.rest.graph.area_px2, "")
+    graph, rest = look.graphs()
+    draw_area_change(ax, graph, rest.area_px2, "")
     return figure

@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.spatial import cKDTree
 
@@ -12,6 +13,7 @@ from twin.types import Observation, PinGraph
 
 FOUND, LOST, EXTRA, EDGE = "#19d3a2", "#ff5c5c", "#ffb000", "#5ec8ff"
 FRAME_REACH = 0.6  # of the pins' extent, to each side of their middle: pins and the ring around them
+BORDER = "#00000040"  # of a coloured cell, on any ground
 ENLARGEMENTS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 LONG_PERCENTILE = 95  # of the arrows' lengths; longer ones may reach beyond the next pin
 SURFACE_GRID = 80  # samples across an interpolated surface
@@ -53,7 +55,7 @@ def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title
     """Voronoi cells coloured by their relative change of area against no contact (percent), up to ``limit`` (default: their own)."""
     change = 100 * (graph.area_px2 / rest_area_px2 - 1)
     limit = limit or max(5.0, float(np.nanpercentile(np.abs(change), 99)))
-    cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors=faint(), linewidths=0.4)
+    cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors=BORDER, linewidths=0.4)
     ax.add_collection(cells)
     _pixel_axes(ax, graph.nodes_px, title)
     ax.figure.colorbar(cells, ax=ax, shrink=0.8, label="change of cell area, %")
@@ -76,13 +78,14 @@ def enlargement(rest_px: np.ndarray, pins_px: np.ndarray) -> float:
     return max((factor for factor in ENLARGEMENTS if factor * longest <= apart), default=ENLARGEMENTS[0])
 
 
-def draw_area_surface(ax: Axes, nodes_px: np.ndarray, value: np.ndarray, title: str) -> None:
+def draw_area_surface(ax: Axes3D, nodes_px: np.ndarray, value: np.ndarray, title: str) -> None:
     """A per-pin value as a smooth surface over the image plane (cubic interpolation; 3D axes)."""
     low, high = nodes_px.min(axis=0), nodes_px.max(axis=0)
     grid_x, grid_y = np.meshgrid(*[np.linspace(a, b, SURFACE_GRID) for a, b in zip(low, high, strict=True)])
     surface = CloughTocher2DInterpolator(nodes_px, value)(grid_x, grid_y)
     ax.plot_surface(grid_x, grid_y, surface, cmap=sequential(), rcount=SURFACE_GRID, ccount=SURFACE_GRID, linewidth=0)
-    ax.set(title=title, xlabel="x, px", ylabel="y, px")
+    ax.set(xlabel="x, px", ylabel="y, px")
+    ax.set_title(title, loc="center", y=0.97)
     ax.invert_yaxis()
 
 

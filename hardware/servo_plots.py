@@ -1,15 +1,14 @@
 """Pictures of a followed surface, as in the paper's figure: trajectory, a zoom with its local smoothness, depth and angle."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from hardware.trajectory import LOCAL_N, Measures, Trajectory, local_slopes
-from twin.views.plots import new_figure
+from twin.report.charts import muted, new_figure
+from twin.report.themes import BLUE, RED
 
 ZOOM_MM = 12.0  # half the side of the zoom
-TOOL, FELT, TRUE = "#1668b0", "#d9480f", "#7a7a7a"
+TOOL, FELT = BLUE, RED
 
 
 def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outline_mm: np.ndarray | None = None) -> Figure:
@@ -21,7 +20,7 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
     )
     for ax in (whole, zoom):
         if outline_mm is not None:
-            ax.plot(*outline_mm.T, color=TRUE, lw=3, alpha=0.5, label="object")
+            ax.plot(*outline_mm.T, color=muted(), lw=3, alpha=0.5, label="object")
         ax.plot(*path.tool_mm.T, color=TOOL, lw=1, label="tool")
         ax.plot(*path.felt_mm.T, ".", color=FELT, ms=3, label="surface as felt")
         ax.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
@@ -38,7 +37,7 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
         (depth, path.depth_mm, path.true_depth_mm, "depth, mm"),
         (angle, path.angle_deg, path.true_angle_deg, "angle from the normal, deg"),
     ):
-        ax.plot(steps, true, color=TRUE, lw=2, label="true")
+        ax.plot(steps, true, color=muted(), lw=2, label="true")
         ax.plot(steps, estimated, color=FELT, lw=0.8, label="estimated")
         ax.set(xlabel="step", ylabel=name)
         ax.legend(fontsize=8)
@@ -51,13 +50,7 @@ def comparison_figure(rows: list[tuple[str, str, Trajectory, np.ndarray]]) -> Fi
     figure, axes = new_figure(len(objects), len(models), panel_inch=3.2)
     for model, name, path, outline in rows:
         ax = axes[models.index(model) * len(objects) + objects.index(name)]
-        ax.plot(*outline.T, color=TRUE, lw=3, alpha=0.5)
+        ax.plot(*outline.T, color=muted(), lw=3, alpha=0.5)
         ax.plot(*path.tool_mm.T, color=TOOL, lw=0.9)
         ax.set(title=f"{name}, {model}", aspect="equal", xticks=[], yticks=[])
     return figure
-
-
-def save_figure(path: Path, figure: Figure) -> Path:
-    """Write a figure as PNG; the path."""
-    figure.savefig(path, dpi=110)
-    return path

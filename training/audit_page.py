@@ -1,19 +1,24 @@
 """An audit's findings as files: a table of corrected labels, numbers, pictures and one page."""
 
 import csv
-import json
-from html import escape
+import io
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from training.audit import STORIES, Audit
 from training.dataset import Dataset
 from training.targets import corrected
-from twin.store import made_by, text_file, write_json, write_text
-from twin.views.plots import new_figure
+from twin.report.charts import muted, new_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, Picture
+from twin.report.table import Column
+from twin.store import made_by, write_json, write_text
 
 NAMES = ("pose_2", "pose_6", "move_1", "move_6")
+LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")
+NAMED = 8  # frames of a list that the page names; audit.json holds all
 LARGE_MOVE = 1.0  # mm or deg: what smaller moves leave undecided changes nothing
 
 
@@ -46,30 +51,79 @@ def summary_of(audit: Audit, data: Dataset) -> dict:
 def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[Path]:
     """``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``."""
     labels = corrected(NAMES, data.targets.raw, audit.executed.round(), data.targets.raw[:, 2:], audit.depth_per_move)
-    table = out / "labels_corrected.csv"
-    with text_file(table) as file:
-        writer = csv.writer(file)
-        writer.writerow(["image_name", "executed", *NAMES, *(f"chi2_{story.replace(' ', '_')}" for story in STORIES), "findings"])
-        for k, name in enumerate(data.pins.image_name):
-            flags = {"no contact": audit.no_contact, "wrong sign": audit.wrong_sign, "fits no story": audit.odd}
-            said = [flag for flag, rows in flags.items() if rows[k]]
-            if audit.twins[k] != k:
-                said.append(f"same pins as {data.pins.image_name[audit.twins[k]]}")
-            numbers = [f"{v:.6g}" for v in (*labels[k], *audit.chi2[k])]
-            writer.writerow([name, f"{audit.executed[k]:.4g}", *numbers, "; ".join(said)])
-    write_json(out / "audit.json", summary | {"made_by": made_by("training.audit")})
-    _draw(out / "audit.png", audit, data, labels)
-    write_text(out / "audit.html", _page(summary, data))
-    return [table, out / "audit.json", out / "audit.png", out / "audit.html"]
+    table = write_text(out / "labels_corrected.csv", _labels_csv(audit, data, labels))
+    numbers = write_json(out / "audit.json", summary | {"made_by": made_by("training.audit")})
+    chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
+    page = Page(
+        f"Audit of {data.folder.name}",
+        "twin audit",
+        topic="TacTip twin: audit",
+        lead="From pins and labels alone. Each frame is asked whether its pins fit the label with the shear move executed, or the state "
+        "before it; labels_corrected.csv holds the answer. Laid beside the recording's targets.csv, it is what training with corrected "
+        "labels uses.",
+    )
+    page.notice("The reader says", summary["reader"])
+    page.figures(
+        Picture(chart, "Evidence for the findings: which story fits each frame, corrections of the angle, moves along the table, drift")
+    )
+    page.section("Findings")
+    page.table(_findings(summary), [Column("finding", "finding"), Column("value", "value", align="right")])
+    page.section("Frames that stand out")
+    page.table(
+        [{"finding": _title(key), "count": len(summary[key]), "frames": _some(summary[key])} for key in LISTS],
+        [Column("finding", "finding"), Column("count", "frames"), Column("frames", "which")],
+    )
+    page.download(table, "corrected labels, and what is said of each frame")
+    page.download(numbers, "all findings, with the names of all frames")
+    return [table, numbers, chart, page.write(out / "audit.html")]
 
 
-def _draw(path: Path, audit: Audit, data: Dataset, labels: np.ndarray) -> None:
+def _findings(summary: dict) -> list[dict]:
+    """The findings that are numbers, one a row; those of a group are named after it."""
+    rows = []
+    for key, value in summary.items():
+        if key in LISTS or key == "reader":
+            continue
+        parts = _flat(_title(key), value)
+        rows += [{"finding": name, "value": number(part)} for name, part in parts]
+    return rows
+
+
+def _flat(name: str, value: object) -> list[tuple[str, object]]:
+    if isinstance(value, dict):
+        return [found for key, part in value.items() for found in _flat(f"{name}: {_title(key)}", part)]
+    return [(name, value)]
+
+
+def _title(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _some(names: list[str]) -> str:
+    return f"{', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''}" or "none"
+
+
+def _labels_csv(audit: Audit, data: Dataset, labels: np.ndarray) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["image_name", "executed", *NAMES, *(f"chi2_{story.replace(' ', '_')}" for story in STORIES), "findings"])
+    for k, name in enumerate(data.pins.image_name):
+        flags = {"no contact": audit.no_contact, "wrong sign": audit.wrong_sign, "fits no story": audit.odd}
+        said = [flag for flag, rows in flags.items() if rows[k]]
+        if audit.twins[k] != k:
+            said.append(f"same pins as {data.pins.image_name[audit.twins[k]]}")
+        numbers = [f"{v:.6g}" for v in (*labels[k], *audit.chi2[k])]
+        writer.writerow([name, f"{audit.executed[k]:.4g}", *numbers, "; ".join(said)])
+    return text.getvalue()
+
+
+def _evidence_figure(audit: Audit, data: Dataset, labels: np.ndarray) -> Figure:
     raw = data.targets.raw
-    figure, axes = new_figure(4, panel_inch=3.8)
+    figure, axes = new_figure(2, 2, panel_inch=4.4)
     difference = audit.chi2[:, 1] - audit.chi2[:, 0]
     size = np.hypot(raw[:, 2], raw[:, 3])
     axes[0].plot(size, np.sign(difference) * np.log10(1 + np.abs(difference)), ".", markersize=2)
-    axes[0].axhline(0, color="#888888", linewidth=0.6)
+    axes[0].axhline(0, color=muted(), linewidth=0.8)
     axes[0].set(title="which story fits better", xlabel="size of the move, mm and deg", ylabel="log10 chi² for (+) executed")
     axes[1].plot(raw[:, 1], raw[:, 1] - labels[:, 1], ".", markersize=2)
     axes[1].set(title="angle label less what the pins say", xlabel="pose_6, deg", ylabel="deg")
@@ -82,26 +136,4 @@ def _draw(path: Path, audit: Audit, data: Dataset, labels: np.ndarray) -> None:
     axes[3].plot(rim - rim.mean(axis=0), ".", markersize=1.5, label=["x", "y"])
     axes[3].set(title="middle of the outmost pins, along the table", xlabel="row", ylabel="px")
     axes[3].legend(markerscale=5)
-    figure.savefig(path, dpi=110)
-
-
-def _page(summary: dict, data: Dataset) -> str:
-    lists = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame", "reader")
-    rows = "".join(
-        f"<tr><th>{escape(key.replace('_', ' '))}</th><td>{escape(_said(value, key in lists))}</td></tr>" for key, value in summary.items()
-    )
-    return (
-        "<!doctype html><meta charset='utf-8'><title>Audit</title>"
-        "<style>body{font:15px sans-serif;max-width:70em;margin:2em auto}th{text-align:left;vertical-align:top;padding-right:2em}"
-        "img{width:100%}</style>"
-        f"<h1>Audit of {escape(data.folder.name)}</h1><p>From pins and labels alone. Each frame is asked whether its pins fit "
-        "the label with the shear move executed, or the state before it; labels_corrected.csv holds the answer. Laid beside "
-        "the recording's targets.csv, it is what training with corrected labels uses.</p>"
-        f"<table>{rows}</table><img src='audit.png' alt='evidence'>"
-    )
-
-
-def _said(value, counted: bool) -> str:
-    if counted:
-        return "none" if not value else f"{len(value)}: {', '.join(map(str, value[:8]))}{', ...' if len(value) > 8 else ''}"
-    return json.dumps(value) if isinstance(value, dict) else str(value)
+    return figure

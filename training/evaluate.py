@@ -15,9 +15,9 @@ from training.recipes import TrainingError
 from training.simulated import is_pins_only
 from training.targets import Targets
 from twin.recordings import open_recording
+from twin.report.charts import new_figure
 from twin.rig.labels import EXECUTED_FILES
 from twin.store import made_by, text_file, write_json
-from twin.views.plots import new_figure
 
 DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)
 ANGLE_EDGES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)

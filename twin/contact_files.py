@@ -8,12 +8,12 @@ from twin.mechanics.path import ContactPose
 from twin.optics.files import write_exr
 from twin.preprocess.pipeline import Pipeline
 from twin.recordings.images import write_image
+from twin.report.panel import Look, contact_panel
+from twin.report.skin3d import displaced_skin, draw_contact_skin
 from twin.simulator import Shot, Simulator
 from twin.stimulus import build_field
 from twin.store import made_by, write_json, write_npz
 from twin.types import ContactState, FloatArray
-from twin.views.panel import Look, contact_panel
-from twin.views.skin3d import displaced_skin, draw_contact_skin
 
 
 def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> list[Path]:

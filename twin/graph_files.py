@@ -15,9 +15,10 @@ from twin.preprocess.legacy import LegacyPipeline
 from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import Reference, nominal_reference
 from twin.recordings import open_recording
+from twin.report.charts import new_figure
+from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
 from twin.store import write_npz
 from twin.types import Form, PinGraph
-from twin.views.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes, new_figure
 
 
 def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:

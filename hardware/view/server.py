@@ -8,7 +8,7 @@ import numpy as np
 
 from hardware.errors import DeviceError
 from hardware.stream import CONTENT_TYPE, jpeg_of, write_part
-from twin.views.page import render_page
+from twin.report.page import render_page
 
 WAIT_S = 0.5
 

@@ -136,7 +136,7 @@ def print_scaling(repeats, out):
     from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
     from twin.geometry.solid import Resolution, build_solid
-    from twin.views.plots import new_figure
+    from twin.report.charts import new_figure
 
     spec, plane = plain_sensor(), load_object("plane")
     head = f"{'s to the end':>14s}{'states':>8s}{'ms per state':>14s}{'normal force, N':>17s}"

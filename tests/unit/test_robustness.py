@@ -10,8 +10,8 @@ from test_training import data, trained  # noqa: F401  (fixtures)
 
 from training.estimator import PoseEstimator
 from training.robustness import CHANGES, judge_changes
+from twin.report.table import write_table
 from twin.types import Form, Frame
-from twin.views.table import write_table
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from drawn_frames import drawn_frame, smooth_warp
 from plain_sensor import changed
+from sound_page import read_sound_page
 
 from scenes import load_sensor
 from twin.detectors import Found, make_detector, shipped_detector
@@ -156,8 +157,9 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
 
     envelopes, written = study(plan, "drawn", tmp_path, Bar)
     assert all(path.stat().st_size for path in written)
-    page = written[0].read_text()
-    assert all(case.title in page for case in plan.cases) and "Narrower" in page or "narrower in none" in page
+    page = read_sound_page(written[0].read_text(encoding="utf-8"), tmp_path)
+    assert all(case.title in page.text for case in plan.cases)
+    assert "Narrower in" in page.text or "narrower in none" in page.text
     assert counts[0] == (0, 7) and counts[-1] == (7, 7)  # severity 0 is one cell for all
     assert all(e.severity > 0 for e in envelopes if e.pipeline == "twin")
     assert all(e.reached for e in envelopes if e.case.name in ("wrong-crop", "noise+jpeg"))

@@ -16,7 +16,7 @@ from training.study.graphs import compare_graphs
 from training.study.models import ordering, plan_run, table_row, train_all
 from twin.cli.progress import epoch_bar
 from twin.preprocess import make_graph
-from twin.views.table import write_table
+from twin.report.table import write_table
 
 WATCHED_S = 0.1  # ten looks at the memory
 

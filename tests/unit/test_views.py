@@ -11,9 +11,10 @@ import pyvista as pv
 from scenes import load_sensor
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
+from twin.report import skin3d
+from twin.report.charts import new_figure
+from twin.report.plots import ENLARGEMENTS, area_surface_figure, draw_area_change, draw_displacement, enlargement
 from twin.stimulus import build_field
-from twin.views import skin3d
-from twin.views.plots import area_surface_figure, draw_area_change, new_figure
 
 
 def test_a_dying_vtk_leaves_a_plain_picture_and_a_reason(tmp_path, monkeypatch):
@@ -29,7 +30,7 @@ def test_a_dying_vtk_leaves_a_plain_picture_and_a_reason(tmp_path, monkeypatch):
 
 
 def test_pictures_need_no_display(tmp_path):
-    code = "from twin.views.skin3d import probe_offscreen; print('reason:', probe_offscreen())"
+    code = "from twin.report.skin3d import probe_offscreen; print('reason:', probe_offscreen())"
     env = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
     assert done.returncode == 0 and "reason:" in done.stdout
@@ -65,3 +66,14 @@ def test_area_pictures_take_any_graph():
     draw_area_change(ax, moved, rest.area_px2, "change")
     assert len(ax.collections[0].get_paths()) == 40
     assert len(area_surface_figure(rest, moved).axes) == 3
+
+
+def test_enlarged_arrows_stay_between_their_pins_and_say_so():
+    grid_px = 10.0 * np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), -1).reshape(-1, 2)
+    for moved_px, wanted in ((0.9, 10.0), (1.1, 5.0), (30.0, 1.0), (1e-6, ENLARGEMENTS[-1])):
+        assert enlargement(grid_px, grid_px + [moved_px, 0.0]) == wanted
+    figure, (ax,) = new_figure(1)
+    draw_displacement(ax, grid_px, grid_px + [0.9, 0.0], "pins", enlarged=10.0)
+    (arrows,) = [part for part in ax.collections if hasattr(part, "U")]
+    assert arrows.scale == 0.1 and np.allclose(arrows.get_array(), 0.9)
+    assert "arrows 10 times" in figure.axes[1].get_ylabel()

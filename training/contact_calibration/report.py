@@ -1,18 +1,22 @@
 """Page, figures and table of a contact calibration."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from training.contact_calibration.fit import INDEPENDENT, ContactFit
 from training.contact_calibration.simulate import Setup
 from training.validation.model import MeasuredFrames
+from twin.report.charts import new_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, Picture
+from twin.report.plots import draw_displacement, enlargement
+from twin.report.table import Cell, Column
 from twin.rig.kinematics import rig_of
-from twin.store import made_by, write_json, write_text
-from twin.views.page import render_page
-from twin.views.plots import draw_displacement, new_figure
+from twin.store import made_by, write_json
 
-DPI = 110
 TOLD = 0.5  # share of the prior's variance that frames must remove before they count as telling a parameter
 TRUSTED = 0.5
 ALIKE = 0.9  # correlation from which on two parameters can hardly be told apart
@@ -40,7 +44,7 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
         "sensor": setup.sensor.name,
         "experiment": setup.experiment.name,
         "parameters": parameters,
-        "turn_sign": {"start": rig_of(setup.sensor).turn_sign, "value": fit.sensor.rig.turn_sign},
+        "turn_sign": {"start": rig_of(setup.sensor).turn_sign, "value": rig_of(fit.sensor).turn_sign},
         "hardly_told_apart": pairs,
         "executed_share": fit.share,
         "fitted_px": {"before": float(np.nanmean(fit.before_px)), "after": float(np.nanmean(fit.after_px)), "frames": len(measured)},
@@ -53,29 +57,99 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
 
 
 def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray, fit: ContactFit, summary: dict) -> Path:
-    """Write ``calibration.json``, pictures and ``index.html``; the page.
+    """Write ``calibration.json``, charts and ``index.html``; the page.
 
     Parameters
     ----------
     moved : (2, 2, M, N, 2) float
         Simulated displacements before and after the calibration; of each, after the tap and after the move.
     """
-    write_json(folder / "calibration.json", summary | {"made_by": made_by("training.contact_calibration.fit")})
+    figures = write_json(folder / "calibration.json", summary | {"made_by": made_by("training.contact_calibration.fit")})
     solved = np.flatnonzero(np.isfinite(fit.after_px) & np.isfinite(fit.before_px) & (fit.trust >= TRUSTED))
     chosen = solved[np.argsort(fit.before_px[solved])[[len(solved) // 2, -1]]] if len(solved) else solved
-    pictures = []
+    page = Page(f"Contact of {summary['sensor']}", "twin calibrate contact", topic="TacTip twin: contact calibration", lead=_lead(summary))
+    page.notice("Not trusted, as neither story fits them", [", ".join(summary["distrusted"])] if summary["distrusted"] else [], tone="bad")
+    page.notice("Noted", summary["problems"])
+    _parameters_section(page, summary)
+    page.section("Frames")
+    page.table(
+        summary["frames"],
+        [
+            Column("image_name", "frame"),
+            Column("executed", "move executed", "%", decimals=0, scale=100),
+            Column("trust", "trust", "%", decimals=0, scale=100),
+            Column("before_px", "before", "px", decimals=2),
+            Column("after_px", "after", "px", decimals=2),
+        ],
+        caption="Mean pin error of each frame; a dash: its contact failed.",
+    )
+    page.section("Real pins to simulated ones")
     for k in chosen:
-        name = f"{Path(measured.names[k]).stem}.png"
-        seen = np.isfinite(measured.pins_px[k, :, 0])
-        figure, axes = new_figure(2, panel_inch=5.0)
-        for ax, title, both, error in zip(axes, ("before", "after"), moved, (fit.before_px[k], fit.after_px[k]), strict=True):
-            story = both[int(fit.executed[k] > 0.5), k]
-            draw_displacement(ax, measured.pins_px[k][seen], (measured.no_contact_px + story)[seen], f"{title}: {error:.2f} px")
-        figure.savefig(folder / name, dpi=DPI)
-        pictures.append(name)
-    page = folder / "index.html"
-    write_text(page, render_page("training.contact_calibration", summary=summary, pictures=pictures))
-    return page
+        name = Path(measured.names[k]).stem
+        chart = write_chart(folder / f"{name}.png", partial(_frame_figure, measured, moved, fit, int(k)))
+        page.figures(Picture(chart, f"Pin errors of {name} before and after the calibration", measured.names[k]))
+    page.download(figures, "all figures of this page")
+    return page.write(folder / "index.html")
+
+
+def _lead(summary: dict) -> str:
+    def px(key: str, part: str) -> str:
+        return number(summary[key][part], decimals=2)
+
+    held = ""
+    if summary["held_out_px"]:
+        frames = summary["held_out_px"]["frames"]
+        held = f"; on {frames} frames that were not fitted {px('held_out_px', 'before')} and {px('held_out_px', 'after')} px"
+    return (
+        f"Fitted to {summary['fitted_px']['frames']} labelled frames of {summary['experiment']}: mean pin error "
+        f"{px('fitted_px', 'before')} px before, {px('fitted_px', 'after')} px after{held}. Each frame counts under its likelier story: "
+        f"move executed, or tap alone. Moves executed: {100 * summary['executed_share']:.0f} %."
+    )
+
+
+def _parameters_section(page: Page, summary: dict) -> None:
+    page.section("Parameters")
+    rows: list[dict] = [
+        {
+            "name": Cell(p["name"], "" if p["known"] else "bad"),
+            "start": number(p["start"], 4),
+            "value": number(p["value"], 4),
+            "sd": number(p["sd"], 2),
+            "told": Cell(100 * p["told"], "" if p["known"] else "bad"),
+        }
+        for p in summary["parameters"]
+    ]
+    sign = summary["turn_sign"]
+    rows.append({"name": "rig.turn_sign", "start": number(sign["start"]), "value": number(sign["value"]), "sd": "", "told": ""})
+    page.table(
+        rows,
+        [
+            Column("name", "parameter"),
+            Column("start", "start", align="right"),
+            Column("value", "fitted", align="right"),
+            Column("sd", "sd", align="right"),
+            Column("told", "told by the frames", "%", decimals=0),
+        ],
+    )
+    page.text(
+        "Told: the share of what was uncertain beforehand that the frames took away. What they do not tell (red) stays near its start. The "
+        f"sd counts a frame's pins as {summary['independent_numbers_a_frame']:.0f} independent numbers, as the model's own errors are "
+        "shared by all pins."
+    )
+    if alike := summary["hardly_told_apart"]:
+        said = "; ".join(f"{a} and {b} ({number(r, decimals=2, signed=True)})" for a, b, r in alike)
+        page.text(f"Hardly told apart: {said}.")
+
+
+def _frame_figure(measured: MeasuredFrames, moved: np.ndarray, fit: ContactFit, k: int) -> Figure:
+    seen = np.isfinite(measured.pins_px[k, :, 0])
+    real = measured.pins_px[k][seen]
+    stories = [(measured.no_contact_px + both[int(fit.executed[k] > 0.5), k])[seen] for both in moved]
+    enlarged = enlargement(real, stories[0])
+    figure, axes = new_figure(2, panel_inch=5.0)
+    for ax, title, story, error in zip(axes, ("before", "after"), stories, (fit.before_px[k], fit.after_px[k]), strict=True):
+        draw_displacement(ax, real, story, f"{title}: {error:.2f} px", enlarged=enlarged)
+    return figure
 
 
 def _number(value: float) -> float | None:

@@ -15,10 +15,11 @@ from training.dataset import Dataset
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.preprocess import Pipeline, make_graph
+from twin.report.charts import new_figure
+from twin.report.plots import draw_area_change
 from twin.simulator import Simulator
 from twin.stimulus import build_field
 from twin.types import Form, PinGraph
-from twin.views.plots import draw_area_change, new_figure
 
 DEPTHS_MM = (2.0, 4.0)
 TAP_MM = 5.0  # of the published recordings (their meta.json: tap_move)

@@ -1,6 +1,8 @@
 """Page, table and figures of a comparison with real frames."""
 
 import csv
+import io
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +10,12 @@ from matplotlib.figure import Figure
 
 from scenes.sensor import SensorSpec
 from training.validation.compare import MEASURES, Comparison, table_of
-from twin.store import made_by, text_file, write_json, write_text
-from twin.views.page import render_page
-from twin.views.plots import draw_displacement, new_figure
-
-DPI = 110
+from twin.report.charts import new_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, Picture
+from twin.report.plots import draw_displacement, enlargement
+from twin.report.table import Column
+from twin.store import made_by, write_json, write_text
 
 
 def summary_of(found: Comparison, spec: SensorSpec) -> dict:
@@ -40,23 +43,68 @@ def summary_of(found: Comparison, spec: SensorSpec) -> dict:
 
 
 def write_validation(out: Path, found: Comparison, spec: SensorSpec, summary: dict) -> list[Path]:
-    """Write ``index.html`` with its pictures, ``frames.csv`` and ``validation.json``; the paths."""
-    table = out / "frames.csv"
-    with text_file(table) as file:
-        writer = csv.writer(file)
-        writer.writerow(["image_name", "executed", *MEASURES, "error_px", "own_friction", "error_own_friction_px", "failure"])
-        for k, name in enumerate(found.measured.names):
-            values = [found.by[key][k] for key in MEASURES]
-            own = [found.error_px[k], found.friction[k], found.friction_error_px[k]]
-            numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*values, *own)]
-            writer.writerow([name, int(found.executed[k]), *numbers, found.failures.get(name, "")])
-    figures = out / "validation.json"
-    write_json(figures, summary | {"made_by": made_by("training.validation.compare")})
-    _draw_errors(found).savefig(out / "errors.png", dpi=DPI)
-    _draw_worst(found).savefig(out / "frames.png", dpi=DPI)
-    page = out / "index.html"
-    write_text(page, render_page("training.validation", spec=spec, summary=summary, measures=MEASURES))
-    return [page, table, figures]
+    """Write ``index.html`` with its charts, ``frames.csv`` and ``validation.json``; the paths."""
+    table = write_text(out / "frames.csv", _frames_csv(found))
+    figures = write_json(out / "validation.json", summary | {"made_by": made_by("training.validation.compare")})
+    errors = write_chart(out / "errors.png", lambda: _draw_errors(found))
+    frames = write_chart(out / "frames.png", lambda: _draw_worst(found))
+    page = Page(
+        f"Pins of {spec.name} against real frames",
+        "twin validate",
+        topic="TacTip twin: validation",
+        lead=f"{spec.description}. Each frame's contact is simulated along the arm's own way, from its label alone, and the simulated "
+        "displacement is added to the recorded no-contact pins. Error: mean over pins and frames, px of the "
+        f"{summary['form']} frames. {summary['frames']} frames, in which pins move by "
+        f"{number(summary['mean_displacement_px'], decimals=2)} px on average.",
+    )
+    page.notice("Contacts that failed", [f"{name}: {reason}" for name, reason in summary["failed"].items()], tone="bad")
+    page.notice("Noted", summary["problems"])
+    page.section("With nothing free")
+    page.table(
+        summary["table"],
+        [Column("group", "frames whose move was"), Column("frames", "frames"), Column("error_px", "error", "px", decimals=2)],
+    )
+    for key, title in MEASURES.items():
+        _binned_table(page, summary["table"], key, title)
+    page.figures(Picture(errors, "Error of each frame by depth, turn and shear"))
+    if own := summary["one_friction_a_frame"]:
+        page.section(
+            "With one friction a frame",
+            f"{own['frames']} frames with an executed move: {number(own['error_px'], decimals=2)} px, each with the friction that suits it "
+            f"best (median {number(own['median'], 2)}); the same frames with the common friction: "
+            f"{number(own['error_with_common_friction_px'], decimals=2)} px.",
+        )
+    page.section("Pin by pin")
+    page.figures(Picture(frames, "Error of each pin in the median and in the worst frame"))
+    page.download(table, "error of each frame")
+    page.download(figures, "all figures of this page")
+    return [page.write(out / "index.html"), table, figures]
+
+
+def _binned_table(page: Page, rows: list[dict], key: str, title: str) -> None:
+    binned = [row for row in rows if key in row["by"]]
+    if not binned:
+        return
+    name, _, unit = title.partition(", ")
+    edges = binned[0]["by"][key]["edges"]
+    bins = [
+        Column(f"bin_{k}", f"{number(low, decimals=1)} to {number(high, decimals=1)}", unit, decimals=2)
+        for k, (low, high) in enumerate(pairwise(edges))
+    ]
+    shown = [{"group": row["group"]} | {f"bin_{k}": mean for k, mean in enumerate(row["by"][key]["means"])} for row in binned]
+    page.table(shown, [Column("group", "error in px"), *bins], caption=f"By {name}")
+
+
+def _frames_csv(found: Comparison) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["image_name", "executed", *MEASURES, "error_px", "own_friction", "error_own_friction_px", "failure"])
+    for k, name in enumerate(found.measured.names):
+        values = [found.by[key][k] for key in MEASURES]
+        own = [found.error_px[k], found.friction[k], found.friction_error_px[k]]
+        numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*values, *own)]
+        writer.writerow([name, int(found.executed[k]), *numbers, found.failures.get(name, "")])
+    return text.getvalue()
 
 
 def _draw_errors(found: Comparison) -> Figure:
@@ -76,5 +124,7 @@ def _draw_worst(found: Comparison) -> Figure:
     for ax, k, title in ((axes[0], order[len(order) // 2], "median frame"), (axes[1], order[-1], "worst frame")):
         measured, simulated = found.measured.pins_px[k], found.simulated_px[k]
         seen = np.isfinite(measured[:, 0])
-        draw_displacement(ax, measured[seen], simulated[seen], f"{title}: real pin to simulated\n{found.measured.names[k]}")
+        real, made = measured[seen], simulated[seen]
+        text = f"{title}: real pin to simulated\n{found.measured.names[k]}"
+        draw_displacement(ax, real, made, text, enlarged=enlargement(real, made))
     return figure

@@ -53,7 +53,7 @@ def _rendering() -> bool:
 
 
 def _pictures() -> None:
-    from twin.views.skin3d import probe_offscreen
+    from twin.report.skin3d import probe_offscreen
 
     print("\n3D pictures (VTK offscreen)")
     reason = probe_offscreen()

@@ -39,7 +39,7 @@ def evaluate(
     from training.recipes import TrainingError
     from training.robustness import judge_changes
     from twin.cli.progress import count_bar
-    from twin.views.table import write_table
+    from twin.report.table import write_table
 
     for value, allowed, option in ((rows, ("validation", "all"), "--rows"), (labels, ("corrected", "raw"), "--labels")):
         if value not in allowed:

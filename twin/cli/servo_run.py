@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hardware.loop import ServoLoop
-from hardware.servo_plots import save_figure, trajectory_figure
+from hardware.servo_plots import trajectory_figure
 from hardware.session import SessionWriter, plain
 from hardware.step import LoopSettings
 from hardware.timing import Timing
@@ -16,6 +16,7 @@ from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
 from twin.cli.at_rest import FIRST, counting_from_first, given_frame
 from twin.cli.rig import build_rig, servo_loop, steps_round
 from twin.errors import TwinError
+from twin.report.charts import save_figure
 from twin.store import made_by, write_json
 from twin.types import Form
 

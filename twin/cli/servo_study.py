@@ -5,11 +5,12 @@ import re
 from dataclasses import asdict
 from pathlib import Path
 
-from hardware.servo_plots import comparison_figure, save_figure
+from hardware.servo_plots import comparison_figure
 from scenes import load_object, load_servo
 from twin.cli.progress import count_bar
 from twin.cli.servo_run import Followed, ServoRun, follow
 from twin.errors import TwinError
+from twin.report.charts import save_figure
 from twin.store import text_file
 
 COLUMNS = ("smoothness", "local_smoothness", "path_error_mm", "depth_error_mm", "angle_error_deg", "completed", "lost_contacts")

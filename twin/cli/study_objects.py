@@ -49,14 +49,13 @@ def study_objects(
     across: Across = FINE,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
-    from training import across_objects
     from training.across_objects import study as objects
+    from training.across_objects.page import write_page
     from training.dataset import load_dataset
     from training.generation import generate
     from training.sim_to_real.study import train_in_twin
     from twin.cli.progress import count_bar, epoch_bar, rate_bar
-    from twin.views.page import render_page
-    from twin.views.table import write_table
+    from twin.report.table import write_table
 
     spec, judged = load_sensor(sensor), load_experiment(experiment)
     plan = objects.Plan(
@@ -85,8 +84,7 @@ def study_objects(
             train_in_twin(data, runs[name], seed=seed, split=None, epochs=epochs, progress=progress)
     rows = objects.table(plan, runs, sets)
     said = objects.verdicts(plan, rows, judged.targets)
-    page = render_page(across_objects.__name__, plan=plan, names=judged.targets, ranges=judged.ranges(), rows=rows, verdicts=said)
-    (out / "index.html").write_text(page)
+    write_page(out, plan=plan, names=judged.targets, ranges=judged.ranges(), rows=rows, verdicts=said)
     for row in rows:
         errors = ", ".join(f"{name} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name in judged.targets)
         print(f"{row['model']}, {row['object']} ({'seen' if row['seen'] else 'never seen'}): {errors}")

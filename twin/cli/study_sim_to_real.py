@@ -76,6 +76,7 @@ def study_sim_to_real(
     from training.dataset import joined, load_dataset
     from training.generation import generate
     from training.sim_to_real.discrepancy import Discrepancy, measure_residuals
+    from training.sim_to_real.page import write_page
     from training.sim_to_real.study import (
         arm_labels,
         choose_frames,
@@ -91,8 +92,7 @@ def study_sim_to_real(
     )
     from training.sim_to_real.twins import Twin, as_mounted, without_one_ingredient
     from twin.cli.progress import count_bar, epoch_bar, rate_bar
-    from twin.views.page import render_page
-    from twin.views.table import write_table
+    from twin.report.table import write_table
 
     spec, plan = load_sensor(sensor), load_experiment(experiment)
     simulated_plan, touched = load_experiment(contacts or plan.wider or experiment), load_object(plan.object)
@@ -163,8 +163,8 @@ def study_sim_to_real(
             train_on_real(real.rows(index), run, seed=seed, epochs=epochs, progress=progress)
         rows += [judged("real", len(index), run, real, chosen.test), quadratic_row("real", real, index, chosen.test)]
     columns = list(rows[0])
-    page = render_page(
-        "training.sim_to_real",
+    write_page(
+        out,
         sensor=spec.name,
         tested=len(chosen.test),
         frames=len(real),
@@ -178,7 +178,6 @@ def study_sim_to_real(
         rows=rows,
         problems=real.problems,
     )
-    (out / "index.html").write_text(page)
     for row in rows:
         errors = ", ".join(f"{key} {row[key]:.3g}" for key in columns if key.endswith(("_corrected", "_raw")))
         print(f"{row['trained_on']}, {row['labelled_frames']} labelled, {row['model']}: {errors}")

@@ -60,7 +60,7 @@ def study_tac_vgnn(
     from training.study.models import SHOWN, error_columns, plan_run, table_row, train_all
     from training.study.report import draw_contacts, draw_curves, draw_efficiency, write_page
     from twin.cli.progress import count_bar, epoch_bar
-    from twin.views.table import write_table
+    from twin.report.table import write_table
 
     if labels not in ("corrected", "raw"):
         raise TrainingError(f"--labels must be corrected or raw, got {labels!r}")

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from scenes import load_object, load_sensor
-from twin.demo.page import contact_figures, contact_pictures, embed, motion_figure, write_figure
+from twin.demo.page import ContactContent, contact_figures, contact_pictures, motion_figure, write_page
 from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, DepthRow, depth_table, run_contact
 from twin.progress import FractionBar
 from twin.projection import project
 from twin.recordings.forms import from_raw
+from twin.report.charts import write_chart
+from twin.report.skin3d import draw_contact_skin
 from twin.simulator import Simulator
 from twin.stimulus import build_field
 from twin.types import Form
-from twin.views.page import render_page
-from twin.views.skin3d import draw_contact_skin
 
 
 def run_demo(out: Path, bar: FractionBar) -> list[Path]:
@@ -59,7 +59,7 @@ def run_demo(out: Path, bar: FractionBar) -> list[Path]:
         for number, (title, pose) in enumerate(MOTIONS):
             looks.append((title, run_contact(simulators[motion_sensor], "plane", pose, Form.RAW).look))
             progress((number + 1) / len(MOTIONS))
-        motions = write_figure(pictures / "motions.png", motion_figure(looks))
+        motions = write_chart(pictures / "motions.png", lambda: motion_figure(looks))
     seconds["motions"] = perf_counter() - start
 
     tables = {}
@@ -73,42 +73,33 @@ def run_demo(out: Path, bar: FractionBar) -> list[Path]:
     machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(
         sorted(notes)
     )
-    page = out / "index.html"
-    page.write_text(
-        render_page(
-            "twin.demo",
-            machine=machine,
-            contacts=contacts,
-            motions=embed(motions),
-            motion_sensor=motion_sensor,
-            tables=tables,
-            seconds=[*seconds.items(), ("all", sum(seconds.values()))],
-        ),
-        encoding="utf-8",
+    page = write_page(
+        out / "index.html",
+        machine=machine,
+        contacts=contacts,
+        motions=motions,
+        motion_sensor=motion_sensor,
+        tables=tables,
+        seconds=seconds,
     )
     _print_tables(tables)
     return [page, *sorted(pictures.iterdir())]
 
 
-def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pictures: Path) -> dict[str, Any]:
+def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pictures: Path) -> ContactContent:
     spec = simulator.spec
     written = contact_pictures(pictures, result)
     touched = result.state.contact_mm
     contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
     contact_px = from_raw(spec.recording, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
-    return {
-        "title": f"{spec.name} against {result.stimulus}",
-        "description": f"{spec.description}. {load_object(result.stimulus).description}, pressed in by {result.pose.indent_mm:g} mm.",
-        "skin": embed(skin),
-        "raw": embed(written["raw"]),
-        "raw_size": f"{width} x {height} px",
-        "recorded": embed(written["recorded"]) if "recorded" in written else "",
-        "pins": embed(written["pins"]),
-        "areas": embed(written["areas"]),
-        "surfaces": embed(written["surfaces"]),
-        "figures": contact_figures(result, contact_px),
-    }
+    return ContactContent(
+        title=f"{spec.name} against {result.stimulus}",
+        description=f"{spec.description}. {load_object(result.stimulus).description}, pressed in by {result.pose.indent_mm:g} mm.",
+        pictures=written | {"skin": skin},
+        raw_size=f"{width} x {height} px",
+        figures=contact_figures(result, contact_px),
+    )
 
 
 def _print_tables(tables: dict[str, list[DepthRow]]) -> None:

@@ -1,40 +1,54 @@
-"""Pictures of the demo and the self-contained page that shows them."""
+"""The demo's page: what it computed, in pictures and tables."""
 
-import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.demo.stages import ContactResult
+from twin.demo.stages import ContactResult, DepthRow
 from twin.recordings.images import write_image
+from twin.report.charts import new_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, Picture, code, sentence
+from twin.report.panel import Look, area_change_at
+from twin.report.plots import area_surface_figure, draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins
+from twin.report.table import Column
 from twin.types import Form
-from twin.views.panel import Look, area_change_at
-from twin.views.plots import area_surface_figure, draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins, new_figure
-
-DPI = 110
 
 
-def write_figure(path: Path, figure: Figure) -> Path:
-    """Write a matplotlib figure as PNG."""
-    figure.savefig(path, dpi=DPI)
-    return path
+@dataclass(frozen=True)
+class ContactContent:
+    """What the page shows of one contact.
+
+    Attributes
+    ----------
+    title, description : str
+    pictures : dict of str to Path
+        As `contact_pictures` gives them, and ``skin``.
+    raw_size : str
+        Of the raw frame.
+    figures : list of (str, str)
+        As `contact_figures` gives them.
+    """
+
+    title: str
+    description: str
+    pictures: dict[str, Path]
+    raw_size: str
+    figures: list[tuple[str, str]]
 
 
 def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
     """Write the pictures of one contact; the skin's own picture is drawn elsewhere."""
     look, stem = result.look, f"{result.sensor}-{result.stimulus}"
-    pins, (ax,) = new_figure(1, panel_inch=6)
-    draw_frame(ax, look.frame.image, around_px=look.rest.graph.nodes_px)
-    draw_graph(ax, look.observation.graph)
-    draw_pins(ax, look.observation)
-    areas, (ax,) = new_figure(1, panel_inch=6)
-    draw_area_change(ax, look.observation.graph, look.rest.graph.area_px2, "")
+    graph, rest = look.graphs()
     written = {
         "raw": write_image(folder / f"{stem}-frame.png", result.raw.frame.image),
-        "pins": write_figure(folder / f"{stem}-graph.png", pins),
-        "areas": write_figure(folder / f"{stem}-areas.png", areas),
-        "surfaces": write_figure(folder / f"{stem}-surfaces.png", area_surface_figure(look.rest.graph, look.observation.graph)),
+        "pins": write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
+        "areas": write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
+        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: area_surface_figure(rest, graph)),
     }
     if look.frame.form is Form.RECORDING:
         written["recorded"] = write_image(folder / f"{stem}-recorded.png", look.frame.image)
@@ -45,7 +59,7 @@ def motion_figure(motions: list[tuple[str, Look]]) -> Figure:
     """Displacement (top) and area change (bottom) for each motion, as in the paper's figure 1(d)."""
     figure, axes = new_figure(len(motions), 2, panel_inch=4.2)
     for column, (title, look) in enumerate(motions):
-        rest, graph = look.rest.graph, look.observation.graph
+        graph, rest = look.graphs()
         draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
         draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
     return figure
@@ -55,16 +69,124 @@ def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple
     """Names and values of one contact's figures, as shown on the page."""
     look, force = result.look, result.state.force_n
     observation = look.observation
+    parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
     return [
         ("pins found", f"{observation.found} of {len(observation.pins_px)}"),
-        ("directed edges (Delaunay)", f"{len(observation.graph.edges)}"),
-        ("force on the object, N", f"({force[0]:+.2f}, {force[1]:+.2f}, {force[2]:+.2f})"),
-        ("contact area, mm²", f"{result.state.area_mm2:.1f}"),
-        ("cell area at the contact against no contact", f"{area_change_at(look, contact_px, count=12):+.1f} %"),
-        *((f"{name}, s", f"{value:.3f}") for name, value in result.seconds.items()),
+        ("directed edges (Delaunay)", number(len(look.graphs()[0].edges))),
+        ("force on the object, N", f"({parts})"),
+        ("contact area, mm²", number(float(result.state.area_mm2), decimals=1)),
+        ("cell area at the contact against no contact", f"{number(area_change_at(look, contact_px, count=12), decimals=1, signed=True)} %"),
+        *((f"{name}, s", number(value, decimals=3)) for name, value in result.seconds.items()),
     ]
 
 
-def embed(path: Path) -> str:
-    """A picture as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+def write_page(
+    path: Path,
+    *,
+    machine: str,
+    contacts: Sequence[ContactContent],
+    motions: Path,
+    motion_sensor: str,
+    tables: Mapping[str, Sequence[DepthRow]],
+    seconds: Mapping[str, float],
+) -> Path:
+    """Write the page with all pictures inside; the path.
+
+    Parameters
+    ----------
+    path : Path
+    machine : str
+        What rendered, and where.
+    contacts : sequence of ContactContent
+    motions : Path
+        Chart of `motion_figure`.
+    motion_sensor : str
+    tables : mapping of str to sequence of DepthRow
+        By sensor.
+    seconds : mapping of str to float
+        Time of each stage.
+    """
+    page = Page("TacTip twin", "twin demo", topic="Demo")
+    page.lead = sentence(
+        "A skin pressed by finite elements, the view of the camera inside it path-traced, and the pins found in that picture by the same "
+        "pipeline that runs on a real sensor. Everything on this page was computed by",
+        code("make demo") + ".",
+        machine,
+    )
+    for contact in contacts:
+        _contact_section(page, contact)
+    page.section(
+        "Three motions, three signatures",
+        "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip.",
+    )
+    page.figures(
+        Picture(
+            motions,
+            "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y",
+            f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {motion_sensor}.",
+        )
+    )
+    page.section(
+        "Against real recordings: displacement by depth",
+        "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "
+        "recordings, pure presses in 1 mm bins. Simulated: true cap positions at the middle of each bin, with nominal stiffness; the "
+        "hexagonal sensor's camera distance and pin spacing were chosen with these figures in view.",
+    )
+    columns = [
+        Column("indent_mm", "indentation", "mm", decimals=1),
+        Column("measured_px", "measured", "px", decimals=1),
+        Column("simulated_px", "simulated", "px", decimals=1),
+        Column("contact_area_change_percent", "cell area at the contact", "%", decimals=1, signed=True),
+        Column("force_n", "force", "N", decimals=2),
+    ]
+    for sensor, rows in tables.items():
+        page.table([vars(row) for row in rows], columns, caption=sensor)
+    page.section("Time")
+    total = {"stage": "all", "seconds": sum(seconds.values())}
+    stages = [{"stage": name, "seconds": value} for name, value in seconds.items()]
+    page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
+    return page.write(path, embed=True)
+
+
+def _contact_section(page: Page, contact: ContactContent) -> None:
+    at, title = contact.pictures, contact.title
+    page.section(title, contact.description)
+    shown = [
+        Picture(
+            at["skin"], f"{title}: deformed skin in 3D", "The skin, cut open, coloured by its displacement, with pins and object.", "photo"
+        ),
+        Picture(at["raw"], f"{title}: rendered camera frame", f"What the camera inside sees ({contact.raw_size}).", "frame"),
+    ]
+    if "recorded" in at:
+        said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
+        shown.append(Picture(at["recorded"], f"{title}: frame in the form of a recording", said, "frame"))
+    page.figures(*shown, layout="row")
+    page.figures(
+        Picture(at["pins"], f"{title}: pins and Voronoi graph", "Pins found (green), graph edges (blue) and Voronoi cells (white)."),
+        Picture(at["areas"], f"{title}: Voronoi area change", "Voronoi cell areas against no contact: cells grow where the dome flattens."),
+        layout="row",
+    )
+    page.figures(
+        Picture(
+            at["surfaces"],
+            f"{title}: interpolated area surfaces",
+            "Cell area interpolated over the image: no contact, contact, difference.",
+        )
+    )
+    page.table([{"name": name, "value": value} for name, value in contact.figures], [Column("name", "figure"), Column("value", "value")])
+
+
+def _graph_figure(look: Look) -> Figure:
+    figure, (ax,) = new_figure(1, panel_inch=6)
+    graph, rest = look.graphs()
+    draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
+    draw_graph(ax, graph)
+    draw_pins(ax, look.observation)
+    return figure
+
+
+def _areas_figure(look: Look) -> Figure:
+    figure, (ax,) = new_figure(1, panel_inch=6)
+    graph, rest = look.graphs()
+    draw_area_change(ax, graph, rest.area_px2, "")
+    return figure

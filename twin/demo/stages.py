@@ -14,9 +14,9 @@ from twin.preprocess.graph import make_graph
 from twin.preprocess.reference import nominal_reference
 from twin.progress import FractionProgress
 from twin.projection import project
+from twin.report.panel import Look
 from twin.simulator import Shot, Simulator
 from twin.types import ContactState, Form
-from twin.views.panel import Look
 
 Result = TypeVar("Result")
 

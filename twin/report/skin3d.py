@@ -7,10 +7,14 @@ picture is drawn plainly with matplotlib instead and the caller is told why.
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyvista as pv
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 
 from scenes.sensor import PinsSpec
 from twin.geometry.export import skin_surface
@@ -21,7 +25,7 @@ from twin.types import ContactState
 SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)
 WINDOW_PX = (1100, 900)
 CHILD_TIMEOUT_S = 120
-FRONT = {"normal": (0, -1, 0), "origin": (0, -0.01, 0)}  # cut away, so that one sees the pins
+CUT_NORMAL, CUT_ORIGIN = (0.0, -1.0, 0.0), (0.0, -0.01, 0.0)  # of the plane whose front is cut away, so that one sees the pins
 REMEDY = "install libegl1 and libgl1 (apt-get install libegl1 libgl1) for shaded 3D pictures"
 
 
@@ -77,7 +81,9 @@ def probe_offscreen() -> str:
         return _run_child(folder, str(Path(folder) / "probe.png"))
 
 
-def stimulus_surface(distance, T_sensor_object: np.ndarray, *, bounds_mm, samples: int = 100) -> pv.PolyData:
+def stimulus_surface(
+    distance: Callable[[np.ndarray], np.ndarray], T_sensor_object: np.ndarray, *, bounds_mm: Sequence[float], samples: int = 100
+) -> pv.PolyData:
     """The zero level of an object's signed distance inside a box of the sensor frame.
 
     Parameters
@@ -97,7 +103,7 @@ def stimulus_surface(distance, T_sensor_object: np.ndarray, *, bounds_mm, sample
 
 
 def _run_child(folder: str, path: str) -> str:
-    command = [sys.executable, "-m", "twin.views.skin3d", folder, path]
+    command = [sys.executable, "-m", "twin.report.skin3d", folder, path]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=CHILD_TIMEOUT_S)
     except subprocess.TimeoutExpired:
@@ -108,34 +114,46 @@ def _run_child(folder: str, path: str) -> str:
 
 
 def _draw_with_pyvista(folder: Path, path: str) -> None:
-    skin, pins, stimulus = (pv.read(folder / f"{name}.vtp") for name in ("skin", "pins", "stimulus"))
+    skin, pins, stimulus = (pv.PolyData(str(folder / f"{name}.vtp")) for name in ("skin", "pins", "stimulus"))
     plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))
-    plotter.set_background("#0d1117", top="#27313f")
+    plotter.set_background("#0d1117", top="#27313f")  # type: ignore[arg-type]  # its decorator hides self from the checker
     scalars = "displacement_mm" if "displacement_mm" in skin.point_data else None
-    bar = {"title": "skin displacement, mm", "color": "white", "fmt": "%.1f", "n_labels": 4, "position_x": 0.25, "position_y": 0.04}
-    plotter.add_mesh(skin.clip(**FRONT), scalars=scalars, cmap=_glow(), ambient=0.2, smooth_shading=True, scalar_bar_args=bar)
-    plotter.add_mesh(pins.clip(**FRONT), color="#f2f7ff", smooth_shading=True, split_sharp_edges=True, specular=0.3)
+    plotter.add_mesh(
+        _cut(skin),
+        scalars=scalars,
+        cmap=_glow(),
+        ambient=0.2,
+        smooth_shading=True,
+        scalar_bar_args={
+            "title": "skin displacement, mm",
+            "color": "white",
+            "fmt": "%.1f",
+            "n_labels": 4,
+            "position_x": 0.25,
+            "position_y": 0.04,
+        },
+    )
+    plotter.add_mesh(_cut(pins), color="#f2f7ff", smooth_shading=True, split_sharp_edges=True, specular=0.3)
     if stimulus.n_points:
-        plotter.add_mesh(stimulus.clip(**FRONT), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
+        plotter.add_mesh(_cut(stimulus), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
     plotter.camera_position = [(22.0, -84.0, 30.0), (0.0, 0.0, 12.5), (0.0, 0.0, 1.0)]
     plotter.enable_anti_aliasing("ssaa")
     plotter.screenshot(path)
 
 
-def _glow():
-    """Inferno without its black end, which would vanish in the background."""
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap
+def _cut(surface: pv.PolyData) -> pv.PolyData:
+    return surface.clip(normal=CUT_NORMAL, origin=CUT_ORIGIN)
 
+
+def _glow() -> ListedColormap:
+    """Inferno without its black end, which would vanish in the background."""
     return ListedColormap(colormaps["inferno"](np.linspace(0.22, 0.97, 256)))
 
 
 def _draw_plain(skin: pv.PolyData, stimulus: pv.PolyData, path: Path) -> None:
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(WINDOW_PX[0] / 100, WINDOW_PX[1] / 100), layout="constrained")
     axes = figure.add_subplot(projection="3d")
-    half = skin.clip(**FRONT).triangulate()
+    half = _cut(skin).triangulate()
     triangles = half.regular_faces
     shell = axes.plot_trisurf(*half.points.T, triangles=triangles, cmap=_glow())
     if "displacement_mm" in half.point_data:

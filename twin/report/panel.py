@@ -7,8 +7,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from twin.types import Frame, Observation
-from twin.views.plots import draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins, new_figure
+from twin.errors import FrameError
+from twin.report.charts import new_figure
+from twin.report.plots import draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins
+from twin.types import Frame, Observation, PinGraph
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,18 @@ class Look:
     frame: Frame
     observation: Observation
     rest: Observation
+
+    def graphs(self) -> tuple[PinGraph, PinGraph]:
+        """The graph of the frame and that of no contact.
+
+        Raises
+        ------
+        FrameError
+            The pipeline found no graph in one of them.
+        """
+        if self.observation.graph is None or self.rest.graph is None:
+            raise FrameError(f"{self.frame.name}: no graph of its pins: {self.observation.reason or self.rest.reason}")
+        return self.observation.graph, self.rest.graph
 
 
 def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
@@ -48,5 +62,6 @@ def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
 
 def area_change_at(look: Look, center_px: np.ndarray, *, count: int) -> float:
     """Mean relative change (percent) of the Voronoi areas of the ``count`` pins nearest to a point."""
-    near = np.argsort(np.hypot(*(look.observation.graph.nodes_px - center_px).T))[:count]
-    return float(100 * np.mean(look.observation.graph.area_px2[near] / look.rest.graph.area_px2[near] - 1))
+    graph, rest = look.graphs()
+    near = np.argsort(np.hypot(*(graph.nodes_px - center_px).T))[:count]
+    return float(100 * np.mean(graph.area_px2[near] / rest.area_px2[near] - 1))

@@ -4,20 +4,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
 from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.spatial import cKDTree
 
+from twin.report.charts import faint, new_figure, sequential
 from twin.types import Observation, PinGraph
 
 FOUND, LOST, EXTRA, EDGE = "#19d3a2", "#ff5c5c", "#ffb000", "#5ec8ff"
 FRAME_REACH = 0.6  # of the pins' extent, to each side of their middle: pins and the ring around them
+BORDER = "#00000040"  # of a coloured cell, on any ground
+ENLARGEMENTS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+LONG_PERCENTILE = 95  # of the arrows' lengths; longer ones may reach beyond the next pin
 SURFACE_GRID = 80  # samples across an interpolated surface
-
-
-def new_figure(columns: int, rows: int = 1, *, panel_inch: float = 4.0, projection: str | None = None) -> tuple[Figure, np.ndarray]:
-    """A figure without any window, and its axes as a flat array."""
-    figure = Figure(figsize=(columns * panel_inch, rows * panel_inch), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": projection})
-    return figure, axes.ravel()
 
 
 def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.ndarray | None = None) -> None:
@@ -28,7 +27,7 @@ def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.nd
         center, reach = around_px.mean(axis=0), FRAME_REACH * np.ptp(around_px, axis=0).max()
         ax.set_xlim(max(center[0] - reach, -0.5), min(center[0] + reach, width - 0.5))
         ax.set_ylim(min(center[1] + reach, height - 0.5), max(center[1] - reach, -0.5))
-    ax.set(title=title, xticks=[], yticks=[])
+    _without_frame(ax, title)
 
 
 def draw_graph(ax: Axes, graph: PinGraph) -> None:
@@ -56,27 +55,37 @@ def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title
     """Voronoi cells coloured by their relative change of area against no contact (percent), up to ``limit`` (default: their own)."""
     change = 100 * (graph.area_px2 / rest_area_px2 - 1)
     limit = limit or max(5.0, float(np.nanpercentile(np.abs(change), 99)))
-    cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors="#00000030", linewidths=0.4)
+    cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors=BORDER, linewidths=0.4)
     ax.add_collection(cells)
     _pixel_axes(ax, graph.nodes_px, title)
-    ax.figure.colorbar(cells, ax=ax, shrink=0.8, label="cell area against no contact, %")
+    ax.figure.colorbar(cells, ax=ax, shrink=0.8, label="change of cell area, %")
 
 
-def draw_displacement(ax: Axes, rest_px: np.ndarray, pins_px: np.ndarray, title: str) -> None:
-    """Arrows from each pin's rest position to where it is now, to scale."""
+def draw_displacement(ax: Axes, rest_px: np.ndarray, pins_px: np.ndarray, title: str, *, enlarged: float = 1.0) -> None:
+    """Arrows from each pin's rest position (N, 2) to where it is now, to scale or ``enlarged``; colours are the true lengths."""
     moved = pins_px - rest_px
-    arrows = ax.quiver(*rest_px.T, *moved.T, np.hypot(*moved.T), angles="xy", scale_units="xy", scale=1, cmap="viridis", width=0.004)
+    length = np.hypot(*moved.T)
+    ax.plot(*rest_px.T, ".", color=faint(), markersize=3)
+    arrows = ax.quiver(*rest_px.T, *moved.T, length, angles="xy", scale_units="xy", scale=1 / enlarged, cmap=sequential(), width=0.004)
     _pixel_axes(ax, rest_px, title)
-    ax.figure.colorbar(arrows, ax=ax, shrink=0.8, label="displacement, px")
+    ax.figure.colorbar(arrows, ax=ax, shrink=0.8, label="displacement, px" + (f" (arrows {enlarged:g} times)" if enlarged != 1 else ""))
 
 
-def draw_area_surface(ax: Axes, nodes_px: np.ndarray, value: np.ndarray, title: str) -> None:
+def enlargement(rest_px: np.ndarray, pins_px: np.ndarray) -> float:
+    """By how much to enlarge arrows between points (N, 2): as far as the usual longest one still fits between two pins."""
+    apart = np.median(cKDTree(rest_px).query(rest_px, k=2)[0][:, 1])
+    longest = np.percentile(np.hypot(*(pins_px - rest_px).T), LONG_PERCENTILE)
+    return max((factor for factor in ENLARGEMENTS if factor * longest <= apart), default=ENLARGEMENTS[0])
+
+
+def draw_area_surface(ax: Axes3D, nodes_px: np.ndarray, value: np.ndarray, title: str) -> None:
     """A per-pin value as a smooth surface over the image plane (cubic interpolation; 3D axes)."""
     low, high = nodes_px.min(axis=0), nodes_px.max(axis=0)
     grid_x, grid_y = np.meshgrid(*[np.linspace(a, b, SURFACE_GRID) for a, b in zip(low, high, strict=True)])
     surface = CloughTocher2DInterpolator(nodes_px, value)(grid_x, grid_y)
-    ax.plot_surface(grid_x, grid_y, surface, cmap="viridis", rcount=SURFACE_GRID, ccount=SURFACE_GRID, linewidth=0)
-    ax.set(title=title, xlabel="x, px", ylabel="y, px")
+    ax.plot_surface(grid_x, grid_y, surface, cmap=sequential(), rcount=SURFACE_GRID, ccount=SURFACE_GRID, linewidth=0)
+    ax.set(xlabel="x, px", ylabel="y, px")
+    ax.set_title(title, loc="center", y=0.97)
     ax.invert_yaxis()
 
 
@@ -89,8 +98,13 @@ def area_surface_figure(rest: PinGraph, contact: PinGraph) -> Figure:
     return figure
 
 
+def _without_frame(ax: Axes, title: str) -> None:
+    ax.set(title=title, xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)
+
+
 def _pixel_axes(ax: Axes, points_px: np.ndarray, title: str) -> None:
     low, high = np.nanmin(points_px, axis=0), np.nanmax(points_px, axis=0)
     margin = 0.08 * (high - low)
-    ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(high[1] + margin[1], low[1] - margin[1]), aspect="equal", title=title)
-    ax.set(xticks=[], yticks=[])
+    ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(high[1] + margin[1], low[1] - margin[1]), aspect="equal")
+    _without_frame(ax, title)

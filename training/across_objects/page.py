@@ -1,0 +1,112 @@
+"""The page of the study of objects never seen: errors on every object, of a model of several objects and of one object alone."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from scenes.object import ObjectSpec
+from training.across_objects.study import MIXED, TIMES, Plan
+from training.targets import unit_of
+from twin.report.charts import muted, sized_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, Picture, sentence, strong
+from twin.report.table import Column
+from twin.report.themes import BLUE, RED
+
+
+def write_page(
+    folder: Path,
+    *,
+    plan: Plan,
+    names: Sequence[str],
+    ranges: Mapping[str, Sequence[float]],
+    rows: Sequence[Mapping],
+    verdicts: Sequence[str],
+) -> Path:
+    """Write ``index.html`` and its chart; the page.
+
+    Parameters
+    ----------
+    folder : Path
+    plan : Plan
+    names : sequence of str
+        Labels.
+    ranges : mapping of str to (low, high)
+        Of the labels that are judged.
+    rows, verdicts : sequences
+        As ``table`` and ``verdicts`` give them.
+    """
+    alone = plan.alone.name
+    judged = ", ".join(f"{name} {number(ranges[name][0])} to {number(ranges[name][1])} {unit_of(name)}".rstrip() for name in names)
+    page = Page(f"Objects never seen: {plan.sensor.name}", "twin study objects", topic="TacTip twin: study")
+    page.lead = (
+        f"Two models from {number(plan.count * len(plan.train))} simulated contacts each, judged on {number(plan.tests)} other contacts of "
+        "every object, seen or not."
+    )
+    page.notice("Objects never seen", verdicts)
+    chart = write_chart(folder / "errors.png", lambda: errors_figure(rows, names, alone))
+    page.figures(
+        Picture(
+            chart,
+            f"Errors of both models on every object, as multiples of their error on {alone}",
+            f"Mean absolute error of each label, as a multiple of the same model's error on {alone} (dashed). Filled: the object was "
+            f"trained on; open: never seen. Dotted: the aim, {TIMES:g} times.",
+        )
+    )
+    page.section("Errors")
+    page.table(
+        [{**row, "seen": "yes" if row["seen"] else "no"} for row in rows],
+        [_column(key, names) for key in rows[0]],
+        caption=f"Mean absolute errors and mean errors (bias); times: over the same model's error on {alone}.",
+    )
+    page.section(
+        "How it was made",
+        sentence(
+            f"Contacts: {plan.wider.name}, {plan.randomisation.name}, {plan.across} elements across, seed {plan.seed}. Model",
+            strong(MIXED),
+            f"learnt from {number(plan.count)} contacts of each of {_described(plan.train)}; model",
+            strong(alone),
+            f"from that alone. Never seen: {_described(plan.unseen)}.",
+        ),
+        f"Judged on {number(plan.tests)} other contacts of each object ({plan.experiment.name}), on all their states whose labels lie "
+        f"within {judged}.",
+        "A label means the same on every object: that of the flat plate which would be touched at the same distance from the dome's centre "
+        "and with the same normal.",
+    )
+    page.download(folder / "objects.csv", "the table, with all digits")
+    return page.write(folder / "index.html")
+
+
+def errors_figure(rows: Sequence[Mapping], names: Sequence[str], alone: str) -> Figure:
+    """A panel for each label: objects down, multiples of the error on the first object across."""
+    objects = list(dict.fromkeys(row["object"] for row in rows))
+    figure, axes = sized_figure((4.4 * len(names) + 1.0, 0.34 * len(objects) + 1.3), len(names))
+    for panel, (ax, name) in enumerate(zip(axes, names, strict=True)):
+        for model, color, mark, above in ((MIXED, BLUE, "o", 0.12), (alone, RED, "s", -0.12)):
+            mine = [row for row in rows if row["model"] == model]
+            for seen in (True, False):
+                part = [row for row in mine if bool(row["seen"]) is seen]
+                places = [len(objects) - 1 - objects.index(row["object"]) + above for row in part]
+                label = f"trained on {'several objects' if model == MIXED else model}" if seen else None
+                ax.plot([row[f"{name}_times"] for row in part], places, mark, color=color, mfc=color if seen else "none", label=label)
+        ax.axvline(1.0, color=muted(), ls="--", lw=1.0)
+        ax.axvline(TIMES, color=muted(), ls=":", lw=1.2)
+        ax.set_yticks(np.arange(len(objects))[::-1], objects if panel == 0 else [])
+        ax.set(xlabel=f"{name}: times the error on {alone}", xlim=(0, None))
+    axes[0].legend()
+    return figure
+
+
+def _column(key: str, names: Sequence[str]) -> Column:
+    for name in names:
+        if key in (f"{name}_error", f"{name}_bias"):
+            return Column(key, f"{name} {key.removeprefix(name)[1:]}", unit_of(name), digits=2, signed=key.endswith("bias"))
+        if key == f"{name}_times":
+            return Column(key, f"{name} times", decimals=2)
+    return Column.of(key)
+
+
+def _described(things: Sequence[ObjectSpec]) -> str:
+    return "; ".join(f"{thing.name} ({thing.description})" for thing in things)

@@ -1,0 +1,151 @@
+"""One style for all charts, drawn once for each theme of the pages."""
+
+import io
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+
+import numpy as np
+from cycler import cycler
+from matplotlib import RcParams, colormaps, rc_context
+from matplotlib.axis import Axis
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from twin.report.numbers import number
+from twin.report.themes import DARK, LIGHT, SERIES, Theme
+from twin.store import write_bytes
+
+DPI = 140
+SHADES = 256  # of a colour map
+FEW_DECADES = 100.0  # largest over smallest value of an axis whose powers of ten alone make no scale
+
+_theme: ContextVar[Theme] = ContextVar("theme", default=LIGHT)
+
+
+def new_figure(columns: int, rows: int = 1, *, panel_inch: float = 4.0, projection: str | None = None) -> tuple[Figure, np.ndarray]:
+    """A figure of square panels without any window, in the theme that is drawn, and its axes as a flat array."""
+    return sized_figure((columns * panel_inch, rows * panel_inch), columns, rows, projection=projection)
+
+
+def sized_figure(
+    size_inch: tuple[float, float], columns: int = 1, rows: int = 1, *, projection: str | None = None
+) -> tuple[Figure, np.ndarray]:
+    """The same of a given width and height."""
+    with rc_context(_style(_theme.get())):
+        figure = Figure(figsize=size_inch, layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": projection})
+    return figure, axes.ravel()
+
+
+def write_chart(path: Path, draw: Callable[[], Figure], *, dpi: int = DPI) -> Path:
+    """Draw a chart in the light theme to ``path`` and in the dark one beside it (`dark_of`); the path.
+
+    Parameters
+    ----------
+    path : Path
+        Of a PNG file.
+    draw : callable
+        Makes the figure, by `new_figure` or `sized_figure`. It is called once for each theme.
+    dpi : int
+    """
+    for theme, target in ((LIGHT, path), (DARK, dark_of(path))):
+        with drawn_in(theme):
+            save_figure(target, draw(), dpi=dpi)
+    return path
+
+
+def save_figure(path: Path, figure: Figure, *, dpi: int = DPI) -> Path:
+    """Write a figure that no page shows, in the theme that it was made in, as PNG; the path."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=dpi, format="png")
+    return write_bytes(path, content.getvalue())
+
+
+def dark_of(path: Path) -> Path:
+    """Where the dark twin of a chart lies."""
+    return path.with_name(f"{path.stem}-dark{path.suffix}")
+
+
+@contextmanager
+def drawn_in(theme: Theme) -> Iterator[None]:
+    """Everything drawn inside has the colours of a theme."""
+    token = _theme.set(theme)
+    try:
+        with rc_context(_style(theme)):
+            yield
+    finally:
+        _theme.reset(token)
+
+
+def ink() -> str:
+    """Colour of text in the theme that is drawn."""
+    return _theme.get().ink
+
+
+def muted() -> str:
+    """Colour of what stands back: limits, references, the true course."""
+    return _theme.get().muted
+
+
+def faint() -> str:
+    """Colour of areas and rules behind everything."""
+    return _theme.get().line
+
+
+def sequential() -> ListedColormap:
+    """Viridis without the end that the theme's background would swallow."""
+    low, high = (0.0, 0.88) if _theme.get() == LIGHT else (0.2, 1.0)
+    return ListedColormap(colormaps["viridis"](np.linspace(low, high, SHADES)))
+
+
+def plain_log(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers, and 2, 3 and 5 between the powers of ten where these are few."""
+
+    def between(value: float, _: int | None) -> str:
+        low, high = sorted(axis.get_view_interval())
+        return number(value, 1) if high < FEW_DECADES * low and f"{value:.0e}"[0] in "235" else ""
+
+    axis.set_major_formatter(FuncFormatter(lambda value, _: number(value, 1)))
+    axis.set_minor_formatter(FuncFormatter(between))
+
+
+def _style(theme: Theme) -> RcParams:
+    panes = {f"axes3d.{axis}axis.panecolor": theme.page for axis in "xyz"}
+    return RcParams(
+        panes
+        | {
+            "figure.facecolor": theme.surface,
+            "savefig.facecolor": theme.surface,
+            "axes.facecolor": theme.surface,
+            "axes.edgecolor": theme.muted,
+            "axes.labelcolor": theme.ink,
+            "axes.titlecolor": theme.ink,
+            "text.color": theme.ink,
+            "xtick.color": theme.muted,
+            "ytick.color": theme.muted,
+            "xtick.labelcolor": theme.ink,
+            "ytick.labelcolor": theme.ink,
+            "axes.grid": True,
+            "axes.axisbelow": True,
+            "grid.color": theme.line,
+            "grid.linewidth": 0.7,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.linewidth": 0.8,
+            "axes.prop_cycle": cycler(color=SERIES),
+            "axes.titlesize": 10.5,
+            "axes.titleweight": "bold",
+            "axes.titlelocation": "left",
+            "axes.labelsize": 9.5,
+            "figure.titlesize": 11.5,
+            "figure.titleweight": "bold",
+            "font.size": 9.5,
+            "legend.frameon": False,
+            "legend.fontsize": 8.5,
+            "lines.linewidth": 1.6,
+            "lines.markersize": 5,
+        }
+    )

@@ -1,0 +1,87 @@
+"""Numbers as text for people: whole numbers whole, no exponents where digits do, one number of decimals down a column."""
+
+import math
+from collections.abc import Sequence
+from numbers import Integral, Real
+from typing import TypeGuard
+
+NOTHING = "–"  # a missing value
+MINUS = "−"  # as wide as a plus sign in tabular figures
+GROUP = "\u202f"  # narrow no-break space between groups of three digits
+GROUPED_FROM = 10_000  # smaller numbers are read well without groups
+PLAIN_LOW, PLAIN_HIGH = 1e-4, 1e9  # sizes between which a number is written without a power of ten
+FEWEST = 2  # significant digits that a column leaves its smallest value
+LONGEST = 6  # digits of a column's largest value; where it would need more, each value has its own decimals
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def number(value: object, digits: int = 3, *, decimals: int | None = None, signed: bool = False) -> str:
+    """One number for running text or a cell.
+
+    Parameters
+    ----------
+    value : int, float, bool, str or None
+        A bool becomes yes or no, None and NaN become a dash, a text stays as it is.
+    digits : int
+        Significant digits of a fraction; digits before the point are never rounded away.
+    decimals : int, optional
+        Digits after the point instead; whole numbers get them, too.
+    signed : bool
+        Write a plus sign before positive numbers.
+    """
+    if value is None or isinstance(value, str):
+        return NOTHING if value is None else value
+    if isinstance(value, bool) or type(value).__name__ == "bool":  # numpy's too, which is not Python's
+        return "yes" if value else "no"
+    if not isinstance(value, Real):
+        return str(value)
+    size = float(value)
+    if math.isnan(size):
+        return NOTHING
+    sign = MINUS if size < 0 else "+" if signed and size > 0 else ""
+    if math.isinf(size):
+        return f"{sign}∞"
+    if decimals is None:
+        if isinstance(value, Integral):
+            decimals = 0
+        elif size and not PLAIN_LOW <= abs(size) < PLAIN_HIGH:
+            mantissa, _, power = f"{abs(size):.{digits - 1}e}".partition("e")
+            return f"{sign}{mantissa}×10{str(int(power)).translate(SUPERSCRIPTS)}"
+        else:
+            decimals = max(0, digits - 1 - _power(size, digits)) if size else 0
+    text = f"{abs(size):.{decimals}f}"
+    if not float(text):
+        sign = ""  # a rounded zero has no sign
+    return sign + _grouped(text)
+
+
+def column(values: Sequence[object], digits: int = 3, *, decimals: int | None = None, signed: bool = False) -> list[str]:
+    """The values of a table's column, all with as many decimals, so that their points stand under each other.
+
+    The column's median gets ``digits`` significant digits and its smallest value at least two. Where that would take more than six
+    digits for the largest one, each value gets its own decimals.
+    """
+    sizes = sorted(abs(float(v)) for v in values if is_number(v) and math.isfinite(float(v)) and float(v))
+    if decimals is None and sizes:
+        if all(size == int(size) for size in sizes):
+            decimals = 0
+        else:
+            middle, least = _power(sizes[len(sizes) // 2], digits), _power(sizes[0], FEWEST)
+            wanted = max(0, digits - 1 - middle, FEWEST - 1 - least)
+            decimals = wanted if wanted + max(_power(sizes[-1], digits), 0) + 1 <= LONGEST else None
+    return [number(v, digits, decimals=decimals, signed=signed) for v in values]
+
+
+def is_number(value: object) -> TypeGuard[Real]:
+    """Whether a value is a number, numpy's included; a bool is none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _power(size: float, digits: int) -> int:
+    """Power of ten of a number's first digit after rounding to ``digits`` digits (9.996 to three is 10.0: 1)."""
+    return int(f"{abs(size):.{digits - 1}e}".partition("e")[2])
+
+
+def _grouped(text: str) -> str:
+    whole, point, rest = text.partition(".")
+    return (f"{int(whole):,}".replace(",", GROUP) if int(whole) >= GROUPED_FROM else whole) + point + rest

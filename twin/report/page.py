@@ -1,0 +1,253 @@
+"""Pages of results: a builder that every command uses, and the templates that give all of them one look.
+
+A page is one HTML file that needs no network. Its pictures lie beside it, or inside it (``embed``). All text is escaped; emphasis
+comes from `strong`, `code`, `good` and `bad`, which escape what they are given.
+"""
+
+import base64
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Literal
+from urllib.parse import quote
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from twin.report.charts import dark_of
+from twin.report.table import Column, Row, Table, make_table
+from twin.report.themes import stylesheet
+from twin.store import write_text
+
+Kind = Literal["chart", "frame", "photo"]
+FEWEST_IN_CONTENTS = 4  # sections: a shorter page needs no list of them
+MIME = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".svg": "image/svg+xml"}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of a page.
+
+    Attributes
+    ----------
+    path : Path
+        Relative to the page's folder, or absolute and then within it.
+    alt : str
+        What it shows, for those who do not see it.
+    caption : str or Markup
+    kind : {"chart", "frame", "photo"}
+        A chart has a dark twin beside it (`twin.report.charts.write_chart`); a frame's pixels are shown as they are.
+    width_px : int, optional
+        Largest width on the page.
+    """
+
+    path: Path
+    alt: str
+    caption: str = ""
+    kind: Kind = "chart"
+    width_px: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.alt.strip():
+            raise ValueError(f"{self.path}: a picture of a page needs a text that says what it shows (alt)")
+
+
+@dataclass(frozen=True)
+class _Block:
+    kind: str
+    title: str = ""
+    anchor: str = ""
+    text: str = ""
+    lines: Sequence[str] = ()
+    tone: str = ""
+    layout: str = ""
+    table: Table | None = None
+    pictures: Sequence[Picture] = ()
+
+
+@dataclass(frozen=True)
+class _File:
+    path: Path
+    what: str
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A picture as the template shows it."""
+
+    src: str
+    dark: str
+    alt: str
+    caption: str
+    kind: str
+    width_px: int | None
+
+
+@dataclass(frozen=True)
+class _Link:
+    href: str
+    name: str
+    what: str
+
+
+@dataclass
+class Page:
+    """A page in the making: parts are added in their order, then it is written.
+
+    Attributes
+    ----------
+    title : str
+    made_by : str
+        The command that makes such a page, as ``twin realism``.
+    topic : str
+        A few words above the title.
+    lead : str
+        First paragraph.
+    """
+
+    title: str
+    made_by: str
+    topic: str = "TacTip twin"
+    lead: str = ""
+    _blocks: list[_Block] = field(default_factory=list, init=False)
+    _files: list[_File] = field(default_factory=list, init=False)
+
+    def section(self, title: str, *paragraphs: str) -> None:
+        """Begin a section, with its first paragraphs."""
+        self._blocks.append(_Block("section", title=title, anchor=slug(title)))
+        self.text(*paragraphs)
+
+    def heading(self, title: str, *, anchor: str = "") -> None:
+        """Begin a part of a section; ``anchor`` is what links of the page name (default: made of the title)."""
+        self._blocks.append(_Block("heading", title=title, anchor=anchor or slug(title)))
+
+    def text(self, *paragraphs: str) -> None:
+        """Add paragraphs."""
+        self._blocks += [_Block("text", text=paragraph) for paragraph in paragraphs if paragraph]
+
+    def items(self, items: Sequence[str]) -> None:
+        """Add a list."""
+        if items:
+            self._blocks.append(_Block("items", lines=items))
+
+    def notice(self, title: str, items: Sequence[str], *, tone: Literal["", "good", "bad"] = "") -> None:
+        """Add notes that must not be overlooked; nothing where there are none."""
+        if items:
+            self._blocks.append(_Block("notice", title=title, lines=items, tone=tone))
+
+    def table(self, rows: Sequence[Row], columns: Sequence[Column | str], *, caption: str = "") -> None:
+        """Add a table (see `twin.report.table.make_table`)."""
+        self._blocks.append(_Block("table", table=make_table(rows, columns, caption=caption)))
+
+    def figures(self, *pictures: Picture, layout: Literal["", "row", "beside"] = "") -> None:
+        """Add pictures: below each other, in a ``row`` that wraps, or a narrow one ``beside`` a wide one."""
+        self._blocks.append(_Block("figures", pictures=pictures, layout=layout))
+
+    def download(self, path: Path, what: str = "") -> None:
+        """Name a file beside the page, and what it holds."""
+        self._files.append(_File(path, what))
+
+    def write(self, path: Path, *, embed: bool = False) -> Path:
+        """Write the page; the path.
+
+        Parameters
+        ----------
+        path : Path
+            Of the HTML file.
+        embed : bool
+            Put the pictures into the file, so that it can be given away alone.
+        """
+        return write_text(path, self.html(path.parent, embed=embed))
+
+    def html(self, folder: Path, *, embed: bool = False) -> str:
+        """The page as HTML, for a file in ``folder``."""
+        blocks = [{**vars(block), "pictures": [_source(picture, folder, embed) for picture in block.pictures]} for block in self._blocks]
+        sections = [block for block in self._blocks if block.kind == "section"]
+        return _render(
+            "page.html.j2",
+            PackageLoader("twin.report", "."),
+            title=self.title,
+            topic=self.topic,
+            lead=self.lead,
+            contents=sections if len(sections) >= FEWEST_IN_CONTENTS else [],
+            blocks=blocks,
+            files=[_Link(quote(_within(file.path, folder).as_posix(), safe="/"), file.path.name, file.what) for file in self._files],
+            provenance=provenance(self.made_by),
+        )
+
+
+def render_page(package: str, **content: object) -> str:
+    """A package's own ``page.html.j2`` as HTML, for pages that are more than results; it extends ``base.html.j2``.
+
+    Every name that the template uses must be given, ``stylesheet`` excepted.
+    """
+    return _render("page.html.j2", ChoiceLoader([PackageLoader(package, "."), PackageLoader("twin.report", ".")]), **content)
+
+
+def provenance(made_by: str) -> Markup:
+    """What made a page: the command, the version of this package, the time."""
+    try:
+        release = version("tactip-twin")
+    except PackageNotFoundError:  # run from a source folder that is not installed
+        release = "(not installed)"
+    return Markup("Made by <code>{}</code>, tactip-twin {}, {:%Y-%m-%d %H:%M} UTC.").format(made_by, release, datetime.now(UTC))
+
+
+def strong(text: object) -> Markup:
+    """Text that stands out."""
+    return Markup("<strong>{}</strong>").format(text)
+
+
+def code(text: object) -> Markup:
+    """A name as it is typed."""
+    return Markup("<code>{}</code>").format(text)
+
+
+def good(text: object) -> Markup:
+    """Text about something that meets its target."""
+    return Markup('<span class="good">{}</span>').format(text)
+
+
+def bad(text: object) -> Markup:
+    """Text about something that misses its target."""
+    return Markup('<span class="bad">{}</span>').format(text)
+
+
+def sentence(*parts: str) -> Markup:
+    """Parts of a paragraph joined by spaces; plain texts among them are escaped, empty ones left out."""
+    return Markup(" ").join(part for part in parts if part)
+
+
+def slug(title: str) -> str:
+    """A title as the name of a place in a page."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "part"
+
+
+def link_to(anchor: str) -> str:
+    """Address of a place in the same page."""
+    return f"#{quote(anchor, safe='')}"
+
+
+def _render(template: str, loader: PackageLoader | ChoiceLoader, **content: object) -> str:
+    environment = Environment(loader=loader, undefined=StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.get_template(template).render(stylesheet=stylesheet(), **content)
+
+
+def _source(picture: Picture, folder: Path, embed: bool) -> _Source:
+    dark = dark_of(picture.path) if picture.kind == "chart" else None
+    paths = [_within(path, folder) for path in (picture.path, dark) if path is not None]
+    found = [_embedded(folder / path) if embed else quote(path.as_posix(), safe="/") for path in paths]
+    return _Source(found[0], found[1] if dark else "", picture.alt, picture.caption, picture.kind, picture.width_px)
+
+
+def _embedded(path: Path) -> str:
+    return f"data:{MIME[path.suffix.lower()]};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
+
+
+def _within(path: Path, folder: Path) -> Path:
+    """A file's path from the page's folder; a path that is neither absolute nor begins with the folder is one already."""
+    return Path(os.path.relpath(path, folder)) if path.is_absolute() or path.is_relative_to(folder) else path

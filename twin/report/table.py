@@ -1,0 +1,180 @@
+"""Tables: as CSV files for machines, and as the tables of a page."""
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from twin.report.numbers import column, is_number
+from twin.store import write_text
+
+Row = Mapping[str, object]
+UNITS = {
+    "mm": "mm", "deg": "deg", "px": "px", "s": "s", "ms": "ms", "n": "N", "mib": "MiB", "percent": "%", "px2": "px²", "mm2": "mm²",
+    "minutes": "min",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Column:
+    """How the values of one key are shown.
+
+    Attributes
+    ----------
+    key : str
+        Of the rows; a row without it has an empty value there.
+    title, unit : str
+        Of the heading.
+    digits : int
+        Significant digits of the column's median.
+    decimals : int, optional
+        Digits after the point instead.
+    signed : bool
+    best : {"", "least", "most"}
+        Which value is marked as the best.
+    scale : float
+        By which numbers are multiplied: 100 for a share that is shown in percent.
+    align : {"", "right"}
+        ``right`` for texts that are numbers, each with its own decimals.
+    """
+
+    key: str
+    title: str
+    unit: str = ""
+    digits: int = 3
+    decimals: int | None = None
+    signed: bool = False
+    best: Literal["", "least", "most"] = ""
+    scale: float = 1.0
+    align: Literal["", "right"] = ""
+
+    @classmethod
+    def of(cls, key: str, *, unit: str = "", best: Literal["", "least", "most"] = "", digits: int = 3) -> "Column":
+        """A column titled by its key; the unit is taken from the key's end (``depth_mm``) unless it is given."""
+        words = key.split("_")
+        if not unit and len(words) > 1 and words[-1] in UNITS:
+            unit = UNITS[words.pop()]
+        return cls(key, " ".join(words), unit, digits, best=best)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A value of a row that carries more than itself.
+
+    Attributes
+    ----------
+    value : object
+        Number, text or None.
+    tone : {"", "good", "bad"}
+    note : str
+        Small text below.
+    bar : float, optional
+        Share in [0, 1], drawn as a bar below.
+    href : str
+        Address within the page.
+    """
+
+    value: object
+    tone: Literal["", "good", "bad"] = ""
+    note: str = ""
+    bar: float | None = None
+    href: str = ""
+
+
+@dataclass(frozen=True)
+class Head:
+    """A heading as it is shown."""
+
+    title: str
+    unit: str
+    number: bool
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A cell as it is shown; ``style`` holds its CSS classes."""
+
+    text: object
+    number: bool
+    style: str
+    note: str
+    bar: int | None
+    href: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as a page shows it: ``body`` has a row of cells for each row, one for each of ``heads``."""
+
+    heads: list[Head]
+    body: list[list[Shown]]
+    caption: str
+
+
+def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption: str = "") -> Table:
+    """Format rows for a page.
+
+    Parameters
+    ----------
+    rows : sequence of mappings
+        Values by key: numbers, texts, None, or `Cell`.
+    columns : sequence of Column or str
+        A key alone stands for ``Column.of(key)``.
+    caption : str
+    """
+    chosen = [entry if isinstance(entry, Column) else Column.of(entry) for entry in columns]
+    heads, shown = [], []
+    for entry in chosen:
+        cells = [value if isinstance(value, Cell) else Cell(value) for value in (row.get(entry.key) for row in rows)]
+        values = [_scaled(cell.value, entry.scale) for cell in cells]
+        numeric = entry.align == "right" or any(is_number(value) for value in values)
+        texts = column(values, entry.digits, decimals=entry.decimals, signed=entry.signed)
+        marked = _best(values, entry.best)
+        heads.append(Head(entry.title, entry.unit, numeric))
+        shown.append([_shown(c, v, t, numeric, k in marked) for k, (c, v, t) in enumerate(zip(cells, values, texts, strict=True))])
+    return Table(heads, [list(row) for row in zip(*shown, strict=True)], caption)
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> Path:
+    """Rows of the same keys as CSV, numbers in full; the path."""
+    return _write_csv(path, list(rows[0]), rows)
+
+
+def write_table(path: Path, rows: Sequence[Row]) -> Path:
+    """Rows as CSV for reading, numbers to six digits; a column of any row is a column of the table."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    return _write_csv(path, columns, [{key: _plain(value) for key, value in row.items()} for row in rows])
+
+
+def _write_csv(path: Path, columns: list[str], rows: Sequence[Row]) -> Path:
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, fieldnames=columns, restval="")
+    writer.writeheader()
+    writer.writerows(rows)
+    return write_text(path, text.getvalue())
+
+
+def _plain(value: object) -> str:
+    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _scaled(value: object, scale: float) -> object:
+    return float(value) * scale if scale != 1 and is_number(value) else value
+
+
+def _best(values: list[object], best: str) -> set[int]:
+    known = {k: float(v) for k, v in enumerate(values) if is_number(v) and math.isfinite(float(v))} if best else {}
+    if len(known) < 2:
+        return set()
+    wanted = min(known.values()) if best == "least" else max(known.values())
+    return {k for k, value in known.items() if value == wanted}
+
+
+def _shown(cell: Cell, value: object, text: str, numeric: bool, best: bool) -> Shown:
+    styles = [name for name, given in (("number", numeric), ("best", best), (cell.tone, bool(cell.tone))) if given]
+    bar = None if cell.bar is None else round(100 * min(max(cell.bar, 0.0), 1.0))
+    shown = value if isinstance(value, str) else text  # marked-up text stays what it is
+    return Shown(shown, numeric, " ".join(styles), cell.note, bar, cell.href)

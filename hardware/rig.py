@@ -1,5 +1,6 @@
 """The composition root of live work: the one place that decides what is simulated, recorded or real."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SHIPPED_LIMITS, load_limits
-from hardware.step import Estimator, LoopSettings
+from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
 from twin.cache import cached_arrays
@@ -156,9 +157,15 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     return preview
 
 
-def servo_loop(rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopSettings, on_step=None) -> ServoLoop:
+def servo_loop(
+    rig: Rig,
+    servo: ServoSpec,
+    estimator: Estimator,
+    settings: LoopSettings,
+    on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None,
+) -> ServoLoop:
     """The loop on a connected rig; a safe arm is told what the sensor feels, and retreats in its own way."""
-    loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[_no_full_turn(rig.arm)], on_step=on_step)
+    loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[no_full_turn(rig.arm)], on_step=on_step)
     loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
         loop.sense = lambda depth_mm, time_s: rig.arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
@@ -182,7 +189,7 @@ def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[
     return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
 
 
-def _no_full_turn(arm: Arm):
+def no_full_turn(arm: Arm) -> Guard:
     """A guard: where an arm of four axes would have to turn back by a full turn at the object, it ends."""
     kinematics = getattr(arm, "kinematics", None)
 

@@ -22,7 +22,7 @@ from hardware.safety import load_limits
 from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.cli.rig import Rig, servo_loop
+from hardware.rig import Rig, servo_loop
 from twin.mounting import Mounting
 from twin.preprocess import Pipeline
 from twin.types import Form

@@ -8,6 +8,6 @@ listed, and what is readable is read.
 from twin.recordings.folders import natural_key
 from twin.recordings.forms import is_two_level, tell_form
 from twin.recordings.images import read_image
-from twin.recordings.recording import Recording, open_recording
+from twin.recordings.recording import Recording, evenly_read, open_recording
 
-__all__ = ["Recording", "is_two_level", "natural_key", "open_recording", "read_image", "tell_form"]
+__all__ = ["Recording", "evenly_read", "is_two_level", "natural_key", "open_recording", "read_image", "tell_form"]

@@ -6,15 +6,21 @@ contacts; every object's errors are those on contacts of its own that no model h
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec
-from training.dataset import Dataset, joined
+from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_experiment
+from training.dataset import Dataset, joined, load_dataset
 from training.estimator import PoseEstimator
 from training.evaluate import predict_rows_of
-from training.generation import GenerationConfig
+from training.generation import GenerationConfig, generate
 from training.recipes import TrainingError
+from training.studies.sim_to_real.steps import train_in_twin
+from twin.progress import Progress, silent, stage
+from twin.types import FINE
+from twin.views.page import render_page
+from twin.views.table import write_table
 
 TESTS_APART = 1000  # of the draws, so that no contact is learnt and judged
 MIXED = "mixed"
@@ -23,39 +29,48 @@ TIMES = 1.5  # the error on an unseen object over that on the first one: what is
 
 @dataclass(frozen=True)
 class Plan:
-    """What is simulated.
+    """What is simulated, learnt and judged.
 
     Attributes
     ----------
     sensor : SensorSpec
     experiment : ExperimentSpec
-        Whose ranges of labels are judged; ``wider`` the one that is trained on.
-    wider : ExperimentSpec
+        Whose ranges of labels are judged. What is trained on is the experiment that it names as wider, else itself.
     randomisation : RandomisationSpec
     train, unseen : tuple of ObjectSpec
         The first of ``train`` is the one that is also trained on alone.
     count, tests : int
         Contacts to train on, and to judge on, for each object.
     seed, across : int
+    epochs : int or None
+        Of both trainings; None: the study's own number.
+    workers : int
+        Processes that simulate.
     """
 
     sensor: SensorSpec
     experiment: ExperimentSpec
-    wider: ExperimentSpec
     randomisation: RandomisationSpec
-    train: tuple
-    unseen: tuple
-    count: int
-    tests: int
-    seed: int
-    across: int
+    train: tuple[ObjectSpec, ...]
+    unseen: tuple[ObjectSpec, ...]
+    count: int = 100
+    tests: int = 50
+    seed: int = 0
+    across: int = FINE
+    epochs: int | None = None
+    workers: int = 1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         names = [each.name for each in (*self.train, *self.unseen)]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise TrainingError(f"{', '.join(twice)}: given twice; an object is either trained on or never seen")
         if len(self.train) < 2 or not self.unseen:
             raise TrainingError("give at least two objects to train on and one never seen")
+
+    @property
+    def wider(self) -> ExperimentSpec:
+        """The experiment that is trained on."""
+        return load_experiment(self.experiment.wider) if self.experiment.wider else self.experiment
 
     @property
     def alone(self) -> ObjectSpec:
@@ -90,13 +105,76 @@ class Plan:
         return {MIXED: joined([first, *parts[1:]]), self.alone.name: parts[0]}
 
 
+@dataclass(frozen=True)
+class Result:
+    """What came of it.
+
+    Attributes
+    ----------
+    rows : list of dict
+        See ``table``.
+    verdicts : list of str
+        See the function of that name.
+    names : tuple of str
+        Of the labels.
+    written : list of Path
+    """
+
+    rows: list[dict[str, Any]]
+    verdicts: list[str]
+    names: tuple[str, ...]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """A line for each model and object, and the verdicts; for people."""
+        lines = []
+        for row in self.rows:
+            errors = ", ".join(f"{name} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name in self.names)
+            lines.append(f"{row['model']}, {row['object']} ({'seen' if row['seen'] else 'never seen'}): {errors}")
+        return lines + self.verdicts
+
+
+def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
+    """Simulate contacts of all objects, train both models, and judge them on contacts of every object.
+
+    Writes data sets, runs, ``objects.csv`` and ``index.html`` to ``out``. What lies there from an earlier call with the same plan is not
+    made again.
+
+    Raises
+    ------
+    DatasetError
+        A folder holds another data set, or contacts can't be made.
+    TrainingError
+        A folder holds another run, or no contact of an object lies within the ranges that are judged.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    sets = {folder: _simulated(plan, out / folder, folder, config, count, progress) for folder, config, count in plan.sets()}
+    runs = {}
+    for name, data in plan.trained_on(sets).items():
+        runs[name] = out / name
+        with stage(progress, name) as step:
+            train_in_twin(data, runs[name], seed=plan.seed, split=None, epochs=plan.epochs, progress=step)
+    names, rows = plan.experiment.targets, table(plan, runs, sets)
+    said, ranges = verdicts(plan, rows, names), plan.experiment.ranges()
+    page = out / "index.html"
+    page.write_text(render_page("training.across_objects", plan=plan, names=names, ranges=ranges, rows=rows, verdicts=said))
+    return Result(rows, said, names, [write_table(out / "objects.csv", rows), page])
+
+
+def _simulated(plan: Plan, folder: Path, title: str, config: GenerationConfig, count: int, progress: Progress) -> Dataset:
+    with stage(progress, title) as step:
+        generate(folder, config, count, workers=plan.workers, progress=step)
+    with stage(progress, f"{title}: states") as step:
+        return load_dataset(folder, plan.sensor, plan.experiment.targets, progress=step)
+
+
 def rows_in_range(data: Dataset, experiment: ExperimentSpec) -> np.ndarray:
     """Rows whose corrected labels lie within the experiment's ranges: the way there, and contacts beside an edge, may not."""
     low, high = np.array([experiment.ranges()[name] for name in data.targets.names]).T
     return np.flatnonzero(((data.targets.corrected >= low) & (data.targets.corrected <= high)).all(axis=1))
 
 
-def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[dict]:
+def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[dict[str, Any]]:
     """A row for each model and object: mean absolute errors, biases, and how many times the model's error on the first object."""
     rows = []
     for model, run in runs.items():
@@ -113,7 +191,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
             off = predict_rows_of(estimator, data, chosen).mean - data.targets.corrected[chosen]
             error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)
             flat = error if flat is None else flat
-            row: dict = {"model": model, "object": thing.name, "seen": thing.name in learnt}
+            row: dict[str, Any] = {"model": model, "object": thing.name, "seen": thing.name in learnt}
             row |= {"contacts": len(np.unique(data.group[chosen])), "states": len(chosen)}
             for k, name in enumerate(data.targets.names):
                 row |= {f"{name}_error": float(error[k]), f"{name}_bias": float(bias[k]), f"{name}_times": float(error[k] / flat[k])}
@@ -121,7 +199,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
     return rows
 
 
-def verdicts(plan: Plan, rows: list[dict], names: tuple) -> list[str]:
+def verdicts(plan: Plan, rows: list[dict[str, Any]], names: tuple[str, ...]) -> list[str]:
     """For each unseen object whether the mixed model's errors stay within ``TIMES`` those on the first one."""
     lines = []
     for row in rows:

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from training.study.contacts import AreaChange, contacts_figure
-from training.study.models import Plan, error_columns, ordering, read_curves
+from training.studies.tac_vgnn.contacts import AreaChange, contacts_figure
+from training.studies.tac_vgnn.models import PlannedRun, error_columns, ordering, read_curves
 from twin.views.page import render_page
 from twin.views.plots import new_figure
 
@@ -24,7 +24,7 @@ def draw_efficiency(path: Path, rows: list[dict]) -> Path:
     return path
 
 
-def draw_curves(path: Path, plans: list[Plan], folder: Path) -> Path:
+def draw_curves(path: Path, plans: list[PlannedRun], folder: Path) -> Path:
     """Error on the watched tenth of the training rows against epochs and against time, of every run that has begun."""
     figure, axes = new_figure(2, panel_inch=5)
     for plan in plans:

@@ -1,6 +1,7 @@
 """The twins of a study: the one that a model is to learn in, and the same without one of its ingredients at a time."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +52,7 @@ class Twin:
     share: float = 1.0
 
     @property
-    def frictions(self) -> tuple:
+    def frictions(self) -> tuple[float, ...]:
         """Of a labelled frame, tried one after another to see what is missed whatever its friction was."""
         return FRICTIONS if self.randomisation.friction else (rig_of(self.sensor).friction,)
 
@@ -92,7 +93,7 @@ def without_one_ingredient(
         Draws skin and gel, too.
     """
 
-    def but(name: str, says: str, *, shared: bool = False, **changes) -> Twin:
+    def but(name: str, says: str, *, shared: bool = False, **changes: Any) -> Twin:
         return replace(full, name=f"sim_{name}", says=says, contacts=full.contacts if shared else name, **changes)
 
     wide = every_tolerance.model_copy(update={"friction": full.randomisation.friction})

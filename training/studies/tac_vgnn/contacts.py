@@ -5,6 +5,7 @@ bottom of the sensor, each 2 and 4 mm beyond first touch. Beside them recorded f
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,6 +16,7 @@ from training.dataset import Dataset
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.preprocess import Pipeline, make_graph
+from twin.progress import Step
 from twin.simulator import Simulator
 from twin.stimulus import build_stimulus
 from twin.types import Form, PinGraph
@@ -55,7 +57,7 @@ class AreaChange:
     rest_area_px2: np.ndarray
     source: str = "twin"
 
-    def figures(self) -> dict:
+    def figures(self) -> dict[str, Any]:
         """Percent by which areas grew, where (px from the middle, weighted by growth), and of how many pins."""
         change = 100 * (self.graph.area_px2 / self.rest_area_px2 - 1)
         grown = np.maximum(change, 0)
@@ -72,7 +74,14 @@ class AreaChange:
         }
 
 
-def twin_contacts(spec: SensorSpec, form: Form, *, depths_mm=DEPTHS_MM, names=tuple(CONTACTS), progress=None) -> list[AreaChange]:
+def twin_contacts(
+    spec: SensorSpec,
+    form: Form,
+    *,
+    depths_mm: tuple[float, ...] = DEPTHS_MM,
+    names: tuple[str, ...] = tuple(CONTACTS),
+    progress: Step | None = None,
+) -> list[AreaChange]:
     """Press, render, find pins, tessellate: every contact at every depth.
 
     Raises

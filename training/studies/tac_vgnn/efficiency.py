@@ -5,10 +5,12 @@ import gc
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from training.dataset import PinTable
+from training.inputs import GraphInputs, ImageInputs, PinInputs
 from training.loop import Loop, Rows
 from training.networks import build_network, parameter_count
 from training.recipes import recipe_of
@@ -35,7 +37,7 @@ class PeakMemory:
         self.thread.start()
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.watching = False
         self.thread.join()
         if self.device == "cuda":
@@ -52,7 +54,9 @@ class PeakMemory:
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / MIB
 
 
-def measure_training(model: str, pins: PinTable, inputs, batch: int, *, device: str = "cpu") -> dict:
+def measure_training(
+    model: str, pins: PinTable, inputs: PinInputs | GraphInputs | ImageInputs, batch: int, *, device: str = "cpu"
+) -> dict[str, Any]:
     """Train on a frame's inputs for a while and see what it costs.
 
     Parameters

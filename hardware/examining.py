@@ -65,7 +65,9 @@ def examine_sensor(
         There is no such camera, or it gives nothing.
     """
     if detector is not None and detector.method != "twin":
-        raise FrameError(f"a pipeline tuned for method '{detector.method}': --pipeline takes method 'twin'; run 'twin tune' without --method")
+        raise FrameError(
+            f"{detector.name}: tuned for method '{detector.method}', --pipeline takes method 'twin'; run 'twin tune' without --method"
+        )
     frames = frames_of(source, sensor, form, limit)
     with stage(progress, "frames") as step:
         return Examination(examine(frames, sensor, detector, progress=step))

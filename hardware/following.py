@@ -210,7 +210,9 @@ def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, fail
 
 
 def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, told: dict[str, Any]) -> list[Path]:
-    figure = trajectory_figure(followed.path, followed.measures, f"{plan.stimulus.name}, {model.sensor.name}", outline_mm=followed.outline_mm)
+    figure = trajectory_figure(
+        followed.path, followed.measures, f"{plan.stimulus.name}, {model.sensor.name}", outline_mm=followed.outline_mm
+    )
     content = {
         **told,
         "measures": asdict(followed.measures),

@@ -120,7 +120,7 @@ def build_rig(
     """
     form = form or (Form.RECORDING if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
-    device = open_arm(arm)
+    device: Arm = open_arm(arm)
     simulated = isinstance(device, SimulatedArm)
     if simulated and camera == TWIN and at_once:
         device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)

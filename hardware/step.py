@@ -15,12 +15,23 @@ from twin.types import Form, Frame
 class Estimate(Protocol):
     """What an estimator makes of a frame (``training.estimator.PoseEstimate``)."""
 
-    names: tuple
-    value: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    valid: bool
-    reason: str
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def value(self) -> np.ndarray: ...
+
+    @property
+    def low(self) -> np.ndarray: ...
+
+    @property
+    def high(self) -> np.ndarray: ...
+
+    @property
+    def valid(self) -> bool: ...
+
+    @property
+    def reason(self) -> str: ...
 
 
 Estimator = Callable[[Frame], Estimate]
@@ -81,7 +92,7 @@ class StepRecord:
     fresh: bool
     latency_s: float
     compute_s: float
-    names: tuple
+    names: tuple[str, ...]
     value: np.ndarray
     low: np.ndarray
     high: np.ndarray

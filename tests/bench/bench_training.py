@@ -12,7 +12,7 @@ import torch
 from scenes import load_sensor
 from training.dataset import PinTable
 from training.inputs import ImageInputs, PinInputs, graph_inputs, pin_features
-from training.study.efficiency import measure_training
+from training.studies.tac_vgnn.efficiency import measure_training
 from twin.preprocess import make_graph, nominal_reference
 from twin.preprocess.forms import frame_size
 from twin.types import Form

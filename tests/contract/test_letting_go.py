@@ -15,15 +15,15 @@ from hardware.arms.lerobot import LeRobotArm
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
+from hardware.endings import signals_as_ctrl_c
 from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.loop import ServoLoop
+from hardware.rig import Rig, servo_loop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SafetyLimits
 from hardware.step import LoopSettings
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
-from hardware.endings import signals_as_ctrl_c
-from hardware.rig import Rig, servo_loop
 from twin.mounting import Mounting
 from twin.types import Form
 

@@ -16,7 +16,7 @@ from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
 from training.recorded_contact import read_arm_labels
 from training.run import fold_rows
-from training.sim_to_real.study import arm_labels, with_missing
+from training.studies.sim_to_real.steps import arm_labels, with_missing
 from training.targets import corrected, read_executed
 from twin.errors import ContactError, RenderError
 from twin.geometry.solid import Resolution

@@ -16,7 +16,7 @@ from training.packed import pack, read_arrays, shipped_names, write_arrays
 from training.recipes import TrainingError
 from training.run import train_run
 from training.run_files import write_tensors
-from training.sim_to_real.study import choose_frames, put_beside, quadratic_row, states_like
+from training.studies.sim_to_real.steps import choose_frames, put_beside, quadratic_row, states_like
 from twin.preprocess import make_reference
 
 SAME = 1e-6  # mm or deg: rounding of the areas' logarithms

@@ -16,7 +16,6 @@ from twin.errors import ContactError, TwinError
 from twin.kinematics import ArmLabel, rig_of
 from twin.types import FINE, Form
 
-
 Images = Literal["raw", "gray", "recording", "none"]
 States = Literal["end", "all"]
 Quality = Literal["preview", "standard", "high"]

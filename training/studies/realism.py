@@ -30,13 +30,19 @@ class Realism:
         lines.append(f"largest difference in a radial bin: {worst}")
         lines += [f"{name}: real {pair['real']:.2f}, rendered {pair['rendered']:.2f}" for name, pair in found["scalars"].items()]
         spots = found["spots"]
-        lines.append(f"spectra differ by {found['spectrum_db']:.2f} dB; {spots['paired']} of {spots['real']} bright spots have a counterpart")
+        lines.append(
+            f"spectra differ by {found['spectrum_db']:.2f} dB; {spots['paired']} of {spots['real']} bright spots have a counterpart"
+        )
         lines.append(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
         if outcome := metrics["two_sample"]:
-            lines.append(f"two-sample accuracy {100 * outcome['accuracy']:.1f} % ({100 * outcome['low']:.1f} to {100 * outcome['high']:.1f} %)")
+            lines.append(
+                f"two-sample accuracy {100 * outcome['accuracy']:.1f} % ({100 * outcome['low']:.1f} to {100 * outcome['high']:.1f} %)"
+            )
         if poses := metrics["pose_aligned"]:
             error = poses["pin_error_px"]
-            lines.append(f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on those fitted to)")
+            lines.append(
+                f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on those fitted to)"
+            )
             lines.append(_image_line("pose-aligned, unseen", metrics["frames"] // 2, poses["test_images"]))
         return lines
 

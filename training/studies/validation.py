@@ -41,9 +41,7 @@ class Validation:
             lines.append(f"{row['group']}: {row['error_px']:.2f} px over {row['frames']} frames, nothing free")
         if own := self.summary["one_friction_a_frame"]:
             common_px = own["error_with_common_friction_px"]
-            lines.append(
-                f"one friction a frame, {own['frames']} frames: {own['error_px']:.2f} px (common friction: {common_px:.2f} px)"
-            )
+            lines.append(f"one friction a frame, {own['frames']} frames: {own['error_px']:.2f} px (common friction: {common_px:.2f} px)")
         if failures := self.comparison.failures:
             lines.append(f"{len(failures)} contacts failed: see frames.csv")
         return lines

@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, Out, Sensor, Workers
-from twin.cli.render import Quality
+from twin.cli.options import CORES, Across, Out, Quality, Sensor, Workers, if_given
 from twin.types import FINE
 
 HELP = """Simulate a labelled data set: the contacts of an experiment, in the recordings' own format, with ground truth.
@@ -88,30 +87,21 @@ def dataset(
     across: Across = FINE,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
-    from training.generation import GenerationConfig, generate
-    from twin.cli.progress import rate_bar
-    from twin.kinematics import rig_of
-    from twin.preprocess.forms import frame_size
+    from training.generation.simulate import config_for, simulate_dataset
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    spec, plan = load_sensor(sensor), load_experiment(experiment)
-    touched = load_object(object_ or plan.object)
-    config = GenerationConfig(
-        sensor=spec,
-        object=touched,
-        experiment=plan,
-        randomisation=load_randomisation(randomise) if randomise else None,
-        friction=rig_of(spec).friction if object_ is None and spec.rig else touched.friction,
-        seed=plan.seed if seed is None else seed,
+    config = config_for(
+        load_sensor(sensor),
+        load_experiment(experiment),
+        touched=if_given(load_object, object_),
         images=images.value,
         states=states.value,
-        quality=(quality or (Quality.PREVIEW if images is Images.RECORDING else Quality.STANDARD)).value,
+        randomisation=if_given(load_randomisation, randomise),
+        seed=seed,
+        quality=quality.value if quality else None,
         across=across,
     )
-    frame_size(spec, config.form)  # before anything is made: has the sensor this form?
-    with rate_bar(f"{plan.name}, {spec.name}") as progress:
-        made = generate(out, config, count, workers=workers, scheduler=scheduler, progress=progress)
-    if made.before:
-        print(f"{made.before} contacts were there before")
-    if made.failed:
-        print(f"{made.failed} draws failed and were drawn anew: see {out / 'failures.csv'}")
-    print(f"{made.frames} frames of {made.contacts} contacts\nwrote {out}")
+    with shown() as progress:
+        made = simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, progress=progress)
+    tell(made)

@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Out, Sensor, writable_folder
-from twin.cli.render import Quality
+from twin.cli.options import Out, Quality, Sensor, writable_folder
 
 HELP = """Compare a folder of real raw frames with their renders, pair by pair and as two sets.
 
@@ -54,47 +53,19 @@ def realism(
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
 ) -> None:
     from scenes import load_sensor
-    from twin.cli.progress import count_bar
-    from twin.realism.run import run_realism
+    from training.studies.realism import compare_with_renders
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    spec = load_sensor(sensor)
-    writable_folder(out)
-    test = _two_sample if two_sample else None
-    metrics, written = run_realism(path, spec, out, count_bar, with_poses=pose_aligned, limit=limit, quality=quality.value, test=test)
-    _print(metrics)
-    for file in written:
-        print(f"wrote {file}")
-
-
-def _two_sample(real, rendered, inside, progress):
-    from training.two_sample import two_sample
-
-    return two_sample(real, rendered, inside, progress=progress)
-
-
-def _print(metrics: dict) -> None:
-    for refused in metrics["refused"]:
-        print(f"refused {refused['image_name']}: {refused['reason']}")
-    _print_images("pin-aligned", metrics["frames"], metrics["pin_aligned"])
-    found = metrics["statistics"]
-    worst = ", ".join(f"{name} {100 * value:.1f} %" for name, value in found["worst_relative_difference"].items())
-    print(f"largest difference in a radial bin: {worst}")
-    for name, pair in found["scalars"].items():
-        print(f"{name}: real {pair['real']:.2f}, rendered {pair['rendered']:.2f}")
-    spots = found["spots"]
-    print(f"spectra differ by {found['spectrum_db']:.2f} dB; {spots['paired']} of {spots['real']} bright spots have a counterpart")
-    print(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
-    if outcome := metrics["two_sample"]:
-        print(f"two-sample accuracy {100 * outcome['accuracy']:.1f} % ({100 * outcome['low']:.1f} to {100 * outcome['high']:.1f} %)")
-    if poses := metrics["pose_aligned"]:
-        error = poses["pin_error_px"]
-        print(f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on those fitted to)")
-        _print_images("pose-aligned, unseen", metrics["frames"] // 2, poses["test_images"])
-
-
-def _print_images(title: str, count: int, images: dict) -> None:
-    mean = {name: images[name]["mean"] for name in ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip")}
-    print(
-        f"{title}, {count} frames: PSNR {mean['psnr_db']:.2f} dB (gray {mean['psnr_gray_db']:.2f}), "
-        f"SSIM {mean['ssim']:.3f} (gray {mean['ssim_gray']:.3f}), FLIP {mean['flip']:.3f}"
-    )
+    with shown() as progress:
+        found = compare_with_renders(
+            path,
+            load_sensor(sensor),
+            writable_folder(out),
+            pose_aligned=pose_aligned,
+            limit=limit,
+            quality=quality.value,
+            test=two_sample,
+            progress=progress,
+        )
+    tell(found)

@@ -49,47 +49,23 @@ def study_objects(
     across: Across = FINE,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
-    from training import across_objects
-    from training.across_objects import study as objects
-    from training.dataset import load_dataset
-    from training.generation import generate
-    from training.sim_to_real.study import train_in_twin
-    from twin.cli.progress import count_bar, epoch_bar, rate_bar
-    from twin.views.page import render_page
-    from twin.views.table import write_table
+    from training.studies import objects
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    spec, judged = load_sensor(sensor), load_experiment(experiment)
     plan = objects.Plan(
-        sensor=spec,
-        experiment=judged,
-        wider=load_experiment(judged.wider or experiment),
+        sensor=load_sensor(sensor),
+        experiment=load_experiment(experiment),
         randomisation=load_randomisation(randomise),
-        train=tuple(load_object(name) for name in names_in(train)),
-        unseen=tuple(load_object(name) for name in names_in(unseen)),
+        train=tuple(map(load_object, names_in(train))),
+        unseen=tuple(map(load_object, names_in(unseen))),
         count=count,
         tests=tests,
         seed=seed,
         across=across,
+        epochs=epochs,
+        workers=workers,
     )
-    writable_folder(out)
-    sets = {}
-    for folder, config, contacts in plan.sets():
-        with rate_bar(folder) as progress:
-            generate(out / folder, config, contacts, workers=workers, progress=progress)
-        with count_bar(f"{folder}: states") as progress:
-            sets[folder] = load_dataset(out / folder, spec, judged.targets, progress=progress)
-    runs = {}
-    for name, data in plan.trained_on(sets).items():
-        runs[name] = out / name
-        with epoch_bar(name) as progress:
-            train_in_twin(data, runs[name], seed=seed, split=None, epochs=epochs, progress=progress)
-    rows = objects.table(plan, runs, sets)
-    said = objects.verdicts(plan, rows, judged.targets)
-    page = render_page(across_objects.__name__, plan=plan, names=judged.targets, ranges=judged.ranges(), rows=rows, verdicts=said)
-    (out / "index.html").write_text(page)
-    for row in rows:
-        errors = ", ".join(f"{name} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name in judged.targets)
-        print(f"{row['model']}, {row['object']} ({'seen' if row['seen'] else 'never seen'}): {errors}")
-    print("\n".join(said))
-    for path in (write_table(out / "objects.csv", rows), out / "index.html"):
-        print(f"wrote {path}")
+    with shown() as progress:
+        found = objects.run(plan, writable_folder(out), progress=progress)
+    tell(found)

@@ -93,7 +93,13 @@ def train_all(
 def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None) -> dict[str, Any]:
     """What became of one run: errors on the rows kept out of training, or only that there was no time for it."""
     folder = out / plan.folder
-    row: dict[str, Any] = {"model": plan.name, "seed": plan.config.seed, "labels": plan.config.labels, "minutes_now": minutes, "state": "not begun"}
+    row: dict[str, Any] = {
+        "model": plan.name,
+        "seed": plan.config.seed,
+        "labels": plan.config.labels,
+        "minutes_now": minutes,
+        "state": "not begun",
+    }
     if not (folder / "weights.pt").is_file():
         return row
     estimator = PoseEstimator.load(folder)

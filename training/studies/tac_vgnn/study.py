@@ -82,8 +82,11 @@ class Plan:
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""
-        options = {"labels": self.labels, "split": self.split, "epochs": self.epochs}
-        return [plan_run(name, seed=seed, **options) for seed in self.seeds for name in self.models]
+        return [
+            plan_run(name, labels=self.labels, seed=seed, split=self.split, epochs=self.epochs)
+            for seed in self.seeds
+            for name in self.models
+        ]
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,11 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     graphs = compare_graphs(data.pins)
     spent = train_all(runs, data, folder, max_minutes=plan.max_minutes, device=device, progress=progress)
     rows = [table_row(each, data, folder, spent.get(each.folder)) for each in runs]
-    written = [write_table(out / "models.csv", rows), write_table(out / "graphs.csv", graphs), draw_curves(out / "curves.png", runs, folder)]
+    written = [
+        write_table(out / "models.csv", rows),
+        write_table(out / "graphs.csv", graphs),
+        draw_curves(out / "curves.png", runs, folder),
+    ]
     efficiency = _efficiency(plan, runs, data, device, progress)
     if efficiency:
         written += [write_table(out / "efficiency.csv", efficiency), draw_efficiency(out / "efficiency.png", efficiency)]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from twin.optics.render import Renderer
 from twin.types import Form, Frame
 
 TWIN = "twin"
-SHADING_QUALITY = "standard"
+SHADING_QUALITY: Literal["standard"] = "standard"
 FRAME_S, TWIN_FRAME_S = 5.0, 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 

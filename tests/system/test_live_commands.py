@@ -13,7 +13,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from twin.cli.rig import build_rig, steps_round
 from typer.testing import CliRunner
 
 from hardware import following
@@ -34,7 +33,7 @@ from hardware.view.server import BrowserView
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimator import PoseEstimator
 from twin.camera import expose, record
-from twin.cli.emulate import run_until_told
+from twin.cli import command_line
 from twin.errors import TwinError
 from twin.mounting import Mounting
 from twin.preprocess import Pipeline

@@ -44,7 +44,8 @@ AtRest = Annotated[
     ),
 ]
 FIRST, NONE = "first", "none"  # as hardware.at_rest has them
-Given, Spec = TypeVar("Given", str, Path), TypeVar("Spec")
+Given = TypeVar("Given", str, Path)
+Spec = TypeVar("Spec")
 
 
 class Quality(StrEnum):

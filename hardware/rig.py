@@ -127,7 +127,8 @@ def build_rig(
         device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
     if not simulated or limits is not None:
         kind = arm.partition(":")[0]
-        device = SafeArm(device, load_limits(limits or kind)) if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file() else device
+        if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file():
+            device = SafeArm(device, load_limits(limits or kind))
     twin = None
     if camera == TWIN:
         preview = drawn(sensor, form, plain_light)

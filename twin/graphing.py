@@ -69,7 +69,8 @@ def write_graphs_of(
     if legacy and (kind != "voronoi" or path.suffix == PINS):
         raise FrameError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
     if path.suffix == PINS:
-        names, nodes_px = read_pins(path, sensor)
+        found, nodes_px = read_pins(path, sensor)
+        names: list[str] = found.tolist()
         form = form or form_of_pins(sensor, nodes_px)
         reference, image, left_out = nominal_reference(sensor, form), None, []
         graphs = graphs_of_nodes(kind, nodes_px, reference)
@@ -78,4 +79,4 @@ def write_graphs_of(
         names, graphs, left_out = seen.names, seen.graphs, seen.left_out
         form, reference, image = seen.form, seen.reference, seen.first_image
     pictures = draw_bare_graph(out, graphs[0]) if legacy else draw_graph_pictures(out, sensor, form, graphs[0], reference, image)
-    return Graphs(list(names), graphs, left_out, [write_graphs(out, names, graphs), *pictures])
+    return Graphs(names, graphs, left_out, [write_graphs(out, names, graphs), *pictures])

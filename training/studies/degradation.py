@@ -103,7 +103,7 @@ def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
 
 
 def _estimates(estimator: PoseEstimator, sensor: SensorSpec, frame: Frame) -> Estimates:
-    if frame.form == Form.RAW and estimator.form == Form.RECORDING:
+    if frame.form == Form.RAW and estimator.form == Form.RECORDING and sensor.recording is not None:
         frame = replace(frame, image=record(frame.image, sensor.recording), form=Form.RECORDING)
     found = estimator(frame)
     return found.value, found.units, found.valid

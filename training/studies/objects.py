@@ -17,6 +17,7 @@ from training.evaluate import predict_rows_of
 from training.generation import GenerationConfig, generate
 from training.recipes import TrainingError
 from training.studies.sim_to_real.steps import train_in_twin
+from training.studies.sim_to_real.twins import contact_of
 from twin.progress import Progress, silent, stage
 from twin.types import FINE
 from twin.views.page import render_page
@@ -101,7 +102,7 @@ class Plan:
     def trained_on(self, sets: dict[str, Dataset]) -> dict[str, Dataset]:
         """Data set of each model, from those of all folders: as many contacts for both."""
         parts = [sets[f"sim/{thing.name}"] for thing in self.train]
-        first = parts[0].rows(np.flatnonzero(parts[0].group < self.count))
+        first = parts[0].rows(np.flatnonzero(contact_of(parts[0]) < self.count))
         return {MIXED: joined([first, *parts[1:]]), self.alone.name: parts[0]}
 
 
@@ -192,7 +193,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
             error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)
             flat = error if flat is None else flat
             row: dict[str, Any] = {"model": model, "object": thing.name, "seen": thing.name in learnt}
-            row |= {"contacts": len(np.unique(data.group[chosen])), "states": len(chosen)}
+            row |= {"contacts": len(np.unique(contact_of(data)[chosen])), "states": len(chosen)}
             for k, name in enumerate(data.targets.names):
                 row |= {f"{name}_error": float(error[k]), f"{name}_bias": float(bias[k]), f"{name}_times": float(error[k] / flat[k])}
             rows.append(row)

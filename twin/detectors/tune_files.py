@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scenes import SensorSpec
-from twin.detectors.spec import Method, write_detector
+from twin.detectors.spec import Evidence, Method, write_detector
 from twin.detectors.tune import Tuned, tune
 from twin.errors import FrameError
 from twin.progress import Progress, silent, stage
@@ -21,6 +21,8 @@ class TunedOnFrames:
     Attributes
     ----------
     tuned : Tuned
+    evidence : Evidence
+        How sure it is.
     pins : int
         Of the sensor.
     written : list of Path
@@ -28,12 +30,13 @@ class TunedOnFrames:
     """
 
     tuned: Tuned
+    evidence: Evidence
     pins: int
     written: list[Path]
 
     def lines(self) -> list[str]:
         """How sure it is, the parameters, and what speaks against them; for people."""
-        detector, evidence = self.tuned.detector, self.tuned.detector.evidence
+        detector, evidence = self.tuned.detector, self.evidence
         blob, exact, low = detector.blob, 100 * evidence.exact_rate, 100 * evidence.low_rate
         (x, y), radius, slack = blob.mask_center_px, blob.mask_radius_px, evidence.mask_slack_px
         lines = [
@@ -79,9 +82,8 @@ def tune_on_frames(
     frames = evenly_read(open_recording(path, sensor, form), limit)
     with stage(progress, "tuning") as step:
         found = tune(frames, sensor, method, progress=step)
-    written = []
+    evidence = found.detector.evidence
+    assert evidence is not None  # whoever tunes says how sure it is
     if out is not None:
-        sure = found.detector.evidence.sure
-        write_detector(out, found.detector, f"Found by 'twin tune' from {len(frames)} frames of {path.name}; {sure}.")
-        written.append(out)
-    return TunedOnFrames(found, sensor.pins.count, written)
+        write_detector(out, found.detector, f"Found by 'twin tune' from {len(frames)} frames of {path.name}; {evidence.sure}.")
+    return TunedOnFrames(found, evidence, sensor.pins.count, [] if out is None else [out])

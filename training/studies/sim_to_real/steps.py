@@ -20,6 +20,7 @@ from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors, write_text
 from training.sim_to_real.discrepancy import Discrepancy
 from training.simulated import config_of, is_pins_only, open_simulated
+from training.studies.sim_to_real.twins import contact_of
 from training.studies.telling import epoch_step
 from training.validation.model import MeasuredFrames
 from twin.kinematics import ArmLabel
@@ -81,7 +82,7 @@ def with_missing(
 ) -> Dataset:
     """A simulated data set whose pins have moved by what the twin may miss, drawn for each contact; ``labels`` are its ``arm_labels``."""
     pins = simulated.pins
-    missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, simulated.group.astype(int), seed)
+    missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
     nodes_px = pins.nodes_px + missing_px
     return replace(simulated, pins=replace(pins, nodes_px=nodes_px, area_px2=voronoi_areas(nodes_px, pins.reference, progress=progress)))
 

@@ -28,7 +28,7 @@ from training.studies.sim_to_real.steps import (
     widen_intervals,
     with_missing,
 )
-from training.studies.sim_to_real.twins import Twin, as_mounted, without_one_ingredient
+from training.studies.sim_to_real.twins import Twin, as_mounted, contact_of, without_one_ingredient
 from training.validation.model import MeasuredFrames
 from twin.progress import Progress, silent, stage
 from twin.types import FINE
@@ -314,7 +314,7 @@ def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: Beside, mis
         modes=missing.summary()[:SHOWN_MODES],
         friction=ground.full.randomisation.friction,
         simulated=len(learnt),
-        contacts=len(np.unique(learnt.group)),
+        contacts=len(np.unique(contact_of(learnt))),
         names=ground.real.targets.names,
         left_out=beside.left_out,
         columns=list(rows[0]),

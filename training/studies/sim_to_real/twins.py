@@ -12,6 +12,7 @@ from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
 from training.dataset import Dataset
 from training.generation import GenerationConfig
+from training.recipes import TrainingError
 from training.sim_to_real.discrepancy import FRICTIONS
 from twin.kinematics import rig_of
 
@@ -74,8 +75,22 @@ class Twin:
         """The states of the contacts that are learnt from."""
         if self.share == 1:
             return contacts
-        numbers = np.unique(contacts.group)
-        return contacts.rows(np.flatnonzero(np.isin(contacts.group, numbers[: int(np.ceil(self.share * len(numbers)))])))
+        group = contact_of(contacts)
+        numbers = np.unique(group)
+        return contacts.rows(np.flatnonzero(np.isin(group, numbers[: int(np.ceil(self.share * len(numbers)))])))
+
+
+def contact_of(simulated: Dataset) -> np.ndarray:
+    """(M,) int: the number of the contact that each state of a simulated data set belongs to.
+
+    Raises
+    ------
+    TrainingError
+        The data set is none of simulated contacts.
+    """
+    if simulated.group is None:
+        raise TrainingError(f"{', '.join(map(str, simulated.folders))}: no simulated contacts; give a data set of 'twin dataset'")
+    return simulated.group.astype(int)
 
 
 def without_one_ingredient(

@@ -91,7 +91,7 @@ def twin_contacts(
     """
     simulator, pipeline = Simulator(spec), Pipeline(spec, form)
     rest = pipeline(simulator.shoot_rest(form).frame)
-    if not rest.valid:
+    if not rest.valid or rest.graph is None:
         raise TwinError(f"{spec.name}: pins of the rendered frame without contact not found: {rest.reason}")
     found = []
     for name in names:
@@ -101,7 +101,7 @@ def twin_contacts(
             poses = plan_path(spec, build_stimulus(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
             state = [state for _, state in simulator.solver.path(thing, ContactPath(_turned(turn_deg) @ poses))][-1]
             seen = pipeline(simulator.shoot(state, form=form).frame)
-            if not seen.valid:
+            if not seen.valid or seen.graph is None:
                 raise TwinError(f"{spec.name}, {name}, {depth:g} mm: {seen.reason}")
             found.append(AreaChange(name, depth, seen.graph, rest.graph.area_px2))
             if progress:

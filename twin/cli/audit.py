@@ -10,12 +10,12 @@ from twin.cli.options import FormOrAuto, Out, Sensor, writable_folder
 
 HELP = """Find what is wrong with the labels of a flat-surface recording, from its pins and targets.csv alone.
 
-Moves that were not executed when the frame was taken, sign errors, frames without contact, frames that fit no label,
-frames that occur twice, drift along the table, and everything odd about the files. Needs pose_2, pose_6, move_1, move_6.
+It looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames that fit no label,
+frames that occur twice, drift along the table, and anything odd about the files. It needs pose_2, pose_6, move_1, move_6.
 
 \b
 Writes labels_corrected.csv (image_name, executed, the four labels corrected, misfit to each story, findings),
-audit.json, audit.png, audit.html. Copied beside targets.csv, labels_corrected.csv is what 'twin train' corrects labels by.
+audit.json, audit.png, audit.html. Copy labels_corrected.csv beside targets.csv, and 'twin train' corrects the labels by it.
 """
 
 

@@ -11,11 +11,11 @@ from twin.cli.options import FormOrAuto, Sensor, if_given
 HELP = """Is the sensor well? Brightness, focus, missing pins, specks, glare, and drift from its calibration; and what to do.
 
 Looks at a frame, a folder of frames, a video or a camera, in contact or not, and compares with what the sensor's specification
-promises (the twin draws that sensor's frame). Thresholded recordings tell of pins, specks and place only. A pin or spot is
-counted as steady if it is lost or there in half of the frames: give frames of several contacts.
+promises (the twin draws that sensor's frame). Thresholded recordings tell of pins, specks and place only. A lost pin, or a spot,
+counts as a fault of the sensor if it is so in half of the frames: give frames of several contacts.
 
 \b
-Exit code 0 if everything is good or to be watched, 2 if something is bad.
+Exit code: 0 if everything is good or to be watched, 2 if something is bad.
 
 \b
 Example:

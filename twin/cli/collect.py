@@ -9,10 +9,10 @@ from twin.cli.options import ArmOption, Camera, FormOrAuto, Limits, Out, PlainLi
 
 HELP = """Collect labelled frames: for each contact a random pose and shear, a tap, and one frame.
 
-A frame is taken only after the arm has said that it stands at the commanded pose, and only one exposed after that; the
-pose that it said is the label. The arm goes around the object to 50 mm before it (straight, and in front of it, where the
-object has no end: a plane, an edge), lifts between contacts, and ends 50 mm clear, disabled. Its links and the object's holder
-are not known: look that both have room. The frame without contact is refused where the sensor seems pressed in it.
+A frame is taken only after the arm has said that it stands at the commanded pose, and it is exposed after that. The pose that
+the arm said is the label. The arm goes around the object to 50 mm before it. Where the object has no end (a plane, an edge), it goes
+straight, and stays in front of it. It lifts between contacts, and ends 50 mm clear, disabled. The arm's links and the object's holder
+are not known: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
 The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json);
 contacts.jsonl has the times. The same command goes on where it was ended.
 

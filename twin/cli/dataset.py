@@ -11,9 +11,9 @@ from twin.types import FINE
 
 HELP = """Simulate a labelled data set: the contacts of an experiment, in the recordings' own format, with ground truth.
 
-For each contact a pose and a move are drawn from the experiment's ranges ('twin experiments' lists them; robot coordinates),
-the arm's way is followed by finite elements, and the last state, or every converged one, becomes a frame. A contact that
-does not converge is drawn anew and listed.
+For each contact a pose and a move are drawn from the experiment's ranges ('twin experiments' lists them; robot coordinates).
+The arm's way is followed by finite elements, and the last state, or every converged one, becomes a frame. A contact that
+does not converge is listed, and drawn anew.
 
 \b
 --images raw        the camera's frames
@@ -37,7 +37,7 @@ Writes:
   records/            one for each finished contact; with them the same command goes on
                       after any end, or to a larger --count
 
-The result depends on the options alone: any number of workers, and any interruption, gives the same bytes.
+The result depends on the options alone. It is the same, byte by byte, with any number of workers and after any interruption.
 
 \b
 Examples:

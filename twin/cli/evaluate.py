@@ -19,8 +19,8 @@ Writes predictions.csv (image_name, and for every label <label>_true, _pred, _lo
 metrics.json (mean absolute errors against raw and corrected labels, overall and by depth, angle and shear; coverage of the
 90 % intervals; slope of the angle's error on move_6 over frames whose move was not executed; ms per frame), errors.png.
 
-With --robustness also robustness.csv: errors of single frames when the image itself is changed (1 % scale, 2 px shift, 1 deg
-turn, 5 pins erased, each in a random direction), and by which part they are larger than those of the same frames unchanged.
+With --robustness it also writes robustness.csv: errors of single frames whose image is changed (1 % scale, 2 px shift, 1 deg
+turn, 5 pins erased, each in a random direction), and how much larger they are than those of the same frames unchanged.
 """
 
 

@@ -10,8 +10,8 @@ from twin.cli.options import NONE, SHIPPED_MODEL, AtRest, Camera, Model
 
 HELP = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
 
-A window opens where there is a display and an OpenCV that can; else a page in the browser (its address is printed); with
---rerun (package rerun-sdk) Rerun's viewer, or its file: frame, pins, graph and pose on a time line.
+A window opens if there is a display, and an OpenCV that can open one. Otherwise a page is served for the browser; its address is
+printed. With --rerun (package rerun-sdk) it is Rerun's viewer, or its file: frame, pins, graph and pose on a time line.
 With --record DIR every frame is kept, lossless, with its estimate; the folder is readable even if the program is killed.
 --replay DIR gives the same frames again, and says whether the estimates are the same. With --at-rest first the camera must see
 no contact at the start; that frame is kept with the session.

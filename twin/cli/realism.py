@@ -10,10 +10,10 @@ from twin.cli.options import Out, Quality, Sensor, writable_folder
 
 HELP = """Compare a folder of real raw frames with their renders, pair by pair and as two sets.
 
-Each real frame's pins are found, the skin is fitted to them, and the sensor in that state is rendered and captured: every
+Each real frame's pins are found, the skin is fitted to them, and the sensor in that state is rendered and captured. Every
 cap stands where it stood in the real frame, so what differs is camera and light. With --pose-aligned the whole twin is
 judged as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5 turns in deg, a tap on a flat plate) become
-contacts, the arm's kinematics being fitted to the pins of one half of the frames and the error stated on the other.
+contacts. The arm's kinematics is fitted to the pins of one half of the frames, and the error is stated on the other half.
 
 \b
 Reads: a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder).
@@ -33,8 +33,8 @@ Writes:
 
 \b
 How to read it: PSNR and SSIM of two real frames with the same contact are the best that can
-be had. Two-sample accuracy: share of patches of unseen frames that a small network puts
-into the right set; 100 % always told apart, 50 % not to be told apart.
+be reached. Two-sample accuracy is the share of patches of unseen frames that a small network
+puts into the right set: at 100 % they are always told apart, at 50 % never.
 
 \b
 Example:

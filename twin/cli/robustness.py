@@ -21,14 +21,14 @@ Writes:
   curves.csv      every measure against severity, with its 90 % interval
   frames.csv      every frame
   real-on-rendered.csv  with --frames: where real and rendered frames fail, and their ratio
-  cells/          finished work: an interrupted run goes on where it was; what was computed from another sensor, other weights
-                  or another version is not taken for it
+  cells/          finished work: an interrupted run goes on where it was; work from another sensor, other weights or another
+                  version is not used
 
 \b
-With --frames DIR real frames take the place of rendered ones: conditions that act on a frame
-alone, the pins on which several detectors agree as the truth. Raw frames are shown on the
-envelope of rendered ones: how much of a sound sensor's margin has this one left? That sweeps
-rendered frames too; --no-rendered leaves it out.
+With --frames DIR real frames take the place of rendered ones. Only conditions that act on a
+frame are swept, and the truth is the pins on which several detectors agree. Raw frames are shown
+on the envelope of rendered ones: how much of a sound sensor's margin has this one left? For that
+rendered frames are swept too; --no-rendered leaves it out.
 
 \b
 A file for --conditions:

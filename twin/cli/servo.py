@@ -21,11 +21,11 @@ from twin.cli.options import (
 
 HELP = """Follow an object's outline with the sensor, frame by frame: pose-based tactile servoing.
 
-In the twin unless told otherwise: the arm is simulated, the frames are drawn for the contact that its pose makes. With
---camera and --arm the same loop runs on devices, real or emulated. The arm goes around the object to 50 mm before it (straight,
-and in front of it, where the object has no end: a plane, an edge; its links and the object's holder are not known), and whatever
-happens (Ctrl-C too) it stops, retreats along the surface's normal and is disabled. Before it touches anything a frame is taken that
-the model counts pins from (--at-rest none: the specification's layout; models on graphs always do).
+It runs in the twin unless told otherwise: the arm is simulated, and the frames are drawn for the contact that its pose makes. With
+--camera and --arm the same loop runs on devices, real or emulated. The arm goes around the object to 50 mm before it. Where the object
+has no end (a plane, an edge), it goes straight, and stays in front of it. The arm's links and the object's holder are not known.
+Whatever happens (Ctrl-C too), the arm stops, retreats along the surface's normal and is disabled. Before it touches anything, a frame
+is taken that the model counts pins from. With --at-rest none it counts from the specification's layout; models on graphs always do.
 
 \b
   twin servo --object can --model RUN --out out/servo

@@ -15,14 +15,15 @@ HELP = """Train in the twin on several objects, and judge on objects that were n
 \b
   twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod --unseen cylinder,edge --out out/objects
 
-Two models learn from as many simulated contacts (pins alone, every state on their way): 'mixed' from --count of each object of
---train, the other from the first of them alone. Both are judged on --tests other contacts of every object, seen or not.
+Two models learn from the same number of simulated contacts (pins alone, every state on their way). 'mixed' learns from --count
+contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other contacts of every
+object, seen or not.
 
-Labels mean the same on every object: depth is the indentation along the surface's normal at the place nearest to the dome's
-centre, the angle that from this normal, as the labels of a flat plate touched alike. --experiment gives the ranges that are judged;
-the one that it names as wider is trained on.
+Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
+centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges that are
+judged; the experiment that it names as wider is trained on.
 
-The same command goes on where it was ended. The run that learnt several objects serves wherever a RUN is asked for:
+The same command goes on where it was ended. The run that learnt several objects can be given wherever a RUN is asked for:
 
 \b
   twin servo --object can --model out/objects/mixed --out out/can

@@ -16,10 +16,10 @@ HELP = """Train in the twin, test on real frames, against training on real frame
 
 The recording's --experiment says how the arm went and what is learnt; --contacts is the experiment that is simulated.
 
---labels real frames are drawn by --seed from four fifths of the recording. Friction is drawn as it was on them. What the twin's
-pins miss on them is learnt as a Gaussian process of the label, and drawn --draws times for every simulated contact; with
---calibrate the specification is fitted to them first ('twin calibrate contact'; about an hour). Judged on the random fifth that
-is left:
+--seed draws --labels real frames from four fifths of the recording. The friction of simulated contacts is drawn as it was on these
+frames. What the twin's pins miss on them is learnt as a Gaussian process of the label, and drawn --draws times for every simulated
+contact. With --calibrate the specification is fitted to these frames first ('twin calibrate contact'; about an hour). All models are
+judged on the random fifth that is left:
 
 \b
   simulated            vgnn trained on simulated contacts alone; its 90 %

@@ -14,12 +14,12 @@ HELP = """Repeat the Tac-VGNN paper's comparison on a recording: graphs, models,
 \b
   twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study --max-minutes 120
 
-Models (--models): gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, ours vgnn, and what its parts earn:
-vgnn-without-graph, vgnn-without-modes, vgnn-without-kernel.
+Models (--models): gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and ours, vgnn. vgnn-without-graph, vgnn-without-modes and
+vgnn-without-kernel show what its parts earn.
 
-All are trained on the same rows and labels and judged on the same fifth. Each run is a folder below --out/runs as 'twin train'
-writes it; the same command goes on where it was ended, so a study can take many evenings. --max-minutes is shared evenly among
-the runs still to come; what a run reached in its time is reported as such.
+All are trained on the same rows and labels, and judged on the same fifth. Each run is a folder below --out/runs as 'twin train'
+writes it. The same command goes on where it was ended, so a study can take many evenings. --max-minutes is shared evenly among
+the runs still to come. A run that was ended by it is reported as ended early.
 
 \b
 Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv, curves.png, efficiency.png, contacts.png, index.html, runs/.

@@ -24,12 +24,12 @@ were not executed are taken out, where move_executed.csv or labels_corrected.csv
 Depth and angle of simulated contacts are those of the surface that was touched, whatever its shape: indentation along its normal
 at the nearest place, and the angle from that normal. So data sets of several objects can be joined: give --data once for each.
 
-A random fifth of the rows (of simulated contacts, with all their states) is kept out of training for 'twin evaluate' (--split S:
-seed S; --split -1: train on all).
+A random fifth of the rows is kept out of training for 'twin evaluate'; of simulated data a fifth of the contacts, with all their
+states. --split gives its seed; --split -1 trains on all.
 
 \b
 Writes to --out: config.json (resolved, with the sensor and the pipeline's parameters), curves.csv, weights.pt, and
-while it runs checkpoint.pt: started again with the same options, a run that was ended goes on where it was.
+while it runs checkpoint.pt. A run that was ended goes on where it was when it is started again with the same options.
 """
 
 

@@ -10,8 +10,8 @@ from twin.cli.options import FormOrAuto, Sensor
 
 HELP = """Find mask, crop, threshold and blob parameters for your own frames.
 
-Uses nothing of the sensor but the layout of its pins (count, rings, round or hexagon). Give some frames, in contact or not, as
-they come from the camera or as a recorder thresholded them (then there is no crop, and the threshold hardly matters).
+It uses nothing of the sensor but the layout of its pins (count, rings, round or hexagon). Give some frames, in contact or not, as
+they come from the camera, or as a recorder thresholded them (then there is no crop, and the threshold hardly matters).
 
 \b
 Prints how sure it is: in how many frames all pins are found, by how many gray levels the

@@ -13,8 +13,8 @@ HELP = """Compare the twin's pins with those of labelled real frames.
 
 Each frame's contact is simulated along the arm's own way, from its label and the sensor's [rig] alone ('twin calibrate
 contact' fits one), and the simulated displacement is added to the recorded no-contact pins (init_0.png). Moves that
-move_executed.csv or labels_corrected.csv ('twin audit') calls not executed are left out. Stated apart for executed and not
-executed moves, by depth, angle and shear; and, for some frames with an executed move, with one friction a frame.
+move_executed.csv or labels_corrected.csv ('twin audit') calls not executed are left out. Errors are stated apart for executed and
+not executed moves, by depth, angle and shear. For some frames with an executed move they are also stated with one friction a frame.
 
 \b
 Writes index.html, frames.csv (a row a frame), validation.json.

@@ -9,9 +9,9 @@ import csv
 import json
 import os
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,14 +22,19 @@ from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError
 from hardware.let_go import try_each
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
+from hardware.step import Guard
 from scenes.experiment import LABELS, ExperimentSpec
+from twin.progress import Step
 from twin.recordings.images import write_image
 from twin.store import locked, made_by, write_json, write_text
 from twin.types import Form, Frame
 
-CLEAR_MM, LIFT_MM, NEAR_MM = 50.0, 10.0, 0.5
-MOVE_TIMEOUT_S, FRAME_TIMEOUT_S = 30.0, 5.0
-SPARE = 2.0  # times what a move takes, beside that: arms take whole percents of their speed
+CLEAR_MM = 50.0  # from the object at the start and at the end
+LIFT_MM = 10.0  # off the object between two contacts
+NEAR_MM = 0.5  # a move that is shortened by more than this is refused
+MOVE_TIMEOUT_S = 30.0  # for a move, beside the time that its way takes
+FRAME_TIMEOUT_S = 5.0  # for a frame of the arm where it stands
+SPARE = 2.0  # times the duration that a move's way and speed give: arms round their speed to whole percents
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
@@ -56,10 +61,10 @@ class Collection:
     """
 
     folder: Path
-    about: dict
+    about: dict[str, Any]
     form: Form
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self.pictures = self.folder / ("frames_bw" if self.form is Form.RECORDING else "images")
         self.folder.mkdir(parents=True, exist_ok=True)
         meta, about = self.folder / META, json.loads(json.dumps(self.about))
@@ -104,7 +109,7 @@ class Collection:
         """Keep the frame without contact."""
         write_image(self.rest, frame.image)
 
-    def keep(self, index: int, frame: Frame, label: np.ndarray, move: np.ndarray, log: dict) -> None:
+    def keep(self, index: int, frame: Frame, label: np.ndarray, move: np.ndarray, log: dict[str, Any]) -> None:
         """Write a contact: its picture, a line of the log, its row; a row's picture is always there."""
         name = f"frame_{index}_0.png"
         write_image(self.pictures / name, frame.image)
@@ -168,10 +173,10 @@ def collect(
     *,
     seed: int,
     speed: tuple[float, float],
-    guards: tuple = (),
+    guards: tuple[Guard, ...] = (),
     frame_timeout_s: float = FRAME_TIMEOUT_S,
     on_rest: Callable[[Frame], None] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Step | None = None,
 ) -> int:
     """Collect up to ``count`` contacts; those that the collection holds already are not made again.
 
@@ -203,79 +208,125 @@ def collect(
     """
     if not source.is_live:
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
-    frame_of = WorkFrame(experiment, placed)
-    clear, tap = np.array(experiment.clear), np.array(experiment.tap)
+    rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s)
+    with locked(collection.folder):
+        failed = _collect_all(rig, experiment, collection, seed=seed, count=count, progress=progress, on_rest=on_rest, speed=speed)
+    if failed:
+        raise DeviceError("; ".join(failed))
+    return collection.count
 
-    def go(label: np.ndarray, away_mm: float = 0.0) -> ArmState:
-        return go_to(frame_of.base_pose(label, arm.state().pose, away_mm=away_mm))
 
-    def go_to(target: np.ndarray) -> ArmState:
-        state = arm.state()
-        for guard in guards:
-            target = guard(state, target)
-        timeout_s = MOVE_TIMEOUT_S + SPARE * float(np.linalg.norm(target[:3] - state.pose[:3])) / speed[0]
-        sent = arm.move_linear(target, wait=False, timeout_s=timeout_s)
-        if (short_mm := float(np.linalg.norm(sent[:3] - target[:3]))) > NEAR_MM:
-            raise DeviceError(f"{arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg")
-        return arm.wait_settled(sent, timeout_s=timeout_s)
-
-    def go_around(label: np.ndarray, away_mm: float) -> ArmState:
-        start = arm.state().pose
-        for pose in way_around(placed, start, frame_of.base_pose(label, start, away_mm=away_mm)):
-            state = go_to(pose)
-        return state
-
-    def frame_after(state: ArmState) -> Frame:
-        try:
-            return source.read_after(state.time_s, timeout_s=frame_timeout_s)
-        except TimeoutError as error:
-            raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
-
-    def stop_at(label: np.ndarray) -> ArmState:
-        """Go there and be seen there: what the skin remembers depends on where the arm has been."""
-        state = go(label)
-        frame_after(state)
-        return state
-
-    here, at_object, held = np.zeros(6), False, ExitStack()
-    held.enter_context(locked(collection.folder))
+def _collect_all(
+    rig: "_Stops",
+    experiment: ExperimentSpec,
+    collection: Collection,
+    *,
+    seed: int,
+    count: int,
+    speed: tuple[float, float],
+    on_rest: Callable[[Frame], None] | None,
+    progress: Step | None,
+) -> list[str]:
+    """Go to the object, make the contacts that are missing, and let go of the arm. Returns what failed while letting go."""
     try:
-        arm.enable()
-        arm.set_speed(*speed)
-        state = go_around(here, CLEAR_MM)
-        at_object = True
+        rig.arm.enable()
+        rig.arm.set_speed(*speed)
+        state = rig.go_around(rig.label, CLEAR_MM)
+        rig.at_object = True
         if not collection.has_rest:
-            rest = frame_after(state)
+            rest = rig.frame_after(state)
             collection.keep_rest(rest)
             if on_rest is not None:
                 on_rest(rest)
         for index in range(collection.count, count):
-            asked = draw_contact(experiment, seed, index)
-            before = asked.pose - asked.move + clear
-            go_around(before, LIFT_MM)
-            here = before
-            stop_at(before)
-            stop_at(before + tap)
-            here = asked.pose + clear + tap
-            confirmed = go(here)
-            frame = frame_after(confirmed)
-            after = arm.state()
-            log = {
-                "asked": [*asked.pose.tolist(), *asked.move.tolist()],
-                "confirmed_pose": confirmed.pose.tolist(),
-                "confirmed_s": confirmed.time_s,
-                "frame_s": frame.time_s,
-                "sequence": frame.sequence,
-                "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
-            }
-            collection.keep(index, frame, frame_of.label(confirmed.pose), asked.move, log)
-            frame_after(go(here, LIFT_MM))
+            _collect_one(rig, experiment, collection, index, draw_contact(experiment, seed, index))
             if progress is not None:
                 progress(index + 1, count)
     finally:
-        back = {"retreat": lambda: go(here, CLEAR_MM)} if at_object else {}
-        failed = try_each(stop=arm.stop, **back, disable=arm.disable)
-        held.close()
-    if failed:
-        raise DeviceError("; ".join(failed))
-    return collection.count
+        back = {"retreat": rig.withdraw} if rig.at_object else {}
+        failed = try_each(stop=rig.arm.stop, **back, disable=rig.arm.disable)
+    return failed
+
+
+def _collect_one(rig: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, asked: Contact) -> None:
+    """Make one contact and keep its frame: above it, onto it, into it, along it, off it.
+
+    At every stop a frame is awaited: what the skin remembers depends on where the arm has been.
+    """
+    clear, tap = np.array(experiment.clear), np.array(experiment.tap)
+    before = asked.pose - asked.move + clear
+    rig.go_around(before, LIFT_MM)
+    rig.label = before
+    rig.frame_after(rig.go(before))
+    rig.frame_after(rig.go(before + tap))
+    rig.label = asked.pose + clear + tap
+    confirmed = rig.go(rig.label)
+    frame = rig.frame_after(confirmed)
+    after = rig.arm.state()
+    log = {
+        "asked": [*asked.pose.tolist(), *asked.move.tolist()],
+        "confirmed_pose": confirmed.pose.tolist(),
+        "confirmed_s": confirmed.time_s,
+        "frame_s": frame.time_s,
+        "sequence": frame.sequence,
+        "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
+    }
+    collection.keep(index, frame, rig.work.label(confirmed.pose), asked.move, log)
+    rig.frame_after(rig.go(rig.label, LIFT_MM))
+
+
+@dataclass
+class _Stops:
+    """Moves an arm from stop to stop of its work frame, and takes frames where it stands.
+
+    Attributes
+    ----------
+    label : (6,) float
+        Work coordinates of the contact that the arm is at or on its way to: from there it is withdrawn.
+    at_object : bool
+        Whether the arm has come around the object, so that withdrawing from ``label`` is a straight way.
+    """
+
+    source: FrameSource
+    arm: Arm
+    placed: PlacedObject
+    work: WorkFrame
+    speed: tuple[float, float]
+    guards: tuple[Guard, ...]
+    frame_timeout_s: float
+    label: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    at_object: bool = False
+
+    def go(self, label: np.ndarray, away_mm: float = 0.0) -> ArmState:
+        """Go straight to work coordinates (6,), or to ``away_mm`` back from them along the approach; the state there."""
+        return self._go_to(self.work.base_pose(label, self.arm.state().pose, away_mm=away_mm))
+
+    def go_around(self, label: np.ndarray, away_mm: float) -> ArmState:
+        """The same, around the object and not through it."""
+        start = self.arm.state().pose
+        for pose in way_around(self.placed, start, self.work.base_pose(label, start, away_mm=away_mm)):
+            state = self._go_to(pose)
+        return state
+
+    def withdraw(self) -> ArmState:
+        """Go clear of the object."""
+        return self.go(self.label, CLEAR_MM)
+
+    def frame_after(self, state: ArmState) -> Frame:
+        """The first frame exposed after a state."""
+        try:
+            return self.source.read_after(state.time_s, timeout_s=self.frame_timeout_s)
+        except TimeoutError as error:
+            raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
+
+    def _go_to(self, target: np.ndarray) -> ArmState:
+        state = self.arm.state()
+        for guard in self.guards:
+            target = guard(state, target)
+        timeout_s = MOVE_TIMEOUT_S + SPARE * float(np.linalg.norm(target[:3] - state.pose[:3])) / self.speed[0]
+        sent = self.arm.move_linear(target, wait=False, timeout_s=timeout_s)
+        if (short_mm := float(np.linalg.norm(sent[:3] - target[:3]))) > NEAR_MM:
+            raise DeviceError(
+                f"{self.arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg"
+            )
+        return self.arm.wait_settled(sent, timeout_s=timeout_s)

@@ -83,8 +83,8 @@ class LiveSession:
     def timing(self) -> Timing:
         """Figures so far."""
         rate_hz = self.count / max(time.monotonic() - self._begun_s, 1e-9)
-        spreads = [Spread.of(list(times)) for times in (self._late, self._ages, self._spent)]
-        return Timing(self.count, rate_hz, rate_hz, *spreads, self.source.dropped)
+        late, ages, spent = (Spread.of(list(times)) for times in (self._late, self._ages, self._spent))
+        return Timing(self.count, rate_hz, rate_hz, late, ages, spent, self.source.dropped)
 
     def lines(self, estimate: Estimate) -> list[str]:
         """Pose with its interval, rates and losses, for people."""

@@ -39,6 +39,31 @@ class Decided(StrEnum):
 
 
 @dataclass
+class _View:
+    """What the newest frame that was taken in showed.
+
+    Attributes
+    ----------
+    frame, estimate : Frame, Estimate
+        None before the first one.
+    reading : Reading
+    doubt : str
+        Why the estimate is not to be believed ("" if it is).
+    exposed_pose : (6,) float
+        The arm's pose when the last frame without doubt was exposed.
+    tangent : (4, 4) float
+        The surface that this frame showed; None before the first one.
+    """
+
+    frame: Frame | None = None
+    estimate: Estimate | None = None
+    reading: Reading = Reading(np.nan, np.nan)
+    doubt: str = ""
+    exposed_pose: np.ndarray = field(default_factory=lambda: np.full(6, np.nan))
+    tangent: np.ndarray | None = None
+
+
+@dataclass
 class ServoLoop:
     """Runs the law on what a camera shows.
 
@@ -80,12 +105,14 @@ class ServoLoop:
     take_rest: Callable[[Frame], Estimator] | None = None
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self.records: list[StepRecord] = []
         self.notes: list[str] = []  # what went wrong
         self.decided: list[tuple[Decided, float]] = []  # every decision, and the age (s) of the frame behind it (NaN without one)
         self._held_since: float | None = None
         self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has one
+        self._behind_since: float | None = None  # since when the arm lags too far behind to be told more
+        self._view, self._memory = _View(), Memory()
         self._track = ArmTrack(self.arm)
         self._started_s = self._ended_s = 0.0
 
@@ -118,7 +145,7 @@ class ServoLoop:
             self._let_go(retreat=touching)
         return self.timing()
 
-    def require_labels(self, names: tuple) -> None:
+    def require_labels(self, names: tuple[str, ...]) -> None:
         """``DeviceError`` if a model that tells these has not what following needs; to be asked before anything moves."""
         depth, angle = self.mounting.depth_label, self.mounting.angle_label
         if not {depth, angle} <= set(names):
@@ -141,10 +168,9 @@ class ServoLoop:
         )
 
     def _follow(self) -> None:
-        memory, used, tangent, estimate, reading, doubt = Memory(), None, None, None, Reading(np.nan, np.nan), ""
-        exposed_pose, self._sent = np.full(6, np.nan), None
-        self._started_s = due_s = arrived_s = time.monotonic()
-        behind_s: float | None = None  # since when the arm lags too far behind
+        """Take frames and decide on each, until the steps are made or a recording ends."""
+        self._view, self._memory, self._sent, self._behind_since = _View(), Memory(), None, None
+        self._started_s = arrived_s = due_s = time.monotonic()
         while len(self.records) < self.settings.steps:
             if not self.settings.blocking:
                 time.sleep(max(0.0, due_s - time.monotonic()))
@@ -157,70 +183,97 @@ class ServoLoop:
             except (StaleDataError, TimeoutError, DeviceError) as problem:
                 self._hold(str(problem), problem)
                 continue
-            taken_s = time.monotonic()
-            age_s = taken_s - frame.time_s
-            fresh = used is None or frame.sequence != used.sequence
-            if fresh:
-                estimate, used = self.estimator(frame), frame
-                reading, doubt = self._reading(estimate)
-                if not doubt:
-                    exposed_pose = self._track.pose_at(frame.time_s) if self.source.is_live else state.pose
-                    tangent = tangent_of(self.mounting, exposed_pose, reading)
-                    if self.sense is not None:
-                        self.sense(reading.depth_mm, frame.time_s)
-            if doubt:
-                self._hold(doubt, None, age_s)
-                continue
-            from_pose = state.pose if self._sent is None or not state.moving else self._sent
-            if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
-                self.decided.append((Decided.AWAIT_ARM, age_s))
-                behind_s = taken_s if behind_s is None else behind_s
-                if taken_s - behind_s > MOVE_TIMEOUT_S:
-                    raise DeviceError(
-                        f"{self.arm.name}: says that it moves, and has not come near to where it was sent for {taken_s - behind_s:.1f} s; "
-                        "look for what holds it, call clear_error(), then begin again"
-                    )
-                continue
-            behind_s = None
-            if not fresh and _apart_mm(from_pose, exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
-                self.decided.append((Decided.AWAIT_FRAME, age_s))
-                continue
-            step = servo_step(self.servo, self.mounting, tangent, from_pose, memory, fresh=fresh)
-            try:
-                self._sent = self._move(step.pose, wait=False)
-            except RefusedMoveError as refused:
-                if refused.decision.code is not Code.STALE_FRAME:
-                    raise
-                self._hold(str(refused), refused, age_s)
-                continue
-            memory, self._held_since = step.memory, None
-            self.decided.append((Decided.MOVE, age_s))
-            now_s = time.monotonic()
-            record = StepRecord(
-                len(self.records),
-                now_s,
-                frame.sequence,
-                frame.time_s,
-                age_s,
-                fresh,
-                now_s - frame.time_s,
-                now_s - taken_s,
-                tuple(estimate.names),
-                estimate.value,
-                estimate.low,
-                estimate.high,
-                reading.depth_mm,
-                reading.angle_deg,
-                from_pose,
-                exposed_pose,
-                state.joints_deg,
-                self._sent,
+            self._decide(state, frame)
+
+    def _decide(self, state: ArmState, frame: Frame) -> None:
+        """One decision on one frame: to move, to wait for the arm or for a newer frame, or to hold still."""
+        taken_s = time.monotonic()
+        age_s = taken_s - frame.time_s
+        fresh = self._look(frame, state)
+        if self._view.doubt:
+            self._hold(self._view.doubt, None, age_s)
+            return
+        from_pose = state.pose if self._sent is None or not state.moving else self._sent
+        if self._lags(state, from_pose, taken_s):
+            self.decided.append((Decided.AWAIT_ARM, age_s))
+            self._require_catching_up(taken_s)
+            return
+        self._behind_since = None
+        if not fresh and _apart_mm(from_pose, self._view.exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
+            self.decided.append((Decided.AWAIT_FRAME, age_s))
+            return
+        assert self._view.tangent is not None  # a view without doubt has one
+        step = servo_step(self.servo, self.mounting, self._view.tangent, from_pose, self._memory, fresh=fresh)
+        try:
+            self._sent = self._move(step.pose, wait=False)
+        except RefusedMoveError as refused:
+            if refused.decision.code is not Code.STALE_FRAME:
+                raise
+            self._hold(str(refused), refused, age_s)
+            return
+        self._memory, self._held_since = step.memory, None
+        self.decided.append((Decided.MOVE, age_s))
+        self._record(state, from_pose, self._sent, fresh=fresh, taken_s=taken_s)
+        if self.settings.blocking:
+            self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
+
+    def _look(self, frame: Frame, state: ArmState) -> bool:
+        """Take in a frame, if it was not used before; whether it is fresh."""
+        used = self._view.frame
+        if used is not None and frame.sequence == used.sequence:
+            return False
+        view = self._view
+        view.frame, view.estimate = frame, self.estimator(frame)
+        view.reading, view.doubt = self._reading(view.estimate)
+        if not view.doubt:
+            view.exposed_pose = self._track.pose_at(frame.time_s) if self.source.is_live else state.pose
+            view.tangent = tangent_of(self.mounting, view.exposed_pose, view.reading)
+            if self.sense is not None:
+                self.sense(view.reading.depth_mm, frame.time_s)
+        return True
+
+    def _lags(self, state: ArmState, from_pose: np.ndarray, now_s: float) -> bool:
+        """Whether the arm is too far from where it was sent to be told more; since when is kept."""
+        if _apart_mm(from_pose, state.pose) <= BEHIND_MOVES * self.servo.largest_move_mm:
+            return False
+        self._behind_since = now_s if self._behind_since is None else self._behind_since
+        return True
+
+    def _require_catching_up(self, now_s: float) -> None:
+        behind_s = now_s - (now_s if self._behind_since is None else self._behind_since)
+        if behind_s > MOVE_TIMEOUT_S:
+            raise DeviceError(
+                f"{self.arm.name}: says that it moves, and has not come near to where it was sent for {behind_s:.1f} s; "
+                "look for what holds it, call clear_error(), then begin again"
             )
-            self.records.append(record)
-            if self.on_step is not None:
-                self.on_step(record, frame, estimate)
-            if self.settings.blocking:
-                self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
+
+    def _record(self, state: ArmState, from_pose: np.ndarray, sent: np.ndarray, *, fresh: bool, taken_s: float) -> None:
+        """Keep what was decided, and tell it."""
+        view, now_s = self._view, time.monotonic()
+        assert view.frame is not None and view.estimate is not None  # nothing is decided before the first frame
+        record = StepRecord(
+            index=len(self.records),
+            time_s=now_s,
+            sequence=view.frame.sequence,
+            frame_s=view.frame.time_s,
+            age_s=taken_s - view.frame.time_s,
+            fresh=fresh,
+            latency_s=now_s - view.frame.time_s,
+            compute_s=now_s - taken_s,
+            names=tuple(view.estimate.names),
+            value=view.estimate.value,
+            low=view.estimate.low,
+            high=view.estimate.high,
+            depth_mm=view.reading.depth_mm,
+            angle_deg=view.reading.angle_deg,
+            pose=from_pose,
+            exposed_pose=view.exposed_pose,
+            joints_deg=state.joints_deg,
+            sent=sent,
+        )
+        self.records.append(record)
+        if self.on_step is not None:
+            self.on_step(record, view.frame, view.estimate)
 
     def _frame(self, state: ArmState, arrived_s: float) -> Frame:
         if not self.source.is_live:

@@ -2,26 +2,61 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from hardware.arms.arm import ArmState
-from twin.types import Frame
+from scenes.sensor import SensorSpec
+from twin.preprocess.pipeline import Pipeline
+from twin.types import Form, Frame
 
 
 class Estimate(Protocol):
     """What an estimator makes of a frame (``training.estimator.PoseEstimate``)."""
 
-    names: tuple
-    value: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    valid: bool
-    reason: str
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def value(self) -> np.ndarray: ...
+
+    @property
+    def low(self) -> np.ndarray: ...
+
+    @property
+    def high(self) -> np.ndarray: ...
+
+    @property
+    def valid(self) -> bool: ...
+
+    @property
+    def reason(self) -> str: ...
 
 
 Estimator = Callable[[Frame], Estimate]
+
+
+class SensorModel(Protocol):
+    """A trained model with its sensor and its pipeline: frame in, estimate out (``training.estimator.PoseEstimator``)."""
+
+    sensor: SensorSpec
+    form: Form
+    pipeline: Pipeline
+
+    @property
+    def counts_from_rest(self) -> bool:
+        """Whether it counts pins from a frame without contact, where it is given one."""
+
+    def __call__(self, frame: Frame) -> Estimate: ...
+
+    def at_rest(self, frame: Frame) -> Self:
+        """The same model, counting pins from a frame without contact."""
+
+    def check(self, sensor: SensorSpec, form: Form) -> None:
+        """Raise an error where frames of that sensor and form are not what the model was trained on."""
+
+
 Guard = Callable[[ArmState, np.ndarray], np.ndarray]  # state and target (6,) to what may be sent; raises to refuse
 
 
@@ -57,7 +92,7 @@ class StepRecord:
     fresh: bool
     latency_s: float
     compute_s: float
-    names: tuple
+    names: tuple[str, ...]
     value: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -68,7 +103,7 @@ class StepRecord:
     joints_deg: np.ndarray
     sent: np.ndarray
 
-    def plain(self) -> dict:
+    def plain(self) -> dict[str, Any]:
         """For a session's line."""
         return asdict(self)
 

@@ -14,7 +14,7 @@ from training.dataset import PinTable
 from training.models import model_named
 from training.models.cnn.inputs import ImageInputs
 from training.models.part import Inputs, PinModel
-from training.study.efficiency import measure_training
+from training.studies.tac_vgnn.efficiency import measure_training
 from twin.preprocess import make_graph, nominal_reference
 from twin.types import Form
 

@@ -20,10 +20,10 @@ from hardware.cameras.uvc import UvcCamera, UvcSettings, apply_settings, exposed
 from hardware.devices import cameras
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.examining import frames_of
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionWriter
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
-from twin.cli import check
 from twin.recordings.images import write_image
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
@@ -343,10 +343,10 @@ def test_check_says_what_to_do_about_a_camera_that_gives_nothing(monkeypatch):
             self._end.wait()
             raise ReadFailed("ended")
 
-    monkeypatch.setattr("hardware.cameras.choose.open_camera", lambda *_: Silent())
+    monkeypatch.setattr("hardware.examining.open_camera", lambda *_: Silent())
     monkeypatch.setattr(reader, "START_S", 0.1)
     with pytest.raises(DeviceError, match=r"noisy camera: no new frame within 0\.15 s; check the camera"):
-        check.frames_of("0", None, None, 2)
+        frames_of("0", None, None, 2)
 
 
 def test_a_first_frame_is_waited_for_as_long_as_its_source_may_need():

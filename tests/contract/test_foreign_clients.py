@@ -155,7 +155,7 @@ def test_an_emulator_ends_on_a_signal_that_another_thread_gets():
     """Threads of numerical libraries don't block what the main thread waits for."""
     source = (
         "import threading, time, signal, contextlib; idle = threading.Thread(target=time.sleep, args=(3,), daemon=True); idle.start();"
-        "from twin.cli.emulate import run_until_told;"
+        "from hardware.emulators.running import run_until_told;"
         "threading.Timer(0.2, lambda: signal.pthread_kill(idle.ident, signal.SIGTERM)).start();"
         "run_until_told(contextlib.nullcontext(), lambda: 'now')"
     )

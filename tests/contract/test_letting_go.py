@@ -15,15 +15,15 @@ from hardware.arms.lerobot import LeRobotArm
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
+from hardware.endings import signals_as_ctrl_c
 from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.loop import ServoLoop
+from hardware.rig import Rig, servo_loop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SafetyLimits
 from hardware.step import LoopSettings
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
-from twin.cli.endings import signals_as_ctrl_c
-from twin.cli.rig import Rig, servo_loop
 from twin.rig.mounting import Mounting
 from twin.types import Form
 
@@ -175,14 +175,6 @@ def test_a_signal_to_end_ends_as_ctrl_c_does(ended):
         assert signal.getsignal(ended) is signal.SIG_DFL
     finally:
         signal.signal(ended, outside)
-
-
-def test_what_failed_is_printed_after_ctrl_c(capsys):
-    with pytest.raises(KeyboardInterrupt), signals_as_ctrl_c():
-        interrupt = KeyboardInterrupt()
-        interrupt.add_note("stop failed: press its emergency stop")
-        raise interrupt
-    assert "twin: note: stop failed: press its emergency stop" in capsys.readouterr().err
 
 
 class TestMg400:

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from contextlib import nullcontext
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from scenes import load_object, load_sensor
 from twin.calibration import calibrate_optics as calibration
 from twin.calibration.aligned import revised
-from twin.calibration.calibrate_optics import calibrate_optics
+from twin.calibration.calibrate_optics import fit_optics
 from twin.mechanics import ContactPose
 from twin.sensor_file import write_sensor
 from twin.simulator import Simulator
@@ -70,7 +69,7 @@ def test_a_known_sensor_is_found_again(tmp_path):
     for k, tilt in enumerate([(0.0, 0.0), (8.0, -5.0), (-6.0, 7.0), (3.0, 9.0)]):
         state = simulator.press(load_object("plane"), ContactPose(indent_mm=2.0 + 0.5 * k, tilt_deg=tilt))
         cv2.imwrite(str(frames / f"{k}.png"), simulator.shoot(state, seed=k).frame.image[..., ::-1])
-    found = calibrate_optics(frames, start, tmp_path / "work", lambda title: nullcontext(lambda *_: None), limit=4)
+    found = fit_optics(frames, start, tmp_path / "work", limit=4)
     print(found.before, found.after)
     assert found.after["psnr_db"] > max(33.0, found.before["psnr_db"] + 3)
     shining = [s.leds.power * max(s.appearance.cap_albedo) * np.array(s.appearance.cap_levels).mean() for s in (found.spec, truth)]

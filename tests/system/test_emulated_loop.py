@@ -16,13 +16,13 @@ from hardware.emulators.arm_pose import FeedbackPose
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
+from hardware.rig import Rig, servo_loop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import load_limits
 from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.cli.rig import Rig, servo_loop
 from twin.preprocess import Pipeline
 from twin.rig.mounting import Mounting
 from twin.types import Form

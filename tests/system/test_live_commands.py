@@ -15,18 +15,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import twin.cli.collect
-import twin.cli.live
-import twin.cli.servo
-import twin.cli.study  # noqa: F401  (each registers its commands)
+from hardware import following
 from hardware.arms.arm import ArmState
 from hardware.arms.kinematics import MG400
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.twin import preview_of
 from hardware.emulators.mg400 import Mg400Emulator
+from hardware.emulators.running import run_until_told
 from hardware.errors import DeviceError
 from hardware.live import LiveSession, Shower
+from hardware.rig import build_rig, no_full_turn, steps_round
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource
 from hardware.view.draw import draw_view, voronoi_map
@@ -34,9 +33,7 @@ from hardware.view.server import BrowserView
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimator import PoseEstimator
 from twin.camera import expose, record
-from twin.cli import app, servo_run
-from twin.cli.emulate import run_until_told
-from twin.cli.rig import _no_full_turn, build_rig, steps_round
+from twin.cli import command_line
 from twin.errors import TwinError
 from twin.preprocess import Pipeline
 from twin.recordings import open_recording
@@ -80,13 +77,13 @@ def stand_in(monkeypatch):
         model.true = TrueEstimator(rig.arm, rig.placed, noise_mm=0.03, noise_deg=0.3)
         return rig
 
-    monkeypatch.setattr(servo_run, "build_rig", build)
+    monkeypatch.setattr(following, "build_rig", build)
     monkeypatch.setattr(PoseEstimator, "load", classmethod(lambda cls, run: model))
     return model
 
 
 def run(*arguments) -> str:
-    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    result = CliRunner().invoke(command_line(), [str(a) for a in arguments], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -111,7 +108,7 @@ def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path
 
 
 def test_a_follow_that_ends_early_is_written_and_is_an_exit_code(stand_in, tmp_path, monkeypatch):
-    monkeypatch.setattr(servo_run, "GIVE_UP_S", 0.2)
+    monkeypatch.setattr(following, "GIVE_UP_S", 0.2)
     calls = []
 
     def fails_later(model, frame):
@@ -121,7 +118,7 @@ def test_a_follow_that_ends_early_is_written_and_is_an_exit_code(stand_in, tmp_p
 
     monkeypatch.setattr(StandIn, "__call__", fails_later)
     result = CliRunner().invoke(
-        app, ["servo", "--object", "can", "--model", "any", "--out", str(tmp_path), "--steps", "9", "--plain-light"]
+        command_line(), ["servo", "--object", "can", "--model", "any", "--out", str(tmp_path), "--steps", "9", "--plain-light"]
     )
     assert result.exit_code == 1 and "ended early" in result.output and (tmp_path / "trajectory.csv").is_file()
 
@@ -139,7 +136,7 @@ def test_pins_are_counted_from_a_frame_taken_clear_of_the_object_and_so_they_are
 
 
 def test_a_model_that_fails_is_a_result_of_the_study(stand_in, tmp_path, monkeypatch):
-    monkeypatch.setattr(servo_run, "GIVE_UP_S", 0.5)
+    monkeypatch.setattr(following, "GIVE_UP_S", 0.5)
     calls = {"count": 0}
     truth = StandIn.__call__
 
@@ -247,7 +244,7 @@ def test_a_round_takes_the_tools_way():
 
 def refused(*arguments) -> str:
     """The one line that a command ends with."""
-    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    result = CliRunner().invoke(command_line(), [str(a) for a in arguments])
     assert result.exit_code and isinstance(result.exception, TwinError), result.exception
     return str(result.exception)
 
@@ -302,7 +299,7 @@ def test_pins_are_not_counted_from_a_pressed_sensor(tmp_path):
 
 
 def test_an_arm_that_can_turn_no_farther_says_how_to_go_on():
-    guard = _no_full_turn(SimpleNamespace(name="mg400", kinematics=MG400))
+    guard = no_full_turn(SimpleNamespace(name="mg400", kinematics=MG400))
     here = ArmState(np.array([300.0, 0, 0, 0, 0, 179.0]), np.array([0.0, 30, 30, 179]), 0.0, True, False)
     within = np.array([300.0, 0, 0, 0, 0, 170.0])
     assert guard(here, within) is within

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from contextlib import nullcontext
 
 import cv2
 import numpy as np
@@ -29,7 +28,7 @@ def folder(tmp_path_factory):
 
 def test_a_render_looks_like_itself(folder, tmp_path):
     """The skin fitted to the detected pins gives the same picture again, but for noise and a few hundredths of a pixel."""
-    metrics, written = run_realism(folder, load_sensor(SENSOR), tmp_path, lambda title: nullcontext(lambda *_: None))
+    metrics, written = run_realism(folder, load_sensor(SENSOR), tmp_path)
     assert metrics["refused"] == [{"image_name": "dark.png", "reason": metrics["refused"][0]["reason"]}]
     images, found = metrics["pin_aligned"], metrics["statistics"]
     assert images["exact_fraction"] == 1.0

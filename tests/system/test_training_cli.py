@@ -17,7 +17,7 @@ from test_training import drawn_pins  # noqa: E402
 
 from scenes import load_sensor  # noqa: E402
 from training.recipes import TrainingError  # noqa: E402
-from twin.cli import app  # noqa: E402
+from twin.cli import command_line  # noqa: E402
 from twin.errors import FrameError, TwinError  # noqa: E402
 from twin.preprocess import nominal_reference  # noqa: E402
 from twin.types import Form  # noqa: E402
@@ -26,18 +26,7 @@ FRAMES = 70
 
 
 def twin(*arguments):
-    from twin.cli import (  # noqa: F401  (each registers its command)
-        audit,
-        dataset,
-        evaluate,
-        predict,
-        study_objects,
-        study_sim_to_real,
-        study_tac_vgnn,
-        train,
-    )
-
-    done = CliRunner().invoke(app, [str(a) for a in arguments])
+    done = CliRunner().invoke(command_line(), [str(a) for a in arguments])
     if isinstance(done.exception, TwinError):
         raise done.exception
     assert done.exit_code == 0, done.output

@@ -5,19 +5,19 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
-from twin.calibration.run import Calibration
 
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.randomisation import FrictionSpread
-from training.across_objects.study import Plan, verdicts
 from training.audit import STORIES, Audit
 from training.audit_page import summary_of, write_audit
 from training.contact_calibration.report import write_calibration
 from training.dataset import PinTable
-from training.study import report as study_report
-from training.study.contacts import AreaChange
-from training.study.models import plan_run
+from training.studies.objects import Plan, verdicts
+from training.studies.tac_vgnn import page as study_report
+from training.studies.tac_vgnn.contacts import AreaChange
+from training.studies.tac_vgnn.models import plan_run
 from training.validation.model import MeasuredFrames
+from twin.calibration.calibrate_optics import Calibration
 from twin.calibration.report import write_page as write_calibration_page
 from twin.demo.page import ContactContent
 from twin.demo.page import write_page as write_demo_page
@@ -52,7 +52,7 @@ def pins():
 
 
 def sim_to_real(out: Path) -> Path:
-    from training.sim_to_real.page import write_page
+    from training.studies.sim_to_real.page import write_page
 
     told = [("simulated", 0, "vgnn", 0.066), ("simulated and real", 40, "vgnn", 0.053), ("simulated, bare", 0, "vgnn", 0.12)]
     told += [("real", n, model, e) for n, e in ((40, 0.2), (3010, 0.021)) for model in ("vgnn", "quadratic regression")]
@@ -86,7 +86,7 @@ def sim_to_real(out: Path) -> Path:
 
 
 def across_objects(out: Path) -> Path:
-    from training.across_objects.page import write_page
+    from training.studies.objects.page import write_page
 
     experiment = load_experiment("objects-2d")
     train, unseen = (load_object("plane"), load_object("sphere")), (load_object("edge"),)

@@ -9,10 +9,10 @@ from small_generation import small_config
 from test_training import data  # noqa: F401  (a fixture)
 
 from scenes import RandomisationSpec, load_object
-from training.across_objects.study import MIXED, Plan, rows_in_range, verdicts
 from training.dataset import joined, split_rows
 from training.recipes import TrainingError
 from training.run import fold_rows
+from training.studies.objects import MIXED, Plan, rows_in_range, verdicts
 from twin.errors import FrameError
 from twin.preprocess import make_reference
 from twin.types import Form
@@ -78,7 +78,7 @@ def plan_of(tmp_path, train=("plane", "sphere"), unseen=("edge",)):
     config = small_config(tmp_path)
     things = [tuple(load_object(name) for name in names) for names in (train, unseen)]
     randomisation = RandomisationSpec(name="none", description="nothing")
-    return Plan(config.sensor, config.experiment, config.experiment, randomisation, *things, count=2, tests=1, seed=4, across=config.across)
+    return Plan(config.sensor, config.experiment, randomisation, *things, count=2, tests=1, seed=4, across=config.across)
 
 
 def test_both_models_learn_from_as_many_contacts_and_are_judged_on_others(data, tmp_path):  # noqa: F811

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.sim_to_real.discrepancy import FEWEST, FRICTIONS, Discrepancy, Residuals, _likeliest, label_axes
+from training.studies.sim_to_real.discrepancy import FEWEST, FRICTIONS, Discrepancy, Residuals, _likeliest, label_axes
 from twin.rig.labels import ArmLabel
 
 PINS = 30

@@ -16,7 +16,7 @@ from training.dataset import load_dataset, split_rows
 from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
 from training.run import fold_rows
-from training.sim_to_real.study import arm_labels, with_missing
+from training.studies.sim_to_real.steps import arm_labels, with_missing
 from training.targets import corrected
 from twin.errors import ContactError, RenderError, StoreError
 from twin.geometry.solid import Resolution

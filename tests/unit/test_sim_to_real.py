@@ -16,7 +16,7 @@ from training.packed import pack, shipped_names
 from training.recipes import TrainingError
 from training.run import train_run
 from training.run_files import write_tensors
-from training.sim_to_real.study import choose_frames, put_beside, quadratic_row, states_like
+from training.studies.sim_to_real.steps import choose_frames, put_beside, quadratic_row, states_like, widen_intervals
 from twin.preprocess import make_reference
 
 SAME = 1e-6  # mm or deg: rounding of the areas' logarithms
@@ -69,12 +69,44 @@ def corrected(data, run, tmp_path_factory):  # noqa: F811
 
     A copy of the run, ``sim_only`` in the same folder's parent, is too sure of itself.
     """
-    off = replace(data, targets=replace(data.targets, corrected=data.targets.corrected + [1.0, -3.0]))
+    off = mislabelled(data)
     out = tmp_path_factory.mktemp("study") / "sim_plus_real"
     alone = copytree(run, out.with_name("sim_only"))
     content = torch.load(alone / "weights.pt", weights_only=True)
     write_tensors(alone / "weights.pt", content | {"quantile": 1e-3 * content["quantile"]})
-    return out, off.targets, put_beside(alone, out, data.rows(SIMULATED), off.rows(FEW), seed=0)
+    before = files_of(alone)
+    made = put_beside(alone, out, data.rows(SIMULATED), off.rows(FEW), seed=0)
+    assert files_of(alone) == before, "the run that frames are put beside stays as it is"
+    widen_intervals(alone, made.intervals)
+    return out, off.targets, made.left_out
+
+
+def files_of(folder):
+    """What a run's files hold, byte by byte."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def mislabelled(found):
+    """The same frames of a sensor whose labels are off."""
+    return replace(found, targets=replace(found.targets, corrected=found.targets.corrected + [1.0, -3.0]))
+
+
+def test_a_study_that_is_gone_on_with_finds_the_same_again(data, corrected, tmp_path):  # noqa: F811
+    """The run beside which frames are put has its intervals widened by then."""
+    out, alone = corrected[0], corrected[0].with_name("sim_only")
+    kept = {folder: torch.load(folder / "weights.pt", weights_only=True) for folder in (out, alone)}
+    again = put_beside(alone, tmp_path / "again", data.rows(SIMULATED), mislabelled(data).rows(FEW), seed=0)
+    assert all(np.array_equal(kept[alone][key].numpy(), wider) for key, wider in again.intervals.items())
+    assert np.array_equal(again.left_out, corrected[2])
+    made = torch.load(tmp_path / "again" / "weights.pt", weights_only=True)
+    assert all(torch.equal(kept[out][key], made[key]) for key in again.intervals)
+
+
+def test_a_run_is_not_written_over_itself(data, run):  # noqa: F811
+    before = files_of(run)
+    with pytest.raises(TrainingError, match="over itself"):
+        put_beside(run, run.parent / "." / run.name, data.rows(SIMULATED), data.rows(FEW), seed=0)
+    assert files_of(run) == before
 
 
 def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, corrected):  # noqa: F811

@@ -10,11 +10,10 @@ from test_training import data  # noqa: F401  (a fixture)
 
 from training.recipes import TrainingError
 from training.run import is_finished, train_run
-from training.study.contacts import AreaChange, recorded_contacts
-from training.study.efficiency import PeakMemory, measure_training
-from training.study.graphs import compare_graphs
-from training.study.models import ordering, plan_run, table_row, train_all
-from twin.cli.progress import epoch_bar
+from training.studies.tac_vgnn.contacts import AreaChange, recorded_contacts
+from training.studies.tac_vgnn.efficiency import PeakMemory, measure_training
+from training.studies.tac_vgnn.graphs import compare_graphs
+from training.studies.tac_vgnn.models import ordering, plan_run, table_row, train_all
 from twin.preprocess import make_graph
 from twin.report.table import write_table
 
@@ -31,13 +30,13 @@ def test_graphs_have_the_edges_their_kind_implies(data):  # noqa: F811
 
 def test_a_study_is_resumed_and_never_speaks_of_what_was_not_run(data, tmp_path):  # noqa: F811
     plans = [plan_run(name, labels="raw", seed=0, split=0, epochs=2) for name in ("tac-vgnn", "vgnn-without-kernel")]
-    train_all(plans, data, tmp_path, max_minutes=0.0, bar=epoch_bar)
+    train_all(plans, data, tmp_path, max_minutes=0.0)
     untouched = table_row(plans[1], data, tmp_path, None)
     assert untouched["state"] == "not begun" and "pose_2_raw" not in untouched
     train_run(plans[0].config, data, tmp_path / plans[0].folder, max_minutes=0.0)  # ends after an epoch
     early = table_row(plans[0], data, tmp_path, 0.0)
     assert early["state"] == "ended early" and early["epochs"] == 1 and early["epochs_allowed"] == 2
-    train_all(plans, data, tmp_path, max_minutes=None, bar=epoch_bar)
+    train_all(plans, data, tmp_path, max_minutes=None)
     rows = [table_row(plan, data, tmp_path, 0.0) for plan in plans]
     assert [row["state"] for row in rows] == ["finished"] * 2 and rows[0]["frames"] == 18 and rows[0]["without_prediction"] == 0
     assert all(is_finished(plan.config, data, tmp_path / plan.folder) for plan in plans)

@@ -1,11 +1,13 @@
 """A contact calibration from a folder of frames to a page."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
@@ -14,10 +16,15 @@ from training.contact_calibration.parameters import PARAMETERS
 from training.contact_calibration.report import summary_of, write_calibration
 from training.contact_calibration.simulate import Setup
 from training.validation.model import MeasuredFrames, measure_frames
+from twin.calibration.optics import folder_beside
+from twin.errors import FrameError
+from twin.progress import Progress, silent, stage
 from twin.rig.kinematics import rig_of
+from twin.sensor_file import write_sensor
 from twin.types import FINE, Form
 
-MOST_HELD_OUT = 20
+LABELS = 20  # frames that are fitted to
+MOST_HELD_OUT = 20  # frames that are kept out of the fit to state its error
 
 
 def calibrate_contact(
@@ -64,3 +71,85 @@ def calibrate_contact(
 def _part(measured: MeasuredFrames, rows: np.ndarray) -> MeasuredFrames:
     names, labels = [measured.names[k] for k in rows], [measured.labels[k] for k in rows]
     return replace(measured, names=names, labels=labels, pins_px=measured.pins_px[rows])
+
+
+@dataclass(frozen=True)
+class ContactCalibration:
+    """What was fitted.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    summary : dict
+        All figures, as ``calibration.json`` holds them.
+    written : list of Path
+        The specification, then the page.
+    """
+
+    sensor: SensorSpec
+    summary: dict[str, Any]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """The parameters with their uncertainty, and the errors before and after; for people."""
+        lines = [f"note: {problem}" for problem in self.summary["problems"]]
+        for p in self.summary["parameters"]:
+            doubt = "" if p["known"] else "  (not told by these frames)"
+            lines.append(f"{p['name']:26s} {p['start']:9.4g} -> {p['value']:9.4g} +- {p['sd']:.2g}{doubt}")
+        for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
+            if part := self.summary[key]:
+                lines.append(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
+        if self.summary["distrusted"]:
+            lines.append(f"not trusted: {', '.join(self.summary['distrusted'])}")
+        return lines
+
+
+def calibrate_to_file(
+    frames: Path,
+    sensor: SensorSpec,
+    experiment: ExperimentSpec,
+    out: Path,
+    *,
+    touched: ObjectSpec | None = None,
+    labels: int = LABELS,
+    seed: int = 0,
+    hold: Collection[str] = (),
+    workers: int = 1,
+    across: int = FINE,
+    form: Form | None = None,
+    progress: Progress = silent,
+) -> ContactCalibration:
+    """Fit the contact of a specification to labelled frames, and write it.
+
+    Beside the specification a folder ``NAME-contact`` holds the page and the simulated contacts: an interrupted run goes on there.
+
+    Parameters
+    ----------
+    frames : Path
+        A labelled recording with its no-contact frame.
+    out : Path
+        The ``.toml`` file to write.
+    touched : ObjectSpec, optional
+        The experiment's own object by default.
+    labels : int
+        Frames to fit to, chosen at random with ``seed``.
+    hold : collection of str
+        Names of parameters that stay as they are.
+
+    Raises
+    ------
+    FrameError
+        No labels, no pins, too few frames, an unknown parameter, or ``out`` is no name of a ``.toml`` file.
+    """
+    names = [parameter.name for parameter in PARAMETERS]
+    if unknown := set(hold) - set(names):
+        raise FrameError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
+    folder = folder_beside(out, "contact")
+    parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
+    how = {"parameters": parameters, "workers": workers, "across": across, "form": form}
+    with stage(progress, "contacts") as step:
+        thing = touched or load_object(experiment.object)
+        fitted, summary, page = calibrate_contact(folder, frames, sensor, experiment, thing, labels, seed, progress=step, **how)
+    said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
+    write_sensor(out, fitted, said)
+    return ContactCalibration(fitted, summary, [out, page])

@@ -17,6 +17,10 @@ from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 from twin.types import FINE, Form
 
+Images = Literal["raw", "gray", "recording", "none"]
+States = Literal["end", "all"]
+Quality = Literal["preview", "standard", "high"]
+
 
 class DatasetError(TwinError):
     """A data set can't be made, or not gone on with."""
@@ -43,9 +47,9 @@ class GenerationConfig(Section):
     randomisation: RandomisationSpec | None = None
     friction: NonNegative
     seed: Annotated[int, Field(ge=0)] = 0
-    images: Literal["raw", "gray", "recording", "none"] = "raw"
-    states: Literal["end", "all"] = "end"
-    quality: Literal["preview", "standard", "high"] = "standard"
+    images: Images = "raw"
+    states: States = "end"
+    quality: Quality = "standard"
     across: Annotated[int, Field(ge=6, le=64, multiple_of=2)] = FINE
 
     @property

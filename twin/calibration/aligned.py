@@ -10,7 +10,7 @@ import numpy as np
 from scenes.sensor import CameraSpec, ResponseSpec, SensorSpec
 from twin.errors import FrameError
 from twin.geometry.skin_fit import FittedPins
-from twin.progress import Progress
+from twin.progress import Step
 from twin.realism.disc import lens_disc
 from twin.realism.frames import read_real
 
@@ -37,7 +37,7 @@ class Aligned:
     state: FittedPins
 
 
-def read_frames(folder: Path, spec: SensorSpec, limit: int, progress: Progress) -> list[tuple[str, np.ndarray, np.ndarray]]:
+def read_frames(folder: Path, spec: SensorSpec, limit: int, progress: Step) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Usable frames of a folder, evenly spread: name, image (H, W[, 3]) uint8 and pins (N, 2) px of each.
 
     Raises

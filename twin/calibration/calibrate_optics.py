@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from twin.errors import FrameError
 from twin.geometry.skin_fit import FittedPins, SkinFit
 from twin.optics.render import Renderer
 from twin.preprocess.pipeline import Pipeline
-from twin.progress import Bar, Progress
+from twin.progress import Bar, Progress, Step, silent, stage
 from twin.realism.disc import lens_disc
 from twin.realism.images import compare_images
 from twin.recordings.images import read_image
@@ -89,8 +89,14 @@ class Studio:
         return [expose(light, spec.capture) for light in self.light(spec, frames, title)]
 
 
-def calibrate_optics(
-    folder: Path, spec: SensorSpec, work: Path, bar: Bar, *, limit: int = FRAMES, no_contact: Path | None = None
+def fit_optics(
+    folder: Path,
+    spec: SensorSpec,
+    work: Path,
+    *,
+    limit: int = FRAMES,
+    no_contact: Path | None = None,
+    progress: Progress = silent,
 ) -> Calibration:
     """Fit a specification to raw frames of a sensor in contact.
 
@@ -102,11 +108,11 @@ def calibrate_optics(
         Where it starts: geometry and camera of the same kind of sensor.
     work : Path
         Folder for what each stage has found; a second run with the same frames, start and code goes on from there.
-    bar : callable
     limit : int
         Frames to fit.
     no_contact : Path, optional
         A raw frame without contact, to which the camera is fitted first.
+    progress : Progress
 
     Raises
     ------
@@ -115,26 +121,26 @@ def calibrate_optics(
     RenderError
         Nothing can be rendered, or differentiated, here.
     """
-    notes = list(ALWAYS)
+    notes, bar = list(ALWAYS), partial(stage, progress)
     if no_contact is not None:
         spec, report = fit_camera(spec, _pins_at_rest(no_contact, spec))
         notes += [f"camera fitted to {report.pins} pins, {report.rms_px:.2f} px rms", *report.held.values()]
-    with bar("read the frames, find their pins") as progress:
-        raw = read_frames(folder, spec, limit, progress)
+    with bar("read the frames, find their pins") as step:
+        raw = read_frames(folder, spec, limit, step)
     log = _Log(work, spec, raw)
-    with bar("fit the skin to the pins") as progress:
-        frames = log.aligned(spec, raw, progress)
+    with bar("fit the skin to the pins") as step:
+        frames = log.aligned(spec, raw, step)
     inside, studio = lens_disc(spec).inside, Studio(bar)
     first = studio.shots(spec, frames, "render the start")
 
     def surroundings(spec: SensorSpec) -> SensorSpec:
-        with bar("fit the ring, the reflections, the specks") as progress:
-            found = fit_surroundings(spec, np.stack([f.image for f in frames]), np.stack([f.pins_px for f in frames]), progress=progress)
+        with bar("fit the ring, the reflections, the specks") as step:
+            found = fit_surroundings(spec, np.stack([f.image for f in frames]), np.stack([f.pins_px for f in frames]), progress=step)
         return found if found.gel.haze else revised(found, gel={"haze_sigma_px": HAZE_SIGMA_PX})
 
     def photometry(spec: SensorSpec) -> SensorSpec:
-        with bar("fit lights and colours") as progress:
-            return fit_photometry(spec, frames, progress).spec
+        with bar("fit lights and colours") as step:
+            return fit_photometry(spec, frames, step).spec
 
     def defocus(spec: SensorSpec) -> SensorSpec:
         shots = studio.shots(spec, frames, "render for the sharpness")
@@ -154,8 +160,8 @@ def calibrate_optics(
         return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"))
 
     stages = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim, noise]
-    for number, stage in enumerate(stages):
-        spec = log.stage(f"{number:02d}-{stage.__name__}", stage, spec)
+    for number, fit in enumerate(stages):
+        spec = log.stage(f"{number:02d}-{fit.__name__}", fit, spec)
     last = studio.shots(spec, frames, "render the result")
     figures = [[compare_images(f.image, image, inside) for f, image in zip(frames, shots, strict=True)] for shots in (first, last)]
     before, after = ({name: float(np.mean([getattr(x, name) for x in part])) for name in vars(part[0])} for part in figures)
@@ -179,7 +185,7 @@ class _Log:
     def __init__(self, work: Path, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
         self._folder, self._inputs = work, inputs_digest(spec, raw)
 
-    def aligned(self, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]], progress: Progress) -> list[Aligned]:
+    def aligned(self, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]], progress: Step) -> list[Aligned]:
         """Frames with their fitted skin, from disk where they are there."""
         fit, frames = cache(lambda: SkinFit(spec)), []
         for done, (name, image, pins_px) in enumerate(raw):

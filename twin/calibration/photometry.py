@@ -15,7 +15,7 @@ from twin.calibration.aligned import SATURATED, Aligned, levels_slope, require_c
 from twin.camera import blurred
 from twin.optics.light_model import Knobs, LightModel
 from twin.optics.render import Renderer
-from twin.progress import Progress
+from twin.progress import Step
 from twin.realism.spots import clear_of_pins, pin_spacing_px
 
 # Reflectance of the caps' brightest channel. Assumed: white printing resin.
@@ -98,7 +98,7 @@ def sample_frame(
     return Samples(pixels, mean[at], veil[at], np.arange(len(pixels)) < len(caps))
 
 
-def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Progress) -> PhotometryFit:
+def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> PhotometryFit:
     """Recover LED powers, colours of caps and skin, and the gel's haze.
 
     Parameters

@@ -15,7 +15,7 @@ from twin.calibration.ring import fit_ring
 from twin.calibration.specks import fit_specks
 from twin.calibration.still import Still, median_still
 from twin.errors import FrameError
-from twin.progress import Progress
+from twin.progress import Step
 
 # Share of pixels at exactly 0 or 255 above which frames are thresholded. Raw frames saturate on the ring only.
 MOST_BINARY = 0.6
@@ -23,7 +23,7 @@ MOST_BINARY = 0.6
 MOST_FRAMES = 40
 
 
-def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, progress: Progress | None = None) -> SensorSpec:
+def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, progress: Step | None = None) -> SensorSpec:
     """The specification with housing, LED places and reflections, and specks as frames of one sensor show them.
 
     Parameters

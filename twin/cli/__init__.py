@@ -20,9 +20,9 @@ app = typer.Typer(
 )
 
 
-def main() -> None:
-    """Run the command line; an error meant for the user is one line on stderr and exit code 1."""
-    from twin.cli import (  # noqa: F401  (each registers its commands)
+def command_line() -> typer.Typer:
+    """The program with all its commands; each module registers its own when it is imported."""
+    from twin.cli import (  # noqa: F401
         audit,
         calibrate,
         catalog,
@@ -52,8 +52,13 @@ def main() -> None:
         validate,
     )
 
+    return app
+
+
+def main() -> None:
+    """Run the command line; an error meant for the user is one line on stderr and exit code 1."""
     try:
-        app()
+        command_line()()
     except (TwinError, SpecError) as error:
         print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
         print_notes(error)

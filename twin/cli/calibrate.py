@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, FormOrAuto, Sensor, Workers
+from twin.cli.options import CORES, Across, FormOrAuto, Sensor, Workers, if_given
 from twin.types import FINE
 
 calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
@@ -46,25 +46,13 @@ def optics(
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
 ) -> None:
     from scenes import load_sensor
-    from twin.calibration.calibrate_optics import calibrate_optics
-    from twin.calibration.report import write_page
-    from twin.cli.progress import count_bar
-    from twin.errors import FrameError
-    from twin.sensor_file import write_sensor
+    from twin.calibration.optics import calibrate_optics
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    if out.suffix != ".toml":
-        raise FrameError(f"--out {out}: give the name of a .toml file")
-    spec = load_sensor(sensor)
-    folder = out.with_name(f"{out.stem}-calibration")
-    folder.mkdir(parents=True, exist_ok=True)
-    found = calibrate_optics(frames, spec, folder, count_bar, limit=limit, no_contact=no_contact)
-    write_sensor(out, found.spec, f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {spec.name}.")
-    page = write_page(folder, spec, found, frames.name)
-    for note in found.notes:
-        print(f"note: {note}")
-    before, after = found.before, found.after
-    print(f"over the disc: PSNR {before['psnr_db']:.2f} -> {after['psnr_db']:.2f} dB, SSIM {before['ssim']:.3f} -> {after['ssim']:.3f}")
-    print(f"wrote {out}\nwrote {page}")
+    with shown() as progress:
+        found = calibrate_optics(frames, load_sensor(sensor), out, limit=limit, no_contact=no_contact, progress=progress)
+    tell(found)
 
 
 CONTACT_HELP = """Fit the contact of a specification to labelled frames of the real sensor on its robot.
@@ -108,34 +96,23 @@ def contact(
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor
-    from training.contact_calibration import PARAMETERS
-    from training.contact_calibration.run import calibrate_contact
-    from twin.cli.progress import rate_bar
-    from twin.errors import FrameError
-    from twin.sensor_file import write_sensor
+    from training.contact_calibration.run import calibrate_to_file
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    if out.suffix != ".toml":
-        raise FrameError(f"--out {out}: give the name of a .toml file")
-    known = {p.name for p in PARAMETERS}
-    if unknown := set(hold or ()) - known:
-        raise FrameError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(known))}")
-    parameters = tuple(p for p in PARAMETERS if p.name not in (hold or ()))
-    spec, plan = load_sensor(sensor), load_experiment(experiment)
-    touched = load_object(object_ or plan.object)
-    folder = out.with_name(f"{out.stem}-contact")
-    folder.mkdir(parents=True, exist_ok=True)
-    with rate_bar("contacts") as progress:
-        how = {"parameters": parameters, "workers": workers, "across": across, "form": form, "progress": progress}
-        fitted, summary, page = calibrate_contact(folder, frames, spec, plan, touched, labels, seed, **how)
-    write_sensor(out, fitted, f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {spec.name}.")
-    for problem in summary["problems"]:
-        print(f"note: {problem}")
-    for p in summary["parameters"]:
-        doubt = "" if p["known"] else "  (not told by these frames)"
-        print(f"{p['name']:26s} {p['start']:9.4g} -> {p['value']:9.4g} +- {p['sd']:.2g}{doubt}")
-    for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
-        if part := summary[key]:
-            print(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
-    if summary["distrusted"]:
-        print(f"not trusted: {', '.join(summary['distrusted'])}")
-    print(f"wrote {out}\nwrote {page}")
+    with shown() as progress:
+        found = calibrate_to_file(
+            frames,
+            load_sensor(sensor),
+            load_experiment(experiment),
+            out,
+            touched=if_given(load_object, object_),
+            labels=labels,
+            seed=seed,
+            hold=hold or (),
+            workers=workers,
+            across=across,
+            form=form,
+            progress=progress,
+        )
+    tell(found)

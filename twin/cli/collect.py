@@ -5,15 +5,14 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, Out, Sensor
-from twin.cli.servo import ArmOption, Camera, PlainLight, ServoName
+from twin.cli.options import ArmOption, Camera, FormOrAuto, Limits, Out, PlainLight, Sensor, ServoName, writable_folder
 
 HELP = """Collect labelled frames: for each contact a random pose and shear, a tap, and one frame.
 
-A frame is taken only after the arm has said that it stands at the commanded pose, and only one exposed after that; the
-pose that it said is the label. The arm goes around the object to 50 mm before it (straight, and in front of it, where the
-object has no end: a plane, an edge), lifts between contacts, and ends 50 mm clear, disabled. Its links and the object's holder
-are not known: look that both have room. The frame without contact is refused where the sensor seems pressed in it.
+A frame is taken only after the arm has said that it stands at the commanded pose, and it is exposed after that. The pose that
+the arm said is the label. The arm goes around the object to 50 mm before it. Where the object has no end (a plane, an edge), it goes
+straight, and stays in front of it. It lifts between contacts, and ends 50 mm clear, disabled. The arm's links and the object's holder
+are not known: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
 The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json);
 contacts.jsonl has the times. The same command goes on where it was ended.
 
@@ -36,64 +35,30 @@ def collect_command(
     object_name: Annotated[str | None, typer.Option("--object", metavar="O", help="the experiment's own if not given")] = None,
     parameters: ServoName = "surface",
     form: FormOrAuto = None,
-    limits: Annotated[str | None, typer.Option("--limits", help="safety limits: mg400, magician, or a TOML file")] = None,
+    limits: Limits = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="of the draws; the experiment's own if not given")] = None,
     plain_light: PlainLight = False,
 ) -> None:
-    from hardware.collect import Collection, collect
+    from hardware.collecting import CollectPlan, collect_frames
     from scenes import load_experiment, load_object, load_sensor, load_servo
-    from twin.cli.endings import signals_as_ctrl_c
-    from twin.cli.options import writable_folder
-    from twin.cli.progress import count_bar
-    from twin.cli.rig import build_rig
-    from twin.preprocess import require_untouched
+    from twin.cli.endings import arm_let_go
+    from twin.cli.output import say
+    from twin.cli.progress import shown
 
-    asked, spec, servo = load_experiment(experiment), load_sensor(sensor), load_servo(parameters)
-    stimulus = load_object(object_name or asked.object)
-    seed = asked.seed if seed is None else seed
-    rig = build_rig(
-        spec,
-        stimulus,
-        servo.placement,
-        asked,
+    asked = load_experiment(experiment)
+    plan = CollectPlan(
+        sensor=load_sensor(sensor),
+        stimulus=load_object(object_name or asked.object),
+        experiment=asked,
+        servo=load_servo(parameters),
         camera=camera,
         arm=arm,
+        count=count,
+        seed=seed,
         form=form,
         limits=limits,
-        seed=seed,
         plain_light=plain_light,
-        at_once=True,
     )
-    low, high = zip(*asked.ranges().values(), strict=True)
-    about = {
-        "comments": f"collected: {asked.name}, {spec.name}, {stimulus.name}",
-        "camera": camera,
-        "arm": arm,
-        "sensor": spec.name,
-        "form": str(rig.source.form),
-        "seed": seed,
-        "experiment": asked.model_dump(mode="json"),
-        "placement": servo.placement.model_dump(mode="json"),
-        "tap_move": asked.tap,
-        "poses_rng": [high[:6], low[:6]],
-        "moves_rng": [high[6:], low[6:]],
-        "linear_speed": servo.linear_mm_s,
-        "angular_speed": servo.angular_deg_s,
-    }
-    collection = Collection(writable_folder(out), about, rig.source.form)
-    begun = collection.count
-
-    def on_rest(frame) -> None:
-        remedy = (
-            f"look what touches it, remove {collection.rest} and give the same command again to have it taken anew; "
-            "or the same command alone, to go on with it"
-        )
-        require_untouched(spec, rig.source.form, frame, remedy)
-
-    if begun < count:
-        with signals_as_ctrl_c(), rig, count_bar("contacts") as progress:
-            rig.await_frame()
-            speed = (servo.linear_mm_s, servo.angular_deg_s)
-            options = {"seed": seed, "speed": speed, "frame_timeout_s": rig.frame_timeout_s, "on_rest": on_rest, "progress": progress}
-            collect(rig.source, rig.arm, asked, rig.placed, collection, count, **options)
-    print(f"{collection.count} contacts in {out} ({collection.count - begun} new)")
+    with arm_let_go(), shown() as progress:
+        collected = collect_frames(plan, writable_folder(out), progress=progress)
+    say(collected.lines())

@@ -6,15 +6,14 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, Out, Sensor, Workers
-from twin.cli.render import Quality
+from twin.cli.options import CORES, Across, Out, Quality, Sensor, Workers, if_given
 from twin.types import FINE
 
 HELP = """Simulate a labelled data set: the contacts of an experiment, in the recordings' own format, with ground truth.
 
-For each contact a pose and a move are drawn from the experiment's ranges ('twin experiments' lists them; robot coordinates),
-the arm's way is followed by finite elements, and the last state, or every converged one, becomes a frame. A contact that
-does not converge is drawn anew and listed.
+For each contact a pose and a move are drawn from the experiment's ranges ('twin experiments' lists them; robot coordinates).
+The arm's way is followed by finite elements, and the last state, or every converged one, becomes a frame. A contact that
+does not converge is listed, and drawn anew.
 
 \b
 --images raw        the camera's frames
@@ -40,7 +39,7 @@ Writes:
   records/            one for each finished contact; with them the same command goes on
                       after any end, or to a larger --count
 
-The result depends on the options alone: any number of workers, and any interruption, gives the same bytes.
+The result depends on the options alone. It is the same, byte by byte, with any number of workers and after any interruption.
 
 \b
 Examples:
@@ -90,30 +89,21 @@ def dataset(
     across: Across = FINE,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
-    from training.generation import GenerationConfig, generate
-    from twin.cli.progress import rate_bar
-    from twin.recordings.forms import frame_size
-    from twin.rig.contact import friction_between
+    from training.generation.simulate import config_for, simulate_dataset
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    spec, plan = load_sensor(sensor), load_experiment(experiment)
-    touched = load_object(object_ or plan.object)
-    config = GenerationConfig(
-        sensor=spec,
-        object=touched,
-        experiment=plan,
-        randomisation=load_randomisation(randomise) if randomise else None,
-        friction=friction_between(spec.rig, touched).static,
-        seed=plan.seed if seed is None else seed,
+    config = config_for(
+        load_sensor(sensor),
+        load_experiment(experiment),
+        touched=if_given(load_object, object_),
         images=images.value,
         states=states.value,
-        quality=(quality or (Quality.PREVIEW if images is Images.RECORDING else Quality.STANDARD)).value,
+        randomisation=if_given(load_randomisation, randomise),
+        seed=seed,
+        quality=quality.value if quality else None,
         across=across,
     )
-    frame_size(spec, config.form)  # before anything is made: has the sensor this form?
-    with rate_bar(f"{plan.name}, {spec.name}") as progress:
-        made = generate(out, config, count, workers=workers, scheduler=scheduler, progress=progress)
-    if made.before:
-        print(f"{made.before} contacts were there before")
-    if made.failed:
-        print(f"{made.failed} draws failed and were drawn anew: see {out / 'failures.csv'}")
-    print(f"{made.frames} frames of {made.contacts} contacts\nwrote {out}")
+    with shown() as progress:
+        made = simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, progress=progress)
+    tell(made)

@@ -9,10 +9,11 @@ from twin.cli.options import Out, writable_folder
 @app.command("demo")
 def demo(out: Out = Path("out/demo")) -> None:
     """Press, render, detect, graph: two sensors and more, as pictures and one page (index.html)."""
-    from twin.cli.progress import step_bar
+    from twin.cli.output import say, tell
+    from twin.cli.progress import shown
     from twin.demo.make_demo import run_demo
 
-    writable_folder(out)
-    for path in run_demo(out, step_bar):
-        print(f"wrote {path}")
-    print(f"open {out / 'index.html'} in a browser")
+    with shown() as progress:
+        made = run_demo(writable_folder(out), progress=progress)
+    tell(made)
+    say([f"open {out / 'index.html'} in a browser"])

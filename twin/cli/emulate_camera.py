@@ -4,9 +4,8 @@ from typing import Annotated
 
 import typer
 
-from twin.cli.emulate import FaultOption, emulate, list_faults, run_until_told
-from twin.cli.options import Object, Sensor
-from twin.cli.servo import PlainLight, ServoName
+from twin.cli.emulate import FaultOption, emulate, faults_of
+from twin.cli.options import Object, PlainLight, Sensor, ServoName
 
 HELP = """Emulate the sensor's camera: a stream of JPEGs over HTTP that shows what an emulated arm's pose makes of the contact.
 
@@ -27,21 +26,13 @@ def camera(
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one")] = 8081,
     fps: Annotated[float, typer.Option("--fps", min=0.1, help="no more pictures a second")] = 30.0,
     parameters: ServoName = "surface",
-    fault: FaultOption = (),
+    fault: FaultOption = None,
     plain_light: PlainLight = False,
 ) -> None:
-    from hardware.emulators.arm_pose import FeedbackPose
-    from hardware.emulators.camera import FAULTS, CameraEmulator
-    from hardware.rig_geometry import PlacedObject
-    from scenes import load_experiment, load_object, load_sensor, load_servo
-    from twin.cli.rig import twin_camera
-    from twin.rig.mounting import Mounting
-    from twin.types import Form
+    from hardware.emulators.camera import FAULTS
+    from hardware.emulators.twin_camera import emulate_camera
+    from scenes import load_object, load_sensor, load_servo
 
-    list_faults(fault, FAULTS)
-    spec, servo = load_sensor(sensor), load_servo(parameters)
-    placed = PlacedObject(load_object(object_name), servo.placement, Mounting.of(spec, load_experiment(servo.experiment)))
-    with FeedbackPose.of(arm) as pose:
-        source = twin_camera(spec, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
-        device = CameraEmulator(source, host=host, port=port, faults=tuple(fault))
-        run_until_told(device, lambda: f"camera {device.url}", lambda: device.error)
+    faults = faults_of(fault, FAULTS)
+    things = load_sensor(sensor), load_object(object_name), load_servo(parameters)
+    emulate_camera(arm, *things, host=host, port=port, fps=fps, faults=faults, plain_light=plain_light)

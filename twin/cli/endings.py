@@ -1,27 +1,19 @@
 """How a command that moves an arm may be ended."""
 
-import signal
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from twin.cli import print_notes
 
 
 @contextmanager
-def signals_as_ctrl_c():
-    """SIGTERM and a closed terminal end as Ctrl-C does: what is to be let go of is let go of. Only in the main thread."""
+def arm_let_go() -> Iterator[None]:
+    """SIGTERM and a closed terminal end the command as Ctrl-C does. What could not be let go of is printed."""
+    from hardware.endings import signals_as_ctrl_c
 
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = {ended: signal.getsignal(ended) for ended in (signal.SIGTERM, signal.SIGHUP)}
-    for ended, handler in before.items():
-        if handler is not signal.SIG_IGN:  # nohup
-            signal.signal(ended, interrupt)
-    try:
-        yield
-    except KeyboardInterrupt as interrupt:
-        print_notes(interrupt)  # here, for typer ends without a word
-        raise
-    finally:
-        for ended, handler in before.items():
-            signal.signal(ended, handler)
+    with signals_as_ctrl_c():
+        try:
+            yield
+        except KeyboardInterrupt as interrupt:
+            print_notes(interrupt)  # here, because typer ends without a word
+            raise

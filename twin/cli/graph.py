@@ -45,40 +45,8 @@ def graph(
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
 ) -> None:
     from scenes import load_sensor
-    from twin.errors import TwinError
-    from twin.graph_files import (
-        draw_bare_graph,
-        draw_graph_pictures,
-        form_of_pins,
-        graphs_of_nodes,
-        graphs_of_recording,
-        read_pins,
-        write_graphs,
-    )
-    from twin.preprocess.reference import nominal_reference
-    from twin.recordings.forms import frame_size
+    from twin.cli.output import tell
+    from twin.graphing import write_graphs_of
 
-    spec = load_sensor(sensor)
-    image = None
-    if legacy and (kind is not Kind.VORONOI or path.suffix == ".npz"):
-        raise TwinError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
-    if path.suffix == ".npz":
-        names, nodes_px = read_pins(path, spec.pins.count)
-        form = form or form_of_pins(spec, nodes_px)
-        reference = nominal_reference(spec, form)
-        graphs = graphs_of_nodes(kind.value, nodes_px, reference)
-    else:
-        seen = graphs_of_recording(path, spec, kind.value, form, legacy=legacy)
-        names, graphs = seen.names, seen.graphs
-        form, reference, image = seen.form, seen.reference, seen.first_image
-        for reason in seen.left_out:
-            print(f"skipped {reason}")
-    writable_folder(out)
-    print(f"{len(graphs)} graphs; the first has {len(graphs[0].nodes_px)} nodes and {len(graphs[0].edges)} directed edges")
-    pictures = (
-        draw_bare_graph(out, graphs[0])
-        if legacy
-        else draw_graph_pictures(out, spec.name, frame_size(spec, form), graphs[0], reference, image)
-    )
-    for written in [write_graphs(out, names, graphs), *pictures]:
-        print(f"wrote {written}")
+    made = write_graphs_of(path, load_sensor(sensor), writable_folder(out), kind=kind.value, form=form, legacy=legacy)
+    tell(made)

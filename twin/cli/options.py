@@ -1,8 +1,10 @@
 """Options that several commands share."""
 
 import os
+from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -25,6 +27,33 @@ Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch
 Target = Annotated[str, typer.Option("--target", help="preset, or label columns with commas between")]
 Workers = Annotated[int, typer.Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
+Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights go with the package")]
+SHIPPED_MODEL = Path("mg400-331")  # its weights go with the package
+Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
+ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400:ADDRESS, magician:PORT")]
+PlainLight = Annotated[bool, typer.Option("--plain-light", help="twin: lamps' direct light alone, no path tracing at the start")]
+ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
+Limits = Annotated[str | None, typer.Option("--limits", help="safety limits: mg400, magician, or a TOML file")]
+AtRest = Annotated[
+    str,
+    typer.Option(
+        "--at-rest",
+        metavar="FRAME|first|none",
+        help="no-contact frame that pins are counted from: a file, the first that is taken (an error if the sensor seems pressed in it), "
+        "or none (the specification's layout)",
+    ),
+]
+FIRST, NONE = "first", "none"  # as hardware.at_rest has them
+Given = TypeVar("Given", str, Path)
+Spec = TypeVar("Spec")
+
+
+class Quality(StrEnum):
+    """Presets of the renderer."""
+
+    PREVIEW = "preview"
+    STANDARD = "standard"
+    HIGH = "high"
 
 
 def _even(value: int) -> int:
@@ -41,6 +70,19 @@ def names_in(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
+def numbers_in(text: str, option: str) -> tuple[int, ...]:
+    """The whole numbers between commas."""
+    try:
+        return tuple(int(part) for part in names_in(text))
+    except ValueError as error:
+        raise TwinError(f"{option} takes whole numbers with commas between, got {text!r}") from error
+
+
+def if_given(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
+    """The specification of that name or file; None where no name is given."""
+    return load(name) if name else None
+
+
 def writable_folder(path: Path) -> Path:
     """Make the folder, or say in one line why it can't be written to."""
     try:
@@ -51,10 +93,3 @@ def writable_folder(path: Path) -> Path:
     except OSError as error:
         raise TwinError(f"{path}: can't write there ({error.strerror}); give another folder with --out") from error
     return path
-
-
-def columns_of(target: str) -> str | tuple:
-    """What ``load_dataset`` takes: the name of a preset, or the columns themselves."""
-    from training.targets import PRESETS
-
-    return target if target in PRESETS else tuple(name.strip() for name in target.split(","))

@@ -22,7 +22,8 @@ It serves wherever a RUN does. Those that go with the package, below training/we
 def pack(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, trained with --no-kernel")], out: Out) -> None:
     from training.estimator import PoseEstimator
     from training.packed import WEIGHTS, pack
+    from twin.cli.output import say
 
     PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
     size = pack(run, writable_folder(out))
-    print(f"wrote {out / WEIGHTS} ({size / 1e3:.0f} kB), {out / 'config.json'}")
+    say([f"wrote {out / WEIGHTS} ({size / 1e3:.0f} kB), {out / 'config.json'}"])

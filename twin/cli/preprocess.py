@@ -1,7 +1,8 @@
 """``twin preprocess``: the real pipeline over frames, wherever they come from."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -35,22 +36,24 @@ def preprocess(
     overlay: Annotated[bool, typer.Option("--overlay", help="also write a picture of every frame with its pins and graph")] = False,
 ) -> None:
     from scenes import load_sensor
-    from twin.cli.progress import count_bar
+    from twin.cli.output import say
+    from twin.cli.progress import shown
     from twin.preprocess.batch import preprocess_recording
+    from twin.progress import stage
 
     spec = load_sensor(sensor)
-    writable_folder(out)
-    with count_bar("frames") as progress:
-        summary = preprocess_recording(path, spec, out, form=form, overlay=overlay, progress=progress)
-    print(
-        f"{summary['frames']} frames, all {spec.pins.count} pins found in {100 * summary['exact_fraction']:.2f} %, "
+    with shown() as progress, stage(progress, "frames") as step:
+        summary = preprocess_recording(path, spec, writable_folder(out), form=form, overlay=overlay, progress=step)
+    say(_lines(summary, spec.pins.count))
+    say(f"wrote {out / name}" for name in ("pins.npz", "summary.json") + (("overlay",) if overlay else ()))
+
+
+def _lines(summary: dict[str, Any], pins: int) -> Iterator[str]:
+    """What ``summary.json`` says, for people."""
+    yield (
+        f"{summary['frames']} frames, all {pins} pins found in {100 * summary['exact_fraction']:.2f} %, "
         f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
     )
-    for invalid in summary["invalid"]:
-        print(f"not valid {invalid['image_name']}: {invalid['reason']}")
-    for problem in summary["problems"]:
-        print(f"note: {problem}")
-    for failed in summary["failed"]:
-        print(f"skipped {failed['image_name']}: {failed['reason']}")
-    for name in ("pins.npz", "summary.json") + (("overlay",) if overlay else ()):
-        print(f"wrote {out / name}")
+    yield from (f"not valid {invalid['image_name']}: {invalid['reason']}" for invalid in summary["invalid"])
+    yield from (f"note: {problem}" for problem in summary["problems"])
+    yield from (f"skipped {failed['image_name']}: {failed['reason']}" for failed in summary["failed"])

@@ -1,81 +1,114 @@
-"""Progress bars on stderr."""
+"""What the command line makes of ``twin.progress``: bars on a terminal, else a line every ten seconds. All of it goes to stderr."""
 
+import sys
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     ProgressColumn,
     SpinnerColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.text import Text
 
+from twin.progress import Progress as Told
 
-@contextmanager
-def step_bar(title: str):
-    """A bar for one piece of work; yields ``progress(fraction)``, with the fraction done in [0, 1]."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(title, total=None)
-        yield lambda fraction: bar.update(task, total=1.0, completed=fraction)
-        bar.update(task, total=1.0, completed=1.0)
+LINE_S = 10.0  # between two lines where there is no terminal
 
 
-@contextmanager
-def count_bar(title: str):
-    """A bar over items; yields ``progress(done, total)``."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(title, total=None)
-        yield lambda done, total: bar.update(task, total=total, completed=done)
+class _CountColumn(ProgressColumn):
+    """Done and total of what is counted; nothing for a fraction, which the bar shows."""
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.completed:.0f}/{task.total:.0f}" if task.total is not None and task.total > 1 else "")
 
 
 class _RateColumn(ProgressColumn):
-    """Items a second, or seconds an item where that reads better."""
+    """Items a second, or seconds an item where that reads better; nothing for a fraction."""
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
-        if not speed:
+        if not speed or task.total is None or task.total <= 1:
             return Text("")
         return Text(f"{speed:.1f}/s" if speed >= 1 else f"{1 / speed:.1f} s each")
 
 
+class Bars:
+    """One bar for each stage. Call ``close`` at the end.
+
+    Stages that run at the same time stand below each other. When all of them are done they stay on the screen as they are, and the next
+    stage begins a new set.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._display: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+
+    def __call__(self, stage: str, done: float, total: float, note: str = "") -> None:
+        begins = stage not in self._tasks or (done == 0 and total == 0)
+        if begins and self._display is not None and self._display.finished:
+            self.close()
+        if self._display is None:
+            columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), _CountColumn(), _RateColumn())
+            self._display = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=self._console)
+            self._display.start()
+        if stage not in self._tasks:
+            self._tasks[stage] = self._display.add_task(stage, total=None)
+        elif begins:  # the same title once more
+            self._display.reset(self._tasks[stage], total=None)
+        title = f"{stage} {note}" if note else stage
+        self._display.update(self._tasks[stage], total=total or None, completed=done, description=title)
+
+    def close(self) -> None:
+        """Leave the bars as they are."""
+        if self._display is not None:
+            self._display.stop()
+        self._display, self._tasks = None, {}
+
+
+class Lines:
+    """A line of text at most every ``every_s`` seconds, for log files and pipes. A stage that ends sooner says nothing.
+
+    Parameters
+    ----------
+    out : TextIO
+    every_s : float
+    clock : callable
+        Tells the time in seconds.
+    """
+
+    def __init__(self, out: TextIO, *, every_s: float = LINE_S, clock: Callable[[], float] = time.monotonic) -> None:
+        self._out, self._every_s, self._clock = out, every_s, clock
+        self._last_s = clock()
+
+    def __call__(self, stage: str, done: float, total: float, note: str = "") -> None:
+        now_s = self._clock()
+        if now_s - self._last_s < self._every_s:
+            return
+        self._last_s = now_s
+        far = "" if total <= 0 else f" {done:.0%}" if total <= 1 else f" {done:.0f} of {total:.0f}"
+        print(f"{stage}:{far or ' begun'}{f', {note}' if note else ''}", file=self._out, flush=True)
+
+
 @contextmanager
-def rate_bar(title: str):
-    """As ``count_bar``, with the rate; the first call says what was there before, which does not count towards it."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _RateColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        tasks = []
-
-        def progress(done: int, total: int) -> None:
-            if not tasks:
-                tasks.append(bar.add_task(title, total=total, completed=done))
-            bar.update(tasks[0], total=total, completed=done)
-
-        yield progress
-
-
-@contextmanager
-def epoch_bar(title: str):
-    """A bar over epochs with the error on held-out rows; yields ``progress(done, total, point)``."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(title, total=None)
-
-        def progress(done: int, total: int, point: dict) -> None:
-            bar.update(task, total=total, completed=done, description=f"{title} {point['held_out_error']:.4f}")
-
-        yield progress
+def shown() -> Iterator[Told]:
+    """The ``Progress`` of a command: bars where stderr is a terminal, else lines."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield Lines(sys.stderr)
+        return
+    bars = Bars(console)
+    try:
+        yield bars
+    finally:
+        bars.close()

@@ -6,15 +6,14 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Out, Sensor, writable_folder
-from twin.cli.render import Quality
+from twin.cli.options import Out, Quality, Sensor, writable_folder
 
 HELP = """Compare a folder of real raw frames with their renders, pair by pair and as two sets.
 
-Each real frame's pins are found, the skin is fitted to them, and the sensor in that state is rendered and captured: every
+Each real frame's pins are found, the skin is fitted to them, and the sensor in that state is rendered and captured. Every
 cap stands where it stood in the real frame, so what differs is camera and light. With --pose-aligned the whole twin is
 judged as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5 turns in deg, a tap on a flat plate) become
-contacts, the arm's kinematics being fitted to the pins of one half of the frames and the error stated on the other.
+contacts. The arm's kinematics is fitted to the pins of one half of the frames, and the error is stated on the other half.
 
 \b
 Reads: a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder).
@@ -34,8 +33,8 @@ Writes:
 
 \b
 How to read it: PSNR and SSIM of two real frames with the same contact are the best that can
-be had. Two-sample accuracy: share of patches of unseen frames that a small network puts
-into the right set; 100 % always told apart, 50 % not to be told apart.
+be reached. Two-sample accuracy is the share of patches of unseen frames that a small network
+puts into the right set: at 100 % they are always told apart, at 50 % never.
 
 \b
 Example:
@@ -54,47 +53,19 @@ def realism(
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
 ) -> None:
     from scenes import load_sensor
-    from twin.cli.progress import count_bar
-    from twin.realism.pictures import run_realism
+    from training.studies.realism import compare_with_renders
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    spec = load_sensor(sensor)
-    writable_folder(out)
-    test = _two_sample if two_sample else None
-    metrics, written = run_realism(path, spec, out, count_bar, with_poses=pose_aligned, limit=limit, quality=quality.value, test=test)
-    _print(metrics)
-    for file in written:
-        print(f"wrote {file}")
-
-
-def _two_sample(real, rendered, inside, progress):
-    from training.two_sample import two_sample
-
-    return two_sample(real, rendered, inside, progress=progress)
-
-
-def _print(metrics: dict) -> None:
-    for refused in metrics["refused"]:
-        print(f"refused {refused['image_name']}: {refused['reason']}")
-    _print_images("pin-aligned", metrics["frames"], metrics["pin_aligned"])
-    found = metrics["statistics"]
-    worst = ", ".join(f"{name} {100 * value:.1f} %" for name, value in found["worst_relative_difference"].items())
-    print(f"largest difference in a radial bin: {worst}")
-    for name, pair in found["scalars"].items():
-        print(f"{name}: real {pair['real']:.2f}, rendered {pair['rendered']:.2f}")
-    spots = found["spots"]
-    print(f"spectra differ by {found['spectrum_db']:.2f} dB; {spots['paired']} of {spots['real']} bright spots have a counterpart")
-    print(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
-    if outcome := metrics["two_sample"]:
-        print(f"two-sample accuracy {100 * outcome['accuracy']:.1f} % ({100 * outcome['low']:.1f} to {100 * outcome['high']:.1f} %)")
-    if poses := metrics["pose_aligned"]:
-        error = poses["pin_error_px"]
-        print(f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on those fitted to)")
-        _print_images("pose-aligned, unseen", metrics["frames"] // 2, poses["test_images"])
-
-
-def _print_images(title: str, count: int, images: dict) -> None:
-    mean = {name: images[name]["mean"] for name in ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip")}
-    print(
-        f"{title}, {count} frames: PSNR {mean['psnr_db']:.2f} dB (gray {mean['psnr_gray_db']:.2f}), "
-        f"SSIM {mean['ssim']:.3f} (gray {mean['ssim_gray']:.3f}), FLIP {mean['flip']:.3f}"
-    )
+    with shown() as progress:
+        found = compare_with_renders(
+            path,
+            load_sensor(sensor),
+            writable_folder(out),
+            pose_aligned=pose_aligned,
+            limit=limit,
+            quality=quality.value,
+            test=two_sample,
+            progress=progress,
+        )
+    tell(found)

@@ -1,12 +1,11 @@
 """``twin render``: one contact, rendered, with its exact ground truth."""
 
-from enum import StrEnum
 from typing import Annotated
 
 import typer
 
 from twin.cli import app
-from twin.cli.options import Object, Out, Pair, Sensor, writable_folder
+from twin.cli.options import Object, Out, Pair, Quality, Sensor, writable_folder
 from twin.types import Form
 
 HELP = """Press an object against a sensor and render what the camera inside sees.
@@ -47,14 +46,6 @@ Example:
 """
 
 
-class Quality(StrEnum):
-    """Presets of the renderer."""
-
-    PREVIEW = "preview"
-    STANDARD = "standard"
-    HIGH = "high"
-
-
 @app.command("render", help=HELP)
 def render(
     sensor: Sensor,
@@ -73,24 +64,13 @@ def render(
     seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
 ) -> None:
     from scenes import load_object, load_sensor
-    from twin.cli.progress import step_bar
-    from twin.contact_files import write_contact
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
     from twin.mechanics.path import ContactPose
-    from twin.simulator import Simulator
+    from twin.one_contact import render_contact
 
     spec, stimulus = load_sensor(sensor), load_object(object_)
     pose = ContactPose(indent_mm=indent_mm, tilt_deg=tilt_deg, shear_mm=shear_mm, twist_deg=twist_deg, offset_mm=offset_mm)
-    writable_folder(out)
-    simulator = Simulator(spec, quality=quality.value)
-    simulator.check_form(form)
-    with step_bar(f"press {stimulus.name}") as progress:
-        state = simulator.press(stimulus, pose, progress=progress)
-    with step_bar("render"):
-        shot = simulator.shoot(state, form=form, seed=seed)
-    with step_bar("pictures"):
-        written = write_contact(out, simulator, stimulus, pose, state, shot)
-    force = state.force_n.round(2) + 0.0  # no negative zeros
-    print(f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {state.area_mm2:.1f} mm2, ", end="")
-    print(f"{int(shot.truth.visible.sum())} of {len(shot.truth.visible)} caps in sight")
-    for path in written:
-        print(f"wrote {path}")
+    with shown() as progress:
+        made = render_contact(spec, stimulus, pose, writable_folder(out), form=form, quality=quality.value, seed=seed, progress=progress)
+    tell(made)

@@ -1,14 +1,12 @@
 """``twin robustness``: how far a sensor may degrade before its pins are lost."""
 
-import os
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from twin.cli import app
-from twin.cli.options import Out, Sensor, writable_folder
+from twin.cli.options import CORES, Out, Sensor, if_given, writable_folder
 
 HELP = """How far may the sensor degrade before preprocessing fails?
 
@@ -23,14 +21,14 @@ Writes:
   curves.csv      every measure against severity, with its 90 % interval
   frames.csv      every frame
   real-on-rendered.csv  with --frames: where real and rendered frames fail, and their ratio
-  cells/          finished work: an interrupted run goes on where it was; what was computed from another sensor, other weights
-                  or another version is not taken for it
+  cells/          finished work: an interrupted run goes on where it was; work from another sensor, other weights or another
+                  version is not used
 
 \b
-With --frames DIR real frames take the place of rendered ones: conditions that act on a frame
-alone, the pins on which several detectors agree as the truth. Raw frames are shown on the
-envelope of rendered ones: how much of a sound sensor's margin has this one left? That sweeps
-rendered frames too; --no-rendered leaves it out.
+With --frames DIR real frames take the place of rendered ones. Only conditions that act on a
+frame are swept, and the truth is the pins on which several detectors agree. Raw frames are shown
+on the envelope of rendered ones: how much of a sound sensor's margin has this one left? For that
+rendered frames are swept too; --no-rendered leaves it out.
 
 \b
 A file for --conditions:
@@ -62,65 +60,29 @@ def robustness(
     frames: Annotated[Path | None, typer.Option("--frames", metavar="DIR", help="real frames instead of rendered ones")] = None,
     limit: Annotated[int, typer.Option("--limit", min=2, metavar="N", help="at most N of the real frames, evenly spread")] = 12,
     rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = os.cpu_count() or 1,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = CORES,
     show: Annotated[bool, typer.Option("--list", help="list the conditions and stop")] = False,
 ) -> None:
-    from twin.robustness.conditions import CONDITIONS
+    from scenes import load_sensor
+    from training.studies import degradation
+    from twin.cli.output import say, tell
+    from twin.cli.progress import shown
+    from twin.robustness.conditions import condition_lines
+    from twin.robustness.plan import SweepPlan, load_plan
 
     if show:
-        for each in CONDITIONS.values():
-            print(f"{each.name:18} {each.family:12} {each.title}: {each.parameter}, up to {each.severe:g} {each.unit}".rstrip())
-        return
-    from scenes import load_sensor
-    from twin.cli.progress import count_bar
-    from twin.robustness.plan import SweepPlan, load_plan
-    from twin.robustness.run import check_pipelines, real_study, rendered_study
-
-    spec, plan = load_sensor(sensor), load_plan(conditions) if conditions else SweepPlan()
-    cases, names = plan.cases(), pipeline or ["twin", "legacy"]
-    runs = tuple(model or ())
-    check_pipelines(names, tuple(run.name for run in runs))
-    writable_folder(out)
-    options: dict = {"jobs": jobs}
-    if runs:
-        load_models(runs, spec)  # each process loads its own: what can't be is told here, and once
-        options |= {"models": partial(load_models, runs, spec), "model_digests": digests_of(runs)}
-    sweep = (names, cases, plan.severities(), out, count_bar)
-    if frames is None:
-        envelopes, written = rendered_study(spec, *sweep, **options)
-    else:
-        envelopes, written = real_study(spec, frames, limit, *sweep, beside=rendered, **options)
-    for found in sorted(envelopes, key=lambda e: (e.pipeline, e.width)):
-        print(f"{found.pipeline:10} {found.case.name:18} {found.label}{f' ({found.measure})' if found.measure else ''}")
-    for file in written:
-        print(f"wrote {file}")
-
-
-def digests_of(runs: tuple[Path, ...]) -> dict[str, str]:
-    """Digests by name of all that the models' answers depend on."""
-    from training.estimator import digest_of
-
-    return {run.name: digest_of(run) for run in runs}
-
-
-def load_models(runs: tuple[Path, ...], spec) -> dict:
-    """Estimators by name, as a sweep calls them: raw frames are recorded first where the model was trained on recordings."""
-    from dataclasses import replace
-
-    from training.estimator import PoseEstimator
-    from twin.camera import record
-    from twin.types import Form
-
-    def ready(run):
-        estimator = PoseEstimator.load(run)
-        estimator.check(spec, estimator.form)
-
-        def estimate(frame):
-            if frame.form == Form.RAW and estimator.form == Form.RECORDING:
-                frame = replace(frame, image=record(frame.image, spec.recording), form=Form.RECORDING)
-            found = estimator(frame)
-            return found.value, found.units, found.valid
-
-        return estimate
-
-    return {run.name: ready(run) for run in runs}
+        say(condition_lines())
+        raise typer.Exit
+    plan = degradation.Plan(
+        load_sensor(sensor),
+        pipelines=tuple(pipeline or degradation.PIPELINES),
+        models=tuple(model or ()),
+        sweep=if_given(load_plan, conditions) or SweepPlan(),
+        frames=frames,
+        limit=limit,
+        rendered=rendered,
+        jobs=jobs,
+    )
+    with shown() as progress:
+        found = degradation.run(plan, writable_folder(out), progress=progress)
+    tell(found)

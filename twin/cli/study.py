@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Out, names_in, writable_folder
-from twin.cli.servo import PlainLight, ServoName
+from twin.cli.options import Out, PlainLight, ServoName, names_in, writable_folder
 
 OBJECTS = "can,mesh-can,square,prism,tin-box"  # the Tac-VGNN paper's
 study = typer.Typer(help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
@@ -23,7 +22,7 @@ Writes to --out: a folder for each model and object as 'twin servo' writes it, s
 
 
 @study.command("servo", help=SERVO_HELP)
-def study_servo(
+def servo_command(
     models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
     out: Out,
     objects: Annotated[str, typer.Option("--objects", help="names with commas between")] = OBJECTS,
@@ -32,13 +31,20 @@ def study_servo(
     seed: Annotated[int, typer.Option("--seed", help="of the twin's noise")] = 0,
     plain_light: PlainLight = False,
 ) -> None:
-    from training.estimator import PoseEstimator
-    from twin.cli.servo_study import run_study
+    from hardware.servo_study import ServoStudyPlan, study_servo
+    from scenes import load_object, load_servo
+    from training.by_name import load_by_name
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    names = names_in(objects)
-    labels = [model.name for model in models]
-    if len(set(labels)) < len(labels):
-        labels = [str(model) for model in models]
-    estimators = {label: PoseEstimator.load(model) for label, model in zip(labels, models, strict=True)}
-    lines = run_study(estimators, names, writable_folder(out), parameters=parameters, steps=steps, seed=seed, plain_light=plain_light)
-    print("\n".join(lines))
+    plan = ServoStudyPlan(
+        models=load_by_name(models),
+        objects=tuple(map(load_object, names_in(objects))),
+        servo=load_servo(parameters),
+        steps=steps,
+        seed=seed,
+        plain_light=plain_light,
+    )
+    with shown() as progress:
+        found = study_servo(plan, writable_folder(out), progress=progress)
+    tell(found)

@@ -15,14 +15,15 @@ HELP = """Train in the twin on several objects, and judge on objects that were n
 \b
   twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod --unseen cylinder,edge --out out/objects
 
-Two models learn from as many simulated contacts (pins alone, every state on their way): 'mixed' from --count of each object of
---train, the other from the first of them alone. Both are judged on --tests other contacts of every object, seen or not.
+Two models learn from the same number of simulated contacts (pins alone, every state on their way). 'mixed' learns from --count
+contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other contacts of every
+object, seen or not.
 
-Labels mean the same on every object: depth is the indentation along the surface's normal at the place nearest to the dome's
-centre, the angle that from this normal, as the labels of a flat plate touched alike. --experiment gives the ranges that are judged;
-the one that it names as wider is trained on.
+Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
+centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges that are
+judged; the experiment that it names as wider is trained on.
 
-The same command goes on where it was ended. The run that learnt several objects serves wherever a RUN is asked for:
+The same command goes on where it was ended. The run that learnt several objects can be given wherever a RUN is asked for:
 
 \b
   twin servo --object can --model out/objects/mixed --out out/can
@@ -48,46 +49,25 @@ def study_objects(
     workers: Workers = CORES,
     across: Across = FINE,
 ) -> None:
-    from scenes import load_experiment, load_object, load_randomisation, load_sensor
-    from training.across_objects import study as objects
-    from training.across_objects.page import write_page
-    from training.dataset import load_dataset
-    from training.generation import generate
-    from training.sim_to_real.study import train_in_twin
-    from twin.cli.progress import count_bar, epoch_bar, rate_bar
-    from twin.report.table import write_table
 
-    spec, judged = load_sensor(sensor), load_experiment(experiment)
+    from scenes import load_experiment, load_object, load_randomisation, load_sensor
+    from training.studies import objects
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
+
     plan = objects.Plan(
-        sensor=spec,
-        experiment=judged,
-        wider=load_experiment(judged.wider or experiment),
+        sensor=load_sensor(sensor),
+        experiment=load_experiment(experiment),
         randomisation=load_randomisation(randomise),
-        train=tuple(load_object(name) for name in names_in(train)),
-        unseen=tuple(load_object(name) for name in names_in(unseen)),
+        train=tuple(map(load_object, names_in(train))),
+        unseen=tuple(map(load_object, names_in(unseen))),
         count=count,
         tests=tests,
         seed=seed,
         across=across,
+        epochs=epochs,
+        workers=workers,
     )
-    writable_folder(out)
-    sets = {}
-    for folder, config, contacts in plan.sets():
-        with rate_bar(folder) as progress:
-            generate(out / folder, config, contacts, workers=workers, progress=progress)
-        with count_bar(f"{folder}: states") as progress:
-            sets[folder] = load_dataset(out / folder, spec, judged.targets, progress=progress)
-    runs = {}
-    for name, data in plan.trained_on(sets).items():
-        runs[name] = out / name
-        with epoch_bar(name) as progress:
-            train_in_twin(data, runs[name], seed=seed, split=None, epochs=epochs, progress=progress)
-    rows = objects.table(plan, runs, sets)
-    said = objects.verdicts(plan, rows, judged.targets)
-    write_page(out, plan=plan, names=judged.targets, ranges=judged.ranges(), rows=rows, verdicts=said)
-    for row in rows:
-        errors = ", ".join(f"{name} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name in judged.targets)
-        print(f"{row['model']}, {row['object']} ({'seen' if row['seen'] else 'never seen'}): {errors}")
-    print("\n".join(said))
-    for path in (write_table(out / "objects.csv", rows), out / "index.html"):
-        print(f"wrote {path}")
+    with shown() as progress:
+        found = objects.run(plan, writable_folder(out), progress=progress)
+    tell(found)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Device, FormOrAuto, Sensor, Target, columns_of
+from twin.cli.options import Device, FormOrAuto, Sensor, Target
 
 HELP = """Train a model that tells the pose from a frame.
 
@@ -24,12 +24,12 @@ were not executed are taken out, where move_executed.csv or labels_corrected.csv
 Depth and angle of simulated contacts are those of the surface that was touched, whatever its shape: indentation along its normal
 at the nearest place, and the angle from that normal. So data sets of several objects can be joined: give --data once for each.
 
-A random fifth of the rows (of simulated contacts, with all their states) is kept out of training for 'twin evaluate' (--split S:
-seed S; --split -1: train on all).
+A random fifth of the rows is kept out of training for 'twin evaluate'; of simulated data a fifth of the contacts, with all their
+states. --split gives its seed; --split -1 trains on all.
 
 \b
 Writes to --out: config.json (resolved, with the sensor and the pipeline's parameters), curves.csv, weights.pt, and
-while it runs checkpoint.pt: started again with the same options, a run that was ended goes on where it was.
+while it runs checkpoint.pt. A run that was ended goes on where it was when it is started again with the same options.
 """
 
 
@@ -55,34 +55,29 @@ def train(
     device: Device = "auto",
     form: FormOrAuto = None,
 ) -> None:
-    import torch
-
     from scenes import load_sensor
-    from training.dataset import joined, load_dataset
-    from training.models import recipe_of
-    from training.networks import choose_device
-    from training.recipes import TrainingError
-    from training.run import RunConfig, train_run
-    from twin.cli.progress import count_bar, epoch_bar
+    from training.train import train_model
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    if labels not in ("corrected", "raw"):
-        raise TrainingError(f"--labels must be corrected or raw, got {labels!r}")
-    recipe = recipe_of(model, epochs=epochs, batch=batch, members=members, kernel=kernel)
-    if threads:
-        torch.set_num_threads(threads)
-    device = choose_device(device)
-    columns = columns_of(target)
-    with count_bar("frames") as progress:
-        parts = [load_dataset(folder, load_sensor(sensor), columns, form=form, progress=progress) for folder in data]
-    found = joined(parts)
-    for problem in found.problems:
-        print(f"note: {problem}")
-    helpers = ("move_1", "move_6") if columns == "surface-2d-shear" else ()
-    config = RunConfig(model, recipe, labels, seed, None if split < 0 else split, helpers)
-    print(f"{len(found)} usable frames; labels {', '.join(found.targets.names)} ({labels})")
-    with epoch_bar(model) as progress:
-        finished = train_run(config, found, out, max_minutes=max_minutes, device=device, progress=progress)
-    if not finished:
-        print(f"time is up: the weights so far are in {out}; the same command goes on from here")
-    for name in ("config.json", "curves.csv", "weights.pt"):
-        print(f"wrote {out / name}")
+    with shown() as progress:
+        made = train_model(
+            model,
+            load_sensor(sensor),
+            data,
+            out,
+            target=target,
+            labels=labels,
+            seed=seed,
+            split=None if split < 0 else split,
+            epochs=epochs,
+            batch=batch,
+            members=members,
+            kernel=kernel,
+            max_minutes=max_minutes,
+            threads=threads,
+            device=device,
+            form=form,
+            progress=progress,
+        )
+    tell(made)

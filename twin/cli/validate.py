@@ -6,15 +6,15 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Across, FormOrAuto, Out, Sensor, writable_folder
+from twin.cli.options import Across, FormOrAuto, Out, Sensor, if_given, writable_folder
 from twin.types import FINE
 
 HELP = """Compare the twin's pins with those of labelled real frames.
 
 Each frame's contact is simulated along the arm's own way, from its label and the sensor's [rig] alone ('twin calibrate
 contact' fits one), and the simulated displacement is added to the recorded no-contact pins (init_0.png). Moves that
-move_executed.csv or labels_corrected.csv ('twin audit') calls not executed are left out. Stated apart for executed and not
-executed moves, by depth, angle and shear; and, for some frames with an executed move, with one friction a frame.
+move_executed.csv or labels_corrected.csv ('twin audit') calls not executed are left out. Errors are stated apart for executed and
+not executed moves, by depth, angle and shear. For some frames with an executed move they are also stated with one friction a frame.
 
 \b
 Writes index.html, frames.csv (a row a frame), validation.json.
@@ -43,27 +43,22 @@ def validate(
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor
-    from training.validation import ContactModel, compare, measure_frames
-    from training.validation.report import summary_of, write_validation
-    from twin.cli.progress import rate_bar
+    from training.studies.validation import validate_contacts
+    from twin.cli.output import tell
+    from twin.cli.progress import shown
 
-    spec, plan = load_sensor(sensor), load_experiment(experiment)
-    touched = load_object(object_ or plan.object)
-    writable_folder(out)
-    with rate_bar("pins") as progress:
-        measured = measure_frames(frames, spec, limit, seed, form=form, progress=progress)
-    model = ContactModel(spec, plan, touched, measured.form, across=across)
-    with rate_bar("contacts") as progress:
-        found = compare(model, measured, friction_frames=friction_frames, progress=progress)
-    summary = summary_of(found, spec)
-    if spec.rig is None:
-        print(f"note: {spec.name} has no [rig]: the tool point counts as the tip; 'twin calibrate contact' fits one")
-    for row in summary["table"]:
-        print(f"{row['group']}: {row['error_px']:.2f} px over {row['frames']} frames, nothing free")
-    if own := summary["one_friction_a_frame"]:
-        print(f"one friction a frame, {own['frames']} frames: {own['error_px']:.2f} px (common friction: ", end="")
-        print(f"{own['error_with_common_friction_px']:.2f} px)")
-    if found.failures:
-        print(f"{len(found.failures)} contacts failed: see frames.csv")
-    for path in write_validation(out, found, spec, summary):
-        print(f"wrote {path}")
+    with shown() as progress:
+        found = validate_contacts(
+            load_sensor(sensor),
+            frames,
+            load_experiment(experiment),
+            writable_folder(out),
+            touched=if_given(load_object, object_),
+            limit=limit,
+            friction_frames=friction_frames,
+            seed=seed,
+            across=across,
+            form=form,
+            progress=progress,
+        )
+    tell(found)

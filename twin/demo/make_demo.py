@@ -2,16 +2,17 @@
 
 import os
 import platform
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
 from scenes import load_object, load_sensor
 from twin.demo.page import ContactContent, contact_figures, contact_pictures, motion_figure, write_page
 from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, DepthRow, depth_table, run_contact
-from twin.progress import FractionBar
+from twin.progress import Progress, silent, stage
 from twin.projection import project
 from twin.recordings.forms import from_raw
 from twin.report.charts import write_chart
@@ -21,31 +22,49 @@ from twin.stimulus import build_field
 from twin.types import Form
 
 
-def run_demo(out: Path, bar: FractionBar) -> list[Path]:
-    """Run the whole demo into a folder.
+@dataclass(frozen=True)
+class Demo:
+    """What the demo made.
 
-    Parameters
+    Attributes
     ----------
-    out : Path
-    bar : callable
-        ``bar(title)`` is a context manager that yields ``progress(fraction)``.
-
-    Returns
-    -------
-    list of Path
-        What was written, the page first.
+    tables : dict of str to list of DepthRow
+        Displacement by depth, by sensor.
+    written : list of Path
+        The page first.
     """
+
+    tables: dict[str, list[DepthRow]]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """The tables for people."""
+        lines = []
+        for sensor, rows in self.tables.items():
+            lines += [
+                f"{sensor}: mean pin displacement, px (measured on the Tac-VGNN recordings / simulated)",
+                "  indentation, mm  " + "".join(f"{row.indent_mm:8.1f}" for row in rows),
+                "  measured, px     " + "".join(f"{row.measured_px:8.1f}" for row in rows),
+                "  simulated, px    " + "".join(f"{row.simulated_px:8.1f}" for row in rows),
+                "  area at contact %" + "".join(f"{row.contact_area_change_percent:+8.1f}" for row in rows),
+            ]
+        return lines
+
+
+def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
+    """Run the whole demo into a folder."""
+    bar = partial(stage, progress)
     pictures = out / "pictures"
     pictures.mkdir(exist_ok=True)
     simulators: dict[str, Simulator] = {}
-    contacts: list[dict[str, Any]] = []
+    contacts: list[ContactContent] = []
     seconds: dict[str, float] = {}
     notes: set[str] = set()
     for sensor, stimulus, pose, form in CONTACTS:
         start = perf_counter()
-        with bar(f"{sensor}: press the {stimulus}, render, detect") as progress:
+        with bar(f"{sensor}: press the {stimulus}, render, detect") as step:
             simulator = simulators[sensor] = Simulator(load_sensor(sensor))
-            result = run_contact(simulator, stimulus, pose, form, progress=progress)
+            result = run_contact(simulator, stimulus, pose, form, progress=step)
         seconds[f"{sensor} against {stimulus}"] = perf_counter() - start
         with bar(f"{sensor}: pictures"):
             skin = pictures / f"{sensor}-{stimulus}-skin.png"
@@ -55,18 +74,18 @@ def run_demo(out: Path, bar: FractionBar) -> list[Path]:
     motion_sensor = CONTACTS[0][0]
     start = perf_counter()
     looks = []
-    with bar(f"{motion_sensor}: motions along Z, X and Y") as progress:
+    with bar(f"{motion_sensor}: motions along Z, X and Y") as step:
         for number, (title, pose) in enumerate(MOTIONS):
             looks.append((title, run_contact(simulators[motion_sensor], "plane", pose, Form.RAW).look))
-            progress((number + 1) / len(MOTIONS))
+            step((number + 1) / len(MOTIONS))
         motions = write_chart(pictures / "motions.png", lambda: motion_figure(looks))
     seconds["motions"] = perf_counter() - start
 
     tables = {}
     start = perf_counter()
     for sensor in MEASURED_DISPLACEMENT_PX:
-        with bar(f"{sensor}: displacement by depth") as progress:
-            tables[sensor] = depth_table(sensor, progress=progress)
+        with bar(f"{sensor}: displacement by depth") as step:
+            tables[sensor] = depth_table(sensor, progress=step)
     seconds["displacement tables"] = perf_counter() - start
 
     renderer = simulators[motion_sensor].describe()["renderer"]
@@ -82,8 +101,7 @@ def run_demo(out: Path, bar: FractionBar) -> list[Path]:
         tables=tables,
         seconds=seconds,
     )
-    _print_tables(tables)
-    return [page, *sorted(pictures.iterdir())]
+    return Demo(tables, [page, *sorted(pictures.iterdir())])
 
 
 def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pictures: Path) -> ContactContent:
@@ -100,12 +118,3 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
         raw_size=f"{width} x {height} px",
         figures=contact_figures(result, contact_px),
     )
-
-
-def _print_tables(tables: dict[str, list[DepthRow]]) -> None:
-    for sensor, rows in tables.items():
-        print(f"{sensor}: mean pin displacement, px (measured on the Tac-VGNN recordings / simulated)")
-        print("  indentation, mm  " + "".join(f"{row.indent_mm:8.1f}" for row in rows))
-        print("  measured, px     " + "".join(f"{row.measured_px:8.1f}" for row in rows))
-        print("  simulated, px    " + "".join(f"{row.simulated_px:8.1f}" for row in rows))
-        print("  area at contact %" + "".join(f"{row.contact_area_change_percent:+8.1f}" for row in rows))

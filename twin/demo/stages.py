@@ -12,7 +12,7 @@ from twin.contact_files import look_at
 from twin.mechanics.path import ContactPose
 from twin.preprocess.graph import make_graph
 from twin.preprocess.reference import nominal_reference
-from twin.progress import FractionProgress
+from twin.progress import Step
 from twin.projection import project
 from twin.report.panel import Look
 from twin.simulator import Shot, Simulator
@@ -66,9 +66,7 @@ class ContactResult:
     seconds: dict[str, float]
 
 
-def run_contact(
-    simulator: Simulator, stimulus: str, pose: ContactPose, form: Form, *, progress: FractionProgress | None = None
-) -> ContactResult:
+def run_contact(simulator: Simulator, stimulus: str, pose: ContactPose, form: Form, *, progress: Step | None = None) -> ContactResult:
     """Press, render, capture, detect, build the graph: one contact beside no contact."""
     timed = Timed()
     state = timed.run("press", lambda: simulator.press(load_object(stimulus), pose, progress=progress))
@@ -90,7 +88,7 @@ class DepthRow:
     force_n: float
 
 
-def depth_table(sensor: str, *, progress: FractionProgress | None = None) -> list[DepthRow]:
+def depth_table(sensor: str, *, progress: Step | None = None) -> list[DepthRow]:
     """Press a plane to the four depths of the recordings' table (true caps, no rendering)."""
     spec = load_sensor(sensor)
     simulator = Simulator(spec)

@@ -13,7 +13,7 @@ from twin.detectors.spec import DetectorSpec, Evidence, Method
 from twin.errors import FrameError
 from twin.preprocess.legacy import LEGACY
 from twin.preprocess.reference import Reference
-from twin.progress import Progress
+from twin.progress import Step
 from twin.recordings.forms import gray_levels
 from twin.types import Form, Frame
 
@@ -79,7 +79,7 @@ class Tuned:
     notes: list[str]
 
 
-def tune(frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, progress: Progress | None = None) -> Tuned:
+def tune(frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, progress: Step | None = None) -> Tuned:
     """Find mask, threshold and blob parameters from frames of one size and form.
 
     Only the layout of the sensor's pins is used (count, rings, round or hexagon). The frames may show any contact.
@@ -114,7 +114,7 @@ def tune(frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, pr
     return Tuned(tried[best].model_copy(update={"evidence": evidence}), table, _notes(evidence, len(seen), len(frames)))
 
 
-def _sightings(frames: list[Frame], flat: np.ndarray, pins: PinsSpec, binary: bool, progress: Progress | None) -> list[Sighting]:
+def _sightings(frames: list[Frame], flat: np.ndarray, pins: PinsSpec, binary: bool, progress: Step | None) -> list[Sighting]:
     """The layout in the frames that show it clearly; ``flat`` (N, 2) as ``flat_layout`` gives it.
 
     Raises

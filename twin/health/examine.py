@@ -16,7 +16,7 @@ from twin.optics.preview import Preview
 from twin.preprocess.mask import Mask
 from twin.preprocess.pipeline import Pipeline
 from twin.preprocess.reference import Reference, make_reference, nominal_reference
-from twin.progress import Progress
+from twin.progress import Step
 from twin.realism.caps import Caps, measure_caps
 from twin.recordings.forms import gray_levels
 from twin.types import Form, Frame, Observation
@@ -74,9 +74,7 @@ class Finding:
     remedy: str
 
 
-def examine(
-    frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Progress | None = None
-) -> list[Finding]:
+def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Step | None = None) -> list[Finding]:
     """Findings on frames of one form, with or without contact.
 
     Parameters

@@ -14,7 +14,7 @@ from twin.geometry.skin_fit import FittedPins, SkinFit
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Renderer
 from twin.preprocess.pipeline import Pipeline
-from twin.progress import Bar, Progress
+from twin.progress import Bar, Step
 from twin.projection import project
 from twin.realism.disc import Disc
 from twin.realism.frames import RealFrame
@@ -82,7 +82,7 @@ class PoseAligned:
     pairs: list[Pair]
 
 
-def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, progress: Progress) -> list[Pair]:
+def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, progress: Step) -> list[Pair]:
     """Fit the skin to each frame's pins, render and capture it: this tests camera and light, not the mechanics."""
     fit, shoot, pairs = SkinFit(spec), _Shooter(spec, disc, quality), []
     for number, real in enumerate(frames):
@@ -121,7 +121,7 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, radius_mm), pairs)
 
 
-def statistics(pairs: list[Pair], disc: Disc, *, progress: Progress) -> Statistics:
+def statistics(pairs: list[Pair], disc: Disc, *, progress: Step) -> Statistics:
     """Real against pin-aligned renders: caps, skin, noise, spectrum, spots."""
     sets: tuple[list[FrameStatistics], list[FrameStatistics]] = ([], [])
     for number, pair in enumerate(pairs):

@@ -8,7 +8,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.preprocess.pipeline import Pipeline
-from twin.progress import Progress
+from twin.progress import Step
 from twin.realism.disc import Disc
 from twin.recordings import open_recording
 from twin.recordings.forms import gray_levels
@@ -52,7 +52,7 @@ class RealFrames:
     refused: list[BadFrame] = field(default_factory=list)
 
 
-def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, progress: Progress | None = None) -> RealFrames:
+def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, progress: Step | None = None) -> RealFrames:
     """Read raw frames, evenly spread over the recording if there are more than ``limit``.
 
     Raises

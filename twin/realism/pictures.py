@@ -1,13 +1,14 @@
 """The whole comparison of a folder of real frames with their renders, into one folder."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.progress import Bar, Progress
+from twin.progress import Progress, Step, silent, stage
 from twin.realism.compare import Quality, pin_aligned, pose_aligned, statistics
 from twin.realism.disc import lens_disc
 from twin.realism.frames import read_real
@@ -37,19 +38,19 @@ class TwoSample(Protocol):
 
 
 # test(real images, rendered images, inside, progress)
-Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Progress], TwoSample]
+Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Step], TwoSample]
 
 
 def run_realism(
     folder: Path,
     spec: SensorSpec,
     out: Path,
-    bar: Bar,
     *,
     with_poses: bool = False,
     limit: int | None = None,
     quality: Quality = "standard",
     test: Test | None = None,
+    progress: Progress = silent,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Compare and write everything.
 
@@ -59,8 +60,6 @@ def run_realism(
         Raw frames, with ``targets.csv`` where the labels are needed.
     spec : SensorSpec
     out : Path
-    bar : callable
-        ``bar(title)`` is a context manager that yields ``progress(done, total)``.
     with_poses : bool
         Also render from the labels alone.
     limit : int, optional
@@ -68,6 +67,7 @@ def run_realism(
     quality : {"preview", "standard", "high"}
     test : callable, optional
         The two-sample test.
+    progress : Progress
 
     Returns
     -------
@@ -83,18 +83,18 @@ def run_realism(
     RenderError
         Nothing can be rendered here.
     """
-    disc = lens_disc(spec)
-    with bar("read the real frames, find their pins") as progress:
-        real = read_real(folder, spec, disc, limit=limit, progress=progress)
-    with bar("fit the skin to the pins, render") as progress:
-        pairs = pin_aligned(spec, real.frames, disc, quality=quality, progress=progress)
+    disc, bar = lens_disc(spec), partial(stage, progress)
+    with bar("read the real frames, find their pins") as step:
+        real = read_real(folder, spec, disc, limit=limit, progress=step)
+    with bar("fit the skin to the pins, render") as step:
+        pairs = pin_aligned(spec, real.frames, disc, quality=quality, progress=step)
     poses = pose_aligned(spec, real.frames, disc, quality=quality, bar=bar) if with_poses else None
-    with bar("measure caps, skin, noise, spectra") as progress:
-        found = statistics(pairs, disc, progress=progress)
+    with bar("measure caps, skin, noise, spectra") as step:
+        found = statistics(pairs, disc, progress=step)
     outcome = None
     if test is not None and len(pairs) > 1:
-        with bar("train the two-sample test") as progress:
-            outcome = test([pair.real.frame.image for pair in pairs], [pair.image for pair in pairs], disc.inside, progress)
+        with bar("train the two-sample test") as step:
+            outcome = test([pair.real.frame.image for pair in pairs], [pair.image for pair in pairs], disc.inside, step)
     metrics = {
         "sensor": spec.name,
         "quality": quality,

@@ -7,6 +7,6 @@ read.
 
 from twin.recordings.folders import natural_key
 from twin.recordings.images import read_image
-from twin.recordings.recording import Recording, open_recording
+from twin.recordings.recording import Recording, evenly_read, open_recording
 
-__all__ = ["Recording", "natural_key", "open_recording", "read_image"]
+__all__ = ["Recording", "evenly_read", "natural_key", "open_recording", "read_image"]

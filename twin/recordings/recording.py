@@ -248,3 +248,9 @@ def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form 
         return _open_video(path, known, form)
     kind = common_kind([path], known, form)
     return Recording(path, kind.form, [path.name], kind.size_px, _files=[path], _bits=kind.bits)
+
+
+def evenly_read(recording: Recording, limit: int) -> list[Frame]:
+    """At most ``limit`` frames of a recording, evenly spread from its first to its last."""
+    chosen = np.linspace(0, len(recording) - 1, min(limit, len(recording))).round()
+    return [recording.read(int(index)) for index in np.unique(chosen)]

@@ -1,16 +1,15 @@
 """A whole robustness study into one folder."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.detectors import METHODS, DetectorSpec, load_detector, shipped_detector, tune, write_detector
 from twin.errors import TwinError
-from twin.recordings import open_recording
+from twin.progress import Progress, silent, stage
+from twin.recordings import evenly_read, open_recording
 from twin.robustness.condition import Case
 from twin.robustness.contacts import CONTACTS
 from twin.robustness.envelope import Envelope
@@ -66,16 +65,23 @@ def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
         raise TwinError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
 
 
-def rendered_study(spec: SensorSpec, pipelines: list[str], cases: tuple[Case, ...], severities: tuple, out: Path, bar: Callable, **options):
+def rendered_study(
+    spec: SensorSpec,
+    pipelines: list[str],
+    cases: tuple[Case, ...],
+    severities: tuple,
+    out: Path,
+    *,
+    progress: Progress = silent,
+    **options,
+) -> tuple[list[Envelope], list[Path]]:
     """A study on rendered frames; options and results as `study`."""
-    source = RenderedSource(spec, CONTACTS)
-    with bar("contacts, undegraded") as progress:
-        progress(0, 1)
+    source, bar = RenderedSource(spec, CONTACTS), partial(stage, progress)
+    with bar("contacts, undegraded"):
         frames = [shot.frame for shot in source.shoot(cases[0], 0.0)]
-        progress(1, 1)
-    with bar("tuning") as progress:
-        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", progress)
-    return study(Plan(source, detectors, cases, severities), "rendered", out, bar, **options)
+    with bar("tuning") as step:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
+    return study(Plan(source, detectors, cases, severities), "rendered", out, progress=progress, **options)
 
 
 def real_study(
@@ -86,20 +92,20 @@ def real_study(
     cases: tuple[Case, ...],
     severities: tuple,
     out: Path,
-    bar: Callable,
     *,
     beside: bool = True,
+    progress: Progress = silent,
     **options,
-):
+) -> tuple[list[Envelope], list[Path]]:
     """A study on a folder of real frames: image-level conditions only; options and results as `study`.
 
     ``beside``: raw frames are shown on the envelope of rendered ones, which are swept too.
     """
     recording = open_recording(path, spec)
-    frames = [recording.read(int(k)) for k in np.unique(np.linspace(0, len(recording) - 1, min(limit, len(recording))).round())]
-    with bar("tuning") as progress:
-        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", progress)
-        judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", progress)
+    frames, bar = evenly_read(recording, limit), partial(stage, progress)
+    with bar("tuning") as step:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
+        judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
     source, notes = consensus(spec, frames, list(dict.fromkeys((*detectors, *judges))))
     usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
     if not usable:
@@ -107,7 +113,7 @@ def real_study(
     if left := [c.name for c in cases if c not in usable]:
         notes.append(f"left out, as they can't be applied to frames that are already there: {', '.join(left)}")
     rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
-    return study(Plan(source, detectors, usable, severities), path.name, out, bar, notes=notes, rendered=rendered, **options)
+    return study(Plan(source, detectors, usable, severities), path.name, out, progress=progress, notes=notes, rendered=rendered, **options)
 
 
 def _on_frames(case: Case) -> bool:
@@ -119,8 +125,8 @@ def study(
     plan: Plan,
     source: str,
     out: Path,
-    bar: Callable,
     *,
+    progress: Progress = silent,
     jobs: int = 1,
     models: Models | None = None,
     model_digests: dict[str, str] | None = None,
@@ -135,8 +141,7 @@ def study(
     source : str
         Name of the frames for the page.
     out : Path
-    bar : callable
-        ``bar(title)`` is a context manager that yields ``progress(done, total)``.
+    progress : Progress
     jobs : int
         Processes.
     models, model_digests : callable, dict of str to str
@@ -147,10 +152,10 @@ def study(
         Frames of the same sensor to sweep likewise (in ``out/rendered``) and to show the plan's beside.
     """
     plan = replace(plan, models=models, model_digests=model_digests or {})
-    with bar("conditions x steps") as progress:
-        judged = judge_sweep(plan, out, jobs=jobs, progress=progress)
+    with stage(progress, "conditions x steps") as step:
+        judged = judge_sweep(plan, out, jobs=jobs, progress=step)
     beside = None
     if rendered is not None:
-        with bar("the same, rendered") as progress:
-            beside = judge_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=progress)
+        with stage(progress, "the same, rendered") as step:
+            beside = judge_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=step)
     return judged.envelopes, write_report(out, judged, source=source, notes=notes or [], rendered=beside)

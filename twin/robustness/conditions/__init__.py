@@ -23,3 +23,8 @@ def condition(name: str) -> Condition:
     near = difflib.get_close_matches(name, CONDITIONS, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(CONDITIONS)}"
     raise TwinError(f"no condition named '{name}': {hint}")
+
+
+def condition_lines() -> list[str]:
+    """Every condition with its parameter, and the value of it that is severe; for people."""
+    return [f"{c.name:18} {c.family:12} {c.title}: {c.parameter}, up to {c.severe:g} {c.unit}".rstrip() for c in CONDITIONS.values()]

@@ -1,9 +1,9 @@
-"""What the twin is worth on real frames: trained in it, with a few labelled frames beside it, and without it."""
+"""The steps of the study of what the twin is worth on real frames; each can be called alone."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,17 +18,21 @@ from training.models import recipe_of
 from training.recipes import TrainingError
 from training.run import RunConfig, is_finished, train_run
 from training.run_files import write_tensors
-from training.sim_to_real.discrepancy import Discrepancy
 from training.simulated import config_of, is_pins_only, open_simulated
+from training.studies.sim_to_real.discrepancy import Discrepancy
+from training.studies.sim_to_real.twins import contact_of
+from training.studies.telling import epoch_step
 from training.validation.model import MeasuredFrames
+from twin.progress import Step
 from twin.recordings import open_recording
 from twin.rig.labels import ArmLabel, read_arm_labels
 from twin.store import write_text
 
-TWIN_EPOCHS = 60  # on thousands of simulated states: more change nothing
-MANY = 500  # labelled frames: a morning's work with the rig
-RANGE_MARGIN = 0.1  # of the labelled frames' range of a label: simulated states beyond it are none of the process's business
-MODES, RIDGES = 20, 10.0 ** np.arange(-4, 3.1, 0.5)  # of the quadratic regression
+TWIN_EPOCHS = 60  # of a training on thousands of simulated states; more epochs change nothing
+MANY = 500  # labelled frames that a morning's work with the rig gives
+RANGE_MARGIN = 0.1  # simulated states may lie beyond the labelled frames' range of a label by this part of it
+MODES = 20  # of the displacements, that the quadratic regression is given
+RIDGES = 10.0 ** np.arange(-4, 3.1, 0.5)  # penalties that it chooses from, by the error of each frame left out
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Frames:
 
     test: np.ndarray
     few: np.ndarray
-    trained: dict
+    trained: dict[str, np.ndarray]
 
 
 def choose_frames(count: int, labels: int, seed: int) -> Frames:
@@ -75,11 +79,11 @@ def arm_labels(data: Dataset) -> list[ArmLabel]:
 
 
 def with_missing(
-    simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, progress: Callable | None = None
+    simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, *, progress: Step | None = None
 ) -> Dataset:
     """A simulated data set whose pins have moved by what the twin may miss, drawn for each contact; ``labels`` are its ``arm_labels``."""
     pins = simulated.pins
-    missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, simulated.group.astype(int), seed)
+    missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
     nodes_px = pins.nodes_px + missing_px
     return replace(simulated, pins=replace(pins, nodes_px=nodes_px, area_px2=voronoi_areas(nodes_px, pins.reference, progress=progress)))
 
@@ -91,24 +95,38 @@ def measured_of(part: Dataset) -> MeasuredFrames:
 
 
 def train_in_twin(
-    sim: Dataset, out: Path, *, seed: int, split: int | None, epochs: int | None, labelled: tuple = (), progress: Callable | None = None
+    sim: Dataset,
+    out: Path,
+    *,
+    seed: int,
+    split: int | None,
+    epochs: int | None,
+    labelled: tuple[str, ...] = (),
+    progress: Step | None = None,
 ) -> None:
-    """A run on simulated contacts, or what is left of it to do; ``labelled`` names the real frames that told what they miss.
+    """A run on simulated contacts, or what is left of it to do.
 
-    ``split`` as in ``RunConfig``.
+    Parameters
+    ----------
+    split : int or None
+        As in ``RunConfig``.
+    epochs : int or None
+        None: ``TWIN_EPOCHS``.
+    labelled : tuple of str
+        Names of the real frames that told what the simulated contacts miss.
     """
-    config = RunConfig(
-        "vgnn", recipe_of("vgnn", members=1, epochs=epochs or TWIN_EPOCHS, kernel=False), seed=seed, split=split, labelled=labelled
-    )
-    if not is_finished(config, sim, out):
-        train_run(config, sim, out, progress=progress)
+    recipe = recipe_of("vgnn", members=1, epochs=epochs or TWIN_EPOCHS, kernel=False)
+    _train(RunConfig("vgnn", recipe, seed=seed, split=split, labelled=labelled), sim, out, progress)
 
 
-def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Callable | None = None) -> None:
-    """A run on real frames alone, all of those given."""
-    config = RunConfig("vgnn", recipe_of("vgnn", epochs=epochs), seed=seed, split=None)
-    if not is_finished(config, real, out):
-        train_run(config, real, out, progress=progress)
+def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Step | None = None) -> None:
+    """A run on real frames alone, all of those given, or what is left of it to do."""
+    _train(RunConfig("vgnn", recipe_of("vgnn", epochs=epochs), seed=seed, split=None), real, out, progress)
+
+
+def _train(config: RunConfig, data: Dataset, out: Path, progress: Step | None) -> None:
+    if not is_finished(config, data, out):
+        train_run(config, data, out, progress=None if progress is None else epoch_step(progress))
 
 
 def states_like(simulated: Dataset, labelled: Dataset) -> np.ndarray:
@@ -135,15 +153,38 @@ def states_touching(parts: list[Dataset], touched: ObjectSpec) -> Dataset:
     return joined([part for part in parts if config_of(part.folder).object.name == touched.name] or parts)
 
 
-def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> np.ndarray:
-    """Write the finished run ``run`` of ``vgnn`` to ``out``, averaged with a Gaussian process that knows labelled frames.
+@dataclass(frozen=True)
+class Beside:
+    """What became of a run that labelled frames were put beside.
 
-    The two err differently, and neither can be weighed by the labelled frames, which have taught both. Intervals of ``run``, which
-    simulated contacts make too narrow, are widened to its errors on the labelled frames and to those of the process on frames
-    that are left out of it one after another; those of ``out`` are the average's.
+    Attributes
+    ----------
+    left_out : (K,) float
+        Mean absolute error (mm, deg) of the Gaussian process alone, on labelled frames that are left out of it one after another.
+    intervals : dict of str to array
+        The intervals of the run itself, widened to what the labelled frames say of it, under their names in ``weights.pt``; see
+        ``widen_intervals``.
+    """
+
+    left_out: np.ndarray
+    intervals: dict[str, np.ndarray]
+
+
+def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> Beside:
+    """Write the average of a run of ``vgnn`` and a Gaussian process that knows labelled frames, as a run, to ``out``.
+
+    The run ``run`` stays as it is. The two models err differently. Labelled frames can't tell how much each is to count, because both
+    have learnt from them, so the average is plain. The intervals of ``out`` are those of the average.
+
+    Simulated contacts make the intervals of ``run`` too narrow. What is returned has them widened to the run's errors on the labelled
+    frames, and to those of the process on frames that are left out of it one after another.
 
     Parameters
     ----------
+    run : Path
+        Folder of the finished run.
+    out : Path
+        Folder of the new run; made if missing.
     simulated : Dataset
         Contacts as the bare specification has them, with labels like the labelled frames' (``states_like``).
     labelled : Dataset
@@ -151,11 +192,13 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     seed : int
         Of the simulated states drawn.
 
-    Returns
-    -------
-    (K,) float
-        Mean absolute error (mm, deg) of the process alone, on labelled frames that are left out of it one after another.
+    Raises
+    ------
+    TrainingError
+        ``run`` and ``out`` are the same folder.
     """
+    if run.resolve() == out.resolve():
+        raise TrainingError(f"{run}: a run can't be written over itself; give another folder for the run with labelled frames beside it")
     estimator = PoseEstimator.load(run)
     ensemble, labels = estimator.ensemble, estimator.config["labels"]
     inputs, rows = estimator.inputs_of(labelled.pins, together=not labelled.pins.measured)
@@ -170,16 +213,24 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     content = torch.load(run / "weights.pt", weights_only=True)
     missed = [intervals(made, truth, raw, scale, executed) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
-    write_tensors(run / "weights.pt", content | wider)
     content |= intervals((mean + alone) / 2, truth, raw, scale, executed) | {"beside": process.arrays()}
     out.mkdir(parents=True, exist_ok=True)
     write_tensors(out / "weights.pt", content)
     about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}
     write_text(out / "config.json", json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
-    return np.abs(alone - truth).mean(axis=0) * ensemble.scale
+    return Beside(np.abs(alone - truth).mean(axis=0) * ensemble.scale, wider)
 
 
-def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict:
+def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
+    """Change a finished run: its intervals become those given (``Beside.intervals``). Its estimates stay as they are.
+
+    Doing it once more with the same intervals changes nothing.
+    """
+    content = torch.load(run / "weights.pt", weights_only=True)
+    write_tensors(run / "weights.pt", content | wider)
+
+
+def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict[str, Any]:
     """A row of the study's table: mean errors of a run on the frames that are judged on."""
     estimator = PoseEstimator.load(run)
     found = judge(predict_rows_of(estimator, real, test), real, test)
@@ -190,7 +241,7 @@ def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray)
     return row | inside | {"leak_slope": found["leak_slope"]}
 
 
-def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) -> dict:
+def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) -> dict[str, Any]:
     """The same of the plainest model: ridge regression on the displacements' first modes and their products."""
     moved = (real.pins.nodes_px - real.pins.reference.pins_px).reshape(len(real), -1)
     middle = moved[rows].mean(axis=0)

@@ -1,6 +1,7 @@
 """The twins of a study: the one that a model is to learn in, and the same without one of its ingredients at a time."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,8 @@ from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
 from training.dataset import Dataset
 from training.generation import GenerationConfig
-from training.sim_to_real.discrepancy import FRICTIONS
+from training.recipes import TrainingError
+from training.studies.sim_to_real.discrepancy import FRICTIONS
 from twin.rig.kinematics import rig_of
 
 COARSE = 12  # elements across
@@ -51,7 +53,7 @@ class Twin:
     share: float = 1.0
 
     @property
-    def frictions(self) -> tuple:
+    def frictions(self) -> tuple[float, ...]:
         """Of a labelled frame, tried one after another to see what is missed whatever its friction was."""
         return FRICTIONS if self.randomisation.friction else (rig_of(self.sensor).friction,)
 
@@ -73,8 +75,22 @@ class Twin:
         """The states of the contacts that are learnt from."""
         if self.share == 1:
             return contacts
-        numbers = np.unique(contacts.group)
-        return contacts.rows(np.flatnonzero(np.isin(contacts.group, numbers[: int(np.ceil(self.share * len(numbers)))])))
+        group = contact_of(contacts)
+        numbers = np.unique(group)
+        return contacts.rows(np.flatnonzero(np.isin(group, numbers[: int(np.ceil(self.share * len(numbers)))])))
+
+
+def contact_of(simulated: Dataset) -> np.ndarray:
+    """(M,) int: the number of the contact that each state of a simulated data set belongs to.
+
+    Raises
+    ------
+    TrainingError
+        The data set is none of simulated contacts.
+    """
+    if simulated.group is None:
+        raise TrainingError(f"{', '.join(map(str, simulated.folders))}: no simulated contacts; give a data set of 'twin dataset'")
+    return simulated.group.astype(int)
 
 
 def without_one_ingredient(
@@ -92,7 +108,7 @@ def without_one_ingredient(
         Draws skin and gel, too.
     """
 
-    def but(name: str, says: str, *, shared: bool = False, **changes) -> Twin:
+    def but(name: str, says: str, *, shared: bool = False, **changes: Any) -> Twin:
         return replace(full, name=f"sim_{name}", says=says, contacts=full.contacts if shared else name, **changes)
 
     wide = every_tolerance.model_copy(update={"friction": full.randomisation.friction})

@@ -2,10 +2,10 @@
 
 import csv
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from training.estimator import PoseEstimator
 from training.evaluate import judge, predict_rows_of, rows_to_judge
 from training.models import model_named, recipe_of, variant_named
 from training.run import RunConfig, is_finished, train_run
+from training.studies.telling import epoch_step
+from twin.progress import Progress, silent, stage
 
 SHOWN = (
     *("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters"),
@@ -22,7 +24,7 @@ SHOWN = (
 
 
 @dataclass(frozen=True)
-class Plan:
+class PlannedRun:
     """One run of the study.
 
     Attributes
@@ -41,7 +43,7 @@ class Plan:
         return f"{self.name}-{self.config.labels}-{self.config.seed}"
 
 
-def plan_run(name: str, *, labels: str, seed: int, split: int, epochs: int | None = None) -> Plan:
+def plan_run(name: str, *, labels: str, seed: int, split: int, epochs: int | None = None) -> PlannedRun:
     """What a model's name stands for.
 
     Raises
@@ -51,18 +53,13 @@ def plan_run(name: str, *, labels: str, seed: int, split: int, epochs: int | Non
     """
     model, variant = variant_named(name)
     recipe = recipe_of(model.name, epochs=epochs, **variant.recipe)
-    return Plan(name, RunConfig(model.name, recipe, labels, seed, split, size=dict(variant.size)))
+    return PlannedRun(name, RunConfig(model.name, recipe, labels, seed, split, size=dict(variant.size)))
 
 
 def train_all(
-    plans: list[Plan], data: Dataset, out: Path, *, max_minutes: float | None, device: str = "cpu", bar: Callable
+    plans: list[PlannedRun], data: Dataset, out: Path, *, max_minutes: float | None, device: str = "cpu", progress: Progress = silent
 ) -> dict[str, float]:
     """Train every run, or continue it; the time left is shared evenly among the runs still to come.
-
-    Parameters
-    ----------
-    bar : callable
-        ``bar(title)`` is a context that yields ``train_run``'s ``progress``.
 
     Returns
     -------
@@ -81,16 +78,22 @@ def train_all(
             if share <= 0:
                 continue
         begun = monotonic()
-        with bar(plan.name) as progress:
-            train_run(plan.config, data, folder, max_minutes=share, device=device, progress=progress)
+        with stage(progress, plan.name) as step:
+            train_run(plan.config, data, folder, max_minutes=share, device=device, progress=epoch_step(step))
         spent[plan.folder] = (monotonic() - begun) / 60
     return spent
 
 
-def table_row(plan: Plan, data: Dataset, out: Path, minutes: float | None) -> dict:
+def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None) -> dict[str, Any]:
     """What became of one run: errors on the rows kept out of training, or only that there was no time for it."""
     folder = out / plan.folder
-    row: dict = {"model": plan.name, "seed": plan.config.seed, "labels": plan.config.labels, "minutes_now": minutes, "state": "not begun"}
+    row: dict[str, Any] = {
+        "model": plan.name,
+        "seed": plan.config.seed,
+        "labels": plan.config.labels,
+        "minutes_now": minutes,
+        "state": "not begun",
+    }
     if not (folder / "weights.pt").is_file():
         return row
     estimator = PoseEstimator.load(folder)
@@ -122,13 +125,13 @@ def error_columns(data: Dataset) -> list[str]:
     return [f"{name}_{kind}" for kind in ("raw", "corrected") for name in data.targets.names]
 
 
-def read_curves(folder: Path) -> list[dict]:
+def read_curves(folder: Path) -> list[dict[str, float]]:
     """The learning curve of a run: one dict of numbers an epoch, networks one after the other."""
     with (folder / "curves.csv").open(newline="") as file:
         return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
 
-def ordering(rows: list[dict], key: str) -> list[tuple[str, float, float]]:
+def ordering(rows: list[dict[str, Any]], key: str) -> list[tuple[str, float, float]]:
     """Models by their mean over seeds of a column, best first: name, mean, spread between seeds (largest less least)."""
     values: dict[str, list[float]] = {}
     for row in rows:

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from training.dataset import Dataset
-from training.study.contacts import AreaChange, contacts_figure
-from training.study.models import Plan, error_columns, ordering, read_curves
+from training.studies.tac_vgnn.contacts import AreaChange, contacts_figure
+from training.studies.tac_vgnn.models import PlannedRun, error_columns, ordering, read_curves
 from training.targets import unit_of
 from twin.report.charts import new_figure, plain_log, sized_figure, write_chart
 from twin.report.numbers import number
@@ -47,7 +47,7 @@ def draw_efficiency(path: Path, rows: list[dict]) -> Path:
     return write_chart(path, lambda: _efficiency_figure(rows))
 
 
-def draw_curves(path: Path, plans: list[Plan], folder: Path) -> Path:
+def draw_curves(path: Path, plans: list[PlannedRun], folder: Path) -> Path:
     """Error on the watched tenth of the training rows against epochs and against time, of every run that has begun."""
     begun = [plan for plan in plans if (folder / plan.folder / "curves.csv").is_file()]
     return write_chart(path, lambda: _curves_figure(begun, folder))
@@ -169,7 +169,7 @@ def _efficiency_figure(rows: Sequence[Mapping]) -> Figure:
     return figure
 
 
-def _curves_figure(plans: Sequence[Plan], folder: Path) -> Figure:
+def _curves_figure(plans: Sequence[PlannedRun], folder: Path) -> Figure:
     figure, axes = new_figure(2, panel_inch=5)
     names = list(dict.fromkeys(plan.name for plan in plans))
     labelled: set[str] = set()

@@ -1,13 +1,15 @@
 """The paper's first table: size of each kind of graph, and the time to make it from found pins."""
 
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from training.dataset import PinTable
 from twin.preprocess import make_graph
+from twin.preprocess.graph import GraphKind
 
-KINDS = ("knn", "delaunay", "voronoi")
+KINDS: tuple[GraphKind, ...] = ("knn", "delaunay", "voronoi")
 TIMED = 200  # graphs
 # directed edges and seconds of Table I, by pins and kind
 PAPER = {
@@ -16,7 +18,7 @@ PAPER = {
 }  # fmt: skip
 
 
-def compare_graphs(pins: PinTable) -> list[dict]:
+def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
     """One row for each kind of graph: nodes, features, directed edges without contact and over frames, ms (median, this machine)."""
     outmost, rest = pins.reference.outmost, pins.reference.pins_px
     chosen = np.linspace(0, len(pins) - 1, min(TIMED, len(pins))).astype(int)

@@ -5,6 +5,7 @@ bottom of the sensor, each 2 and 4 mm beyond first touch. Beside them recorded f
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,6 +16,7 @@ from training.dataset import Dataset
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.preprocess import Pipeline, make_graph
+from twin.progress import Step
 from twin.report.charts import new_figure
 from twin.report.plots import draw_area_change
 from twin.simulator import Simulator
@@ -56,7 +58,7 @@ class AreaChange:
     rest_area_px2: np.ndarray
     source: str = "twin"
 
-    def figures(self) -> dict:
+    def figures(self) -> dict[str, Any]:
         """Percent by which areas grew, where (px from the middle, weighted by growth), and of how many pins."""
         change = 100 * (self.graph.area_px2 / self.rest_area_px2 - 1)
         grown = np.maximum(change, 0)
@@ -73,7 +75,14 @@ class AreaChange:
         }
 
 
-def twin_contacts(spec: SensorSpec, form: Form, *, depths_mm=DEPTHS_MM, names=tuple(CONTACTS), progress=None) -> list[AreaChange]:
+def twin_contacts(
+    spec: SensorSpec,
+    form: Form,
+    *,
+    depths_mm: tuple[float, ...] = DEPTHS_MM,
+    names: tuple[str, ...] = tuple(CONTACTS),
+    progress: Step | None = None,
+) -> list[AreaChange]:
     """Press, render, find pins, tessellate: every contact at every depth.
 
     Raises
@@ -83,7 +92,7 @@ def twin_contacts(spec: SensorSpec, form: Form, *, depths_mm=DEPTHS_MM, names=tu
     """
     simulator, pipeline = Simulator(spec), Pipeline(spec, form)
     rest = pipeline(simulator.shoot_rest(form).frame)
-    if not rest.valid:
+    if not rest.valid or rest.graph is None:
         raise TwinError(f"{spec.name}: pins of the rendered frame without contact not found: {rest.reason}")
     found = []
     for name in names:
@@ -93,7 +102,7 @@ def twin_contacts(spec: SensorSpec, form: Form, *, depths_mm=DEPTHS_MM, names=tu
             poses = plan_path(spec.geometry, build_field(thing), ContactPose(indent_mm=depth, offset_mm=(aside_mm, 0.0))).poses
             state = [state for _, state in simulator.solver.path(thing, ContactPath(_turned(turn_deg) @ poses))][-1]
             seen = pipeline(simulator.shoot(state, form=form).frame)
-            if not seen.valid:
+            if not seen.valid or seen.graph is None:
                 raise TwinError(f"{spec.name}, {name}, {depth:g} mm: {seen.reason}")
             found.append(AreaChange(name, depth, seen.graph, rest.graph.area_px2))
             if progress:

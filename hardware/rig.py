@@ -1,6 +1,8 @@
 """The composition root of live work: the one place that decides what is simulated, recorded or real."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +18,7 @@ from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SHIPPED_LIMITS, load_limits
-from hardware.step import Estimator, LoopSettings
+from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
 from twin.errors import RenderError
@@ -27,7 +29,7 @@ from twin.store import cached_arrays
 from twin.types import Form, Frame
 
 TWIN = "twin"
-SHADING_QUALITY = "standard"
+SHADING_QUALITY: Literal["standard"] = "standard"
 FRAME_S, TWIN_FRAME_S = 5.0, 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 
@@ -119,13 +121,14 @@ def build_rig(
     """
     form = form or (Form.RECORDING if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
-    device = open_arm(arm)
+    device: Arm = open_arm(arm)
     simulated = isinstance(device, SimulatedArm)
     if simulated and camera == TWIN and at_once:
         device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
     if not simulated or limits is not None:
         kind = arm.partition(":")[0]
-        device = SafeArm(device, load_limits(limits or kind)) if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file() else device
+        if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file():
+            device = SafeArm(device, load_limits(limits or kind))
     twin = None
     if camera == TWIN:
         preview = drawn(sensor, form, plain_light)
@@ -156,9 +159,15 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     return preview
 
 
-def servo_loop(rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopSettings, on_step=None) -> ServoLoop:
+def servo_loop(
+    rig: Rig,
+    servo: ServoSpec,
+    estimator: Estimator,
+    settings: LoopSettings,
+    on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None,
+) -> ServoLoop:
     """The loop on a connected rig; a safe arm is told what the sensor feels, and retreats in its own way."""
-    loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[_no_full_turn(rig.arm)], on_step=on_step)
+    loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[no_full_turn(rig.arm)], on_step=on_step)
     loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
         loop.sense = lambda depth_mm, time_s: rig.arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
@@ -182,7 +191,7 @@ def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[
     return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
 
 
-def _no_full_turn(arm: Arm):
+def no_full_turn(arm: Arm) -> Guard:
     """A guard: where an arm of four axes would have to turn back by a full turn at the object, it ends."""
     kinematics = getattr(arm, "kinematics", None)
 

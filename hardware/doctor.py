@@ -1,0 +1,86 @@
+"""What is there on this machine, what is missing, and the remedy."""
+
+import importlib.metadata
+import platform
+import sys
+from dataclasses import dataclass
+
+from hardware.devices import Device, cameras, serial_ports
+from twin.errors import RenderError
+from twin.optics.variant import report
+from twin.report.skin3d import probe_offscreen
+
+PACKAGES = ("mitsuba", "drjit", "pyvista", "vtk", "trimesh", "torch", "scikit-image", "pyserial", "opencv-python-headless", "numba")
+DEVICES = {
+    "camera": "plug in the sensor's USB camera; in a container pass --device /dev/video0",
+    "serial": "plug in the arm's USB cable; the user must be in the group 'dialout'",
+}
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What was found.
+
+    Attributes
+    ----------
+    packages : dict of str to str
+        Versions; "" for a package that is missing.
+    rendering : list of str
+        Lines on Mitsuba's variants, LLVM and the GPU.
+    can_render : bool
+        Whether anything can be rendered here.
+    plain_pictures : str
+        Why VTK draws no 3D pictures, which are drawn plainly then; "" if it does.
+    devices : dict of str to list of Device
+        By kind: ``camera`` and ``serial``.
+    """
+
+    packages: dict[str, str]
+    rendering: list[str]
+    can_render: bool
+    plain_pictures: str
+    devices: dict[str, list[Device]]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        lines = [f"Python      {platform.python_version()} ({sys.executable}) on {platform.system()} {platform.machine()}"]
+        lines += [f"{name:11} {version or 'MISSING; run ' + repr('make setup')}" for name, version in self.packages.items()]
+        lines += ["", "Rendering (Mitsuba)", *(f"  {line}" for line in self.rendering)]
+        lines += ["", "3D pictures (VTK offscreen)", f"  {'PLAIN ONLY: ' + self.plain_pictures if self.plain_pictures else 'works'}"]
+        lines += ["", "Devices"]
+        for kind, found in self.devices.items():
+            lines += [f"  {kind}: {device.node} ({device.description})" for device in found]
+            if not found:
+                lines.append(f"  {kind}: none found; {DEVICES[kind]}")
+        return lines
+
+
+def examine_machine() -> Machine:
+    """Look for packages, Mitsuba's variants, LLVM, a GPU, offscreen 3D, cameras and serial ports. Opens no device."""
+    rendering, can_render = _rendering()
+    devices = dict(zip(DEVICES, (cameras(), serial_ports()), strict=True))
+    return Machine({name: _version(name) for name in PACKAGES}, rendering, can_render, probe_offscreen(), devices)
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def _rendering() -> tuple[list[str], bool]:
+    try:
+        found = report()
+    except RenderError as error:
+        return [f"NOT POSSIBLE: {error}"], False
+    lines = [f"variants installed: {', '.join(found['variants'])}"]
+    for channels, used in found["used"].items():
+        lines.append(f"for {channels} cameras: {used['variant'] or 'NONE'} ({used['reason']})")
+    llvm = found["llvm"]
+    lines.append(f"LLVM: {llvm['version']} at {llvm['path']}" if llvm else f"LLVM: none that works; {found['remedy']}")
+    lines += [f"  not used: {rejected['path']}: {rejected['reason']}" for rejected in found["llvm_rejected"]]
+    lines.append(f"GPU: {'yes' if found['gpu'] else 'none used'} ({found['gpu_reason']})")
+    if found["override"]:
+        lines.append(f"TACTIP_VARIANT={found['override']} is set")
+    return lines, any(used["variant"] for used in found["used"].values())

@@ -1,0 +1,88 @@
+"""Running an emulator until somebody ends it."""
+
+import signal
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from hardware.emulators.magician import MagicianEmulator
+from hardware.emulators.mg400 import OLD_FIRMWARE, Mg400Emulator
+
+CHECK_S = 0.5  # between two looks at whether the emulator failed
+
+
+def say(line: str) -> None:
+    """Print a line at once, so that a program that waits for it on a pipe goes on."""
+    print(line, flush=True)
+
+
+def run_until_told(
+    device: AbstractContextManager[Any],
+    ready: Callable[[], str],
+    failure: Callable[[], Exception | None] = lambda: None,
+    *,
+    on_ready: Callable[[str], None] = say,
+) -> None:
+    """Run a device until SIGTERM or Ctrl-C, or until it fails. Only in the main thread.
+
+    Parameters
+    ----------
+    device : context manager
+        Listens while it is entered.
+    ready : callable
+        Tells what listens, and where, once it does.
+    failure : callable
+        Tells what the device ended with, or None while it runs. That error is raised.
+    on_ready : callable, optional
+        Called once with ``ready ...`` when the device listens; by default it is printed.
+    """
+    ends = {signal.SIGTERM, signal.SIGINT}
+    told: list[bool] = []
+    handlers = {end: signal.signal(end, lambda *_: told.append(True)) for end in ends}  # libraries' threads get signals, too
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # waited for: nothing is ever interrupted halfway
+    try:
+        with device:
+            on_ready(f"ready {ready()}")
+            while not told and signal.sigtimedwait(ends, CHECK_S) is None:
+                if (error := failure()) is not None:
+                    raise error
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for end, handler in handlers.items():
+            signal.signal(end, handler)
+
+
+def emulate_mg400(
+    *,
+    host: str = "127.0.0.1",
+    port_offset: int | None = 0,
+    faults: tuple[str, ...] = (),
+    firmware: str = "1.7.0",
+    lenient: bool = False,
+    time_scale: float = 1.0,
+    on_ready: Callable[[str], None] = say,
+) -> None:
+    """Emulate a Dobot MG400 until told to end; see ``Mg400Emulator``.
+
+    Parameters
+    ----------
+    lenient : bool
+        As firmware 1.5.5, whatever ``firmware`` says: bare echoes, no reply to moves.
+    """
+    version = OLD_FIRMWARE if lenient else firmware
+    arm = Mg400Emulator(host=host, port_offset=port_offset, faults=faults, firmware=version, time_scale=time_scale)
+    run_until_told(arm, lambda: f"mg400 {host} {' '.join(str(port) for port in arm.ports.values())}", on_ready=on_ready)
+
+
+def emulate_magician(
+    *, link: Path | None = None, faults: tuple[str, ...] = (), time_scale: float = 1.0, on_ready: Callable[[str], None] = say
+) -> None:
+    """Emulate a Dobot Magician on a pseudo-terminal until told to end; see ``MagicianEmulator``."""
+    arm = MagicianEmulator(link=link, faults=faults, time_scale=time_scale)
+    run_until_told(arm, lambda: f"magician {link or arm.device}", on_ready=on_ready)
+
+
+def fault_lines(known: dict[str, tuple[float | None, str]]) -> list[str]:
+    """The faults that an emulator knows, with their default values and what they do, for people."""
+    return [f"{name + ('' if default is None else f'={default:g}'):22} {meaning}" for name, (default, meaning) in known.items()]

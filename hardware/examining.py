@@ -1,0 +1,82 @@
+"""Whether the sensor in hand is well: frames of a camera, or of what was recorded, examined."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from hardware.cameras.choose import open_camera
+from hardware.cameras.source import await_frame
+from scenes import SensorSpec
+from twin.detectors import DetectorSpec
+from twin.errors import FrameError
+from twin.health import Finding, Grade, examine
+from twin.progress import Progress, silent, stage
+from twin.recordings import evenly_read, open_recording
+from twin.types import Form, Frame
+
+LIMIT = 20  # frames that are looked at
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What was found."""
+
+    findings: list[Finding]
+
+    @property
+    def bad(self) -> bool:
+        """Whether something is bad."""
+        return any(found.verdict is Grade.BAD for found in self.findings)
+
+    def lines(self) -> list[str]:
+        """For people: each finding, and below it what to do."""
+        lines = []
+        for found in self.findings:
+            lines.append(f"{found.verdict.upper():5} {found.name:10} {found.text}")
+            if found.remedy:
+                lines.append(f"      -> {found.remedy}")
+        return lines
+
+
+def examine_sensor(
+    source: str,
+    sensor: SensorSpec,
+    *,
+    form: Form | None = None,
+    detector: DetectorSpec | None = None,
+    limit: int = LIMIT,
+    progress: Progress = silent,
+) -> Examination:
+    """Examine at most ``limit`` frames of a camera or a recording.
+
+    Parameters
+    ----------
+    source : str
+        As ``open_camera`` takes it.
+    form : Form, optional
+        Of the frames; told by size and content by default.
+    detector : DetectorSpec, optional
+        What 'twin tune' found; the specification's own by default.
+
+    Raises
+    ------
+    FrameError
+        The detector is not of method ``twin``, or there are no frames.
+    DeviceError
+        There is no such camera, or it gives nothing.
+    """
+    if detector is not None and detector.method != "twin":
+        raise FrameError(
+            f"{detector.name}: tuned for method '{detector.method}', --pipeline takes method 'twin'; run 'twin tune' without --method"
+        )
+    frames = frames_of(source, sensor, form, limit)
+    with stage(progress, "frames") as step:
+        return Examination(examine(frames, sensor, detector, progress=step))
+
+
+def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: int) -> list[Frame]:
+    """The next ``limit`` frames of a camera, or as many, evenly spread, of what was recorded."""
+    camera = open_camera(source, sensor, form)
+    if not camera.is_live:
+        return evenly_read(open_recording(Path(source), sensor, form), limit)
+    with camera:
+        return [await_frame(camera) for _ in range(limit)]

@@ -1,0 +1,226 @@
+"""One run of surface following: from a plan to its results, which are also written to disk."""
+
+import json
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hardware.at_rest import FIRST, counting_from_first, given_frame
+from hardware.errors import DeviceError
+from hardware.loop import ServoLoop
+from hardware.rig import Rig, build_rig, servo_loop, steps_round
+from hardware.servo_plots import trajectory_figure
+from hardware.session import SessionWriter, plain
+from hardware.step import Estimate, LoopSettings, SensorModel, StepRecord
+from hardware.timing import Timing
+from hardware.trajectory import Measures, Trajectory, measure, trajectory_of, write_csv
+from scenes import ObjectSpec, ServoSpec, load_experiment
+from twin.errors import TwinError
+from twin.progress import Progress, Step, silent, stage
+from twin.report.charts import save_figure
+from twin.types import Frame
+
+GIVE_UP_S = 5.0  # without a usable frame for so long, following ends
+STREAM_HZ = 10.0  # decisions a second that the loop's settings name where each waits for the move before, and none is timed
+
+
+@dataclass(frozen=True)
+class FollowPlan:
+    """What to follow, with what. The sensor and the form of its frames are the model's.
+
+    Attributes
+    ----------
+    stimulus : ObjectSpec
+        The object.
+    servo : ServoSpec
+        Gains, speeds and where the object stands.
+    camera, arm : str
+        As ``build_rig`` takes them.
+    steps : int or None
+        None: once around the object.
+    stream_hz : float or None
+        Decisions a second; None: each waits for the move before.
+    limits : str or None
+        Safety limits, by name or file; those of the arm's kind by default.
+    record : bool
+        Keep every frame and step in a session.
+    seed : int
+        Of the twin's noise.
+    plain_light : bool
+        The twin's frames without path tracing; see ``build_rig``.
+    known_place : bool
+        The object stands where the servo's placement has it, so that there is a truth to measure against (always so in the twin).
+    at_rest : str
+        What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none``, or a file.
+    """
+
+    stimulus: ObjectSpec
+    servo: ServoSpec
+    camera: str = "twin"
+    arm: str = "simulated"
+    steps: int | None = None
+    stream_hz: float | None = None
+    limits: str | None = None
+    record: bool = False
+    seed: int = 0
+    plain_light: bool = False
+    known_place: bool = False
+    at_rest: str = FIRST
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What came of it; ``failure`` says why it ended early ("" if it did not)."""
+
+    measures: Measures
+    timing: Timing
+    path: Trajectory
+    outline_mm: np.ndarray
+    failure: str
+    notes: list[str]
+    written: list[Path] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """For people; what is not known is left out."""
+        m = self.measures
+        smooth = {"smoothness S": m.smoothness, "local": m.local_smoothness, "jerk in mm per step^3": m.jerk}
+        out = [
+            f"{m.steps} steps on fresh frames",
+            ", ".join(f"{what} {value:.3f}" for what, value in smooth.items() if np.isfinite(value)),
+            *self.timing.lines(),
+            *(f"note: {note}" for note in self.notes),
+        ]
+        if np.isfinite(m.completed):
+            out[0] += f", {m.completed:.0%} of the way, contact lost {m.lost_contacts:g} times"
+            out[2:2] = [
+                f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
+                f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
+            ]
+        else:
+            out[0] += "; where the object truly stands is not known, so nothing is measured against it ('--known-place' says it is)"
+        return out + ([f"ended early: {self.failure}"] if self.failure else [])
+
+
+def follow(
+    plan: FollowPlan, model: SensorModel, out: Path, *, about: dict[str, Any] | None = None, progress: Progress = silent
+) -> Followed:
+    """Follow an object and write what came of it to ``out``; an end before the last step is a result, too.
+
+    Parameters
+    ----------
+    model : SensorModel
+        Tells the pose in each frame.
+    about : dict, optional
+        What to keep beside the measures, such as the model's name (JSON).
+
+    Raises
+    ------
+    TwinError
+        It could not be begun, or ended before its first step.
+    """
+    rest = given_frame(plan.at_rest, model)
+    if rest is not None:
+        model = model.at_rest(rest)
+    rig = _rig_of(plan, model)
+    round_steps, wanted_mm = steps_round(rig.placed, plan.servo, 1.0)
+    steps = plan.steps or round_steps
+    if plan.steps:
+        wanted_mm = min(wanted_mm, plan.steps * plan.servo.feed_mm)
+    told = _told(plan, model) | (about or {})
+    failure, followed = "", None
+    with rig, stage(progress, f"following the {plan.stimulus.name}") as step, ExitStack() as stack:
+        first = rig.await_frame()
+        loop = servo_loop(rig, plan.servo, model, _settings(plan, rig, steps))
+        loop.require_labels(model(first).names)
+        session = stack.enter_context(SessionWriter(out / "session", told)) if plan.record else None
+        if session is not None and rest is not None:
+            session.keep_rest(rest)
+        loop.on_step = partial(_note_step, session, step, steps)
+        if plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live:
+            loop.take_rest = partial(_take_rest, session, model)
+        try:
+            loop.run(rig.placed.start_pose(plan.servo.indent_mm))
+        except TwinError as error:
+            if not loop.records:
+                raise
+            failure = str(error)
+        finally:  # after Ctrl-C, too: what was followed so far is kept
+            if loop.records:
+                followed = _results(plan, rig, loop, wanted_mm, failure)
+                followed.written.extend(_write(out, plan, model, followed, told))
+    if followed is None:
+        raise DeviceError(f"{rig.source.name}: ended before the first step, nothing was followed; give a camera or a longer recording")
+    return followed
+
+
+def _rig_of(plan: FollowPlan, model: SensorModel) -> Rig:
+    return build_rig(
+        model.sensor,
+        plan.stimulus,
+        plan.servo.placement,
+        load_experiment(plan.servo.experiment),
+        camera=plan.camera,
+        arm=plan.arm,
+        form=model.form,
+        limits=plan.limits,
+        seed=plan.seed,
+        plain_light=plan.plain_light,
+        at_once=plan.stream_hz is None,
+    )
+
+
+def _settings(plan: FollowPlan, rig: Rig, steps: int) -> LoopSettings:
+    return LoopSettings(
+        steps,
+        blocking=plan.stream_hz is None,
+        period_s=1.0 / (plan.stream_hz or STREAM_HZ),
+        frame_timeout_s=rig.frame_timeout_s,
+        give_up_s=GIVE_UP_S,
+    )
+
+
+def _told(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
+    """What is kept beside the results."""
+    names = {"sensor": model.sensor.name, "object": plan.stimulus.name, "camera": plan.camera, "arm": plan.arm}
+    return names | {"servo": plan.servo.model_dump()}
+
+
+def _note_step(session: SessionWriter | None, step: Step, steps: int, record: StepRecord, frame: Frame, estimate: Estimate) -> None:
+    if session is not None:
+        session.append(frame, record.plain())
+    step(record.index + 1, steps)
+
+
+def _take_rest(session: SessionWriter | None, model: SensorModel, frame: Frame) -> SensorModel:
+    """Keep the frame that was taken clear of the object, and count pins from it."""
+    if session is not None:
+        session.keep_rest(frame)
+    return counting_from_first(model, frame)
+
+
+def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, failure: str) -> Followed:
+    path = trajectory_of(loop.records, rig.mounting, rig.placed if rig.knows_truth or plan.known_place else None)
+    measures = measure(path, indent_mm=plan.servo.indent_mm, angle_deg=plan.servo.angle_deg, wanted_mm=wanted_mm)
+    flat = rig.placed.outline()
+    turn, origin = rig.placed.T_base_object[:2, [0, 2]], rig.placed.T_base_object[:2, 3]
+    return Followed(measures, loop.timing(), path, flat @ turn.T + origin, failure, loop.notes)
+
+
+def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, told: dict[str, Any]) -> list[Path]:
+    figure = trajectory_figure(
+        followed.path, followed.measures, f"{plan.stimulus.name}, {model.sensor.name}", outline_mm=followed.outline_mm
+    )
+    content = {
+        **told,
+        "measures": asdict(followed.measures),
+        "timing": asdict(followed.timing),
+        "failure": followed.failure,
+        "notes": followed.notes,
+    }
+    measures = out / "measures.json"
+    measures.write_text(json.dumps(plain(content), indent=1) + "\n")
+    return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]

@@ -1,0 +1,125 @@
+"""Surface following of several objects with several models, compared."""
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hardware.following import Followed, FollowPlan, follow
+from hardware.servo_plots import comparison_figure
+from hardware.step import SensorModel
+from scenes import ObjectSpec, ServoSpec
+from twin.errors import TwinError
+from twin.progress import Progress, silent
+from twin.report.charts import save_figure
+
+# the measures that are printed, with their headings
+SHOWN = {
+    "smoothness": "S",
+    "local_smoothness": "local S",
+    "path_error_mm": "path mm",
+    "depth_error_mm": "depth mm",
+    "angle_error_deg": "angle deg",
+    "completed": "way",
+    "lost_contacts": "lost",
+}
+
+
+@dataclass(frozen=True)
+class ServoStudyPlan:
+    """What is compared.
+
+    Attributes
+    ----------
+    models : mapping of str to SensorModel
+        By the name that the results give them.
+    objects : tuple of ObjectSpec
+    servo : ServoSpec
+    steps : int or None
+        For each object; None: once around it.
+    seed : int
+        Of the twin's noise.
+    plain_light : bool
+        See ``build_rig``.
+    """
+
+    models: Mapping[str, SensorModel]
+    objects: tuple[ObjectSpec, ...]
+    servo: ServoSpec
+    steps: int | None = None
+    seed: int = 0
+    plain_light: bool = False
+
+
+@dataclass(frozen=True)
+class ServoStudy:
+    """What came of it.
+
+    Attributes
+    ----------
+    found : dict
+        By model and object: a run, or why it did not make a single step.
+    written : list of Path
+    """
+
+    found: dict[tuple[str, str], Followed | str]
+    written: list[Path]
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """``model``, ``object``, every measure and ``failure`` of each run that made a step."""
+        return [
+            {"model": model, "object": name, **asdict(run.measures), "failure": run.failure}
+            for (model, name), run in self.found.items()
+            if isinstance(run, Followed)
+        ]
+
+    def lines(self) -> list[str]:
+        """The comparison as a table for people."""
+        wide = max((len(model) for model, _ in self.found), default=0)
+        lines = [f"{'model':{wide}} {'object':10}" + "".join(f"{head:>11}" for head in SHOWN.values())]
+        for (model, name), run in self.found.items():
+            lines.append(f"{model:{wide}} {name:10}{f'  failed: {run}' if isinstance(run, str) else _cells(run)}")
+        return lines
+
+
+def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent) -> ServoStudy:
+    """Follow each object with each model, in the twin; each run and the comparison are written to ``out``.
+
+    Writes a folder for each model and object as ``follow`` writes it, ``study.csv`` and ``study.png``. A run that can't make a single
+    step is a result of the study, too.
+    """
+    found: dict[tuple[str, str], Followed | str] = {}
+    for label, model in plan.models.items():
+        for thing in plan.objects:
+            asked = FollowPlan(thing, plan.servo, steps=plan.steps, seed=plan.seed, plain_light=plan.plain_light)
+            folder = out / re.sub(r"[^\w.-]+", "_", label) / thing.name
+            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                found[label, thing.name] = follow(asked, model, folder, about={"model": label})
+            except TwinError as error:
+                found[label, thing.name] = str(error)
+            progress("objects followed", len(found), len(plan.models) * len(plan.objects))
+    made = ServoStudy(found, [])
+    made.written.append(_write_rows(out / "study.csv", made.rows))
+    pictures = [(*key, run.path, run.outline_mm) for key, run in found.items() if isinstance(run, Followed)]
+    if pictures:
+        made.written.append(save_figure(out / "study.png", comparison_figure(pictures)))
+    return made
+
+
+def _write_rows(path: Path, rows: list[dict[str, Any]]) -> Path:
+    names = list(rows[0]) if rows else ["model", "object", "failure"]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(names)
+        writer.writerows(row.values() for row in rows)
+    return path
+
+
+def _cells(run: Followed) -> str:
+    measures = asdict(run.measures)
+    cells = (f"{measures[key]:>11.0%}" if key == "completed" else f"{measures[key]:>11.4g}" for key in SHOWN)
+    return "".join(cells) + (f"  ended early: {run.failure}" if run.failure else "")

@@ -1,1 +1,0 @@
-"""A model trained on some objects, judged on others."""

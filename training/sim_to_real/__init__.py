@@ -1,1 +1,0 @@
-"""Trained in the twin, tested on real frames."""

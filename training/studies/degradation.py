@@ -1,0 +1,109 @@
+"""How far a sensor may degrade before its pins are lost, and what trained models make of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes import SensorSpec
+from training.estimator import PoseEstimator, digest_of
+from twin.camera import record
+from twin.progress import Progress, silent
+from twin.robustness.envelope import Envelope
+from twin.robustness.plan import SweepPlan
+from twin.robustness.run import check_pipelines, real_study, rendered_study
+from twin.types import Form, Frame
+
+PIPELINES = ("twin", "legacy")
+LIMIT = 12  # real frames
+Estimates = tuple[np.ndarray, tuple[str, ...], bool]  # values, their units, whether they are valid
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is degraded, and what is judged.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    pipelines : tuple of str
+        Methods, or files of 'twin tune'.
+    models : tuple of Path
+        Folders of runs.
+    sweep : SweepPlan
+        Which conditions, and how severe.
+    frames : Path or None
+        Real frames instead of rendered ones.
+    limit : int
+        At most so many of them, evenly spread.
+    rendered : bool
+        Raw real frames are shown beside rendered ones.
+    jobs : int
+        Processes.
+    """
+
+    sensor: SensorSpec
+    pipelines: tuple[str, ...] = PIPELINES
+    models: tuple[Path, ...] = ()
+    sweep: SweepPlan = field(default_factory=SweepPlan)
+    frames: Path | None = None
+    limit: int = LIMIT
+    rendered: bool = True
+    jobs: int = 1
+
+
+@dataclass(frozen=True)
+class Result:
+    """Where each pipeline and model fails under each condition, and the files, the page first."""
+
+    envelopes: list[Envelope]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """For people: by pipeline, the narrowest first."""
+        found = sorted(self.envelopes, key=lambda each: (each.pipeline, each.width))
+        return [f"{e.pipeline:10} {e.case.name:18} {e.label}{f' ({e.measure})' if e.measure else ''}" for e in found]
+
+
+def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
+    """Sweep every condition from nothing to severe, judge pipelines and models on every frame, and write what was found.
+
+    ``out`` exists. What lies there from an earlier call is not computed again where it depends on nothing else.
+
+    Raises
+    ------
+    TwinError
+        A pipeline or model is not there, two have the same name, or no condition can be applied to the frames.
+    """
+    pipelines, runs = list(plan.pipelines), plan.models
+    check_pipelines(pipelines, tuple(each.name for each in runs))
+    options: dict[str, Any] = {"jobs": plan.jobs, "progress": progress}
+    if runs:
+        load_models(runs, plan.sensor)  # each process loads its own: what can't be is told here, and once
+        options["models"] = partial(load_models, runs, plan.sensor)
+        options["model_digests"] = {each.name: digest_of(each) for each in runs}
+    cases, severities = plan.sweep.cases(), plan.sweep.severities()
+    if plan.frames is None:
+        return Result(*rendered_study(plan.sensor, pipelines, cases, severities, out, **options))
+    return Result(*real_study(plan.sensor, plan.frames, plan.limit, pipelines, cases, severities, out, beside=plan.rendered, **options))
+
+
+def load_models(runs: tuple[Path, ...], sensor: SensorSpec) -> dict[str, Callable[[Frame], Estimates]]:
+    """Models by name, as a sweep calls them: raw frames are recorded first where the model was trained on recordings."""
+    return {each.name: partial(_estimates, _checked(each, sensor), sensor) for each in runs}
+
+
+def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
+    estimator = PoseEstimator.load(run)
+    estimator.check(sensor, estimator.form)
+    return estimator
+
+
+def _estimates(estimator: PoseEstimator, sensor: SensorSpec, frame: Frame) -> Estimates:
+    if frame.form == Form.RAW and estimator.form == Form.RECORDING and sensor.recording is not None:
+        frame = replace(frame, image=record(frame.image, sensor.recording), form=Form.RECORDING)
+    found = estimator(frame)
+    return found.value, found.units, found.valid

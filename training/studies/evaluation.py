@@ -1,0 +1,113 @@
+"""How good a trained model is on labelled recordings, from the run's folder to tables and figures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from training.dataset import joined, load_dataset
+from training.estimator import PoseEstimator
+from training.evaluate import judge, predict_rows_of, rows_to_judge, time_frames, write_evaluation
+from training.recipes import TrainingError
+from training.robustness import judge_changes
+from twin.progress import Progress, silent, stage
+from twin.report.table import write_table
+
+ROWS, LABELS = ("validation", "all"), ("corrected", "raw")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What was found.
+
+    Attributes
+    ----------
+    metrics : dict
+        As ``metrics.json`` holds them.
+    changes : list of dict
+        Errors on changed images; none where they were not asked for.
+    units : dict of str to str
+        Of each label.
+    frames : int
+        That were judged.
+    problems : list of str
+        What is odd about the recordings.
+    written : list of Path
+    """
+
+    metrics: dict[str, Any]
+    changes: list[dict[str, Any]]
+    units: dict[str, str]
+    frames: int
+    problems: list[str]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        lines = [f"note: {problem}" for problem in self.problems]
+        for name, unit in self.units.items():
+            raw, corrected = self.metrics["raw"][name], self.metrics["corrected"][name]
+            lines.append(
+                f"{name}: mean error {corrected['mae']:.4g} {unit} against corrected labels, {raw['mae']:.4g} against raw; "
+                f"{100 * corrected['coverage_90']:.1f} % and {100 * raw['coverage_90']:.1f} % inside the 90 % intervals for them"
+            )
+        if self.metrics["leak_slope"] is not None:
+            lines.append(f"slope of the angle's error on move_6 where it was not executed: {self.metrics['leak_slope']:+.3f}")
+        ms = self.metrics["ms_per_frame"]
+        lines.append(f"{self.frames} frames" + ("" if ms is None else f", {ms:.1f} ms per frame (median, one thread)"))
+        for row in self.changes:
+            said = (f"{name} {row[f'{name}_mae']:.4g} ({100 * row[f'{name}_more']:+.1f} %)" for name in self.units)
+            lines.append(f"{row['change']}: {', '.join(said)}; {row['not_valid']} frames not valid")
+        return lines
+
+
+def evaluate_run(
+    run: str | Path,
+    recordings: Sequence[Path],
+    out: Path,
+    *,
+    rows: str = "validation",
+    labels: str = "corrected",
+    robustness: bool = False,
+    progress: Progress = silent,
+) -> Evaluation:
+    """Judge a trained model, and write what was found to an existing folder.
+
+    Parameters
+    ----------
+    run : path
+        As ``PoseEstimator.load`` takes it.
+    recordings : sequence of Path
+        Labelled; for ``validation`` all that the run was trained on.
+    rows : {"validation", "all"}
+        Those that were kept out of the run's training, or every one.
+    labels : {"corrected", "raw"}
+        The truth in ``predictions.csv`` and ``errors.png``.
+    robustness : bool
+        Also judge changed images.
+
+    Raises
+    ------
+    TrainingError
+        There is no such run, or an option has another value.
+    FrameError
+        The recordings are not of the run's sensor, or have no labels.
+    """
+    for value, allowed, option in ((rows, ROWS, "--rows"), (labels, LABELS, "--labels")):
+        if value not in allowed:
+            raise TrainingError(f"{option} must be {' or '.join(allowed)}, got {value!r}")
+    estimator, parts = PoseEstimator.load(run), []
+    for folder in recordings:
+        with stage(progress, f"frames of {folder.name}") as step:
+            parts.append(load_dataset(folder, estimator.sensor, estimator.names, form=estimator.form, progress=step))
+    found = joined(parts)
+    chosen = rows_to_judge(estimator, found, rows)
+    made = predict_rows_of(estimator, found, chosen)
+    metrics = {"model": estimator.model, "rows": rows, **judge(made, found, chosen), "ms_per_frame": time_frames(estimator, found)}
+    written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []
+    if robustness:
+        with stage(progress, "changed frames") as step:
+            changes = judge_changes(estimator, found, chosen, progress=step)
+        written.append(write_table(out / "robustness.csv", changes))
+    units = dict(zip(estimator.names, estimator.units, strict=True))
+    return Evaluation(metrics, changes, units, len(chosen), found.problems, written)

@@ -1,0 +1,94 @@
+"""The plan of the study of unseen objects: what is simulated, learnt and judged."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_experiment
+from training.dataset import Dataset, joined
+from training.generation import GenerationConfig
+from training.recipes import TrainingError
+from training.studies.sim_to_real.twins import contact_of
+from twin.types import FINE
+
+TESTS_APART = 1000  # of the draws, so that no contact is learnt and judged
+MIXED = "mixed"
+TIMES = 1.5  # the error on an unseen object over that on the first one: what is aimed at
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is simulated, learnt and judged.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    experiment : ExperimentSpec
+        Whose ranges of labels are judged. What is trained on is the experiment that it names as wider, else itself.
+    randomisation : RandomisationSpec
+    train, unseen : tuple of ObjectSpec
+        The first of ``train`` is the one that is also trained on alone.
+    count, tests : int
+        Contacts to train on, and to judge on, for each object.
+    seed, across : int
+    epochs : int or None
+        Of both trainings; None: the study's own number.
+    workers : int
+        Processes that simulate.
+    """
+
+    sensor: SensorSpec
+    experiment: ExperimentSpec
+    randomisation: RandomisationSpec
+    train: tuple[ObjectSpec, ...]
+    unseen: tuple[ObjectSpec, ...]
+    count: int = 100
+    tests: int = 50
+    seed: int = 0
+    across: int = FINE
+    epochs: int | None = None
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        names = [each.name for each in (*self.train, *self.unseen)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise TrainingError(f"{', '.join(twice)}: given twice; an object is either trained on or never seen")
+        if len(self.train) < 2 or not self.unseen:
+            raise TrainingError("give at least two objects to train on and one never seen")
+
+    @property
+    def wider(self) -> ExperimentSpec:
+        """The experiment that is trained on."""
+        return load_experiment(self.experiment.wider) if self.experiment.wider else self.experiment
+
+    @property
+    def alone(self) -> ObjectSpec:
+        """The object that is also trained on alone."""
+        return self.train[0]
+
+    def sets(self) -> list[tuple[str, GenerationConfig, int]]:
+        """Folder, configuration and number of contacts of every data set."""
+        learnt = [
+            (f"sim/{o.name}", self._config(o, self.wider, 0), self.count * (len(self.train) if o is self.alone else 1)) for o in self.train
+        ]
+        judged = [(f"tests/{o.name}", self._config(o, self.experiment, TESTS_APART), self.tests) for o in (*self.train, *self.unseen)]
+        return learnt + judged
+
+    def _config(self, thing: ObjectSpec, experiment: ExperimentSpec, apart: int) -> GenerationConfig:
+        return GenerationConfig(
+            sensor=self.sensor,
+            object=thing,
+            experiment=experiment,
+            randomisation=self.randomisation,
+            friction=thing.friction,
+            seed=self.seed + apart,
+            images="none",
+            states="all",
+            across=self.across,
+        )
+
+    def trained_on(self, sets: dict[str, Dataset]) -> dict[str, Dataset]:
+        """Data set of each model, from those of all folders: as many contacts for both."""
+        parts = [sets[f"sim/{thing.name}"] for thing in self.train]
+        first = parts[0].rows(np.flatnonzero(contact_of(parts[0]) < self.count))
+        return {MIXED: joined([first, *parts[1:]]), self.alone.name: parts[0]}

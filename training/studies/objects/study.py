@@ -1,0 +1,131 @@
+"""What training on several objects is worth on an object that was never touched, beside training on the first of them alone.
+
+All contacts are simulated, pins alone. Labels mean the same on every object (``twin.rig.touch``). Both models learn from as many
+contacts; every object's errors are those on contacts of its own that no model has seen.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes import ExperimentSpec
+from training.dataset import Dataset, load_dataset
+from training.estimator import PoseEstimator
+from training.evaluate import predict_rows_of
+from training.generation import GenerationConfig, generate
+from training.recipes import TrainingError
+from training.studies.objects.page import write_page
+from training.studies.objects.plan import MIXED, TIMES, Plan
+from training.studies.sim_to_real.steps import train_in_twin
+from training.studies.sim_to_real.twins import contact_of
+from twin.progress import Progress, silent, stage
+from twin.report.table import write_table
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of it.
+
+    Attributes
+    ----------
+    rows : list of dict
+        See ``table``.
+    verdicts : list of str
+        See the function of that name.
+    names : tuple of str
+        Of the labels.
+    written : list of Path
+    """
+
+    rows: list[dict[str, Any]]
+    verdicts: list[str]
+    names: tuple[str, ...]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """A line for each model and object, and the verdicts; for people."""
+        lines = []
+        for row in self.rows:
+            errors = ", ".join(f"{name} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name in self.names)
+            lines.append(f"{row['model']}, {row['object']} ({'seen' if row['seen'] else 'never seen'}): {errors}")
+        return lines + self.verdicts
+
+
+def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
+    """Simulate contacts of all objects, train both models, and judge them on contacts of every object.
+
+    Writes data sets, runs, ``objects.csv`` and ``index.html`` to ``out``. What lies there from an earlier call with the same plan is not
+    made again.
+
+    Raises
+    ------
+    DatasetError
+        A folder holds another data set, or contacts can't be made.
+    TrainingError
+        A folder holds another run, or no contact of an object lies within the ranges that are judged.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    sets = {folder: _simulated(plan, out / folder, folder, config, count, progress) for folder, config, count in plan.sets()}
+    runs = {}
+    for name, data in plan.trained_on(sets).items():
+        runs[name] = out / name
+        with stage(progress, name) as step:
+            train_in_twin(data, runs[name], seed=plan.seed, split=None, epochs=plan.epochs, progress=step)
+    names, rows = plan.experiment.targets, table(plan, runs, sets)
+    said, ranges = verdicts(plan, rows, names), plan.experiment.ranges()
+    page = write_page(out, plan=plan, names=names, ranges=ranges, rows=rows, verdicts=said)
+    return Result(rows, said, names, [write_table(out / "objects.csv", rows), page])
+
+
+def _simulated(plan: Plan, folder: Path, title: str, config: GenerationConfig, count: int, progress: Progress) -> Dataset:
+    with stage(progress, title) as step:
+        generate(folder, config, count, workers=plan.workers, progress=step)
+    with stage(progress, f"{title}: states") as step:
+        return load_dataset(folder, plan.sensor, plan.experiment.targets, progress=step)
+
+
+def rows_in_range(data: Dataset, experiment: ExperimentSpec) -> np.ndarray:
+    """Rows whose corrected labels lie within the experiment's ranges: the way there, and contacts beside an edge, may not."""
+    low, high = np.array([experiment.ranges()[name] for name in data.targets.names]).T
+    return np.flatnonzero(((data.targets.corrected >= low) & (data.targets.corrected <= high)).all(axis=1))
+
+
+def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[dict[str, Any]]:
+    """A row for each model and object: mean absolute errors, biases, and how many times the model's error on the first object."""
+    rows = []
+    for model, run in runs.items():
+        estimator = PoseEstimator.load(run)
+        learnt = {thing.name for thing in (plan.train if model == MIXED else (plan.alone,))}
+        flat: np.ndarray | None = None
+        for thing in (*plan.train, *plan.unseen):
+            data = sets[f"tests/{thing.name}"]
+            chosen = rows_in_range(data, plan.experiment)
+            if not len(chosen):
+                raise TrainingError(
+                    f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more --tests"
+                )
+            off = predict_rows_of(estimator, data, chosen).mean - data.targets.corrected[chosen]
+            error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)
+            flat = error if flat is None else flat
+            row: dict[str, Any] = {"model": model, "object": thing.name, "seen": thing.name in learnt}
+            row |= {"contacts": len(np.unique(contact_of(data)[chosen])), "states": len(chosen)}
+            for k, name in enumerate(data.targets.names):
+                row |= {f"{name}_error": float(error[k]), f"{name}_bias": float(bias[k]), f"{name}_times": float(error[k] / flat[k])}
+            rows.append(row)
+    return rows
+
+
+def verdicts(plan: Plan, rows: list[dict[str, Any]], names: tuple[str, ...]) -> list[str]:
+    """For each unseen object whether the mixed model's errors stay within ``TIMES`` those on the first one."""
+    lines = []
+    for row in rows:
+        if row["model"] != MIXED or row["object"] not in {thing.name for thing in plan.unseen}:
+            continue
+        held = all(row[f"{name}_times"] <= TIMES for name in names)
+        said = ", ".join(f"{name} {row[f'{name}_times']:.2f}" for name in names)
+        lines.append(
+            f"{row['object']}, never seen: {said} times the error on {plan.alone.name} ({'within' if held else 'not within'} {TIMES:g})"
+        )
+    return lines

@@ -1,0 +1,93 @@
+"""How close the renders of a sensor come to its real frames, the two-sample test included."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes import SensorSpec
+from training.two_sample import TwoSample, two_sample
+from twin.progress import Progress, Step, silent
+from twin.realism.pictures import run_realism
+
+IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip")
+
+
+@dataclass(frozen=True)
+class Realism:
+    """What was found: all figures, as ``metrics.json`` holds them, and the files, the page first."""
+
+    metrics: dict[str, Any]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        metrics, found = self.metrics, self.metrics["statistics"]
+        lines = [f"refused {refused['image_name']}: {refused['reason']}" for refused in metrics["refused"]]
+        lines.append(_image_line("pin-aligned", metrics["frames"], metrics["pin_aligned"]))
+        worst = ", ".join(f"{name} {100 * value:.1f} %" for name, value in found["worst_relative_difference"].items())
+        lines.append(f"largest difference in a radial bin: {worst}")
+        lines += [f"{name}: real {pair['real']:.2f}, rendered {pair['rendered']:.2f}" for name, pair in found["scalars"].items()]
+        spots = found["spots"]
+        lines.append(
+            f"spectra differ by {found['spectrum_db']:.2f} dB; {spots['paired']} of {spots['real']} bright spots have a counterpart"
+        )
+        lines.append(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
+        if outcome := metrics["two_sample"]:
+            lines.append(
+                f"two-sample accuracy {100 * outcome['accuracy']:.1f} % ({100 * outcome['low']:.1f} to {100 * outcome['high']:.1f} %)"
+            )
+        if poses := metrics["pose_aligned"]:
+            error = poses["pin_error_px"]
+            lines.append(
+                f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on those fitted to)"
+            )
+            lines.append(_image_line("pose-aligned, unseen", metrics["frames"] // 2, poses["test_images"]))
+        return lines
+
+
+def compare_with_renders(
+    frames: Path,
+    sensor: SensorSpec,
+    out: Path,
+    *,
+    pose_aligned: bool = False,
+    limit: int | None = None,
+    quality: str = "standard",
+    test: bool = True,
+    progress: Progress = silent,
+) -> Realism:
+    """Compare a folder of real raw frames with their renders, and write what was found to an existing folder.
+
+    Parameters
+    ----------
+    pose_aligned : bool
+        Also render from the labels alone.
+    limit : int, optional
+        Most frames, evenly spread.
+    quality : {"preview", "standard", "high"}
+    test : bool
+        Train the two-sample test (minutes).
+
+    Raises
+    ------
+    FrameError
+        No frame can be used, or the labels are missing.
+    RenderError
+        Nothing can be rendered here.
+    """
+    asked = _two_sample if test else None
+    return Realism(*run_realism(frames, sensor, out, with_poses=pose_aligned, limit=limit, quality=quality, test=asked, progress=progress))
+
+
+def _two_sample(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> TwoSample:
+    return two_sample(real, rendered, inside, progress=step)
+
+
+def _image_line(title: str, count: int, images: dict[str, Any]) -> str:
+    mean = {name: images[name]["mean"] for name in IMAGES}
+    return (
+        f"{title}, {count} frames: PSNR {mean['psnr_db']:.2f} dB (gray {mean['psnr_gray_db']:.2f}), "
+        f"SSIM {mean['ssim']:.3f} (gray {mean['ssim_gray']:.3f}), FLIP {mean['flip']:.3f}"
+    )

@@ -1,0 +1,323 @@
+"""The study of what the twin is worth on real frames, from its plan to its tables and runs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object, load_randomisation
+from training.contact_calibration import fit_contact
+from training.contact_calibration.simulate import Setup
+from training.dataset import Dataset, joined, load_dataset
+from training.generation import generate
+from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
+from training.studies.sim_to_real.page import write_page
+from training.studies.sim_to_real.steps import (
+    Beside,
+    Frames,
+    arm_labels,
+    choose_frames,
+    judged,
+    measured_of,
+    put_beside,
+    quadratic_row,
+    states_like,
+    states_touching,
+    train_in_twin,
+    train_on_real,
+    widen_intervals,
+    with_missing,
+)
+from training.studies.sim_to_real.twins import Twin, as_mounted, contact_of, without_one_ingredient
+from training.validation.model import MeasuredFrames
+from twin.progress import Progress, silent, stage
+from twin.report.table import write_table
+from twin.types import FINE
+
+SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
+FULL, BESIDE = "sim_only", "sim_plus_real"  # folders of the twin's own run, and of the run with labelled frames beside it
+SHOWN_MODES = 4  # of what the twin misses, that the page names
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    frames : Path
+        A labelled real recording.
+    experiment : ExperimentSpec
+        How it was recorded, and what is learnt.
+    contacts : ExperimentSpec or None
+        What is simulated; None: the experiment that ``experiment`` names as wider, else itself.
+    labels : int
+        Labelled frames beside the simulated contacts.
+    seed : int
+        Of the frames drawn, the contacts and the weights.
+    draws : int
+        Of what the twin misses, for each contact.
+    count : int
+        Contacts to simulate.
+    simulated : tuple of Path
+        Finished data sets to learn from instead; several are joined. None is simulated then for the twin with all ingredients.
+    calibrate : bool
+        Fit the specification to the labelled frames first.
+    ablate : bool
+        Also train without one ingredient at a time.
+    epochs : int or None
+        Of every training; None: the model's own number.
+    workers : int
+        Processes that simulate.
+    across : int
+        Elements along each side of the skin's grid.
+    """
+
+    sensor: SensorSpec
+    frames: Path
+    experiment: ExperimentSpec
+    contacts: ExperimentSpec | None = None
+    labels: int = 40
+    seed: int = 0
+    draws: int = 2
+    count: int = 500
+    simulated: tuple[Path, ...] = ()
+    calibrate: bool = False
+    ablate: bool = False
+    epochs: int | None = None
+    workers: int = 1
+    across: int = FINE
+
+    @property
+    def touched(self) -> ObjectSpec:
+        """The object of the recording's experiment."""
+        return load_object(self.experiment.object)
+
+    @property
+    def wider(self) -> ExperimentSpec:
+        """The experiment that is simulated."""
+        if self.contacts is not None:
+            return self.contacts
+        return load_experiment(self.experiment.wider) if self.experiment.wider else self.experiment
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of it.
+
+    Attributes
+    ----------
+    rows : list of dict
+        One for each model: what it was trained on, its errors (mm, deg) against corrected and raw labels, and more.
+    left_out : (K,) float
+        See ``Beside``.
+    residual_px : float
+        Mean distance of the labelled frames' pins from the twin's.
+    written : list of Path
+    """
+
+    rows: list[dict[str, Any]]
+    left_out: np.ndarray
+    residual_px: float
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """A line for each model, for people."""
+        shown = [key for key in self.rows[0] if key.endswith(("_corrected", "_raw"))]
+        return [
+            f"{row['trained_on']}, {row['labelled_frames']} labelled, {row['model']}: "
+            + ", ".join(f"{key} {row[key]:.3g}" for key in shown)
+            for row in self.rows
+        ]
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """What all models of a study start from.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+        As shipped, or fitted to the labelled frames.
+    real, few : Dataset
+        The recording, and its labelled frames.
+    chosen : Frames
+    measured : MeasuredFrames
+        Pins and arm's labels of the labelled frames.
+    residuals : Residuals
+        What the twin with all ingredients misses on them.
+    full : Twin
+        That twin, and ``twins``: it and those that lack one ingredient.
+    """
+
+    plan: Plan
+    out: Path
+    progress: Progress
+    sensor: SensorSpec
+    real: Dataset
+    few: Dataset
+    chosen: Frames
+    measured: MeasuredFrames
+    residuals: Residuals
+    full: Twin
+    twins: list[Twin]
+
+
+def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
+    """Train in the twin, with labelled frames beside it, and without the twin; judge all on the same real frames.
+
+    Writes runs, ``study.csv`` and ``index.html`` to ``out``. What lies there from an earlier call with the same plan is not made again.
+
+    Raises
+    ------
+    TrainingError
+        There are too few frames, or the simulated contacts have other labels than they.
+    """
+    ground = _prepare(plan, out, progress)
+    known = {_tried(ground.full): Discrepancy(ground.residuals)}
+    sets: dict[str, list[Dataset]] = {}
+    rows: list[dict[str, Any]] = []
+    for twin in ground.twins:
+        missing = _missing(ground, twin, known)
+        if twin.contacts not in sets:
+            sets[twin.contacts] = _simulated(ground, twin)
+        learnt = _learnt(ground, twin, sets[twin.contacts], missing)
+        folder = _trained(ground, twin, learnt, missing is not None)
+        if twin is ground.full:
+            beside = _beside(ground, folder, sets[twin.contacts])
+            full_learnt = learnt[0]
+        rows.append(judged(twin.says, 0, folder, ground.real, ground.chosen.test))
+        if twin is ground.full:
+            rows.append(judged("simulated and real", plan.labels, out / BESIDE, ground.real, ground.chosen.test))
+    rows += _without_the_twin(ground)
+    page = _write_page(ground, rows, beside, known[_tried(ground.full)], full_learnt)
+    return Result(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
+
+
+def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
+    """Read and choose frames, fit the specification if asked to, and see what the twin misses on the labelled ones."""
+    with stage(progress, "frames") as step:
+        real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step)
+    chosen = choose_frames(len(real), plan.labels, plan.seed)
+    out.mkdir(parents=True, exist_ok=True)
+    few = real.rows(chosen.few)
+    measured, sensor = measured_of(few), plan.sensor
+    if plan.calibrate:
+        setup = Setup(sensor, plan.experiment, plan.touched, measured.form, plan.across, out / "calibration", plan.workers)
+        with stage(progress, "calibration") as step:
+            sensor = fit_contact(setup, measured, progress=step).sensor
+    with stage(progress, "labelled frames") as step:
+        residuals = measure_residuals(_labelled(plan, sensor, measured, out, plan.across), measured, step)
+    moves = load_randomisation("moves")
+    seen = moves.model_copy(update={"friction": residuals.friction_spread() or moves.friction})
+    full = Twin(FULL, "simulated", "sim", sensor, plan.wider, seen, plan.across)
+    others = without_one_ingredient(full, as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
+    return _Ground(plan, out, progress, sensor, real, few, chosen, measured, residuals, full, [full, *others])
+
+
+def _labelled(plan: Plan, sensor: SensorSpec, measured: MeasuredFrames, out: Path, across: int) -> Setup:
+    """How the labelled frames are simulated."""
+    return Setup(sensor, plan.experiment, plan.touched, measured.form, across, out / "labelled", plan.workers, ())
+
+
+def _tried(twin: Twin) -> tuple[int, tuple[float, ...]]:
+    """What the residuals of a twin depend on, within one study."""
+    return twin.across, twin.frictions
+
+
+def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
+    """What the twin misses on the labelled frames, where it is told; ``known`` keeps it for the next twin."""
+    if not twin.learns:
+        return None
+    if _tried(twin) not in known:
+        setup = _labelled(ground.plan, ground.sensor, ground.measured, ground.out, twin.across)
+        with stage(ground.progress, f"{twin.name}: labelled frames") as step:
+            known[_tried(twin)] = Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
+    return known[_tried(twin)]
+
+
+def _simulated(ground: _Ground, twin: Twin) -> list[Dataset]:
+    """The twin's contacts: simulated here, or finished data sets."""
+    plan, folders = ground.plan, list(ground.plan.simulated) if twin is ground.full else []
+    if not folders:
+        folders = [ground.out / twin.contacts]
+        with stage(ground.progress, f"{twin.name}: {twin.experiment.name}") as step:
+            generate(folders[0], twin.config(plan.touched, plan.seed), plan.count, workers=plan.workers, progress=step)
+    found = []
+    for folder in folders:
+        with stage(ground.progress, f"states of {folder.name}") as step:
+            found.append(load_dataset(folder, ground.sensor, plan.experiment.targets, form=ground.real.pins.form, progress=step))
+    return found
+
+
+def _learnt(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
+    """What a model learns from: the states once for each draw of what the twin misses, or once as they are."""
+    if missing is None:
+        return [twin.part(joined(sets))]
+    labels, drawn = [arm_labels(each) for each in sets], []
+    for k in range(ground.plan.draws):
+        seed = ground.plan.seed + SEEDS_APART * k
+        with stage(ground.progress, f"{twin.name}: draw {k + 1}") as step:
+            pairs = zip(sets, labels, strict=True)
+            drawn.append(joined([with_missing(each, told, missing, seed, progress=step) for each, told in pairs]))
+    return [twin.part(each) for each in drawn]
+
+
+def _trained(ground: _Ground, twin: Twin, learnt: list[Dataset], told: bool) -> Path:
+    """The folder of the twin's run; ``told``: whether labelled frames taught what it misses."""
+    folder, plan = ground.out / twin.name, ground.plan
+    with stage(ground.progress, twin.name) as step:
+        train_in_twin(
+            learnt[0].beside([each.pins for each in learnt[1:]]),
+            folder,
+            seed=plan.seed,
+            split=plan.seed,
+            epochs=plan.epochs,
+            labelled=tuple(ground.measured.names) if told else (),
+            progress=step,
+        )
+    return folder
+
+
+def _beside(ground: _Ground, folder: Path, sets: list[Dataset]) -> Beside:
+    """Put the labelled frames beside the twin's run, and widen its intervals to what these frames say of it."""
+    bare = states_touching(sets, ground.plan.touched)
+    made = put_beside(folder, ground.out / BESIDE, bare.rows(states_like(bare, ground.few)), ground.few, seed=ground.plan.seed)
+    widen_intervals(folder, made.intervals)
+    return made
+
+
+def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
+    """Rows of models that are trained on real frames alone."""
+    rows = []
+    for name, index in ground.chosen.trained.items():
+        folder = ground.out / f"real_{name}"
+        with stage(ground.progress, folder.name) as step:
+            train_on_real(ground.real.rows(index), folder, seed=ground.plan.seed, epochs=ground.plan.epochs, progress=step)
+        rows.append(judged("real", len(index), folder, ground.real, ground.chosen.test))
+        rows.append(quadratic_row("real", ground.real, index, ground.chosen.test))
+    return rows
+
+
+def _write_page(ground: _Ground, rows: list[dict[str, Any]], beside: Beside, missing: Discrepancy, learnt: Dataset) -> Path:
+    return write_page(
+        ground.out,
+        sensor=ground.sensor.name,
+        tested=len(ground.chosen.test),
+        frames=len(ground.real),
+        labelled=ground.plan.labels,
+        seed=ground.plan.seed,
+        calibrated=ground.plan.calibrate,
+        error_px=ground.residuals.error_px,
+        modes=missing.summary()[:SHOWN_MODES],
+        friction=ground.full.randomisation.friction,
+        simulated=len(learnt),
+        contacts=len(np.unique(contact_of(learnt))),
+        names=ground.real.targets.names,
+        left_out=beside.left_out,
+        columns=list(rows[0]),
+        rows=rows,
+        problems=ground.real.problems,
+    )

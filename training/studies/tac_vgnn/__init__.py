@@ -1,0 +1,5 @@
+"""The Tac-VGNN paper's comparison on a recording: graphs, models, training efficiency, and what the areas show."""
+
+from training.studies.tac_vgnn.study import Plan, Result, run
+
+__all__ = ["Plan", "Result", "run"]

@@ -1,0 +1,183 @@
+"""The paper's whole comparison, from its plan to its tables, figures and page."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from scenes import SensorSpec
+from training.dataset import Dataset, load_dataset
+from training.models import model_named
+from training.networks import choose_device
+from training.recipes import TrainingError
+from training.studies.tac_vgnn.contacts import AreaChange, recorded_contacts, twin_contacts
+from training.studies.tac_vgnn.efficiency import measure_training
+from training.studies.tac_vgnn.graphs import compare_graphs
+from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, plan_run, table_row, train_all
+from training.studies.tac_vgnn.page import draw_contacts, draw_curves, draw_efficiency, write_page
+from twin.progress import Progress, silent, stage
+from twin.report.table import write_table
+from twin.types import Form
+
+MODELS = ("gnn", "tac-vgnn", "vgnn", "cnn-v2", "cnn-v1")
+BATCHES = (64, 256, 512)  # of the efficiency figure
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is compared, on what.
+
+    Attributes
+    ----------
+    data : Path
+        A labelled recording.
+    sensor : SensorSpec
+    models : tuple of str
+        As ``plan_run`` takes them.
+    seeds : tuple of int
+        Of weights and order; every model is trained with each.
+    labels : {"raw", "corrected"}
+        That are learnt.
+    target : str or tuple of str
+        A preset, or the label columns.
+    split : int
+        Seed of the fifth that is kept out of training.
+    epochs : int or None
+        None: each model's own number.
+    max_minutes : float or None
+        For all trainings together.
+    batches : tuple of int
+        Of the efficiency figure; none: no figure.
+    contacts : bool
+        Press and render the contacts of the area figure.
+    device : {"auto", "cpu", "cuda"}
+    threads : int or None
+        Of the CPU.
+    form : Form or None
+        Of the frames; told by size and content where None.
+    """
+
+    data: Path
+    sensor: SensorSpec
+    models: tuple[str, ...] = MODELS
+    seeds: tuple[int, ...] = (0,)
+    labels: str = "raw"
+    target: str | tuple[str, ...] = "surface-2d"
+    split: int = 0
+    epochs: int | None = None
+    max_minutes: float | None = None
+    batches: tuple[int, ...] = BATCHES
+    contacts: bool = True
+    device: str = "auto"
+    threads: int | None = None
+    form: Form | None = None
+
+    def __post_init__(self) -> None:
+        if self.labels not in ("corrected", "raw"):
+            raise TrainingError(f"--labels must be corrected or raw, got {self.labels!r}")
+        if not self.models or not self.seeds:
+            raise TrainingError("nothing to compare: give at least one of --models and of --seeds")
+
+    def runs(self) -> list[PlannedRun]:
+        """Every run of the study."""
+        return [
+            plan_run(name, labels=self.labels, seed=seed, split=self.split, epochs=self.epochs)
+            for seed in self.seeds
+            for name in self.models
+        ]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of it.
+
+    Attributes
+    ----------
+    rows : list of dict
+        One for each run, see ``table_row``.
+    graphs, efficiency, contacts : list of dict
+        Rows of the tables beside it; the last two are empty where they were not asked for.
+    names : tuple of str
+        Of the labels.
+    written : list of Path
+    """
+
+    rows: list[dict[str, Any]]
+    graphs: list[dict[str, Any]]
+    efficiency: list[dict[str, Any]]
+    contacts: list[dict[str, Any]]
+    names: tuple[str, ...]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """A line for each run, for people."""
+        return [f"{row['model']}, seed {row['seed']}: {row['state']}{self._errors(row)}" for row in self.rows]
+
+    def _errors(self, row: dict[str, Any]) -> str:
+        if "epochs" not in row:
+            return ""
+        return ", " + "; ".join(f"{name} {row[f'{name}_raw']:.4g} raw, {row[f'{name}_corrected']:.4g} corrected" for name in self.names)
+
+
+def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
+    """Compare graphs, models, training efficiency, and what the areas show.
+
+    Writes ``runs/``, ``models.csv``, ``graphs.csv``, ``efficiency.csv``, ``contacts.csv``, their figures and ``index.html`` to ``out``.
+    A run that was ended is gone on with.
+
+    Raises
+    ------
+    TrainingError
+        A model is not known, the device is missing, or a folder holds another run.
+    """
+    device, runs = choose_device(plan.device), plan.runs()
+    if plan.threads:
+        torch.set_num_threads(plan.threads)
+    with stage(progress, "frames") as step:
+        data = load_dataset(plan.data, plan.sensor, plan.target, form=plan.form, progress=step)
+    folder = out / "runs"
+    folder.mkdir(parents=True, exist_ok=True)
+    graphs = compare_graphs(data.pins)
+    spent = train_all(runs, data, folder, max_minutes=plan.max_minutes, device=device, progress=progress)
+    rows = [table_row(each, data, folder, spent.get(each.folder)) for each in runs]
+    written = [
+        write_table(out / "models.csv", rows),
+        write_table(out / "graphs.csv", graphs),
+        draw_curves(out / "curves.png", runs, folder),
+    ]
+    efficiency = _efficiency(plan, runs, data, device, progress)
+    if efficiency:
+        written += [write_table(out / "efficiency.csv", efficiency), draw_efficiency(out / "efficiency.png", efficiency)]
+    changes = _contacts(plan, data, progress)
+    contacts = [change.figures() for change in changes]
+    if contacts:
+        written += [write_table(out / "contacts.csv", contacts), draw_contacts(out / "contacts.png", changes)]
+    notes = {"device": device, "threads": torch.get_num_threads(), "labels": plan.labels, "max_minutes": plan.max_minutes}
+    notes["columns"] = [*SHOWN, *error_columns(data)]
+    written.append(write_page(out, data=data, models=rows, graphs=graphs, efficiency=efficiency, contacts=contacts, notes=notes))
+    return Result(rows, graphs, efficiency, contacts, data.targets.names, written)
+
+
+def _efficiency(plan: Plan, runs: list[PlannedRun], data: Dataset, device: str, progress: Progress) -> list[dict[str, Any]]:
+    """Time and memory of training for each model and batch size."""
+    if not plan.batches:
+        return []
+    models, rows = list(dict.fromkeys(each.config.model for each in runs)), []
+    with stage(progress, "training efficiency") as step:
+        for model in models:
+            inputs = model_named(model).prepare(data, np.arange(len(data))).inputs
+            for batch in plan.batches:
+                rows.append(measure_training(model, data.pins, inputs, batch, device=device))
+                step(len(rows), len(models) * len(plan.batches))
+    return rows
+
+
+def _contacts(plan: Plan, data: Dataset, progress: Progress) -> list[AreaChange]:
+    """Contacts of the twin, where they are asked for, and recorded ones."""
+    recorded = recorded_contacts(data)
+    if not plan.contacts:
+        return recorded
+    with stage(progress, "contacts") as step:
+        return twin_contacts(data.pins.sensor, data.pins.form, progress=step) + recorded

@@ -1,0 +1,92 @@
+"""The twin's pins against those of labelled real frames, from the recording to tables and a page."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_object
+from training.validation import ContactModel, compare, measure_frames
+from training.validation.compare import Comparison
+from training.validation.report import summary_of, write_validation
+from twin.progress import Progress, silent, stage
+from twin.types import FINE, Form
+
+FRICTION_FRAMES = 5  # frames for which a friction of their own is sought
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What was found.
+
+    Attributes
+    ----------
+    comparison : Comparison
+    summary : dict
+        As ``validation.json`` holds it.
+    sensor : SensorSpec
+    written : list of Path
+    """
+
+    comparison: Comparison
+    summary: dict[str, Any]
+    sensor: SensorSpec
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        lines = []
+        if self.sensor.rig is None:
+            lines.append(f"note: {self.sensor.name} has no [rig]: the tool point counts as the tip; 'twin calibrate contact' fits one")
+        for row in self.summary["table"]:
+            lines.append(f"{row['group']}: {row['error_px']:.2f} px over {row['frames']} frames, nothing free")
+        if own := self.summary["one_friction_a_frame"]:
+            common_px = own["error_with_common_friction_px"]
+            lines.append(f"one friction a frame, {own['frames']} frames: {own['error_px']:.2f} px (common friction: {common_px:.2f} px)")
+        if failures := self.comparison.failures:
+            lines.append(f"{len(failures)} contacts failed: see frames.csv")
+        return lines
+
+
+def validate_contacts(
+    sensor: SensorSpec,
+    frames: Path,
+    experiment: ExperimentSpec,
+    out: Path,
+    *,
+    touched: ObjectSpec | None = None,
+    limit: int | None = None,
+    friction_frames: int = FRICTION_FRAMES,
+    seed: int = 0,
+    across: int = FINE,
+    form: Form | None = None,
+    progress: Progress = silent,
+) -> Validation:
+    """Simulate the contacts of labelled frames, compare the pins, and write what was found to an existing folder.
+
+    Parameters
+    ----------
+    frames : Path
+        A labelled recording.
+    experiment : ExperimentSpec
+        How it was recorded.
+    touched : ObjectSpec, optional
+        The experiment's own object by default.
+    limit : int, optional
+        So many frames, chosen at random with ``seed``; all by default.
+    friction_frames : int
+        Frames for which a friction of their own is sought.
+    across : int
+        Elements along each side of the skin's grid.
+
+    Raises
+    ------
+    FrameError
+        The recording has no labels, or no frame with pins.
+    """
+    with stage(progress, "pins") as step:
+        measured = measure_frames(frames, sensor, limit, seed, form=form, progress=step)
+    model = ContactModel(sensor, experiment, touched or load_object(experiment.object), measured.form, across=across)
+    with stage(progress, "contacts") as step:
+        found = compare(model, measured, friction_frames=friction_frames, progress=step)
+    summary = summary_of(found, sensor)
+    return Validation(found, summary, sensor, write_validation(out, found, sensor, summary))

@@ -1,0 +1,135 @@
+"""A trained model from labelled recordings: the data sets read, joined and learnt in one call."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from scenes import SensorSpec
+from training.dataset import joined, load_dataset
+from training.models import recipe_of
+from training.networks import choose_device
+from training.recipes import TrainingError
+from training.run import RunConfig, train_run
+from training.studies.telling import epoch_step
+from training.targets import PRESETS
+from twin.progress import Progress, silent, stage
+from twin.types import Form
+
+SHEAR_PRESET, SHEAR_HELPERS = "surface-2d-shear", ("move_1", "move_6")  # this preset's moves also help its other labels
+FILES = ("config.json", "curves.csv", "weights.pt")
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What came of it.
+
+    Attributes
+    ----------
+    out : Path
+        The run's folder.
+    finished : bool
+        Whether training came to its end; if not, the same call goes on.
+    frames : int
+        That were usable.
+    names : tuple of str
+        Of the labels.
+    labels : str
+        Whether they are corrected or raw.
+    problems : list of str
+        What is odd about the recordings.
+    """
+
+    out: Path
+    finished: bool
+    frames: int
+    names: tuple[str, ...]
+    labels: str
+    problems: list[str]
+
+    @property
+    def written(self) -> list[Path]:
+        """The run's files."""
+        return [self.out / name for name in FILES]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        lines = [f"note: {problem}" for problem in self.problems]
+        lines.append(f"{self.frames} usable frames; labels {', '.join(self.names)} ({self.labels})")
+        if not self.finished:
+            lines.append(f"time is up: the weights so far are in {self.out}; the same command goes on from here")
+        return lines
+
+
+def train_model(
+    model: str,
+    sensor: SensorSpec,
+    recordings: Sequence[Path],
+    out: Path,
+    *,
+    target: str = "surface-2d",
+    labels: str = "corrected",
+    seed: int = 0,
+    split: int | None = 0,
+    epochs: int | None = None,
+    batch: int | None = None,
+    members: int | None = None,
+    kernel: bool | None = None,
+    max_minutes: float | None = None,
+    threads: int | None = None,
+    device: str = "auto",
+    form: Form | None = None,
+    progress: Progress = silent,
+) -> Trained:
+    """Train a model on labelled recordings, or go on with the run in ``out``.
+
+    Parameters
+    ----------
+    model : str
+        As ``recipe_of`` takes it.
+    recordings : sequence of Path
+        Several are joined.
+    target : str
+        A preset's name, or label columns with commas between.
+    labels : {"corrected", "raw"}
+    seed : int
+        Of weights and order.
+    split : int or None
+        Seed of the fifth that is kept out of training; None: train on all.
+    epochs, batch, members, kernel : optional
+        Instead of the recipe's own.
+    max_minutes : float, optional
+        Stop after the epoch that passes this time.
+    threads : int, optional
+        Of the CPU.
+    device : {"auto", "cpu", "cuda"}
+    form : Form, optional
+        Of the frames; told by size and content by default.
+
+    Raises
+    ------
+    TrainingError
+        There is no such model or device, or ``out`` holds another run.
+    FrameError
+        The recordings have no such labels, or can't be joined.
+    """
+    if labels not in ("corrected", "raw"):
+        raise TrainingError(f"--labels must be corrected or raw, got {labels!r}")
+    recipe = recipe_of(model, epochs=epochs, batch=batch, members=members, kernel=kernel)
+    if threads:
+        torch.set_num_threads(threads)
+    chosen, parts = choose_device(device), []
+    for folder in recordings:
+        with stage(progress, f"frames of {folder.name}") as step:
+            parts.append(load_dataset(folder, sensor, columns_of(target), form=form, progress=step))
+    found = joined(parts)
+    config = RunConfig(model, recipe, labels, seed, split, SHEAR_HELPERS if target == SHEAR_PRESET else ())
+    with stage(progress, model) as step:
+        finished = train_run(config, found, out, max_minutes=max_minutes, device=chosen, progress=epoch_step(step))
+    return Trained(out, finished, len(found), found.targets.names, labels, found.problems)
+
+
+def columns_of(target: str) -> str | tuple[str, ...]:
+    """What ``load_dataset`` takes: the name of a preset, or the columns that are named with commas between."""
+    return target if target in PRESETS else tuple(name.strip() for name in target.split(","))

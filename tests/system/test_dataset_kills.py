@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
 from small_generation import ACROSS, EXPERIMENT, SENSOR, contents
 
 ROOT = Path(__file__).parents[2]

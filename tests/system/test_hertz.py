@@ -8,22 +8,17 @@ layer is stiffer than the half space: by 9 % at 10 radii, 1 % at 100.
 Lengths are large, so that the penalty's penetration (0.005 mm) is nothing against the indentation.
 """
 
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
+from block import build_block, material
 
 from twin.mechanics.balance import Body, Friction, LoadState
 from twin.mechanics.contact import ContactPoints
 from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.newton import LoadStepper
 from twin.stimulus.analytic import Sphere
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
-
-from block import build_block, material  # noqa: E402
 
 SPHERE_MM, RADIUS_MM = 500.0, 40.0  # a / R = 0.08
 SIZE = 100.0  # of the block, in contact radii

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from command import run_twin as run
 
 from scenes import load_sensor
 from twin.detectors import make_detector, shipped_detector, tune
@@ -22,14 +23,6 @@ COMPARED = ("noise", "defocus", "jpeg", "exposure-low", "resolution", "motion-bl
 STEPS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 0.95, 1.0)
 FRAMES = 4
 AGREEMENT = 1.25  # ratio of the real and the rendered failing severity
-
-
-def run(*arguments):
-    import subprocess
-    import sys
-
-    code = "from twin.cli import main; main()"
-    return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, timeout=600)
 
 
 def evenly(recording, count):

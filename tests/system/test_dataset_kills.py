@@ -109,7 +109,7 @@ def test_a_killed_worker_is_replaced_and_a_killed_main_takes_its_workers_along(t
     _, left = psutil.wait_procs(alive, timeout=PATIENCE_S)
     assert not left
     job.check_records()
-    finish(job.start(workers=2))
+    job.complete()
     assert contents(job.out) == undisturbed(COUNT)
 
 

@@ -125,7 +125,7 @@ def test_what_the_twin_is_worth_on_frames_is_one_command_and_goes_on_where_it_wa
     (tmp_path / "gentle.toml").write_text(EXPERIMENT)
     gentle = ("--sensor", SENSOR, "--experiment", tmp_path / "gentle.toml", "--across", ACROSS, "--workers", 1)
     twin("dataset", *gentle, "--images", "none", "--count", 24, "--seed", 7, "--randomise", "contact", "--out", tmp_path / "frames")
-    command = ("study", "sim-to-real", *gentle, "--frames", tmp_path / "frames", "--labels", 12, "--count", 10, "--draws", 1, "--ablate")
+    command = ("study", "sim-to-real", *gentle, "--frames", tmp_path / "frames", "--labels", 12, "--count", 12, "--draws", 1, "--ablate")
     command += ("--epochs", 2, "--out", tmp_path / "study")
     said = twin(*command)
     rows = list(csv.DictReader((tmp_path / "study" / "study.csv").open()))

@@ -3,6 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
 export TACTIP_REAL ?= ../shared/real
+SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
 .PHONY: help setup demo test golden bench figures tables validate lint types wheel clean
 help:            ## what can be made
@@ -25,13 +26,13 @@ test: setup      ## run the tests; at the end which took longest
 	@$(BIN)/python -m pytest -n auto --dist loadfile --durations=15 --durations-min=1
 
 golden: setup    ## make the golden renders anew (after a wanted change of the pictures; look at them in out/golden)
-	@$(BIN)/python tests/golden/make.py --pictures out/golden
+	@$(SCRIPT) tests/golden/make.py --pictures out/golden
 
 bench: setup     ## speed, as ratios to named baselines in the same run
-	@$(BIN)/python tests/bench/bench_pipeline.py --sensor mg400-331
-	@$(BIN)/python tests/bench/bench_pipeline.py --sensor mg400-127
-	@$(BIN)/python tests/bench/bench_mechanics.py
-	@$(BIN)/python tests/bench/bench_render.py
+	@$(SCRIPT) tests/bench/bench_pipeline.py --sensor mg400-331
+	@$(SCRIPT) tests/bench/bench_pipeline.py --sensor mg400-127
+	@$(SCRIPT) tests/bench/bench_mechanics.py
+	@$(SCRIPT) tests/bench/bench_render.py
 
 validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts, Rerun (670 MB)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,rerun]'
@@ -39,10 +40,10 @@ validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, Calculi
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests
 
 figures: setup   ## every figure that a document states, into figures.json; goes on where it was; ONLY=pins,render for some of them
-	@$(BIN)/python -m tests.figures $(if $(ONLY),--only $(ONLY))
+	@$(SCRIPT) tests/figures $(if $(ONLY),--only $(ONLY))
 
 tables: setup    ## make the documents' tables from figures.json
-	@$(BIN)/python -m tests.figures.tables
+	@$(SCRIPT) tests/figures --tables
 
 lint: setup      ## style
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .

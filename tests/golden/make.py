@@ -1,17 +1,14 @@
 """Make the golden renders anew, because a change of the pictures is wanted: ``make golden``, or with ``--pictures DIR`` also to look at."""
 
 import argparse
-import sys
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1] / "helpers")]
+import cv2
+import numpy as np
+from golden_renders import CASES, dented, make
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-from golden_renders import CASES, dented, make  # noqa: E402
-
-from twin.camera import expose  # noqa: E402
-from twin.optics.render import Renderer  # noqa: E402
+from twin.camera import expose
+from twin.optics.render import Renderer
 
 REFERENCE = Path(__file__).with_name("renders.npz")
 

@@ -1,7 +1,7 @@
 """Time the pipeline against the published method, frame by frame in the same run and thread.
 
-Run by ``make bench``, or: PYTHONPATH=.:tests/helpers python tests/bench/bench_pipeline.py [--sensor mg400-331] [--frames 200]. It takes the recordings named by
-TACTIP_REAL (default ../shared/real) where they are, else drawn frames.
+Run by ``make bench``, or: PYTHONPATH=.:tests/helpers python tests/bench/bench_pipeline.py [--sensor mg400-331] [--frames 200]. It takes
+the recordings named by TACTIP_REAL (default ../shared/real) where they are, else drawn frames.
 """
 
 import argparse

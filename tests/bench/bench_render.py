@@ -1,9 +1,9 @@
 """Time the renderer: error against samples, beside plain path tracing and the preview; film, pins and threads; memory.
 
-Run by ``make bench``, or: PYTHONPATH=.:tests/helpers python tests/bench/bench_render.py [--sensor mg400-331] [--repeats 5] [--leak 2000]. All in one process, so that
-the ratios mean something where the times do not. Times are medians, of wall-clock and of all threads' CPU time, which a busy
-machine changes less: ratios are of the latter. A frame is a new state: vertices moved, light traced, exposed. Errors are
-those of gray levels and of the caps' centroids, of noiseless frames.
+Run by ``make bench``, or: PYTHONPATH=.:tests/helpers python tests/bench/bench_render.py [--sensor mg400-331] [--repeats 5] [--leak 2000].
+All in one process, so that the ratios mean something where the times do not. Times are medians, of wall-clock and of all threads' CPU
+time, which a busy machine changes less: ratios are of the latter. A frame is a new state: vertices moved, light traced, exposed. Errors
+are those of gray levels and of the caps' centroids, of noiseless frames.
 """
 
 import argparse

@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
 export TACTIP_REAL ?= ../shared/real
-SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
+SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
 .PHONY: help setup demo test golden bench figures tables validate lint types wheel clean
 help:            ## what can be made
@@ -40,10 +40,10 @@ validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, Calculi
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests
 
 figures: setup   ## every figure that a document states, into figures.json; goes on where it was; ONLY=pins,render for some of them
-	@$(SCRIPT) tests/figures $(if $(ONLY),--only $(ONLY))
+	@$(SCRIPT) -m figures $(if $(ONLY),--only $(ONLY))
 
 tables: setup    ## make the documents' tables from figures.json
-	@$(SCRIPT) tests/figures --tables
+	@$(SCRIPT) -m figures --tables
 
 lint: setup      ## style
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .

@@ -1,4 +1,4 @@
-"""The skin beside CalculiX's results in ``tests/reference/calculix.json``: axisymmetric, on a mesh of its own, made by ``calculix.py`` there."""
+"""The skin beside CalculiX in ``tests/reference/calculix.json``: axisymmetric, on a mesh of its own, made by ``calculix.py`` there."""
 
 import json
 from pathlib import Path

@@ -1,6 +1,6 @@
 """A job measures some figures; ``figures.json`` keeps what it found until its inputs change.
 
-A job's inputs are the sensors' specifications and the code it runs: the packages it names and its own module. ``fingerprint`` is the one
+A job's inputs are the sensors' specifications and the code it runs: the packages it names and its own function. ``fingerprint`` is the one
 place that says what code counts.
 """
 
@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -131,9 +132,11 @@ def specification_digest(sensors: tuple[str, ...]) -> str:
 
 
 def fingerprint(made: Job) -> str:
-    """Of the code that a job runs: its packages and its own module."""
-    own = Path(inspect.getfile(getattr(made.measure, "func", made.measure))).read_bytes()  # ``func`` of a partial
-    return hashlib.sha256(code_digest(*made.code).encode() + own).hexdigest()[:16]
+    """Of the code that a job runs: its packages, and its own function with what is bound to it."""
+    measure, bound = made.measure, ""
+    if isinstance(measure, partial):
+        measure, bound = measure.func, repr(sorted(measure.keywords.items()))
+    return hashlib.sha256(f"{code_digest(*made.code)}\n{inspect.getsource(measure)}\n{bound}".encode()).hexdigest()[:16]
 
 
 def key_of(made: Job) -> dict[str, str]:

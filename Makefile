@@ -3,8 +3,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
 export TACTIP_REAL ?= ../shared/real
+SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
-.PHONY: help setup demo test bench validate lint clean
+.PHONY: help setup demo test golden bench figures tables validate lint types wheel clean
 help:            ## what can be made
 	@sed -n 's/^\([a-z]*\): .*## /\1\t/p' $(MAKEFILE_LIST)
 
@@ -21,22 +22,37 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 demo: setup      ## the main job: press, render, detect, graph; pictures and a page in out/demo
 	@$(BIN)/twin demo --out $(OUT)
 
-test: setup      ## run the tests
-	@$(BIN)/python -m pytest -n auto
+test: setup      ## run the tests; at the end which took longest
+	@$(BIN)/python -m pytest -n auto --dist loadfile --durations=15 --durations-min=1
+
+golden: setup    ## make the golden renders anew (after a wanted change of the pictures; look at them in out/golden)
+	@$(SCRIPT) tests/golden/make.py --pictures out/golden
 
 bench: setup     ## speed, as ratios to named baselines in the same run
-	@$(BIN)/python tests/bench/bench_pipeline.py --sensor mg400-331
-	@$(BIN)/python tests/bench/bench_pipeline.py --sensor mg400-127
-	@$(BIN)/python tests/bench/bench_mechanics.py
-	@$(BIN)/python tests/bench/bench_render.py
+	@$(SCRIPT) tests/bench/bench_pipeline.py --sensor mg400-331
+	@$(SCRIPT) tests/bench/bench_pipeline.py --sensor mg400-127
+	@$(SCRIPT) tests/bench/bench_mechanics.py
+	@$(SCRIPT) tests/bench/bench_render.py
 
 validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts, Rerun (670 MB)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,rerun]'
 	@$(BIN)/python -m pytest -n 0 tests/unit/test_rerun_view.py
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests
 
-lint: setup
+figures: setup   ## every figure that a document states, into figures.json; goes on where it was; ONLY=pins,render for some of them
+	@$(SCRIPT) -m figures $(if $(ONLY),--only $(ONLY))
+
+tables: setup    ## make the documents' tables from figures.json
+	@$(SCRIPT) -m figures --tables
+
+lint: setup      ## style
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+types: setup     ## the type checker over all product packages
+	@$(BIN)/mypy scenes twin training hardware
+
+wheel: setup     ## build the wheel, install it into a clean environment, try it from there
+	@.ci/try-wheel $(BIN)/python
 
 clean:
 	rm -rf $(VENV) out build *.egg-info

@@ -3,9 +3,14 @@
 import os
 from pathlib import Path
 
-import pytest
+# One thread for linear algebra, here and in the processes that tests start: the tests themselves run side by side, and threads that wait
+# for each other take twice the CPU time. It must be said before numpy and torch are imported.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
 
-from scenes import load_sensor
+import pytest  # noqa: E402
+
+from scenes import load_sensor  # noqa: E402
 
 
 @pytest.fixture(scope="session", autouse=True)

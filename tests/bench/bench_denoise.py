@@ -1,20 +1,16 @@
 """Does denoising pay? Open Image Denoise on data-set frames, without a guide and guided by the preview, against more samples.
 
-Run: pip install pyoidn, then python tests/bench/bench_denoise.py [--sensor mg400-331].
+Run: pip install pyoidn, then PYTHONPATH=.:tests/helpers python tests/bench/bench_denoise.py [--sensor mg400-331].
 """
 
 import argparse
-import sys
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
+import numpy as np
+from bench_render import CONVERGED, Bench
+from image_error import timed_ms
+from pyoidn import denoise
 
-import numpy as np  # noqa: E402, I001
-from bench_render import CONVERGED, Bench  # noqa: E402  (it finds the package)
-from image_error import timed_ms  # noqa: E402
-from pyoidn import denoise  # noqa: E402
-
-from twin.optics.preview import Preview  # noqa: E402
+from twin.optics.preview import Preview
 
 SAMPLES = (1, 2, 4, 8)
 BRIGHT = 99.5  # percentile of the preview that counts as albedo 1

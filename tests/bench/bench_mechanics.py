@@ -1,8 +1,8 @@
 """Time contacts: against the first version of the solver, and against unknowns, load-step size, a mesh's triangles and processes.
 
-Run: python tests/bench/bench_mechanics.py [--repeats 3] [--out out/bench]. Times are CPU seconds on one thread, the least of the
-repeats, so that what is compiled on the first is left out. The first version is taken from this repository's history and runs
-in a process of its own, on the same contacts; without that history only absolute figures are printed.
+Run by ``make bench``, or: PYTHONPATH=. python tests/bench/bench_mechanics.py [--repeats 3] [--out out/bench]. Times are CPU seconds on
+one thread, the least of the repeats, so that what is compiled on the first is left out. The first version is taken from this repository's
+history and runs in a process of its own, on the same contacts; without that history only absolute figures are printed.
 """
 
 import argparse
@@ -21,8 +21,6 @@ from time import perf_counter, process_time
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 ROOT = Path(__file__).parents[2]
-if "PYTHONPATH" not in os.environ:
-    sys.path.insert(0, str(ROOT))
 
 import numpy as np  # noqa: E402
 import trimesh  # noqa: E402

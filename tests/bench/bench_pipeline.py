@@ -1,18 +1,17 @@
 """Time the pipeline against the published method, frame by frame in the same run and thread.
 
-Run: python tests/bench/bench_pipeline.py [--sensor mg400-331] [--frames 200]. It takes the recordings named by
-TACTIP_REAL (default ../shared/real) where they are, else drawn frames.
+Run by ``make bench``, or: PYTHONPATH=.:tests/helpers python tests/bench/bench_pipeline.py [--sensor mg400-331] [--frames 200]. It takes
+the recordings named by TACTIP_REAL (default ../shared/real) where they are, else drawn frames.
 """
 
 import argparse
 import os
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "unit"), str(ROOT / "tests" / "bench")]
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
@@ -49,20 +48,36 @@ def timed(call, *arguments):
     return result, 1e3 * (perf_counter() - start)
 
 
-def main():
-    """Print p50, p95, p99 of every stage and the ratio of the medians."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sensor", choices=FOLDERS, default="mg400-331")
-    parser.add_argument("--frames", type=int, default=200)
-    options = parser.parse_args()
+@dataclass(frozen=True)
+class Times:
+    """ms of every frame by stage, ours and the published method's, and what the frames are."""
+
+    what: str
+    ours: dict[str, list[float]]
+    theirs: dict[str, list[float]]
+
+    @property
+    def ours_ms(self) -> float:
+        """Median of pins, areas and graph together."""
+        return float(np.median(self.ours["total"]))
+
+    @property
+    def ratio(self) -> float:
+        """Of the median totals, published method to ours."""
+        return float(np.median(self.theirs["total"])) / self.ours_ms
+
+
+def measure(sensor: str, count: int) -> Times:
+    """Times of both methods on the same frames, one after the other, on one thread."""
     cv2.setNumThreads(1)
-    spec = load_sensor(options.sensor)
-    frames, what = take_frames(spec, options.frames)
+    spec = load_sensor(sensor)
+    frames, what = take_frames(spec, count)
     pipeline, baseline = Pipeline(spec, Form.RECORDING), Baseline(spec)
-    ours, theirs = {}, {}
+    ours: dict[str, list[float]] = {}
+    theirs: dict[str, list[float]] = {}
     for k, frame in enumerate(frames[:1] * WARM_UP + frames):
         observation, total = timed(pipeline, frame)
-        node_features, feature_ms = timed(features, observation.graph, pipeline.reference) if observation.valid else (None, 0.0)
+        _, feature_ms = timed(features, observation.graph, pipeline.reference) if observation.valid else (None, 0.0)
         nodes, detect_ms = timed(baseline.detect, frame.image)
         _, graph_ms = timed(baseline.graph, nodes)
         if k >= WARM_UP:
@@ -70,12 +85,22 @@ def main():
                 ours.setdefault(stage, []).append(ms)
             for stage, ms in {"detect": detect_ms, "graph": graph_ms, "total": detect_ms + graph_ms}.items():
                 theirs.setdefault(stage, []).append(ms)
-    print(f"{len(frames)} {what}, {spec.name}, one thread, ms per frame")
+    return Times(f"{len(frames)} {what}, {spec.name}", ours, theirs)
+
+
+def main() -> None:
+    """Print p50, p95, p99 of every stage and the ratio of the medians."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sensor", choices=FOLDERS, default="mg400-331")
+    parser.add_argument("--frames", type=int, default=200)
+    options = parser.parse_args()
+    found = measure(options.sensor, options.frames)
+    print(f"{found.what}, one thread, ms per frame")
     print(f"{'':24s}{'p50':>9s}{'p95':>9s}{'p99':>9s}")
-    for title, stages in (("pipeline", ours), ("published method", theirs)):
+    for title, stages in (("pipeline", found.ours), ("published method", found.theirs)):
         for stage, ms in stages.items():
             print(f"{title + ' ' + stage:24s}" + "".join(f"{value:9.3f}" for value in np.percentile(ms, (50, 95, 99))))
-    print(f"ratio of the median totals: {np.median(theirs['total']) / np.median(ours['total']):.1f}")
+    print(f"ratio of the median totals: {found.ratio:.1f}")
 
 
 if __name__ == "__main__":

@@ -1,33 +1,30 @@
 """Time the renderer: error against samples, beside plain path tracing and the preview; film, pins and threads; memory.
 
-Run: python tests/bench/bench_render.py [--sensor mg400-331] [--repeats 5] [--leak 2000]. All in one process, so that
-the ratios mean something where the times do not. Times are medians, of wall-clock and of all threads' CPU time, which a busy
-machine changes less: ratios are of the latter. A frame is a new state: vertices moved, light traced, exposed. Errors are
-those of gray levels and of the caps' centroids, of noiseless frames.
+Run by ``make bench``, or: PYTHONPATH=.:tests/helpers python tests/bench/bench_render.py [--sensor mg400-331] [--repeats 5] [--leak 2000].
+All in one process, so that the ratios mean something where the times do not. Times are medians, of wall-clock and of all threads' CPU
+time, which a busy machine changes less: ratios are of the latter. A frame is a new state: vertices moved, light traced, exposed. Errors
+are those of gray levels and of the caps' centroids, of noiseless frames.
 """
 
 import argparse
 import os
 import platform
-import sys
 from functools import partial
-from pathlib import Path
 from time import perf_counter
 
-sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent)]
+import numpy as np
+from film import scaled
+from image_error import Truth, memory_mb, timed_ms
+from plain_path import PlainPath
 
-import numpy as np  # noqa: E402
-from image_error import Truth, memory_mb, timed_ms  # noqa: E402
-from plain_path import PlainPath  # noqa: E402
-
-from scenes import load_object, load_sensor  # noqa: E402
-from scenes.sensor import SensorSpec  # noqa: E402
-from twin.camera import expose  # noqa: E402
-from twin.mechanics.path import ContactPose  # noqa: E402
-from twin.mechanics.solver import SkinSolver  # noqa: E402
-from twin.optics.preview import Preview  # noqa: E402
-from twin.optics.render import Renderer  # noqa: E402
-from twin.projection import project  # noqa: E402
+from scenes import load_object, load_sensor
+from scenes.sensor import SensorSpec
+from twin.camera import expose
+from twin.mechanics.path import ContactPose
+from twin.mechanics.solver import SkinSolver
+from twin.optics.preview import Preview
+from twin.optics.render import Renderer
+from twin.projection import project
 
 LADDER, CONVERGED = (1, 2, 4, 8, 16), 256  # samples per pixel
 PLAIN_LADDER, PLAIN_CONVERGED = (4, 16, 64), 256
@@ -81,8 +78,8 @@ class Bench:
         print(f"within {FRAME_MS} ms and {CENTROID_PX} px: {', '.join(map(str, good)) or 'none'} samples")
         return truth, rows
 
-    def plain(self, rows: list) -> None:
-        """Print what plain path tracing needs for the same errors against its own converged picture."""
+    def plain(self, rows: list) -> dict[str, float]:
+        """Print what plain path tracing needs for the same errors against its own converged picture; how many times ours, by error."""
         plain = PlainPath(self.renderer(1), self.window[2] - self.window[0])
         state, theirs = self.states[1], []
         mask = self.spec.pipeline.raw
@@ -97,18 +94,22 @@ class Bench:
             theirs.append((spp, wall, cpu, gray, rms))
             print(f"{spp:8d}{wall:12.0f}{cpu:8.0f}{gray:10.2f}{rms:8.3f}", flush=True)
         _, _, our_ms, *ours = next(row for row in rows if row[0] == CHOSEN)
+        ratios = {}
         for name, column, error in zip(("gray levels", "centroids"), (3, 4), ours, strict=True):
             needed = time_for(theirs, column, error)
             print(f"for the {name} of our {CHOSEN} samples ({error:.3f}): {needed:.0f} CPU ms, {needed / our_ms:.1f} times ours")
+            ratios[name] = needed / our_ms
+        return ratios
 
-    def photo(self) -> None:
-        """Print the time of a large coloured picture of the highest quality."""
+    def photo(self) -> float:
+        """Print the time of a large coloured picture of the highest quality; s of wall-clock time."""
         renderer = Renderer(load_sensor("ur5-331"), quality="high")
         wall, cpu = timed_ms(lambda k: renderer.render(seed=k), 2, warm_up=1)
         print(f"\nur5-331 in colour, 640 x 480 px, quality 'high' ({renderer.spp} samples): {wall / 1e3:.1f} s, {cpu / 1e3:.1f} CPU s")
+        return wall / 1e3
 
-    def preview(self, truth: Truth) -> None:
-        """Print the preview's time and errors, with direct light alone and calibrated."""
+    def preview(self, truth: Truth) -> tuple[float, float]:
+        """Print the preview's time and errors, with direct light alone and calibrated; ms a frame and centroids' rms error in px."""
         start = perf_counter()
         preview = Preview(self.spec, window_px=self.window)
         shape, built = preview.render().shape, perf_counter() - start
@@ -120,6 +121,7 @@ class Bench:
         print(f"\npreview {shape[1]} x {shape[0]} px, built in {built:.1f} s")
         print(f"{wall:.1f} ms a frame ({1e3 / wall:.0f} per s), {cpu:.1f} CPU ms")
         print(f"against the path-traced frame: gray {gray:.2f} rms, centroids {rms:.3f} px rms, {median:.3f} px median")
+        return wall, rms
 
     def scaling(self) -> None:
         """Print times against film, samples and pins (ratios to the first row), and threads."""
@@ -157,15 +159,7 @@ def time_for(rows: list, column: int, error: float) -> float:
     return float(np.exp(cost[k - 1] + share * (cost[k] - cost[k - 1])))
 
 
-def scaled(spec: SensorSpec, scale: float) -> SensorSpec:
-    """The same view on another number of pixels."""
-    camera, sizes = spec.camera, ("width_px", "height_px", "fx_px", "fy_px")
-    changed = {name: type(getattr(camera, name))(scale * getattr(camera, name)) for name in sizes}
-    changed |= {name: scale * (getattr(camera, name) + 0.5) - 0.5 for name in ("cx_px", "cy_px")}
-    return spec.model_copy(update={"camera": camera.model_copy(update=changed)})
-
-
-def main():
+def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sensor", default="mg400-331")

@@ -4,11 +4,9 @@ Both are unbiased estimates of the same light: over independent batches their di
 be able to fail: the same comparison refuses a renderer with one thing wrong.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from brute_force import BLOCK_PX, blocks, changed, laboratory, reference, z_scores
 from scipy import stats
 
 from twin.geometry.pins import rest_pins
@@ -17,10 +15,6 @@ from twin.optics.static_layer import ACROSS
 from twin.optics.variant import use_variant
 from twin.optics.window import Window
 from twin.projection import window_tangent
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
-
-from brute_force import BLOCK_PX, blocks, changed, laboratory, reference, z_scores  # noqa: E402
 
 BOUNCES = 6  # of the bright laboratory: what a seventh brings is below the noise
 CHANCE = 1e-3  # of refusing a right renderer, by blocks or in total

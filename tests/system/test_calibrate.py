@@ -1,11 +1,9 @@
 """``twin calibrate optics``: what it refuses, that it resumes, and (slow) that it finds a known sensor again."""
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
+from command import run_twin
 
 from scenes import load_object, load_sensor
 from twin.calibration import calibrate_optics as calibration
@@ -18,13 +16,6 @@ from twin.simulator import Simulator
 SENSOR = "ur5-331"
 
 
-def command(*arguments):
-    return subprocess.run(
-        [sys.executable, "-c", "from twin.cli import main; main()", "calibrate", "optics", *map(str, arguments)],
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-
-
 def test_what_cannot_be_calibrated_is_refused_in_one_line(tmp_path):
     frames = tmp_path / "frames"
     frames.mkdir()
@@ -35,7 +26,7 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line(tmp_path):
     cv2.imwrite(str(dark / "a.png"), np.zeros((480, 640, 3), np.uint8))
     cases.append(((dark, out), "black"))
     for (folder, target), word in cases:
-        done = command("--sensor", SENSOR, "--frames", folder, "--out", target)
+        done = run_twin("calibrate", "optics", "--sensor", SENSOR, "--frames", folder, "--out", target)
         assert done.returncode == 1 and word in done.stderr, done.stderr
         assert len([line for line in done.stderr.splitlines() if line.startswith("twin: error")]) == 1
         assert not out.exists()

@@ -8,14 +8,10 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from command import run_twin as twin
 
 from scenes import load_sensor
 from scenes.load import SHIPPED
-
-
-def twin(*arguments, env=None):
-    command = [sys.executable, "-c", "from twin.cli import main; main()", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=env)
 
 
 def one_line_error(done, *words):
@@ -59,12 +55,19 @@ def test_preprocess_finds_the_rendered_pins(rendered, tmp_path):
     assert summary["frames"] == 1 and summary["ms"]["total"]["p50"] > 0 and summary["parameters"]
 
 
+@pytest.fixture(scope="module")
+def pins(rendered, tmp_path_factory):
+    """The file of the rendered frame's pins."""
+    out = tmp_path_factory.mktemp("pins")
+    assert twin("preprocess", rendered[0] / "frame.png", "--sensor", "mg400-127", "--out", out).returncode == 0
+    return out / "pins.npz"
+
+
 @pytest.mark.parametrize(("kind", "edges"), [("knn", 762), ("delaunay", None), ("voronoi", None)])
-def test_graph_of_a_frame_and_of_its_pins(rendered, tmp_path, kind, edges):
+def test_graph_of_a_frame_and_of_its_pins(rendered, pins, tmp_path, kind, edges):
     out, _ = rendered
-    assert twin("preprocess", out / "frame.png", "--sensor", "mg400-127", "--out", tmp_path).returncode == 0
     graphs = []
-    for source, folder in ((out / "frame.png", tmp_path / "a"), (tmp_path / "pins.npz", tmp_path / "b")):
+    for source, folder in ((out / "frame.png", tmp_path / "a"), (pins, tmp_path / "b")):
         done = twin("graph", source, "--sensor", "mg400-127", "--kind", kind, "--out", folder)
         assert done.returncode == 0, done.stderr
         assert (folder / "graph.png").is_file() and (folder / "surface.png").is_file() == (kind == "voronoi")
@@ -121,18 +124,16 @@ def test_bad_input_is_one_line_with_the_remedy(tmp_path):
     one_line_error(twin("render", "--sensor", typo, "--object", "plane", "--indent-mm", 1, "--out", tmp_path), "mine.toml", "did you mean")
 
 
-def test_a_damaged_pins_file_is_named(rendered, tmp_path):
-    out, _ = rendered
-    assert twin("preprocess", out / "frame.png", "--sensor", "mg400-127", "--out", tmp_path).returncode == 0
-    whole = (tmp_path / "pins.npz").read_bytes()
+def test_a_damaged_pins_file_is_named(pins, tmp_path):
+    whole = pins.read_bytes()
     for name, content in (("cut.npz", whole[: len(whole) // 2]), ("empty.npz", b""), ("text.npz", b"pins")):
         (tmp_path / name).write_bytes(content)
         one_line_error(twin("graph", tmp_path / name, "--sensor", "mg400-127", "--out", tmp_path / "g"), name, "twin preprocess")
-    with np.load(tmp_path / "pins.npz") as data:
+    with np.load(pins) as data:
         arrays = {key: data[key] for key in data}
     np.savez(tmp_path / "holes.npz", **(arrays | {"pins_px": np.full_like(arrays["pins_px"], np.nan)}))
     one_line_error(twin("graph", tmp_path / "holes.npz", "--sensor", "mg400-127", "--out", tmp_path / "g"), "holes.npz", "prediction")
-    one_line_error(twin("graph", tmp_path / "pins.npz", "--sensor", "mg400-331", "--out", tmp_path / "g"), "127", "331")
+    one_line_error(twin("graph", pins, "--sensor", "mg400-331", "--out", tmp_path / "g"), "127", "331")
 
 
 def test_no_good_frame_is_a_failure_that_still_leaves_its_summary(tmp_path):
@@ -190,3 +191,14 @@ def test_doctor_says_what_will_be_used():
     assert done.returncode == 0, done.stderr
     for word in ("LLVM", "GPU", "3D pictures", "camera", "serial"):
         assert word in done.stdout
+
+
+def test_a_process_of_its_own_ends_the_same_way(tmp_path):
+    """What the other tests see in this process is what a shell sees: text, the one line of an error, exit codes."""
+    command = [sys.executable, "-c", "from twin.cli import main; main()"]
+    said = subprocess.run([*command, "sensors"], capture_output=True, text=True, timeout=300)
+    assert said.returncode == 0 and said.stdout == twin("sensors").stdout
+    wrong = ("preprocess", str(tmp_path / "nowhere"), "--sensor", "mg400-127", "--out", str(tmp_path / "out"))
+    done = subprocess.run([*command, *wrong], capture_output=True, text=True, timeout=300)
+    one_line_error(done, "nowhere")
+    assert done.stderr == twin(*wrong).stderr

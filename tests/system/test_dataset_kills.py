@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
+from command import run_twin
 from small_generation import ACROSS, EXPERIMENT, SENSOR, contents
 
 ROOT = Path(__file__).parents[2]
-COUNT, SLOW_COUNT, SLOW_MOMENTS = 12, 30, 20
+COUNT, SLOW_COUNT, SLOW_MOMENTS = 10, 30, 20
 PATIENCE_S = 120.0
 ADDRESS = "tcp://127.0.0.1:{port}"
 
@@ -28,13 +27,24 @@ class Job:
         self.experiment = home / "gentle.toml"
         self.experiment.write_text(EXPERIMENT)
 
-    def start(self, *options: str) -> subprocess.Popen:
-        command = "from twin.cli import main; main()"
+    def arguments(self, workers: int, *options: str) -> list[str]:
+        """Of ``twin``."""
         fixed = ["dataset", "--experiment", self.experiment, "--sensor", SENSOR, "--images", "none", "--randomise", "contact"]
         sized = ["--count", self.count, "--across", ACROSS, "--out", self.out]
-        arguments = [str(part) for part in (*fixed, *sized, *options)]
+        return [str(part) for part in (*fixed, *sized, "--workers", workers, *options)]
+
+    def start(self, *options: str, workers: int = 1) -> subprocess.Popen:
+        """In a process of its own, which can be killed."""
+        command = "from twin.cli import main; main()"
         environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-        return subprocess.Popen([sys.executable, "-c", command, *arguments], env=environment, stderr=subprocess.PIPE, text=True)
+        return subprocess.Popen(
+            [sys.executable, "-c", command, *self.arguments(workers, *options)], env=environment, stderr=subprocess.PIPE, text=True
+        )
+
+    def complete(self) -> None:
+        """In this process and undisturbed."""
+        done = run_twin(*self.arguments(1))
+        assert done.returncode == 0, done.stderr
 
     def done(self) -> int:
         return len(list((self.out / "records").glob("*.npz")))
@@ -65,7 +75,7 @@ def undisturbed(tmp_path_factory):
     def get(count):
         if count not in made:
             job = Job(tmp_path_factory.mktemp("undisturbed"), count)
-            finish(job.start())
+            job.complete()
             made[count] = contents(job.out)
         return made[count]
 
@@ -74,20 +84,20 @@ def undisturbed(tmp_path_factory):
 
 def test_killed_twice_it_goes_on_to_the_same_bytes(tmp_path, undisturbed):
     job = Job(tmp_path, COUNT)
-    for moment in (2, 6):
-        process = job.start()
+    for moment, workers in ((2, 1), (5, 2)):
+        process = job.start(workers=workers)
         job.wait_for(moment, process)
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         job.check_records()
         assert moment <= job.done() < COUNT and not (job.out / "targets.csv").exists()
-    finish(job.start())
+    job.complete()
     assert contents(job.out) == undisturbed(COUNT)
 
 
 def test_a_killed_worker_is_replaced_and_a_killed_main_takes_its_workers_along(tmp_path, undisturbed):
     job = Job(tmp_path, COUNT)
-    process = job.start("--workers", "2")
+    process = job.start(workers=2)
     job.wait_for(2, process)
     workers = [p for p in psutil.Process(process.pid).children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
     assert len(workers) == 2
@@ -99,7 +109,7 @@ def test_a_killed_worker_is_replaced_and_a_killed_main_takes_its_workers_along(t
     _, left = psutil.wait_procs(alive, timeout=PATIENCE_S)
     assert not left
     job.check_records()
-    finish(job.start("--workers", "2"))
+    job.complete()
     assert contents(job.out) == undisturbed(COUNT)
 
 
@@ -144,7 +154,7 @@ def test_a_lost_scheduler_ends_the_run_in_one_line(tmp_path, undisturbed):
 def test_killed_at_twenty_moments(tmp_path, undisturbed):
     job, generator = Job(tmp_path, SLOW_COUNT), np.random.default_rng(0)
     for moment in range(SLOW_MOMENTS):
-        process = job.start("--workers", str(1 + moment % 2))
+        process = job.start(workers=1 + moment % 2)
         job.wait_for(min(job.done() + 1, SLOW_COUNT), process)
         time.sleep(generator.uniform(0, 0.4))
         process.kill()

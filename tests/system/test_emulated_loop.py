@@ -1,12 +1,11 @@
 """The whole rig over real sockets: an emulated MG400 and, beside it, the twin's camera that knows the arm by its feedback alone."""
 
-import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from true_estimator import TrueEstimator
 
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT
@@ -26,9 +25,6 @@ from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.preprocess import Pipeline
 from twin.rig.mounting import Mounting
 from twin.types import Form
-
-sys.path.append(str(Path(__file__).parents[1] / "contract"))
-from true_estimator import TrueEstimator  # noqa: E402
 
 FIRST_S = 90.0  # kernels may have to be compiled
 STEPS = 12

@@ -8,11 +8,14 @@ import sys
 import time
 import urllib.request
 from contextlib import nullcontext
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from drawn_frames import drawn_frame
+from free_ports import free_offset
+from noisy_camera import NoisyCamera, number_of
+from true_estimator import TrueEstimate, TrueEstimator
 from typer.testing import CliRunner
 
 from hardware import following
@@ -40,12 +43,6 @@ from twin.recordings import open_recording
 from twin.recordings.images import write_image
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
-
-sys.path += [str(Path(__file__).parents[1] / folder) for folder in ("contract", "unit")]
-from drawn_frames import drawn_frame  # noqa: E402
-from free_ports import free_offset  # noqa: E402
-from noisy_camera import NoisyCamera, number_of  # noqa: E402
-from true_estimator import TrueEstimate, TrueEstimator  # noqa: E402
 
 STEPS = 6
 

@@ -17,9 +17,10 @@ pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127"}
 FRAMES, FRICTION_FRAMES, SEED = 80, 10, 20
-MOST_PX = {"mg400-331": 0.9, "mg400-127": 1.1}  # one friction for all frames
-MOST_PER_FRAME_PX = {"mg400-331": 0.75, "mg400-127": 0.75}  # one friction a frame
-MOST_NOT_EXECUTED_PX = {"mg400-331": 0.6, "mg400-127": 0.55}
+# mean over pins and frames in px of the recordings, the measured value and a tenth
+MOST_PX = {"mg400-331": 0.83, "mg400-127": 0.99}  # one friction for all frames (0.75, 0.90)
+MOST_PER_FRAME_PX = {"mg400-331": 0.54, "mg400-127": 0.50}  # one friction a frame (0.49, 0.45)
+MOST_NOT_EXECUTED_PX = {"mg400-331": 0.48, "mg400-127": 0.51}  # taps alone (0.44, 0.46)
 MOST_RING_BIAS_PX = 0.4
 UNLIKELY_PX, DECISIVE = 0.8, 0.5  # a move counts as not executed after all where a tap alone leaves less than this, and half the error
 MOST_FAILED = 0.02  # of the contacts

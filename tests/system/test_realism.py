@@ -1,12 +1,11 @@
 """A closed loop: a rendered frame taken for a real one is found to look like its own render."""
 
 import json
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
+from command import run_twin
 
 from scenes import load_object, load_sensor
 from twin.mechanics import ContactPose
@@ -45,17 +44,6 @@ def test_a_render_looks_like_itself(folder, tmp_path):
 def test_the_command_refuses_in_one_line(folder, tmp_path):
     (tmp_path / "none").mkdir()
     for path, word in ((tmp_path / "none", "empty"), (tmp_path / "missing", "no such"), (folder / "dark.png", "black")):
-        command = [
-            sys.executable,
-            "-c",
-            "from twin.cli import main; main()",
-            "realism",
-            str(path),
-            "--sensor",
-            SENSOR,
-            "--out",
-            str(tmp_path),
-        ]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        done = run_twin("realism", path, "--sensor", SENSOR, "--out", tmp_path)
         assert done.returncode == 1 and "Traceback" not in done.stderr
         assert any(line.startswith("twin: error:") and word in line for line in done.stderr.splitlines()), done.stderr

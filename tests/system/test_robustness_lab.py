@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from command import run_twin as run
 
 from scenes import load_sensor
 from twin.detectors import make_detector, shipped_detector, tune
@@ -24,14 +25,6 @@ FRAMES = 4
 AGREEMENT = 1.25  # ratio of the real and the rendered failing severity
 
 
-def run(*arguments):
-    import subprocess
-    import sys
-
-    code = "from twin.cli import main; main()"
-    return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, timeout=600)
-
-
 def evenly(recording, count):
     return [recording.read(int(k)) for k in np.linspace(0, len(recording) - 1, count)]
 
@@ -50,8 +43,8 @@ def test_tune_check_and_robustness_from_the_command_line(tmp_path):
     checked = run("check", frames, "--sensor", "mg400-127", "--pipeline", tmp_path / "mine.toml")
     assert checked.returncode == 0 and "GOOD" in checked.stdout, checked.stdout + checked.stderr
     plan = tmp_path / "plan.toml"
-    plan.write_text('steps = [0.5, 1.0]\n[[condition]]\nname = "hot-pixels"\n[[condition]]\nname = "caps-faded"\n')
-    pipelines = ("--pipeline", "twin", "--pipeline", tmp_path / "mine.toml", "--conditions", plan, "--jobs", "2", "--limit", "2")
+    plan.write_text('steps = [1.0]\n[[condition]]\nname = "hot-pixels"\n[[condition]]\nname = "caps-faded"\n')
+    pipelines = ("--pipeline", "twin", "--pipeline", tmp_path / "mine.toml", "--conditions", plan, "--jobs", "1", "--limit", "2")
     swept = run("robustness", "--sensor", "mg400-127", "--frames", frames, "--out", tmp_path / "out", *pipelines)
     assert swept.returncode == 0, swept.stderr
     assert "hot-pixels" in swept.stdout and "caps-faded" in (tmp_path / "out" / "index.html").read_text()  # named as left out

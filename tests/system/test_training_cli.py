@@ -2,25 +2,21 @@
 
 import csv
 import json
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from drawn_frames import drawn_frame
+from drawn_recording import drawn_pins
+from small_generation import ACROSS, EXPERIMENT, SENSOR
 from typer.testing import CliRunner
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
-from drawn_frames import drawn_frame  # noqa: E402
-from small_generation import ACROSS, EXPERIMENT, SENSOR  # noqa: E402
-from test_training import drawn_pins  # noqa: E402
-
-from scenes import load_sensor  # noqa: E402
-from training.recipes import TrainingError  # noqa: E402
-from twin.cli import command_line  # noqa: E402
-from twin.errors import FrameError, TwinError  # noqa: E402
-from twin.preprocess import nominal_reference  # noqa: E402
-from twin.types import Form  # noqa: E402
+from scenes import load_sensor
+from training.recipes import TrainingError
+from twin.cli import command_line
+from twin.errors import FrameError, TwinError
+from twin.preprocess import nominal_reference
+from twin.types import Form
 
 FRAMES = 70
 

@@ -1,5 +1,7 @@
 """The whole way on rendered frames: press, render, detect, graph, against exact truth."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -21,20 +23,31 @@ def simulators():
     return {name: Simulator(load_sensor(name)) for name in ("mg400-331", "mg400-127", "ur5-331")}
 
 
+@pytest.fixture(scope="module")
+def at_rest(simulators):
+    """A sensor's frame without contact in a form, and what the pipeline sees in it; each is rendered once."""
+
+    @cache
+    def make(name, form):
+        shot = simulators[name].shoot(simulators[name].rest, form=form)
+        return shot, Pipeline(simulators[name].spec, form)(shot.frame)
+
+    return make
+
+
 @pytest.mark.parametrize(("name", "form"), FORMS)
-def test_rendered_caps_are_found_where_they_project(simulators, name, form):
+def test_rendered_caps_are_found_where_they_project(simulators, at_rest, name, form):
     simulator = simulators[name]
-    shot = simulator.shoot(simulator.rest, form=form)
-    observation = Pipeline(simulator.spec, form)(shot.frame)
+    shot, observation = at_rest(name, form)
     assert observation.found == simulator.spec.pins.count and shot.truth.visible.all()
     error = observation.pins_px - shot.truth.caps_px
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < CENTROID_RMS_PX
 
 
 @pytest.mark.parametrize(("name", "delaunay"), [("mg400-331", 1860), ("ur5-331", 1860), ("mg400-127", 744)])
-def test_edges_without_contact(simulators, name, delaunay):
+def test_edges_without_contact(simulators, at_rest, name, delaunay):
     simulator = simulators[name]
-    observation = Pipeline(simulator.spec, Form.RAW)(simulator.shoot(simulator.rest).frame)
+    _, observation = at_rest(name, Form.RAW)
     assert len(observation.graph.edges) == delaunay
     assert len(make_graph("knn", observation.pins_px).edges) == 6 * simulator.spec.pins.count
 
@@ -51,13 +64,18 @@ def test_cells_at_the_contact_grow_with_depth(simulators):
     assert means == sorted(means) and means[-1] > 1.1 * means[0]
 
 
+@pytest.fixture(scope="module")
+def pressed(simulators):
+    simulator = simulators["mg400-127"]
+    return simulator.shoot(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0)))
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_drag_carries_the_pins_along(simulators, axis, sign):
+def test_a_drag_carries_the_pins_along(simulators, pressed, axis, sign):
     simulator = simulators["mg400-127"]
     shear = [0.0, 0.0]
     shear[axis] = 2.0 * sign
-    pressed = simulator.shoot(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0)))
     dragged = simulator.shoot(simulator.press(load_object("plane"), ContactPose(indent_mm=3.0, shear_mm=tuple(shear))))
     pipeline = Pipeline(simulator.spec, Form.RAW)
     moved = np.nanmean(pipeline(dragged.frame).pins_px - pipeline(pressed.frame).pins_px, axis=0)

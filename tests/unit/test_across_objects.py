@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_generation import small_config
-from test_training import data  # noqa: F401  (a fixture)
 
 from scenes import RandomisationSpec, load_object
 from training.dataset import joined, split_rows
@@ -31,7 +30,7 @@ def places(found, rows):
     return {name: found.targets.corrected[row].tolist() for row, name in zip(rows, found.pins.image_name[rows].tolist(), strict=True)}
 
 
-def test_contacts_of_different_sets_stay_apart_and_whole(data):  # noqa: F811
+def test_contacts_of_different_sets_stay_apart_and_whole(data):
     parts = [named(data, "sim/plane", 0, 45), named(data, "sim/ball", 45, 45)]
     both = joined(parts)
     assert len(both) == 90 and len(np.unique(both.group)) == 10, "the sets number their contacts alike, and mean different ones"
@@ -42,7 +41,7 @@ def test_contacts_of_different_sets_stay_apart_and_whole(data):  # noqa: F811
     assert both.pins.image_name[0].startswith("ball/f_") and np.array_equal(both.pins.nodes_px[:45], parts[1].pins.nodes_px)
 
 
-def test_the_order_in_which_sets_are_given_changes_nothing(data):  # noqa: F811
+def test_the_order_in_which_sets_are_given_changes_nothing(data):
     parts = [named(data, f"sim/{name}", 30 * k, 27) for k, name in enumerate(("plane", "ball", "edge"))]
     one, other = joined(parts), joined(parts[::-1])
     for seed in range(3):
@@ -51,20 +50,20 @@ def test_the_order_in_which_sets_are_given_changes_nothing(data):  # noqa: F811
     assert np.array_equal(one.pins.nodes_px, other.pins.nodes_px) and one.folders == other.folders
 
 
-def test_frames_without_contacts_of_their_own_are_each_their_own(data):  # noqa: F811
+def test_frames_without_contacts_of_their_own_are_each_their_own(data):
     real = replace(named(data, "real/tap", 0, 40), group=None)
     both = joined([real, named(data, "sim/plane", 40, 45)])
     assert len(np.unique(both.group)) == 40 + 5
 
 
-def test_pins_are_counted_from_one_layout(data):  # noqa: F811
+def test_pins_are_counted_from_one_layout(data):
     moved = make_reference(data.pins.reference.pins_px + [3.0, -2.0], data.pins.sensor.pins.rings)
     other = named(data, "sim/b", 45, 45)
     both = joined([named(data, "sim/a", 0, 45), replace(other, pins=other.pins.seen_from(moved))])
     assert np.allclose(both.pins.nodes_px[45:], other.pins.nodes_px)
 
 
-def test_what_can_not_be_joined_is_named(data):  # noqa: F811
+def test_what_can_not_be_joined_is_named(data):
     part = named(data, "sim/a")
     with pytest.raises(FrameError, match="given twice"):
         joined([part, part])
@@ -81,7 +80,7 @@ def plan_of(tmp_path, train=("plane", "sphere"), unseen=("edge",)):
     return Plan(config.sensor, config.experiment, randomisation, *things, count=2, tests=1, seed=4, across=config.across)
 
 
-def test_both_models_learn_from_as_many_contacts_and_are_judged_on_others(data, tmp_path):  # noqa: F811
+def test_both_models_learn_from_as_many_contacts_and_are_judged_on_others(data, tmp_path):
     plan = plan_of(tmp_path)
     made = {folder: (config, count) for folder, config, count in plan.sets()}
     assert {folder: count for folder, (_, count) in made.items()} == {
@@ -102,7 +101,7 @@ def test_an_object_is_learnt_or_never_seen(tmp_path):
         plan_of(tmp_path, train=("plane",))
 
 
-def test_only_labels_within_the_ranges_are_judged(data, tmp_path):  # noqa: F811
+def test_only_labels_within_the_ranges_are_judged(data, tmp_path):
     experiment = plan_of(tmp_path).experiment
     rows = rows_in_range(data, experiment)
     depth, angle = data.targets.corrected.T

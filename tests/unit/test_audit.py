@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_training import drawn_pins
+from drawn_recording import drawn_pins
 
 from scenes import load_sensor
 from training.audit import audit_labels

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 from drawn_frames import drawn_frame
-from test_training import data, trained  # noqa: F401  (fixtures)
 
 from training.estimator import PoseEstimator
 from training.robustness import CHANGES, judge_changes
@@ -15,11 +14,11 @@ from twin.types import Form, Frame
 
 
 @pytest.fixture(scope="module")
-def estimator(trained):  # noqa: F811
+def estimator(trained):
     return PoseEstimator.load(trained)
 
 
-def test_each_change_moves_the_pins_as_named(data, estimator):  # noqa: F811
+def test_each_change_moves_the_pins_as_named(data, estimator):
     rest = data.pins.reference.pins_px
     image = drawn_frame(data.pins.sensor, Form.RECORDING, rest).image
     middle = (np.array(image.shape[::-1]) - 1) / 2
@@ -36,7 +35,7 @@ def test_each_change_moves_the_pins_as_named(data, estimator):  # noqa: F811
     assert np.isnan(seen["5 pins erased"].pins_px[:, 0]).sum() == 5
 
 
-def test_the_table_has_every_change_and_every_frame(data, estimator, tmp_path):  # noqa: F811
+def test_the_table_has_every_change_and_every_frame(data, estimator, tmp_path):
     folder = tmp_path / "recording"
     (folder / "frames_bw").mkdir(parents=True)
     rows = np.arange(6)

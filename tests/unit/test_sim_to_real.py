@@ -7,7 +7,7 @@ from shutil import copytree
 import numpy as np
 import pytest
 import torch
-from test_training import config_of, data  # noqa: F401  (a fixture)
+from drawn_recording import config_of
 
 from training.estimator import PoseEstimator
 from training.gaussian_process import Points, fit_two_fidelities
@@ -24,7 +24,7 @@ HALF = 0.02  # of a label's spread: what half precision may change
 
 
 @pytest.fixture(scope="module")
-def run(data, tmp_path_factory):  # noqa: F811
+def run(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     train_run(config_of("vgnn", epochs=30, members=1, batch=16, kernel=False), data, out)
     return out
@@ -36,7 +36,7 @@ def other_camera(pins):
     return replace(pins, measured=True).seen_from(make_reference(moved, pins.sensor.pins.rings))
 
 
-def test_pins_are_counted_from_the_no_contact_frame_in_hand(data, run):  # noqa: F811
+def test_pins_are_counted_from_the_no_contact_frame_in_hand(data, run):
     estimator, pins = PoseEstimator.load(run), replace(data.pins, measured=True)
     here, there = estimator.predict_table(pins), estimator.predict_table(other_camera(pins))
     assert np.abs(here.mean - there.mean).max() < SAME
@@ -64,7 +64,7 @@ FEW, REST, SIMULATED = np.arange(24), np.arange(24, 44), np.arange(44, 90)
 
 
 @pytest.fixture(scope="module")
-def corrected(data, run, tmp_path_factory):  # noqa: F811
+def corrected(data, run, tmp_path_factory):
     """The run beside a process that knows some frames of a sensor whose labels are off; its targets; and the process's own error.
 
     A copy of the run, ``sim_only`` in the same folder's parent, is too sure of itself.
@@ -109,7 +109,7 @@ def test_a_run_is_not_written_over_itself(data, run):  # noqa: F811
     assert files_of(run) == before
 
 
-def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, corrected):  # noqa: F811
+def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, corrected):
     out, off, left_out = corrected
     assert (left_out < [0.5, 3.0]).all()
     plain, plus = (PoseEstimator.load(path).predict_table(data.pins.rows(REST)) for path in (run, out))
@@ -118,7 +118,7 @@ def test_a_corrected_run_is_a_run_and_better_where_the_model_was_off(data, run, 
     assert json.loads((out / "config.json").read_text())["beside"]["frames"] == data.pins.image_name[FEW].tolist()
 
 
-def test_intervals_are_widened_to_what_labelled_frames_say(data, corrected):  # noqa: F811
+def test_intervals_are_widened_to_what_labelled_frames_say(data, corrected):
     out, off, _ = corrected
     for run in (out, out.with_name("sim_only")):
         told = PoseEstimator.load(run).predict_table(data.pins.rows(REST))
@@ -126,14 +126,14 @@ def test_intervals_are_widened_to_what_labelled_frames_say(data, corrected):  # 
         assert (inside.mean(axis=0) > 0.7).all()
 
 
-def test_contacts_of_another_experiment_are_refused(data):  # noqa: F811
+def test_contacts_of_another_experiment_are_refused(data):
     far = replace(data, targets=replace(data.targets, corrected=data.targets.corrected + [50.0, 0.0]))
     with pytest.raises(TrainingError, match="^0 simulated states .*--contacts"):
         states_like(far, data.rows(FEW))
     assert len(states_like(data, data.rows(FEW))) >= len(FEW)
 
 
-def test_a_displaced_camera_is_left_to_the_network(data, run, corrected):  # noqa: F811
+def test_a_displaced_camera_is_left_to_the_network(data, run, corrected):
     plain, plus = (PoseEstimator.load(path) for path in (run, corrected[0]))
     inputs, rows = plus.inputs_of(data.pins, together=False)
     assert np.abs(plus.ensemble(inputs, rows).mean - plain.ensemble(inputs, rows).mean).max() > 0.5
@@ -141,13 +141,13 @@ def test_a_displaced_camera_is_left_to_the_network(data, run, corrected):  # noq
     assert np.array_equal(plus.ensemble(inputs, rows).mean, plain.ensemble(inputs, rows).mean)
 
 
-def test_a_small_copy_of_a_corrected_run_says_the_same(data, corrected, tmp_path):  # noqa: F811
+def test_a_small_copy_of_a_corrected_run_says_the_same(data, corrected, tmp_path):
     pack(corrected[0], tmp_path)
     whole, small = (PoseEstimator.load(path).predict_table(data.pins) for path in (corrected[0], tmp_path))
     assert (np.abs(whole.mean - small.mean).max(axis=0) < HALF * data.targets.corrected.std(axis=0)).all()
 
 
-def test_a_small_copy_says_the_same_on_any_machine(data, run, tmp_path, monkeypatch):  # noqa: F811
+def test_a_small_copy_says_the_same_on_any_machine(data, run, tmp_path, monkeypatch):
     """Waves of equal frequency may be any basis: another linear algebra finds another one."""
     size = pack(run, tmp_path)
     assert size < 0.5 * (run / "weights.pt").stat().st_size
@@ -181,6 +181,6 @@ def test_frames_that_are_judged_on_are_never_learnt():
         choose_frames(100, 90, 0)
 
 
-def test_the_quadratic_regression_learns(data):  # noqa: F811
+def test_the_quadratic_regression_learns(data):
     row = quadratic_row("real", data, np.arange(60), np.arange(60, 90))
     assert row["pose_2_corrected"] < 0.4 * np.abs(data.targets.corrected[:, 0] - data.targets.corrected[:, 0].mean()).mean()

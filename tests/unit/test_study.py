@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_training import data  # noqa: F401  (a fixture)
 
 from training.recipes import TrainingError
 from training.run import is_finished, train_run
@@ -20,7 +19,7 @@ from twin.report.table import write_table
 WATCHED_S = 0.1  # ten looks at the memory
 
 
-def test_graphs_have_the_edges_their_kind_implies(data):  # noqa: F811
+def test_graphs_have_the_edges_their_kind_implies(data):
     rows = {row["graph"]: row for row in compare_graphs(data.pins)}
     assert rows["knn"]["edges_no_contact"] == 6 * 127 == rows["knn"]["edges_least"] == rows["knn"]["edges_most"]
     hull = 6  # the outer sides of the hexagon bow inwards: its hull is the corners
@@ -28,7 +27,7 @@ def test_graphs_have_the_edges_their_kind_implies(data):  # noqa: F811
     assert rows["voronoi"]["features"] == 3 and all(row["ms"] > 0 for row in rows.values())
 
 
-def test_a_study_is_resumed_and_never_speaks_of_what_was_not_run(data, tmp_path):  # noqa: F811
+def test_a_study_is_resumed_and_never_speaks_of_what_was_not_run(data, tmp_path):
     plans = [plan_run(name, labels="raw", seed=0, split=0, epochs=2) for name in ("tac-vgnn", "vgnn-without-kernel")]
     train_all(plans, data, tmp_path, max_minutes=0.0)
     untouched = table_row(plans[1], data, tmp_path, None)
@@ -50,7 +49,7 @@ def test_a_study_is_resumed_and_never_speaks_of_what_was_not_run(data, tmp_path)
     assert text.count("\n") == 4 and "not begun,,," in text
 
 
-def test_a_run_taught_by_other_labelled_frames_is_not_gone_on_with(data, tmp_path):  # noqa: F811
+def test_a_run_taught_by_other_labelled_frames_is_not_gone_on_with(data, tmp_path):
     """The simulated contacts' pins differ, and nothing else that a run tells."""
     plan = plan_run("vgnn-without-kernel", labels="raw", seed=0, split=0, epochs=2).config
     taught, otherwise = (replace(plan, labelled=names) for names in (("frame_1.png",), ("frame_2.png",)))
@@ -69,7 +68,7 @@ def test_unknown_parts_are_named():
     assert plan_run("vgnn-without-graph", labels="raw", seed=0, split=0).config.size == {"layers": 0}
 
 
-def test_an_epochs_time_is_given_only_where_an_epoch_was_run(data):  # noqa: F811
+def test_an_epochs_time_is_given_only_where_an_epoch_was_run(data):
     from training.models import MODELS
     from training.models.cnn.inputs import ImageInputs
 
@@ -92,7 +91,7 @@ def test_memory_is_what_was_taken_while_watched():
     assert 50 < first.peak < 90 and 50 < second.peak < 90
 
 
-def test_growth_is_found_where_it_is(data):  # noqa: F811
+def test_growth_is_found_where_it_is(data):
     rest = data.pins.reference
     graph = make_graph("voronoi", rest.pins_px, outmost=rest.outmost)
     middle = rest.pins_px.mean(axis=0)
@@ -101,7 +100,7 @@ def test_growth_is_found_where_it_is(data):  # noqa: F811
     assert found["largest_growth_percent"] == pytest.approx(100) and found["growth_y_px"] > 30 and abs(found["growth_x_px"]) < 3
 
 
-def test_recorded_frames_beside_the_twins_are_straight_presses(data):  # noqa: F811
+def test_recorded_frames_beside_the_twins_are_straight_presses(data):
     found = recorded_contacts(data)
     assert [contact.name for contact in found] == ["centre, recorded"] * 2
     names = data.pins.image_name.tolist()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from drawn_frames import drawn_frame
+from drawn_recording import FRAMES, config_of
 
 from scenes import load_sensor
 from training.dataset import Dataset, PinTable
@@ -16,56 +17,10 @@ from training.evaluate import judge, leak_check, predict_rows_of, rows_to_judge,
 from training.models import recipe_of
 from training.models.part import Prediction
 from training.recipes import TrainingError
-from training.run import RunConfig, fold_rows, train_run
-from training.targets import Targets
+from training.run import fold_rows, train_run
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, make_graph, nominal_reference
+from twin.preprocess import Pipeline, nominal_reference
 from twin.types import Form, Frame
-
-FRAMES = 90
-
-
-def drawn_pins(labels, reference):
-    """Pins (M, N, 2) that follow four labels smoothly: a bump that grows with depth, moves with angle and shear."""
-    rest = reference.pins_px
-    r = (rest - rest.mean(axis=0)) / np.linalg.norm(rest - rest.mean(axis=0), axis=1).max()
-    depth, angle, shear, turn = (labels / [4, 20, 5, 5]).T[:, :, None]
-    middle = np.stack([0.2 * angle, 0 * angle], axis=-1)
-    bump = np.exp(-4 * ((r - middle) ** 2).sum(axis=2))[..., None]
-    spun = np.stack([-r[:, 1], r[:, 0]], axis=1)
-    moved = (
-        5 * (1.2 + depth)[..., None] * bump * (6 * (r - middle) + 4 * np.stack([shear, 0.1 * shear], axis=-1) + 3 * turn[..., None] * spun)
-    )
-    return rest + moved
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    spec = load_sensor("mg400-127")
-    reference = nominal_reference(spec, Form.RECORDING)
-    rng = np.random.default_rng(0)
-    raw = np.column_stack([rng.uniform(-4, 0, FRAMES), rng.uniform(-20, 20, FRAMES), rng.uniform(-5, 5, (FRAMES, 2))])
-    executed = (rng.random(FRAMES) < 0.7).astype(float)
-    true = raw * np.column_stack([np.ones((FRAMES, 2)), executed, executed])
-    true[:, 1] -= (1 - executed) * raw[:, 3]
-    nodes = drawn_pins(true, reference) + rng.normal(0, 0.02, (FRAMES, 127, 2))
-    area = np.stack([make_graph("voronoi", n, outmost=reference.outmost).area_px2 for n in nodes])
-    names = np.array([f"f_{k}.png" for k in range(FRAMES)])
-    pins = PinTable(spec, Form.RECORDING, reference, names, nodes, area, np.zeros((FRAMES, 127), bool), np.ones(FRAMES, bool))
-    targets = Targets(("pose_2", "pose_6"), raw[:, :2], true[:, :2], executed, raw[:, 2:])
-    return Dataset(pins, targets, (tmp_path_factory.mktemp("drawn"),))
-
-
-def config_of(model, **recipe):
-    size = {"width": 16, "modes": 8, "area_modes": 4, "channels": 2, "frequencies": 3} if model == "vgnn" else {}
-    return RunConfig(model, recipe_of(model, **recipe), size=size)
-
-
-@pytest.fixture(scope="module")
-def trained(data, tmp_path_factory):
-    out = tmp_path_factory.mktemp("run")
-    assert train_run(config_of("vgnn", epochs=30, batch=16), data, out)
-    return out
 
 
 @pytest.mark.parametrize("model", ["vgnn", "tac-vgnn-release"])

@@ -1,0 +1,214 @@
+"""A job measures some figures; ``figures.json`` keeps what it found until its inputs change.
+
+A job's inputs are the sensors' specifications and the code it runs: the packages it names and its own function. ``fingerprint`` is the one
+place that says what code counts.
+"""
+
+import hashlib
+import inspect
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+
+from scenes import load_sensor
+from twin.store import code_digest
+
+ROOT = Path(__file__).parents[2]
+FIGURES = ROOT / "figures.json"
+WORK = ROOT / "out" / "figures"
+TAIL = 2000  # characters of a failed command's output that are shown
+
+
+class FiguresError(Exception):
+    """A figure can't be measured or named; says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """A measured number and its unit ("" for a plain number; shares are fractions)."""
+
+    value: float
+    unit: str = ""
+
+
+Measured = dict[str, Value]
+
+
+@dataclass(frozen=True)
+class Job:
+    """How some figures are measured.
+
+    Attributes
+    ----------
+    name : str
+        ``family.what``; figures are called ``name.figure``.
+    measure : callable
+        From the job's own folder, which is kept between runs, to its figures.
+    command : str
+        What a reader would type to get the same.
+    sensors : tuple of str
+        Whose specifications it depends on.
+    code : tuple of str
+        Packages whose code it depends on.
+    recordings : tuple of str
+        Folders of ``TACTIP_REAL`` that it needs.
+    minutes : float
+        About how long it takes on two cores.
+    """
+
+    name: str
+    measure: Callable[[Path], Measured]
+    command: str
+    sensors: tuple[str, ...]
+    code: tuple[str, ...]
+    recordings: tuple[str, ...]
+    minutes: float
+
+    @property
+    def family(self) -> str:
+        """The name's first part."""
+        return self.name.split(".")[0]
+
+
+JOBS: dict[str, Job] = {}
+
+
+def job(
+    name: str,
+    command: str,
+    *,
+    sensors: tuple[str, ...] = (),
+    code: tuple[str, ...] = ("scenes", "twin"),
+    recordings: tuple[str, ...] = (),
+    minutes: float = 1.0,
+) -> Callable:
+    """Register a function as the job of that name."""
+
+    def register(measure: Callable[[Path], Measured]) -> Callable[[Path], Measured]:
+        if name in JOBS:
+            raise FiguresError(f"two jobs are called {name!r}")
+        JOBS[name] = Job(name, measure, command, sensors, code, recordings, minutes)
+        return measure
+
+    return register
+
+
+def real_folder(recording: str = "") -> Path:
+    """A folder of the real recordings."""
+    return Path(os.environ.get("TACTIP_REAL", ROOT / "../shared/real")) / recording
+
+
+def run_twin(work: Path, *arguments: object) -> str:
+    """``twin ARGUMENTS`` in a process of its own; its output, which is also kept in ``work/log.txt``.
+
+    Raises
+    ------
+    FiguresError
+        It fails.
+    """
+    work.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-c", "from twin.cli import main; main()", *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
+    (work / "log.txt").write_text(f"twin {' '.join(map(str, arguments))}\n\n{done.stdout}\n{done.stderr}")
+    if done.returncode:
+        raise FiguresError(f"twin {' '.join(map(str, arguments))}\nended with {done.returncode}: {done.stderr[-TAIL:]}")
+    return done.stdout
+
+
+def specification_digest(sensors: tuple[str, ...]) -> str:
+    """Of the resolved specifications, however their files are laid out."""
+    text = "\n".join(load_sensor(name).model_dump_json() for name in sensors)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def fingerprint(made: Job) -> str:
+    """Of the code that a job runs: its packages, and its own function with what is bound to it."""
+    measure, bound = made.measure, ""
+    if isinstance(measure, partial):
+        measure, bound = measure.func, repr(sorted(measure.keywords.items()))
+    return hashlib.sha256(f"{code_digest(*made.code)}\n{inspect.getsource(measure)}\n{bound}".encode()).hexdigest()[:16]
+
+
+def key_of(made: Job) -> dict[str, str]:
+    """What must not have changed for a job's figures to count."""
+    return {"specification": specification_digest(made.sensors), "fingerprint": fingerprint(made)}
+
+
+def read(path: Path = FIGURES) -> dict[str, dict]:
+    """What is kept, by job."""
+    return json.loads(path.read_text())["jobs"] if path.is_file() else {}
+
+
+def values(path: Path = FIGURES) -> dict[str, Value]:
+    """Every kept figure by its whole name."""
+    kept = read(path)
+    return {f"{name}.{figure}": Value(**found) for name, entry in kept.items() for figure, found in entry["figures"].items()}
+
+
+def is_kept(made: Job, path: Path = FIGURES) -> bool:
+    """Whether a job's figures are there and its inputs are what they were."""
+    entry = read(path).get(made.name)
+    return entry is not None and {key: entry[key] for key in ("specification", "fingerprint")} == key_of(made)
+
+
+def missing_recordings(made: Job) -> list[str]:
+    """Folders that a job needs and this machine does not have."""
+    return [name for name in made.recordings if not real_folder(name).is_dir()]
+
+
+def run(made: Job, path: Path = FIGURES, work: Path = WORK) -> Measured:
+    """Measure a job's figures and keep them; others stay as they are."""
+    key, started = key_of(made), perf_counter()
+    folder = work / made.name / key["fingerprint"]
+    folder.mkdir(parents=True, exist_ok=True)
+    found = made.measure(folder)
+    entry = {
+        "command": made.command,
+        **key,
+        "commit": _commit(),
+        "date": datetime.now(UTC).date().isoformat(),
+        "machine": machine(),
+        "minutes": round((perf_counter() - started) / 60, 2),
+        "figures": {name: asdict(value) for name, value in found.items()},
+    }
+    _write(path, read(path) | {made.name: entry})
+    return found
+
+
+def machine() -> str:
+    """Processor and number of cores."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+
+
+def _commit() -> str:
+    """The commit, with ``+`` where the tree differs from it; "" without history."""
+    try:
+        commit, changed = (
+            subprocess.run(["git", "-C", str(ROOT), *command], capture_output=True, text=True, check=True).stdout.strip()
+            for command in (("rev-parse", "--short=12", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return commit + "+" * bool(changed)
+
+
+def _write(path: Path, jobs: dict[str, dict]) -> None:
+    """Whole or not at all."""
+    text = json.dumps({"jobs": dict(sorted(jobs.items()))}, indent=1) + "\n"
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f"{path.name}.", suffix=".part", delete=False) as file:
+        file.write(text)
+    Path(file.name).chmod(0o644)
+    os.replace(file.name, path)

@@ -1,0 +1,74 @@
+"""How real the renders are, and what they cost."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from bench_render import CHOSEN, Bench
+
+from figures.jobs import Measured, Value, job, real_folder, run_twin
+from scenes import load_sensor
+from twin.realism.images import compare_images
+from twin.recordings import open_recording
+from twin.simulator import Simulator
+from twin.types import Form
+
+RECORDED = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
+RENDERED = {"psnr_db": "dB", "psnr_gray_db": "dB", "ssim": "", "flip": ""}
+REPEATS = 5
+
+
+@job(
+    "render.realism.ur5-331",
+    "twin realism DIR --sensor ur5-331 --out OUT",
+    sensors=("ur5-331",),
+    code=("scenes", "twin", "training"),
+    recordings=("ur5-331-raw",),
+    minutes=10,
+)
+def realism(work: Path) -> Measured:
+    """30 frames with caps where they stand in the real ones: likeness, and the worst bin of radius of what caps look like."""
+    run_twin(work, "realism", real_folder("ur5-331-raw"), "--sensor", "ur5-331", "--out", work / "realism")
+    metrics = json.loads((work / "realism" / "metrics.json").read_text())
+    images, seen = metrics["pin_aligned"], metrics["statistics"]
+    found = {name: Value(part["mean"], RENDERED.get(name, "px")) for name, part in images.items() if isinstance(part, dict)}
+    found |= {"frames": Value(metrics["frames"]), "exact": Value(images["exact_fraction"])}
+    found |= {f"worst_{name}": Value(value) for name, value in seen["worst_relative_difference"].items()}
+    noise = seen["scalars"]["noise_sd"]
+    found |= {"noise_real": Value(noise["real"], "gray levels"), "noise_rendered": Value(noise["rendered"], "gray levels")}
+    return found | ({"told_apart": Value(metrics["two_sample"]["accuracy"])} if metrics["two_sample"] else {})
+
+
+@job("render.speed", "tests/bench/bench_render.py", sensors=("mg400-331", "ur5-331"), minutes=8)
+def speed(work: Path) -> Measured:
+    """A frame of a data set, plain path tracing for the same errors in the same run, a large colour picture, and the preview."""
+    bench = Bench("mg400-331", REPEATS)
+    truth, rows = bench.samples()
+    ratios = bench.plain(rows)
+    _, wall_ms, _, _, centroid_px = next(row for row in rows if row[0] == CHOSEN)
+    half_px = next(row for row in rows if row[0] == CHOSEN // 2)[4]
+    preview_ms, preview_px = bench.preview(truth)
+    return {
+        "frame_s": Value(wall_ms / 1e3, "s"),
+        "centroid_px": Value(centroid_px, "px"),
+        "centroid_half_px": Value(half_px, "px"),
+        "plain_ratio_centroids": Value(ratios["centroids"]),
+        "plain_ratio_grays": Value(ratios["gray levels"]),
+        "photo_s": Value(bench.photo(), "s"),
+        "preview_s": Value(preview_ms / 1e3, "s"),
+        "preview_px": Value(preview_px, "px"),
+    }
+
+
+@job(
+    "render.at_rest", "pytest -m slow -s tests/system/test_real.py", sensors=tuple(RECORDED), recordings=tuple(RECORDED.values()), minutes=1
+)
+def at_rest(work: Path) -> Measured:
+    """SSIM of rendered and recorded frames without contact, in the recordings' thresholded form."""
+    found = {}
+    for name, recording in RECORDED.items():
+        simulator = Simulator(load_sensor(name))
+        recorded = open_recording(real_folder(recording), simulator.spec).reference.image
+        rendered = simulator.shoot(simulator.rest, form=Form.RECORDING).frame.image
+        found[f"{name}_ssim"] = Value(compare_images(recorded, rendered, np.ones(recorded.shape[:2], bool)).ssim)
+    return found

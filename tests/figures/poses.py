@@ -1,0 +1,175 @@
+"""Errors of pose models: trained on recordings, taught by the twin, and on objects never touched."""
+
+import csv
+import json
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+from bench_training import drawn_table, inputs_of
+
+from figures.jobs import JOBS, WORK, FiguresError, Measured, Value, fingerprint, job, real_folder, run_twin
+from training.studies.tac_vgnn.efficiency import measure_training
+
+SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
+CODE = ("scenes", "twin", "training")
+UNITS = {"pose_2": "mm", "pose_6": "deg"}
+SPLITS = (0, 1, 2)
+MODELS = {"vgnn": 40.0, "tac-vgnn-release": 25.0, "gnn": 20.0}  # on three splits; minutes of a training on two cores
+SLOW_MODELS = {"cnn-v2": 35.0, "cnn-v1": 27.0}  # on one split, stopped after as many minutes
+PARTS = ("vgnn", "vgnn-without-graph", "vgnn-without-modes", "vgnn-without-kernel")
+LABELS = 40
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Of a CSV file."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def trained(work: Path, *, model: str, sensor: str, split: int) -> Measured:
+    """Train on four fifths of a recording (the paper's models on raw labels) and judge on the last one, also on changed images."""
+    labels = "corrected" if model == "vgnn" else "raw"
+    data, run = real_folder(SETS[sensor]), work / "run"
+    limit = ("--max-minutes", SLOW_MODELS[model]) if model in SLOW_MODELS else ()
+    options = ("--target", "surface-2d-shear", "--labels", labels, "--seed", split, "--split", split, *limit)
+    if not (run / "weights.pt").is_file():
+        run_twin(work, "train", "--model", model, "--sensor", sensor, "--data", data, *options, "--out", run)
+    changed = ("--robustness",) if model == "vgnn" else ()
+    run_twin(work, "evaluate", run, "--data", data, "--out", work / "judged", *changed)
+    metrics = json.loads((work / "judged" / "metrics.json").read_text())
+    found = {"frames": Value(metrics["frames"]), "leak_slope": Value(metrics["leak_slope"])}
+    for kind, (name, unit) in product(("corrected", "raw"), UNITS.items()):
+        part = metrics[kind][name]
+        found |= {f"{kind}_{unit}": Value(part["mae"], unit), f"{kind}_{unit}_inside": Value(part["coverage_90"])}
+    for row in rows_of(work / "judged" / "robustness.csv") if changed else ():
+        name = row["change"].replace(" ", "_")
+        found |= {f"{name}_{unit}_more": Value(float(row[f"{column}_more"])) for column, unit in UNITS.items()}
+    return found
+
+
+def over_splits(work: Path, *, model: str, sensor: str) -> Measured:
+    """Mean, least and largest error over seeds and splits, of runs that the single jobs made."""
+    found = {}
+    each = []
+    for split in SPLITS:
+        name = f"training.{model}.{sensor}.split{split}"
+        metrics = WORK / name / fingerprint(JOBS[name]) / "judged" / "metrics.json"
+        if not metrics.is_file():
+            raise FiguresError(f"{metrics} is missing: run {name} first (make figures ONLY={name})")
+        each.append(json.loads(metrics.read_text()))
+    for kind, (name, unit) in product(("corrected", "raw"), UNITS.items()):
+        errors = [metrics[kind][name]["mae"] for metrics in each]
+        parts = (("mean", np.mean(errors)), ("least", min(errors)), ("most", max(errors)))
+        found |= {f"{kind}_{unit}_{key}": Value(float(value), unit) for key, value in parts}
+    return found
+
+
+def parts_of_vgnn(work: Path) -> Measured:
+    """What each part of `vgnn` earns on the 331's split 0."""
+    options = ("--labels", "corrected", "--models", ",".join(PARTS), "--batches", "", "--no-contacts")
+    run_twin(
+        work, "study", "tac-vgnn", "--data", real_folder(SETS["mg400-331"]), "--sensor", "mg400-331", "--out", work / "study", *options
+    )
+    found = {}
+    for row in rows_of(work / "study" / "models.csv"):
+        found |= {f"{row['model']}_{unit}": Value(float(row[f"{column}_corrected"]), unit) for column, unit in UNITS.items()}
+    return found
+
+
+def taught_by_the_twin(work: Path, *, sensor: str, seed: int, extra: tuple = (), count: int = 300) -> Measured:
+    """Rows of a study from the twin to real frames, against corrected and raw labels."""
+    options = ("--labels", LABELS, "--seed", seed, "--count", count, *extra)
+    run_twin(work, "study", "sim-to-real", "--sensor", sensor, "--frames", real_folder(SETS[sensor]), *options, "--out", work / "study")
+    found = {}
+    for row in rows_of(work / "study" / "study.csv"):
+        about = f"{row['trained_on']}_{row['labelled_frames']}_{row['model']}"
+        name = "".join(letter if letter.isalnum() else "_" for letter in about)
+        for kind, (column, unit) in product(("corrected", "raw"), UNITS.items()):
+            found[f"{name}.{kind}_{unit}"] = Value(float(row[f"{column}_{kind}"]), unit)
+    return found
+
+
+def never_touched(work: Path) -> Measured:
+    """A model taught by nine objects and one by the plane alone, on objects seen and unseen."""
+    options = ("--count", 60, "--tests", 25, "--across", 12, "--seed", 1)
+    run_twin(work, "study", "objects", "--sensor", "mg400-331", *options, "--out", work / "study")
+    found = {}
+    for row in rows_of(work / "study" / "objects.csv"):
+        for column, unit in UNITS.items():
+            name = f"{row['model']}.{row['object']}"
+            found |= {
+                f"{name}.{unit}": Value(float(row[f"{column}_error"]), unit),
+                f"{name}.{unit}_times": Value(float(row[f"{column}_times"])),
+            }
+    return found
+
+
+def shipped_on_frames(work: Path) -> Measured:
+    """The shipped weights of ``ur5-331``, trained in the twin alone, on the 30 published raw frames."""
+    run_twin(work, "evaluate", "ur5-331", "--data", real_folder("ur5-331-raw"), "--rows", "all", "--out", work / "judged")
+    metrics = json.loads((work / "judged" / "metrics.json").read_text())
+    return {name: Value(metrics["corrected"][name]["mae"], "mm" if name == "pose_3" else "deg") for name in ("pose_3", "pose_4", "pose_5")}
+
+
+def seconds_an_epoch(work: Path) -> Measured:
+    """Of models on 3763 drawn graphs, batches of 128, two threads."""
+    torch.set_num_threads(2)
+    found = {}
+    for sensor, model in (("mg400-127", "tac-vgnn"), ("mg400-331", "tac-vgnn"), ("mg400-331", "vgnn")):
+        pins = drawn_table(sensor, 3763)
+        seconds = measure_training(model, pins, inputs_of(model, pins), 128)["s_per_epoch"]
+        found[f"{model}.{sensor}"] = Value(seconds, "s")
+    return found
+
+
+def register() -> None:
+    """All jobs of this file."""
+    for (model, minutes), sensor in product((MODELS | SLOW_MODELS).items(), SETS):
+        splits = SPLITS if model in MODELS else SPLITS[:1]
+        common = {"sensors": (sensor,), "code": CODE, "recordings": (SETS[sensor],)}
+        for split in splits:
+            command = f"twin train --model {model} --sensor {sensor} --data DIR --target surface-2d-shear --split {split} --out RUN"
+            job(f"training.{model}.{sensor}.split{split}", command, minutes=minutes, **common)(
+                partial(trained, model=model, sensor=sensor, split=split)
+            )
+        if len(splits) > 1:
+            job(f"training.{model}.{sensor}.splits", f"mean of the runs of {model}", minutes=minutes + 0.1, **common)(
+                partial(over_splits, model=model, sensor=sensor)
+            )
+    real = {"code": CODE, "recordings": (SETS["mg400-331"],), "sensors": ("mg400-331",)}
+    job("training.parts.mg400-331", f"twin study tac-vgnn --labels corrected --models {','.join(PARTS)}", minutes=120, **real)(
+        parts_of_vgnn
+    )
+    for sensor, seeds in (("mg400-331", range(5)), ("mg400-127", range(3))):
+        common = {"sensors": (sensor,), "code": CODE, "recordings": (SETS[sensor],)}
+        command = f"twin study sim-to-real --sensor {sensor} --frames DIR --labels {LABELS} --count 300 --seed"
+        for seed in seeds:
+            job(f"sim_to_real.{sensor}.seed{seed}", f"{command} {seed}", minutes=60, **common)(
+                partial(taught_by_the_twin, sensor=sensor, seed=seed)
+            )
+        job(f"sim_to_real.{sensor}.calibrated", f"{command} 0 --calibrate", minutes=90, **common)(
+            partial(taught_by_the_twin, sensor=sensor, seed=0, extra=("--calibrate",))
+        )
+    ablation = ("--ablate", "--across", 16)
+    command = "twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 --seed 0 --ablate --count 80 --across 16"
+    job("sim_to_real.mg400-331.ablation", command, minutes=35, **real)(
+        partial(taught_by_the_twin, sensor="mg400-331", seed=0, extra=ablation, count=80)
+    )
+    command = "twin study objects --sensor mg400-331 --count 60 --tests 25 --across 12 --seed 1"
+    job("objects.mg400-331", command, sensors=("mg400-331",), code=CODE, minutes=30)(never_touched)
+    command = "tests/bench/bench_training.py --models tac-vgnn vgnn --batches 128 --threads 2"
+    job("training.epoch", command, sensors=tuple(SETS), code=CODE, minutes=2)(seconds_an_epoch)
+    job(
+        "training.shipped.ur5-331",
+        "twin evaluate ur5-331 --data DIR --rows all",
+        sensors=("ur5-331",),
+        code=CODE,
+        recordings=("ur5-331-raw",),
+        minutes=1,
+    )(shipped_on_frames)
+
+
+register()

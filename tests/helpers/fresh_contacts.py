@@ -1,0 +1,33 @@
+"""Contacts that no shipped model has seen, simulated on a coarse mesh."""
+
+from pathlib import Path
+
+from scenes import load_experiment, load_object, load_randomisation, load_sensor
+from training.dataset import Dataset, load_dataset
+from training.estimator import PoseEstimator
+from training.generation import GenerationConfig, generate
+from training.simulated import config_of
+from twin.rig.kinematics import rig_of
+
+
+def simulate_contacts(folder: Path, sensor: str, experiment: str, count: int, *, seed: int, across: int, states: str = "all") -> Path:
+    """A data set of pins alone, contacts randomised as 'contact'; goes on where it was."""
+    spec, plan = load_sensor(sensor), load_experiment(experiment)
+    config = GenerationConfig(
+        sensor=spec,
+        object=load_object(plan.object),
+        experiment=plan,
+        randomisation=load_randomisation("contact"),
+        friction=rig_of(spec).friction,
+        seed=seed,
+        images="none",
+        states=states,
+        across=across,
+    )
+    generate(folder, config, count)
+    return folder
+
+
+def read_for(estimator: PoseEstimator, folder: Path) -> Dataset:
+    """The data set as a model's inputs and truth."""
+    return load_dataset(folder, config_of(folder).sensor, estimator.names, form=estimator.form)

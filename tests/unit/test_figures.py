@@ -1,0 +1,85 @@
+"""Figures: kept until their inputs change, printed into documents from where they are kept, and never stated otherwise there."""
+
+import json
+from functools import partial
+
+import pytest
+from figures import __main__ as driver
+from figures import jobs as module
+from figures import tables
+from figures.jobs import FIGURES, JOBS, FiguresError, Job, Value, is_kept, run, values
+
+
+@pytest.fixture
+def counted():
+    """A job that says how often it ran."""
+    calls = []
+
+    def measure(work):
+        calls.append(work)
+        return {"force": Value(0.5 * len(calls), "N")}
+
+    return Job("probe.force", partial(measure), "nothing", ("mg400-127",), ("scenes",), (), 0.0), calls
+
+
+def test_a_figure_is_kept_with_what_made_it(counted, tmp_path):
+    job, calls = counted
+    path = tmp_path / "figures.json"
+    assert not is_kept(job, path)
+    run(job, path, tmp_path)
+    assert is_kept(job, path) and values(path) == {"probe.force.force": Value(0.5, "N")}
+    entry = json.loads(path.read_text())["jobs"]["probe.force"]
+    assert set(entry) == {"command", "specification", "fingerprint", "commit", "date", "machine", "minutes", "figures"}
+    assert calls[0].is_dir() and [p.name for p in tmp_path.glob("*.part")] == []
+
+
+def test_what_it_was_made_from_decides_whether_it_counts(counted, tmp_path, monkeypatch):
+    job, _ = counted
+    path = tmp_path / "figures.json"
+    run(job, path, tmp_path)
+    other = Job(job.name, job.measure, job.command, ("mg400-331",), job.code, (), 0.0)
+    assert not is_kept(other, path), "another specification"
+    monkeypatch.setattr(module, "code_digest", lambda *packages: "changed")
+    assert not is_kept(job, path), "other code"
+    run(job, path, tmp_path)
+    assert is_kept(job, path) and values(path)["probe.force.force"].value == 1.0
+
+
+def test_other_jobs_figures_stay(counted, tmp_path):
+    job, _ = counted
+    path = tmp_path / "figures.json"
+    run(job, path, tmp_path)
+    run(Job("probe.other", job.measure, "", (), ("scenes",), (), 0.0), path, tmp_path)
+    assert set(values(path)) == {"probe.force.force", "probe.other.force"}
+
+
+def test_jobs_are_chosen_by_family_and_name():
+    assert {job.family for job in driver.chosen("pins,render")} == {"pins", "render"}
+    assert [job.name for job in driver.chosen("mechanics.hertz")] == ["mechanics.hertz"]
+    assert len(driver.chosen("")) == len(JOBS)
+    with pytest.raises(FiguresError, match="pinz.*families: .*pins"):
+        driver.chosen("pinz")
+
+
+def test_every_figure_of_a_table_is_some_jobs():
+    strange = [name for name in tables.named_in_templates() if not any(name.startswith(f"{job}.") for job in JOBS)]
+    assert not strange and tables.templates()
+
+
+def test_a_document_gets_its_tables_and_numbers(monkeypatch, tmp_path):
+    (tmp_path / "forces.md").write_text("| force | {probe.force:.1f} N |\n| share | {probe.share:.0%} |\n")
+    monkeypatch.setattr(tables, "TEMPLATES", tmp_path)
+    text = "Before\n<!-- figures: forces -->\nold\n<!-- /figures -->\nand <!-- figure: probe.force .2f -->9<!-- /figure --> N."
+    made = tables.filled(text, {"probe.force": Value(1.25, "N")})
+    assert "| force | 1.2 N |\n| share | ? |" in made and "-->1.25<!-- /figure --> N." in made and "old" not in made
+    assert tables.filled(made, {"probe.force": Value(1.25, "N")}) == made
+    assert sorted(tables.used_in(text)) == ["probe.force", "probe.force", "probe.share"]
+    with pytest.raises(FiguresError, match="no table is called 'force'.*forces"):
+        tables.filled(text.replace("figures: forces", "figures: force"), {})
+
+
+@pytest.mark.parametrize("path", tables.documents(), ids=lambda path: path.name)
+def test_documents_state_what_was_measured(path):
+    """Marked tables and numbers are those of figures.json: `make tables` writes them."""
+    text = path.read_text()
+    assert tables.filled(text, values(FIGURES)) == text, f"{path.name} states other figures than {FIGURES.name}: run 'make tables'"

@@ -20,7 +20,7 @@ from pathlib import Path
 from time import perf_counter
 
 from scenes import load_sensor
-from twin.store import code_digest
+from twin import store
 
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "figures.json"
@@ -131,12 +131,23 @@ def specification_digest(sensors: tuple[str, ...]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+UNMEASURED = ("twin.cli", "twin.report")
+"""Packages whose code changes no figure: the command line's words and the pages' looks."""
+
+
+def code_of_packages(*packages: str) -> str:
+    """Fingerprint of all modules of some packages that may change a figure."""
+    files = (path.relative_to(ROOT).with_suffix("") for package in packages for path in sorted((ROOT / package).rglob("*.py")))
+    modules = [".".join(path.parts).removesuffix(".__init__") for path in files]
+    return store.fingerprint(*(name for name in modules if not name.startswith(UNMEASURED)))
+
+
 def fingerprint(made: Job) -> str:
     """Of the code that a job runs: its packages, and its own function with what is bound to it."""
     measure, bound = made.measure, ""
     if isinstance(measure, partial):
         measure, bound = measure.func, repr(sorted(measure.keywords.items()))
-    return hashlib.sha256(f"{code_digest(*made.code)}\n{inspect.getsource(measure)}\n{bound}".encode()).hexdigest()[:16]
+    return hashlib.sha256(f"{code_of_packages(*made.code)}\n{inspect.getsource(measure)}\n{bound}".encode()).hexdigest()[:16]
 
 
 def key_of(made: Job) -> dict[str, str]:

@@ -11,7 +11,8 @@ from scenes import RandomisationSpec, load_object
 from training.dataset import joined, split_rows
 from training.recipes import TrainingError
 from training.run import fold_rows
-from training.studies.objects import MIXED, Plan, rows_in_range, verdicts
+from training.studies.objects import Plan, rows_in_range, verdicts
+from training.studies.objects.plan import MIXED
 from twin.errors import FrameError
 from twin.preprocess import make_reference
 from twin.types import Form

@@ -39,7 +39,7 @@ def test_what_it_was_made_from_decides_whether_it_counts(counted, tmp_path, monk
     run(job, path, tmp_path)
     other = Job(job.name, job.measure, job.command, ("mg400-331",), job.code, (), 0.0)
     assert not is_kept(other, path), "another specification"
-    monkeypatch.setattr(module, "code_digest", lambda *packages: "changed")
+    monkeypatch.setattr(module, "code_of_packages", lambda *packages: "changed")
     assert not is_kept(job, path), "other code"
     run(job, path, tmp_path)
     assert is_kept(job, path) and values(path)["probe.force.force"].value == 1.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from drawn_frames import drawn_frame
-from test_training import config_of, data, drawn_pins  # noqa: F401  (data is a fixture)
+from drawn_recording import config_of, drawn_pins
 from torch import nn
 
 from training.dataset import PinTable
@@ -77,7 +77,7 @@ def toy():
     del MODELS["line"]
 
 
-def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change(data, toy, tmp_path):  # noqa: F811
+def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change(data, toy, tmp_path):
     assert train_run(RunConfig(toy, recipe_of(toy)), data, tmp_path)
     assert json.loads((tmp_path / "config.json").read_text())["model"] == toy and (tmp_path / "weights.pt").is_file()
     estimator = PoseEstimator.load(tmp_path)
@@ -96,7 +96,7 @@ def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change
     assert np.array_equal(predict_rows_of(again, data, rows).mean, made.mean)
 
 
-def test_what_a_new_model_does_not_provide_it_says(data, toy, tmp_path):  # noqa: F811
+def test_what_a_new_model_does_not_provide_it_says(data, toy, tmp_path):
     with pytest.raises(TrainingError, match="line has no modes that a Gaussian process could see; train it with --no-kernel"):
         recipe_of(toy, kernel=True)
     with pytest.raises(TrainingError, match="line has no part that can be left out"):
@@ -122,7 +122,7 @@ def test_every_model_is_called_as_it_is_registered_and_can_be_trained_as_it_come
         recipe_of(name, **variant.recipe)
 
 
-def test_sizes_that_a_model_does_not_have_are_named(data):  # noqa: F811
+def test_sizes_that_a_model_does_not_have_are_named(data):
     with pytest.raises(TrainingError, match="vgnn has no size layer; there are channels, layers"):
         model_named("vgnn").build(data.pins.reference, 2, {"layer": 1})
     for name in ("gnn", "cnn-v2"):
@@ -130,7 +130,7 @@ def test_sizes_that_a_model_does_not_have_are_named(data):  # noqa: F811
             model_named(name).build(data.pins.reference, 2, {"layers": 1})
 
 
-def test_a_model_of_pictures_refuses_pins_instead_of_guessing(data):  # noqa: F811
+def test_a_model_of_pictures_refuses_pins_instead_of_guessing(data):
     model, reference = model_named("cnn-v2"), data.pins.reference
     content = {"networks": [model.build(reference, 2, {}).state_dict()], "kernels": [], "kernel_labels": [], "aside": {}}
     content |= {"shift": np.zeros(2), "scale": np.ones(2), "blend": np.zeros(2), "quantile": np.ones(2), "raw_quantile": np.ones((2, 2))}
@@ -246,13 +246,13 @@ def test_rounding_is_no_mode_wherever_modes_are_taken():
     assert spanned(np.array([1.0, 0.5, 0.2]), 2) == 2
 
 
-def test_a_run_with_processes_beside_its_networks_has_no_small_copy(data, tmp_path):  # noqa: F811
+def test_a_run_with_processes_beside_its_networks_has_no_small_copy(data, tmp_path):
     train_run(config_of("vgnn", epochs=1, batch=16, members=1, kernel=True), data, tmp_path)
     with pytest.raises(TrainingError, match="has Gaussian processes beside its networks.*--no-kernel"):
         pack(tmp_path, tmp_path / "small")
 
 
-def test_a_run_whose_processes_are_kept_as_by_an_earlier_version_is_refused_with_advice(data, tmp_path):  # noqa: F811
+def test_a_run_whose_processes_are_kept_as_by_an_earlier_version_is_refused_with_advice(data, tmp_path):
     train_run(config_of("vgnn", epochs=1, batch=16, members=1, kernel=True), data, tmp_path)
     content = torch.load(tmp_path / "weights.pt", weights_only=True)
     for kernel in content["kernels"]:

@@ -21,12 +21,9 @@ from twin.types import Form
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}
-# left of a pin's displacement after the set's own smooth modes: measured 0.90, 0.82, 1.23 px and a tenth; a swapped pin leaves a pitch (11 px)
+# What is left of a pin's displacement after the set's own smooth modes, px: measured (0.90, 0.82, 1.23) and a tenth.
+# A swapped pin leaves a pitch, 11 px or more.
 SMOOTH_PX = {"tac-vgnn-331": 0.99, "tac-vgnn-127": 0.90, "ur5-331-raw": 1.35}
-    "tac-vgnn-331": 0.99,
-    "tac-vgnn-127": 0.90,
-    "ur5-331-raw": 1.35,
-}  # measured 0.90, 0.82, 1.23 px, and a tenth: left of a pin's displacement after the set's own smooth modes; a swapped pin leaves a pitch (11 px or more)
 DEPTH_MIDDLES_MM = (1.5, 2.5, 3.5, 4.5)  # indentation, about pose_2 + 5 mm, in the middle of the four bins
 LEAST_SSIM = {"tac-vgnn-331": 0.77, "tac-vgnn-127": 0.82}  # a tenth below measured 0.857, 0.911; caps half a pixel off cost a rim each
 ORDER_OF_MAGNITUDE = (0.7, 1.3)  # simulated to measured displacement; nothing is fitted to the table

@@ -1,9 +1,8 @@
 """The weights that go with the package tell freshly simulated contacts as well as is stated here, and say so.
 
 Stated is what was measured: mean absolute errors, and the share of labels inside intervals of 90 %, over all converged states of contacts
-with ``SEED`` of the experiment that a model was trained for. The same seed gives the same contacts, so that there is no sampling error:
-what differs is the twin, the models, or the weights. It is by intention that no number is better than measured by more than the tolerance:
-then the twin has changed, and the figures that documents state of these weights are to be measured again.
+with ``SEED`` of the experiment that a model was trained for. The same seed gives the same contacts, so there is no sampling error. A number
+that is much better than stated fails, too: the twin has changed, and what documents state of these weights has to be measured again.
 """
 
 from dataclasses import dataclass

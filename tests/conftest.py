@@ -13,6 +13,16 @@ import pytest  # noqa: E402
 from scenes import load_sensor  # noqa: E402
 
 
+def pytest_sessionstart(session):
+    """Before workers start, compile the kernels that most of them need, once: each would do so for itself (half a CPU minute)."""
+    if getattr(session.config.option, "numprocesses", None):
+        from scenes import load_object
+        from twin.geometry.solid import Resolution
+        from twin.mechanics import ContactPose, SkinSolver
+
+        SkinSolver(load_sensor("mg400-127"), resolution=Resolution(8), keep=False).press(load_object("plane"), ContactPose(1.0))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory):
     """The tests keep their arrays apart from the user's."""

@@ -55,7 +55,7 @@ def image_of(spec: SensorSpec) -> np.ndarray:
         pytest.skip("the scalar variant does without the window")
     with pytest.MonkeyPatch.context() as patch:
         for module in (tracer, static_layer):
-            patch.setattr(module, "lights", sky)
+            patch.setattr(module, "lights", lambda *_: sky(spec))
         return made.render(seed=0).astype(float)
 
 

@@ -22,12 +22,14 @@ from twin.types import Form
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}
+# What is left of a pin's displacement after the set's own smooth modes, px: measured (0.90, 0.82, 1.23) and a tenth.
+# A swapped pin leaves a pitch, 11 px or more.
+SMOOTH_PX = {"tac-vgnn-331": 0.99, "tac-vgnn-127": 0.90, "ur5-331-raw": 1.35}
 MOST_LOST = 0.001  # of all pins of all frames
-SMOOTH_PX = 1.5  # left of a pin's displacement after the set's own smooth modes; a swapped pin leaves a pitch (11 px or more)
 DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)  # of pose_2
 DEPTH_MIDDLES_MM = (1.5, 2.5, 3.5, 4.5)  # indentation, about pose_2 + 5 mm, in the middle of the four bins
 PURE = {"angle_deg": 3.0, "shear_mm": 1.0, "shear_deg": 1.0}  # contacts with less of each count as straight presses
-LEAST_SSIM = 0.6  # of two thresholded frames; caps half a pixel off cost a rim of black and white each
+LEAST_SSIM = {"tac-vgnn-331": 0.77, "tac-vgnn-127": 0.82}  # a tenth below measured 0.857, 0.911; caps half a pixel off cost a rim each
 ORDER_OF_MAGNITUDE = (0.7, 1.3)  # simulated to measured displacement; nothing is fitted to the table
 
 
@@ -55,8 +57,8 @@ def test_every_pin_is_found_in_its_place(observed):
     modes = np.linalg.svd(moved, full_matrices=False)[2][: 40 if len(seen) > 100 else 10]
     left = np.linalg.norm((moved - moved @ modes.T @ modes).reshape(len(seen), -1, 2), axis=2)[~lost].max()
     print(f"\n{folder}: {len(seen)} frames, exact {100 * exact:.2f} %, lost pins {100 * lost.mean():.4f} %, worst residual {left:.2f} px")
-    assert all(o.valid for o in seen) and lost.mean() <= MOST_LOST and left < SMOOTH_PX
-    assert exact >= (1.0 if folder == "tac-vgnn-127" else 29 / 30)
+    assert all(o.valid for o in seen) and not lost.any() and left < SMOOTH_PX[folder]
+    assert exact == 1
 
 
 def test_legacy_throws_away_what_the_release_does(real_dir):
@@ -117,4 +119,4 @@ def test_the_rendered_frame_without_contact_is_like_the_recorded_one(real_dir, f
     likeness = compare_images(recorded, rendered, np.ones(recorded.shape[:2], bool))
     turned = compare_images(recorded, np.ascontiguousarray(rendered[::-1]), np.ones(recorded.shape[:2], bool))
     print(f"\n{folder}: SSIM {likeness.ssim:.3f}, PSNR {likeness.psnr_db:.1f} dB; mirrored {turned.ssim:.3f}, {turned.psnr_db:.1f} dB")
-    assert likeness.ssim > LEAST_SSIM and likeness.ssim > turned.ssim + 0.05
+    assert likeness.ssim > LEAST_SSIM[folder] and likeness.ssim > turned.ssim + 0.05

@@ -1,9 +1,8 @@
 """The weights that go with the package tell freshly simulated contacts as well as is stated here, and say so.
 
 Stated is what was measured: mean absolute errors, and the share of labels inside intervals of 90 %, over all converged states of contacts
-with ``SEED`` of the experiment that a model was trained for. The same seed gives the same contacts, so that there is no sampling error:
-what differs is the twin, the models, or the weights. It is by intention that no number is better than measured by more than the tolerance:
-then the twin has changed, and the figures that documents state of these weights are to be measured again.
+with ``SEED`` of the experiment that a model was trained for. The same seed gives the same contacts, so there is no sampling error. A number
+that is much better than stated fails, too: the twin has changed, and what documents state of these weights has to be measured again.
 """
 
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from training.packed import shipped_names
 
 SEED = 5  # of contacts that no training drew
 RELATIVE = 0.1  # of an error
-INSIDE = 0.05  # of a share: 9 of 174 states
+INSIDE = 0.05  # of a share: 4 of 85 states
 
 
 @dataclass(frozen=True)
@@ -30,11 +29,11 @@ class Stated:
 
 
 EXPERIMENTS = {"mg400-331": "surface-2d", "mg400-127": "surface-2d", "ur5-331": "surface-3d"}
-QUICK, FULL = (10, 12), (40, 16)  # contacts, elements across
+QUICK, FULL = (5, 12), (40, 16)  # contacts, elements across
 STATED = {
-    ("mg400-331", QUICK): Stated((0.1117, 0.3775), (0.966, 0.966)),
-    ("mg400-127", QUICK): Stated((0.1008, 0.3891), (0.696, 1.000)),
-    ("ur5-331", QUICK): Stated((0.1023, 0.1628, 0.2474), (0.520, 0.765, 0.647)),
+    ("mg400-331", QUICK): Stated((0.1166, 0.2515), (1.000, 1.000)),
+    ("mg400-127", QUICK): Stated((0.0646, 0.3167), (0.894, 1.000)),
+    ("ur5-331", QUICK): Stated((0.1051, 0.2083, 0.3101), (0.620, 0.680, 0.580)),
     ("mg400-331", FULL): Stated((0.1089, 0.2975), (0.938, 0.986)),
     ("mg400-127", FULL): Stated((0.0961, 0.3109), (0.753, 1.000)),
     ("ur5-331", FULL): Stated((0.0651, 0.1400, 0.1488), (0.766, 0.849, 0.816)),

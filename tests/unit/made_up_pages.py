@@ -90,7 +90,7 @@ def across_objects(out: Path) -> Path:
 
     experiment = load_experiment("objects-2d")
     train, unseen = (load_object("plane"), load_object("sphere")), (load_object("edge"),)
-    plan = Plan(load_sensor(SENSOR), experiment, experiment, load_randomisation("moves"), train, unseen, 100, 50, 0, 24)
+    plan = Plan(load_sensor(SENSOR), experiment, load_randomisation("moves"), train, unseen, count=100, tests=50, across=24)
     rows = [
         {"model": model, "object": thing.name, "seen": thing.name in seen, "contacts": 50, "states": 1204}
         | {f"{label}_{part}": (-0.1 if part == "bias" else 1.2) * (1 + k) for label in LABELS for part in ("error", "bias", "times")}

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+OWN_ARRAYS = ("scenes/sensors/", "tests/golden/")  # tables of the specifications, and renders of ours to compare with
 MAY_IMPORT = {
     "scenes": {"scenes"},
     "twin": {"scenes", "twin"},
@@ -56,7 +57,7 @@ def test_the_repository_holds_no_foreign_data():
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("no git, or not a git checkout")
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
-    ours = "scenes/sensors/"  # tables of measured light and caps, which belong to the specifications
-    assert not [name for name in tracked if name.endswith((".csv", ".npz", ".npy", ".pt")) and not name.startswith(ours)]
+    strange = [name for name in tracked if name.endswith((".csv", ".npz", ".npy", ".pt")) and not name.startswith(OWN_ARRAYS)]
+    assert not strange
     too_large = [name for name in tracked if (ROOT / name).is_file() and (ROOT / name).stat().st_size > 2_000_000]
     assert not too_large

@@ -28,7 +28,7 @@ def foreign(spec):
     turn = np.radians(8.0)
     turning = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     center, frames, truths = np.array([300.0, 255.0]), [], []
-    for k in range(4):
+    for k in range(2):
         rest = center + 165.0 * (flat @ turning) * (1 - 0.08 * np.linalg.norm(flat, axis=1, keepdims=True))
         truth = smooth_warp(rest, 6.0, np.random.default_rng(k))
         image = draw_discs((640, 480), truth, 6.0, level=(20, 120), blur_px=0.8, noise_sd=1.0, rng=np.random.default_rng(k))
@@ -36,6 +36,12 @@ def foreign(spec):
         frames.append(Frame(image, Form.RAW, f"foreign-{k}"))
         truths.append(truth)
     return frames, truths
+
+
+@pytest.fixture(scope="module")
+def tuned(spec, foreign):
+    """By the default method."""
+    return tune(foreign[0], spec)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -52,28 +58,27 @@ def test_every_method_tunes_itself_and_finds_the_pins(spec, foreign, method):
     assert detector.evidence.exact_rate == 1.0
 
 
-def test_names_are_those_of_the_layout(spec, foreign):
+def test_names_are_those_of_the_layout(spec, foreign, tuned):
     frames, truths = foreign
-    found = make_detector(spec, tune(frames, spec).detector)(frames[0])
+    found = make_detector(spec, tuned.detector)(frames[0])
     assert np.linalg.norm(found.pins_px - truths[0], axis=1).max() < 1.0
 
 
-def test_a_tuning_says_when_it_is_unsure(spec, foreign):
+def test_a_tuning_says_when_it_is_unsure(spec, foreign, tuned):
     frames, _ = foreign
     rng = np.random.default_rng(0)
     noisy = [Frame(np.clip(f.image + rng.normal(0, 60, f.image.shape), 0, 255).astype(np.uint8), f.form, f.name) for f in frames[:1]]
-    sure = tune(frames, spec)
     try:
         doubtful = tune(noisy, spec)
     except FrameError as error:
         assert "shows 127 pins" in str(error)
     else:
         assert doubtful.detector.evidence.sure != "sure" and doubtful.notes
-    assert sure.detector.evidence.threshold_slack > 1 and sure.detector.evidence.mask_slack_px > 5
+    assert tuned.detector.evidence.threshold_slack > 1 and tuned.detector.evidence.mask_slack_px > 5
 
 
-def test_a_tuning_survives_its_file(spec, foreign, tmp_path):
-    detector = tune(foreign[0], spec).detector
+def test_a_tuning_survives_its_file(tuned, tmp_path):
+    detector = tuned.detector
     path = tmp_path / "mine.toml"
     write_detector(path, detector, "two\nlines")
     assert load_detector(path) == detector.model_copy(update={"name": "mine"})

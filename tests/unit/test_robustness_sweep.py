@@ -145,17 +145,11 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
     plan = real_plan(spec, frames)
     counts = []
 
-    class Bar:
-        def __init__(self, title):
-            pass
+    def progress(stage, done, total, note=""):
+        if total:
+            counts.append((done, total))
 
-        def __enter__(self):
-            return lambda done, total: counts.append((done, total))
-
-        def __exit__(self, *_):
-            pass
-
-    envelopes, written = study(plan, "drawn", tmp_path, Bar)
+    envelopes, written = study(plan, "drawn", tmp_path, progress=progress)
     assert all(path.stat().st_size for path in written)
     page = read_sound_page(written[0].read_text(encoding="utf-8"), tmp_path)
     assert all(case.title in page.text for case in plan.cases)
@@ -171,6 +165,12 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
     assert counts == [(6, 7), (7, 7)] and cells[0].stat().st_mtime_ns == kept
     assert len(rows) == 3 * 3 * 2 * 2
     assert json.loads(cells[1].read_text())
+
+
+def test_two_processes_find_what_one_does(spec, frames, tmp_path):
+    plan = replace(real_plan(spec, frames), severities=(0.0, 1.0))
+    rows = [run_sweep(plan, tmp_path / str(jobs), jobs=jobs, progress=lambda done, total: None) for jobs in (1, 2)]
+    assert rows[0] == rows[1]
 
 
 def levels_of_light():

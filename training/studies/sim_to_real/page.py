@@ -17,7 +17,7 @@ from twin.report.themes import BLUE, OLIVE, PURPLE, RED
 
 SIMULATED = "simulated"  # trained in the twin alone; the names of the other rows that did without frames begin so
 BARE = "simulated, bare"
-SERIES_OF = {"vgnn": ("real frames, vgnn", RED, "o-"), "quadratic regression": ("real frames, quadratic regression", OLIVE, "s--")}
+STYLES = ((RED, "o-"), (OLIVE, "s--"))  # of the models that were trained on real frames, in the order of the rows
 
 
 def write_page(
@@ -128,9 +128,10 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
     figure, axes = sized_figure((5.2 * len(names), 4.2), len(names))
     for ax, name in zip(axes, names, strict=True):
         key = f"{name}_corrected"
-        for model, (label, color, line) in SERIES_OF.items():
+        models = dict.fromkeys(row["model"] for row in _of(rows, "real"))
+        for model, (color, line) in zip(models, STYLES, strict=False):
             mine = sorted((row for row in _of(rows, "real") if row["model"] == model), key=lambda row: row["labelled_frames"])
-            ax.plot([row["labelled_frames"] for row in mine], [row[key] for row in mine], line, color=color, label=label)
+            ax.plot([row["labelled_frames"] for row in mine], [row[key] for row in mine], line, color=color, label=f"real frames, {model}")
         for row in _of(rows, SIMULATED):
             ax.axhline(row[key], color=BLUE, ls=(0, (5, 2)), label="twin alone")
         for row in _of(rows, "simulated and real"):

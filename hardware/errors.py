@@ -1,4 +1,9 @@
-"""Errors of attached devices. Their shape is what users of LeRobot expect."""
+"""Errors of attached devices. Their shape is what users of LeRobot expect.
+
+Devices as context managers: connected when entered, disconnected when left."""
+
+from abc import ABC, abstractmethod
+from typing import Self
 
 from twin.errors import TwinError
 
@@ -17,3 +22,20 @@ class DeviceAlreadyConnectedError(DeviceError, ConnectionError):
 
 class StaleDataError(DeviceError):
     """The newest frame or feedback is older than allowed."""
+
+
+class Connection(ABC):
+    """Base of whatever has ``connect()`` and ``disconnect()``."""
+
+    @abstractmethod
+    def connect(self) -> None: ...
+
+    @abstractmethod
+    def disconnect(self) -> None: ...
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.disconnect()

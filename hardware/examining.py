@@ -6,11 +6,10 @@ from pathlib import Path
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import await_frame
 from scenes import SensorSpec
-from twin.detectors import DetectorSpec
 from twin.errors import FrameError
-from twin.health import Finding, Grade, examine
+from twin.frames import evenly_read, open_recording
+from twin.pins import DetectorSpec, Finding, Grade, examine
 from twin.progress import Progress, silent, stage
-from twin.recordings import evenly_read, open_recording
 from twin.types import Form, Frame
 
 LIMIT = 20  # frames that are looked at

@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from hardware.at_rest import FIRST, counting_from_first, given_frame
 from hardware.errors import DeviceError
 from hardware.loop import ServoLoop
-from hardware.rig import Rig, build_rig, servo_loop, steps_round
-from hardware.servo_plots import trajectory_figure
+from hardware.rig import FIRST, Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
 from hardware.session import SessionWriter, plain
 from hardware.step import Estimate, LoopSettings, SensorModel, StepRecord
 from hardware.timing import Timing
-from hardware.trajectory import Measures, Trajectory, measure, trajectory_of, write_csv
+from hardware.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from twin.errors import TwinError
 from twin.progress import Progress, Step, silent, stage

@@ -1,7 +1,14 @@
-"""The composition root of live work: the one place that decides what is simulated, recorded or real."""
+"""How work that moves an arm may be ended from outside.
 
-from collections.abc import Callable
+Which frame without contact a model counts pins from: a given one, the first that is taken, or none.
+
+The composition root of live work: the one place that decides what is simulated, recorded or real."""
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -18,15 +25,72 @@ from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SHIPPED_LIMITS, load_limits
-from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
+from hardware.step import Estimate, Estimator, Guard, LoopSettings, SensorModel, StepRecord
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
-from twin.errors import RenderError
+from twin.errors import FrameError, RenderError
+from twin.frames import open_recording
 from twin.optics.preview import Preview, Shading
 from twin.optics.render import Renderer
+from twin.pins import require_untouched
 from twin.rig.mounting import Mounting
 from twin.store import cached_arrays
 from twin.types import Form, Frame
+
+
+@contextmanager
+def signals_as_ctrl_c() -> Iterator[None]:
+    """SIGTERM and a closed terminal (SIGHUP) raise ``KeyboardInterrupt``, as Ctrl-C does, so that the arm is let go of.
+
+    For the main thread only. A signal that is ignored outside (``nohup``) stays ignored. The handlers of before are put back at the end.
+    """
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {ended: signal.getsignal(ended) for ended in (signal.SIGTERM, signal.SIGHUP)}
+    for ended, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(ended, interrupt)
+    try:
+        yield
+    finally:
+        for ended, handler in before.items():
+            signal.signal(ended, handler)
+
+
+FIRST, NONE = "first", "none"
+
+
+def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
+    """The no-contact frame of a file, or of a recording's folder; None for ``first`` and ``none``.
+
+    Raises
+    ------
+    FrameError
+        There is no such frame.
+    """
+    if at_rest in (FIRST, NONE):
+        return None
+    if not Path(at_rest).exists():
+        raise FrameError(f"--at-rest {at_rest}: no such file; expected a frame without contact, '{FIRST}' or '{NONE}'")
+    recording = open_recording(at_rest, model.sensor, model.form)
+    return recording.reference if recording.reference is not None else recording.read(0)
+
+
+def counting_from_first(model: SensorModel, frame: Frame) -> SensorModel:
+    """The model that counts pins from the first frame that was taken.
+
+    Raises
+    ------
+    FrameError
+        The sensor seems pressed in it, or the model can't count from it.
+    """
+    found = model.at_rest(frame)
+    remedy = "move it clear of everything and begin again, or give a frame that was taken without contact: --at-rest FRAME"
+    require_untouched(model.sensor, model.form, frame, remedy)
+    return found
+
 
 TWIN = "twin"
 SHADING_QUALITY: Literal["standard"] = "standard"

@@ -1,5 +1,8 @@
-"""An arm whose every move is checked by ``hardware.safety``."""
+"""Letting go of a device: every step is tried, whatever became of the others.
 
+An arm whose every move is checked by ``hardware.safety``."""
+
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -10,8 +13,32 @@ import numpy as np
 from hardware.arms.arm import Arm, ArmState
 from hardware.arms.kinematics import Kinematics
 from hardware.errors import DeviceError, StaleDataError
-from hardware.let_go import try_each
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
+
+
+def try_each(**steps: Callable[[], object]) -> list[str]:
+    """Call each step; a second Ctrl-C ends the step that it meets, not those after it.
+
+    Returns
+    -------
+    list of str
+        What failed. It is also noted on the exception that is on its way, if there is one, and printed with it.
+    """
+    on_its_way, failed, interrupt = sys.exc_info()[1], [], None
+    for name, act in steps.items():
+        try:
+            act()
+        except Exception as error:
+            failed.append(f"{name} failed: {error}")
+            if on_its_way is not None:
+                on_its_way.add_note(failed[-1])
+        except BaseException as error:
+            failed.append(f"{name} was interrupted")
+            interrupt = error
+    if interrupt is not None:
+        raise interrupt
+    return failed
+
 
 KEPT_DECISIONS = 10_000
 RETREAT_SHARES = (1.0, 0.75, 0.5, 0.25)  # shares of the retreat, tried in turn until the limits allow one

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from hardware.following import Followed, FollowPlan, follow
-from hardware.servo_plots import comparison_figure
 from hardware.step import SensorModel
+from hardware.trajectory import comparison_figure
 from scenes import ObjectSpec, ServoSpec
 from twin.errors import TwinError
 from twin.progress import Progress, silent

@@ -15,7 +15,7 @@ import numpy as np
 from hardware.cameras.recorded import SequentialSource
 from hardware.errors import DeviceError
 from twin.errors import FrameError
-from twin.recordings.images import read_image, write_image
+from twin.frames.images import read_image, write_image
 from twin.store import write_json
 from twin.types import Form, Frame
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hardware.arms.arm import ArmState
 from scenes.sensor import SensorSpec
-from twin.preprocess.pipeline import Pipeline
+from twin.pins.pipeline import Pipeline
 from twin.types import Form, Frame
 
 

@@ -1,6 +1,6 @@
 """Specifications: what exists. Sensors, objects, experiments and servo parameters as data, validated where they enter."""
 
-from scenes.errors import SpecError
+from scenes.base import SpecError
 from scenes.experiment import ExperimentSpec
 from scenes.load import (
     list_experiments,

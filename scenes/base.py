@@ -1,8 +1,18 @@
-"""What every specification section shares: frozen, strict, no unknown key, no NaN."""
+"""The one error a specification can raise.
+
+What every specification section shares: frozen, strict, no unknown key, no NaN."""
 
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
+
+
+class SpecError(ValueError):
+    """A specification file is missing, unreadable or impossible.
+
+    The message names the file, the key and the remedy, on one line.
+    """
+
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]

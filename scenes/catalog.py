@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel
 
-from scenes.errors import SpecError
+from scenes.base import SpecError
 from scenes.load import (
     SHIPPED,
     list_experiments,

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from scenes.errors import SpecError
+from scenes.base import SpecError
 from scenes.experiment import ExperimentSpec
 from scenes.object import MeshShape, ObjectSpec
 from scenes.randomisation import RandomisationSpec

@@ -18,7 +18,7 @@ from training.dataset import Dataset
 from training.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points, Processes, fit_processes
 from training.models.part import Inputs, Model, Modes, Prediction, Prepared
 from training.networks import predict_rows
-from twin.preprocess.reference import Reference
+from twin.pins.reference import Reference
 
 COVERAGE = 0.9
 SMALL_GROUP = 30  # rows, below which a quantile of their own says little

@@ -11,10 +11,10 @@ from scenes.sensor import SensorSpec
 from training.simulated import is_pins_only, is_simulated, open_simulated, touched_labels
 from training.targets import Targets, choose_targets
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, make_graph, make_reference, nominal_reference
-from twin.preprocess.batch import UNMEASURED, recording_reference
-from twin.preprocess.reference import Reference
-from twin.recordings import Recording, open_recording
+from twin.frames import Recording, open_recording
+from twin.pins import Pipeline, make_graph, make_reference, nominal_reference
+from twin.pins.batch import UNMEASURED, recording_reference
+from twin.pins.reference import Reference
 from twin.rig.labels import label_slope, plate_slope
 from twin.store import cached_arrays
 from twin.types import Form

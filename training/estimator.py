@@ -1,7 +1,10 @@
-"""A trained model, its sensor and its pipeline in one: frame in, pose out. The one thing a live loop calls."""
+"""A trained model, its sensor and its pipeline in one: frame in, pose out. The one thing a live loop calls.
+
+Several trained models under the names that results give them."""
 
 import hashlib
 import json
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +22,7 @@ from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.recipes import TrainingError
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, make_reference, measure_reference
+from twin.pins import Pipeline, make_reference, measure_reference
 from twin.store import fingerprint
 from twin.types import Form, Frame
 
@@ -225,3 +228,17 @@ def digest_of(run: str | Path) -> str:
 
 def _ms(started: float) -> float:
     return 1e3 * (perf_counter() - started)
+
+
+def load_by_name(runs: Sequence[Path]) -> dict[str, PoseEstimator]:
+    """Models by the names of their folders, or by their whole paths where two folders are called alike.
+
+    Raises
+    ------
+    TrainingError
+        A folder holds no run.
+    """
+    names = [run.name for run in runs]
+    if len(set(names)) < len(names):
+        names = [str(run) for run in runs]
+    return {name: PoseEstimator.load(run) for name, run in zip(names, runs, strict=True)}

@@ -1,7 +1,9 @@
-"""One network's training, epoch by epoch, in a state that can be kept and taken up again."""
+"""One network's training, epoch by epoch, in a state that can be kept and taken up again.
+
+How trainings tell how far they are, in the terms of ``twin.progress``."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -11,6 +13,7 @@ from torch import nn
 from training.models.part import Inputs
 from training.networks import device_of, predict_rows
 from training.recipes import Recipe
+from twin.progress import Step
 
 RISE_STEPS = 100  # over which the cosine schedule's rate rises to its full size
 PLATEAU_PATIENCE = 3
@@ -191,3 +194,12 @@ def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: to
         cross = nn.functional.binary_cross_entropy_with_logits(out["executed"][known], executed[known])
         loss = loss + EXECUTED_LOSS * cross
     return loss
+
+
+def epoch_step(step: Step) -> Callable[[int, int, Mapping[str, float]], None]:
+    """What ``train_run`` calls with (epochs done, epochs in all, the curve's last row): the error on held-out rows becomes the note."""
+
+    def told(done: int, total: int, point: Mapping[str, float]) -> None:
+        step(done, total, f"{point['held_out_error']:.4f}")
+
+    return told

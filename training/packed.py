@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save
 from scenes.sensor import SensorSpec
 from training.models import model_named
 from training.recipes import TrainingError
-from twin.preprocess import make_reference
+from twin.pins import make_reference
 from twin.store import write_bytes, write_text
 
 WEIGHTS = "weights.safetensors"

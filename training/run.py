@@ -1,9 +1,12 @@
-"""Training runs: a folder with configuration, learning curves, weights, and what continuing after a kill needs.
+"""The files of a training run, each written whole or not at all.
+
+Training runs: a folder with configuration, learning curves, weights, and what continuing after a kill needs.
 
 ``config.json`` (resolved: model, recipe, sensor, pipeline, labels, rows), ``curves.csv``, ``checkpoint.pt`` while the run
-goes on, ``weights.pt`` when it is done. Every file is written whole or not at all.
-"""
+goes on, ``weights.pt`` when it is done. Every file is written whole or not at all."""
 
+import csv
+import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,9 +23,33 @@ from training.models import model_named
 from training.models.part import Prepared
 from training.networks import parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
-from training.run_files import write_curves, write_tensors
-from twin.recordings.forms import blob_spec
-from twin.store import fingerprint, write_text
+from twin.frames.forms import blob_spec
+from twin.store import fingerprint, write_text, write_with
+
+
+def write_tensors(path: Path, content: dict) -> None:
+    """A dict of numbers, text, lists, arrays and tensors, as ``torch.load`` reads it with ``weights_only``."""
+    write_with(path, lambda file: torch.save(_as_tensors(content), file))
+
+
+def _as_tensors(value: object) -> object:
+    """The same with arrays as tensors, which are read back without running anything that a file may hold."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value)
+    if isinstance(value, dict):
+        return {key: _as_tensors(part) for key, part in value.items()}
+    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
+
+
+def write_curves(out: Path, curves: list) -> None:
+    """``curves.csv`` of networks one after the other."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
+    for k, points in enumerate(curves):
+        writer.writerows([k, *point.values()] for point in points)
+    write_text(out / "curves.csv", text.getvalue())
+
 
 FOLDS = 10  # each network of an ensemble watches another tenth of the training rows
 KEEP_EVERY_S = 20.0

@@ -8,13 +8,12 @@ import zarr
 
 from scenes.sensor import SensorSpec
 from training.generation.config import GenerationConfig
-from training.generation.store import CONFIG, DRAWS
-from training.generation.truth_file import TRUTH
+from training.generation.store import CONFIG, DRAWS, TRUTH
 from twin.errors import FrameError
-from twin.recordings import Recording
-from twin.recordings.folders import image_folders
-from twin.recordings.forms import frame_size
-from twin.recordings.tables import order_by_table, read_table
+from twin.frames import Recording
+from twin.frames.folders import image_folders
+from twin.frames.forms import frame_size
+from twin.frames.tables import order_by_table, read_table
 from twin.rig.kinematics import object_pose, rig_of
 from twin.rig.mounting import Mounting
 from twin.rig.touch import Surface, surface_labels

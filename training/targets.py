@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin.errors import FrameError
-from twin.recordings import Recording
+from twin.frames import Recording
 from twin.rig.labels import read_executed
 
 PRESETS = {

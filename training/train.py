@@ -8,11 +8,11 @@ import torch
 
 from scenes import SensorSpec
 from training.dataset import joined, load_dataset
+from training.loop import epoch_step
 from training.models import recipe_of
 from training.networks import choose_device
 from training.recipes import TrainingError
 from training.run import RunConfig, train_run
-from training.studies.telling import epoch_step
 from training.targets import PRESETS
 from twin.progress import Progress, silent, stage
 from twin.types import Form

@@ -23,3 +23,7 @@ class RenderError(TwinError):
 
 class StoreError(TwinError):
     """A result can't be written, or what lies in a folder was made otherwise, or another run is at work there."""
+
+
+class DatasetError(TwinError):
+    """A data set can't be made, or not gone on with."""

@@ -8,14 +8,14 @@ import numpy as np
 
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.camera import expose, record
+from twin.camera.capture import expose, record
+from twin.camera.truth import CapTruth, cap_truth
 from twin.errors import FrameError
+from twin.frames.forms import frame_size
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.render import Quality, Renderer
-from twin.recordings.forms import frame_size
-from twin.truth import CapTruth, cap_truth
 from twin.types import ContactState, FloatArray, Form, Frame
 
 

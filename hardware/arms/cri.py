@@ -1,22 +1,41 @@
-"""Scripts written for the sensor group's ``cri`` drive our arms: change the imports, keep the rest.
+"""Poses as matrices and back.
+
+Scripts written for the sensor group's ``cri`` drive our arms: change the imports, keep the rest.
 
 from hardware.arms.cri import SyncRobot, MG400Controller as Controller
 
 with SyncRobot(Controller()) as robot:
     robot.coord_frame = (300, 0, 0, -180, 0, 0)
-    robot.move_linear((0, 0, 0, 0, 0, 0))
-"""
+    robot.move_linear((0, 0, 0, 0, 0, 0))"""
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hardware.arms.arm import Arm
-from hardware.arms.frames import matrix_pose, pose_matrix
 from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS
 from hardware.arms.open_arm import open_arm
 from hardware.errors import DeviceError
+
+
+def pose_matrix(pose: np.ndarray, axes: str = "sxyz") -> np.ndarray:
+    """(4, 4) of ``x, y, z`` in mm and three Euler angles in deg; axes as ``sxyz``: s static, r rotating."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler(_scipy_axes(axes), np.asarray(pose, float)[3:], degrees=True).as_matrix()
+    T[:3, 3] = np.asarray(pose, float)[:3]
+    return T
+
+
+def matrix_pose(T: np.ndarray, axes: str = "sxyz") -> np.ndarray:
+    """The reverse of ``pose_matrix``."""
+    return np.r_[T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_euler(_scipy_axes(axes), degrees=True)]
+
+
+def _scipy_axes(axes: str) -> str:
+    return axes[1:] if axes[0] == "s" else axes[1:].upper()
+
 
 EULER_AXES = tuple(
     frame + order for frame in "sr" for order in ("xyz", "xyx", "xzy", "xzx", "yzx", "yzy", "yxz", "yxy", "zxy", "zxz", "zyx", "zyz")

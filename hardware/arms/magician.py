@@ -11,12 +11,10 @@ import numpy as np
 import serial
 from serial.tools import list_ports
 
-from hardware.arms.arm import ArmState
-from hardware.arms.base import POLL_S, BaseArm
+from hardware.arms.arm import POLL_S, ArmState, BaseArm
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import MAGICIAN
+from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
-from hardware.arms.targets import joint_target, linear_target, require_possible
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 REPLY_TIMEOUT_S = 0.3  # a reply usually takes about 10 ms

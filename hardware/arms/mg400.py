@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hardware.arms import kinematics as arms
-from hardware.arms.arm import ArmState
-from hardware.arms.base import POLL_S, BaseArm
+from hardware.arms.arm import POLL_S, ArmState, BaseArm
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import LinkageKinematics
+from hardware.arms.kinematics import LinkageKinematics, joint_target, linear_target, require_possible
 from hardware.arms.mg400_link import SILENCE_S, CommandPort, Feedback
 from hardware.arms.mg400_wire import (
     DASHBOARD_PORT,
@@ -26,7 +25,6 @@ from hardware.arms.mg400_wire import (
     require_ports,
     why_refused,
 )
-from hardware.arms.targets import joint_target, linear_target, require_possible
 from hardware.errors import DeviceError, DeviceNotConnectedError
 
 ENABLE_TIMEOUT_S = 5.0

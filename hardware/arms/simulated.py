@@ -6,8 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from hardware.arms.arm import ArmState
-from hardware.arms.base import BaseArm
+from hardware.arms.arm import ArmState, BaseArm
 from hardware.arms.kinematics import MG400, Kinematics, StageKinematics, Violation
 from hardware.arms.motion import MotionTrack, Speeds
 from hardware.errors import DeviceError, StaleDataError

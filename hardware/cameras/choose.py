@@ -9,7 +9,7 @@ from hardware.cameras.uvc import UvcCamera, UvcSettings
 from hardware.errors import DeviceError
 from hardware.session import SessionSource, is_session
 from scenes.sensor import SensorSpec
-from twin.recordings.forms import frame_size
+from twin.frames.forms import frame_size
 from twin.types import Form
 
 

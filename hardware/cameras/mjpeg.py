@@ -1,4 +1,6 @@
-"""A camera behind a URL: JPEG pictures over HTTP, multipart/x-mixed-replace."""
+"""JPEG pictures over HTTP as multipart/x-mixed-replace: what a server of such a stream writes.
+
+A camera behind a URL: JPEG pictures over HTTP, multipart/x-mixed-replace."""
 
 import http.client
 import time
@@ -8,12 +10,35 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 
-from hardware.cameras.capture import capture
-from hardware.cameras.reader import LiveSource, Picture, ReadFailed
+from hardware.cameras.reader import LiveSource, Picture, ReadFailed, capture
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
-from twin.recordings.quiet import quiet
+from twin.frames.images import quiet
 from twin.types import Form
+
+BOUNDARY = "frame"
+CONTENT_TYPE = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+JPEG_QUALITY = 95
+
+
+def jpeg_of(image: np.ndarray) -> bytes:
+    """A gray (H, W) or RGB (H, W, 3) picture as JPEG."""
+    _, coded = cv2.imencode(".jpg", image if image.ndim == 2 else image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return coded.tobytes()
+
+
+class Writable(Protocol):
+    """What bytes can be written to."""
+
+    def write(self, data: bytes, /) -> int | None: ...
+
+
+def write_part(out: Writable, jpeg: bytes, headers: dict[str, object] | None = None) -> None:
+    """Write one picture of a stream; ``OSError`` where the client has gone."""
+    more = "".join(f"{name}: {value}\r\n" for name, value in (headers or {}).items())
+    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n{more}\r\n"
+    out.write(head.encode("ascii") + jpeg + b"\r\n")
+
 
 SILENT_S = 2.0  # without a byte for so long the read has failed
 LARGEST_PART = 32_000_000  # bytes

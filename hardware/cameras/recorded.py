@@ -4,10 +4,9 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 
-from hardware.connection import Connection
-from hardware.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceNotConnectedError
 from scenes.sensor import SensorSpec
-from twin.recordings import Recording, open_recording
+from twin.frames import Recording, open_recording
 from twin.types import Form, Frame
 
 

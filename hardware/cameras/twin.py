@@ -11,12 +11,12 @@ from hardware.cameras.reader import LiveSource, Picture, ReadFailed
 from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject
 from scenes.sensor import SensorSpec
-from twin.camera import expose, record
+from twin.camera.capture import expose, record
 from twin.errors import ContactError
+from twin.frames.forms import frame_size
 from twin.mechanics.follow import Follower
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
-from twin.recordings.forms import frame_size
 from twin.rig.contact import contact_law
 from twin.types import ContactState, Form, Frame
 

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hardware.cameras.capture import capture
-from hardware.cameras.reader import LiveSource, Picture, ReadFailed
+from hardware.cameras.reader import LiveSource, Picture, ReadFailed, capture
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
-from twin.recordings.quiet import quiet
+from twin.frames.images import quiet
 from twin.types import Form
 
 MANUAL_EXPOSURE = 1  # V4L2; 3 is automatic

@@ -7,10 +7,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
+from hardware.cameras.mjpeg import CONTENT_TYPE, jpeg_of, write_part
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import Faults
 from hardware.errors import DeviceError
-from hardware.stream import CONTENT_TYPE, jpeg_of, write_part
 from twin.errors import TwinError
 
 CLIENT_WAIT_S = 0.5

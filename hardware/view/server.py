@@ -6,8 +6,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
+from hardware.cameras.mjpeg import CONTENT_TYPE, jpeg_of, write_part
 from hardware.errors import DeviceError
-from hardware.stream import CONTENT_TYPE, jpeg_of, write_part
 from twin.report.page import render_page
 
 WAIT_S = 0.5

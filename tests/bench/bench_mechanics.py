@@ -30,7 +30,7 @@ from scenes import load_object, load_sensor  # noqa: E402
 from twin.errors import ContactError  # noqa: E402
 from twin.mechanics.path import ContactPose  # noqa: E402
 from twin.mechanics.solver import SkinSolver  # noqa: E402
-from twin.stimulus.mesh_field import sample_mesh  # noqa: E402
+from twin.objects.mesh_field import sample_mesh  # noqa: E402
 
 FIRST_VERSION = "c3e0227"
 SENSOR = "mg400-331"

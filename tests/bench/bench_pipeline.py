@@ -19,8 +19,8 @@ from baseline_release import Baseline  # noqa: E402
 from drawn_frames import drawn_frame, smooth_warp  # noqa: E402
 
 from scenes import load_sensor  # noqa: E402
-from twin.preprocess import Pipeline, features, nominal_reference  # noqa: E402
-from twin.recordings import open_recording  # noqa: E402
+from twin.frames import open_recording  # noqa: E402
+from twin.pins import Pipeline, features, nominal_reference  # noqa: E402
 from twin.types import Form  # noqa: E402
 
 FOLDERS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}

@@ -19,12 +19,12 @@ from plain_path import PlainPath
 
 from scenes import load_object, load_sensor
 from scenes.sensor import SensorSpec
-from twin.camera import expose
+from twin.camera.capture import expose
+from twin.camera.projection import project
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
 from twin.optics.render import Renderer
-from twin.projection import project
 
 LADDER, CONVERGED = (1, 2, 4, 8, 16), 256  # samples per pixel
 PLAIN_LADDER, PLAIN_CONVERGED = (4, 16, 64), 256

@@ -14,8 +14,8 @@ from training.dataset import PinTable
 from training.models import model_named
 from training.models.cnn.inputs import ImageInputs
 from training.models.part import Inputs, PinModel
-from training.studies.tac_vgnn.efficiency import measure_training
-from twin.preprocess import make_graph, nominal_reference
+from training.studies.tac_vgnn.models import measure_training
+from twin.pins import make_graph, nominal_reference
 from twin.types import Form
 
 PAPER_RATIO = {"gnn": 0.86 / 1.05, "tac-vgnn": 1.0, "cnn-v1": "about 10", "cnn-v2": "2 to 3"}

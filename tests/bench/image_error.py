@@ -8,7 +8,7 @@ from time import perf_counter, process_time
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.camera import expose
+from twin.camera.capture import expose
 
 SPOT = 0.5  # of the distance to the next cap: what counts to a cap's centroid
 SKIN_SHARE = 20  # percentile of the gray levels around a cap that is skin

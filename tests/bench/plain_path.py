@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from twin.camera.projection import project
 from twin.geometry.pins import rest_pins
 from twin.optics.render import BOUNCES, Renderer
 from twin.optics.scalar import ScalarView
 from twin.optics.variant import use_variant
-from twin.projection import project
 
 
 class PlainPath:

@@ -11,20 +11,20 @@ from noisy_camera import NoisyCamera, number_of
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
-from hardware.cameras.lerobot import LeRobotCamera
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
 from hardware.cameras.uvc import UvcCamera, UvcSettings, apply_settings, exposed_s
-from hardware.devices import cameras
+from hardware.doctor import cameras
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.examining import frames_of
+from hardware.lerobot import LeRobotCamera
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionWriter
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
-from twin.recordings.images import write_image
+from twin.frames.images import write_image
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 

@@ -11,14 +11,13 @@ from arms import mg400_of
 from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimator
 
-from hardware.arms.lerobot import LeRobotArm
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.endings import signals_as_ctrl_c
 from hardware.errors import DeviceError, DeviceNotConnectedError
+from hardware.lerobot import LeRobotArm
 from hardware.loop import ServoLoop
-from hardware.rig import Rig, servo_loop
+from hardware.rig import Rig, servo_loop, signals_as_ctrl_c
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SafetyLimits

@@ -8,8 +8,8 @@ from bench_render import CHOSEN, Bench
 
 from figures.jobs import Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
-from twin.realism.images import compare_images
-from twin.recordings import open_recording
+from twin.frames import open_recording
+from twin.judge.pictures.images import compare_images
 from twin.simulator import Simulator
 from twin.types import Form
 

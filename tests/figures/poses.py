@@ -11,7 +11,7 @@ import torch
 from bench_training import drawn_table, inputs_of
 
 from figures.jobs import JOBS, WORK, FiguresError, Measured, Value, fingerprint, job, real_folder, run_twin
-from training.studies.tac_vgnn.efficiency import measure_training
+from training.studies.tac_vgnn.models import measure_training
 
 SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
 CODE = ("scenes", "twin", "training")

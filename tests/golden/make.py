@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from golden_renders import CASES, dented, make
 
-from twin.camera import expose
+from twin.camera.capture import expose
 from twin.optics.render import Renderer
 
 REFERENCE = Path(__file__).with_name("renders.npz")

@@ -11,7 +11,7 @@ from scenes.sensor import GelSpec, SensorSpec, SkinSpec
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.stimulus.analytic import Plane, Sphere
+from twin.objects.analytic import Plane, Sphere
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "calculix.json").read_text())
 

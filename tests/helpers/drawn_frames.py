@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.preprocess import nominal_reference
-from twin.recordings.forms import frame_size
+from twin.frames.forms import frame_size
+from twin.pins import nominal_reference
 from twin.types import Form, Frame
 
 SUBPIXELS = 16  # per pixel and axis: places are drawn to 1/16 px or better

@@ -9,7 +9,7 @@ from training.dataset import Dataset, PinTable
 from training.models import recipe_of
 from training.run import RunConfig
 from training.targets import Targets
-from twin.preprocess import make_graph, nominal_reference
+from twin.pins import make_graph, nominal_reference
 from twin.types import Form
 
 FRAMES = 90

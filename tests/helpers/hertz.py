@@ -17,7 +17,7 @@ from twin.mechanics.balance import Body, Friction, LoadState
 from twin.mechanics.contact import ContactPoints
 from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.newton import LoadStepper
-from twin.stimulus.analytic import Sphere
+from twin.objects.analytic import Sphere
 
 SPHERE_MM, RADIUS_MM = 500.0, 40.0  # a / R = 0.08
 SIZE = 100.0  # of the block, in contact radii

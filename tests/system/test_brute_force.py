@@ -9,12 +9,12 @@ import pytest
 from brute_force import BLOCK_PX, blocks, changed, laboratory, reference, z_scores
 from scipy import stats
 
+from twin.camera.projection import window_tangent
 from twin.geometry.pins import rest_pins
 from twin.optics.render import Renderer
 from twin.optics.static_layer import ACROSS
 from twin.optics.variant import use_variant
 from twin.optics.window import Window
-from twin.projection import window_tangent
 
 BOUNCES = 6  # of the bright laboratory: what a seventh brings is below the noise
 CHANCE = 1e-3  # of refusing a right renderer, by blocks or in total

@@ -6,11 +6,11 @@ import pytest
 from command import run_twin
 
 from scenes import load_object, load_sensor
-from twin.calibration import calibrate_optics as calibration
-from twin.calibration.aligned import revised
-from twin.calibration.calibrate_optics import fit_optics
+from twin.fit import optics as calibration
+from twin.fit.optics import fit_optics
+from twin.fit.sensor_file import write_sensor
+from twin.judge.pictures.aligned import revised
 from twin.mechanics import ContactPose
-from twin.sensor_file import write_sensor
 from twin.simulator import Simulator
 
 SENSOR = "ur5-331"

@@ -11,9 +11,9 @@ from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.twin import TwinCamera
-from hardware.emulators.arm_pose import FeedbackPose
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
+from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
 from hardware.rig import Rig, servo_loop
 from hardware.rig_geometry import PlacedObject
@@ -22,7 +22,7 @@ from hardware.safety import load_limits
 from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.preprocess import Pipeline
+from twin.pins import Pipeline
 from twin.rig.mounting import Mounting
 from twin.types import Form
 

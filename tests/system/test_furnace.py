@@ -11,7 +11,7 @@ from brute_force import BLOCK_PX, changed, laboratory
 from scipy import stats
 
 from scenes.sensor import SensorSpec
-from twin.camera import expose
+from twin.camera.capture import expose
 from twin.optics import static_layer, tracer
 from twin.optics.lights import Patch
 from twin.optics.render import Renderer

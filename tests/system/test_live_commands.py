@@ -35,12 +35,12 @@ from hardware.view.draw import draw_view, voronoi_map
 from hardware.view.server import BrowserView
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimator import PoseEstimator
-from twin.camera import expose, record
+from twin.camera.capture import expose, record
 from twin.cli import command_line
 from twin.errors import TwinError
-from twin.preprocess import Pipeline
-from twin.recordings import open_recording
-from twin.recordings.images import write_image
+from twin.frames import open_recording
+from twin.frames.images import write_image
+from twin.pins import Pipeline
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from scenes import load_object, load_sensor
+from twin.camera.projection import project
+from twin.frames import open_recording
+from twin.frames.forms import recording_to_raw
+from twin.judge.pictures.images import compare_images
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.preprocess import Pipeline, nominal_reference
-from twin.preprocess.batch import recording_reference
-from twin.preprocess.legacy import LegacyPipeline
-from twin.projection import project
-from twin.realism.images import compare_images
-from twin.recordings import open_recording
-from twin.recordings.forms import recording_to_raw
+from twin.pins import Pipeline, nominal_reference
+from twin.pins.batch import recording_reference
+from twin.pins.legacy import LegacyPipeline
 from twin.rig.labels import read_arm_labels
 from twin.simulator import Simulator
 from twin.types import Form

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from scenes import load_experiment, load_object, load_sensor
-from training.pin_error import pin_errors, ring_bias
-from training.validation import ContactModel, compare, measure_frames, table_of
+from twin.judge.labelled import ContactModel, compare, measure_frames, table_of
+from twin.judge.labelled.compare import pin_errors, ring_bias
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 

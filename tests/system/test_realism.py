@@ -8,8 +8,8 @@ import pytest
 from command import run_twin
 
 from scenes import load_object, load_sensor
+from twin.judge.pictures.realism import run_realism
 from twin.mechanics import ContactPose
-from twin.realism.pictures import run_realism
 from twin.simulator import Simulator
 
 SENSOR = "ur5-331"

@@ -5,9 +5,9 @@ import pytest
 
 from scenes import load_sensor
 from training.two_sample import random_halves, two_sample
-from twin.realism.disc import lens_disc
-from twin.realism.frames import read_real
-from twin.realism.statistics import TARGET, TARGET_MEASURES, compare_statistics, measure_frame
+from twin.camera.projection import lens_disc
+from twin.judge.pictures.frames import read_real
+from twin.judge.pictures.statistics import TARGET, TARGET_MEASURES, compare_statistics, measure_frame
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 

@@ -5,17 +5,16 @@ import pytest
 from command import run_twin as run
 
 from scenes import load_sensor
-from twin.detectors import make_detector, shipped_detector, tune
-from twin.preprocess.reference import nominal_reference
-from twin.recordings import open_recording
-from twin.recordings.images import write_image
-from twin.robustness.condition import Case
-from twin.robustness.conditions import CONDITIONS
-from twin.robustness.contacts import CONTACTS
-from twin.robustness.envelope import curves_of, envelopes_of
-from twin.robustness.real import consensus
-from twin.robustness.shots import RenderedSource
-from twin.robustness.sweep import Plan, run_sweep
+from twin.frames import open_recording
+from twin.frames.images import write_image
+from twin.judge.degradation.condition import Case
+from twin.judge.degradation.conditions import CONDITIONS
+from twin.judge.degradation.envelope import curves_of, envelopes_of
+from twin.judge.degradation.shots import CONTACTS, RenderedSource
+from twin.judge.degradation.study import consensus
+from twin.judge.degradation.sweep import Plan, run_sweep
+from twin.pins import make_detector, shipped_detector, tune
+from twin.pins.reference import nominal_reference
 from twin.types import Form
 
 SETS = {"tac-vgnn-331": "mg400-331", "tac-vgnn-127": "mg400-127", "ur5-331-raw": "ur5-331"}

@@ -15,7 +15,7 @@ from scenes import load_sensor
 from training.recipes import TrainingError
 from twin.cli import command_line
 from twin.errors import FrameError, TwinError
-from twin.preprocess import nominal_reference
+from twin.pins import nominal_reference
 from twin.types import Form
 
 FRAMES = 70

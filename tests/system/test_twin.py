@@ -7,9 +7,9 @@ import pytest
 
 from scenes import load_object, load_sensor
 from twin.mechanics.path import ContactPose
-from twin.preprocess.graph import make_graph
-from twin.preprocess.pipeline import Pipeline
-from twin.preprocess.reference import nominal_reference
+from twin.pins.graph import make_graph
+from twin.pins.pipeline import Pipeline
+from twin.pins.reference import nominal_reference
 from twin.simulator import Simulator
 from twin.types import Form
 
@@ -56,7 +56,7 @@ def test_cells_at_the_contact_grow_with_depth(simulators):
     simulator = simulators["mg400-331"]
     outmost = nominal_reference(simulator.spec, Form.RAW).outmost
     truth = [simulator.rest] + [simulator.press(load_object("plane"), ContactPose(indent_mm=d)) for d in (1.5, 3.0, 4.5)]
-    from twin.projection import project
+    from twin.camera.projection import project
 
     graphs = [make_graph("voronoi", project(simulator.spec.view, state.caps_mm), outmost=outmost) for state in truth]
     middle = np.arange(37)  # the inner three rings and the centre

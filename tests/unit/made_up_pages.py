@@ -9,25 +9,25 @@ import numpy as np
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.randomisation import FrictionSpread
 from training.audit import STORIES, Audit
-from training.audit_page import summary_of, write_audit
-from training.contact_calibration.report import write_calibration
 from training.dataset import PinTable
+from training.studies.label_audit import summary_of, write_audit
 from training.studies.objects import Plan, verdicts
 from training.studies.tac_vgnn import page as study_report
 from training.studies.tac_vgnn.contacts import AreaChange
 from training.studies.tac_vgnn.models import plan_run
-from training.validation.model import MeasuredFrames
-from twin.calibration.calibrate_optics import Calibration
-from twin.calibration.report import write_page as write_calibration_page
 from twin.demo.page import ContactContent
 from twin.demo.page import write_page as write_demo_page
 from twin.demo.stages import DepthRow
-from twin.preprocess import make_graph, nominal_reference
-from twin.realism import report as realism
-from twin.realism.compare import Pair
-from twin.realism.images import ImageFigures
-from twin.realism.radial import RadialRow
-from twin.realism.statistics import RADIAL_MEASURES
+from twin.fit.contact.report import write_calibration
+from twin.fit.optics import Calibration
+from twin.fit.optics import write_page as write_calibration_page
+from twin.judge.labelled.model import MeasuredFrames
+from twin.judge.pictures import report as realism
+from twin.judge.pictures.compare import Pair
+from twin.judge.pictures.images import ImageFigures
+from twin.judge.pictures.spectra import RadialRow
+from twin.judge.pictures.statistics import RADIAL_MEASURES
+from twin.pins import make_graph, nominal_reference
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import render_page
 from twin.report.table import write_table

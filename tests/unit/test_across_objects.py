@@ -14,7 +14,7 @@ from training.run import fold_rows
 from training.studies.objects import Plan, rows_in_range, verdicts
 from training.studies.objects.plan import MIXED
 from twin.errors import FrameError
-from twin.preprocess import make_reference
+from twin.pins import make_reference
 from twin.types import Form
 
 STATES = 9  # of each of the drawn data set's ten contacts

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hardware.arms.cri import EULER_AXES, Controller, SyncRobot
-from hardware.arms.frames import matrix_pose, pose_matrix
-from hardware.arms.lerobot import LeRobotArm
+from hardware.arms.cri import EULER_AXES, Controller, SyncRobot, matrix_pose, pose_matrix
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.simulated import SimulatedArm
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
+from hardware.lerobot import LeRobotArm
 from hardware.safe_arm import SafeArm
 from hardware.safety import load_limits
 

@@ -5,8 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from hardware.arms.arm import ArmState
-from hardware.arms.base import BaseArm
+from hardware.arms.arm import ArmState, BaseArm
 from hardware.errors import DeviceError
 
 TARGET = np.array([300.0, 0, 0, 0, 0, 179.0])

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from twin.calibration.camera_pose import PARAMETERS, fit_camera, nearest_order
+from twin.camera.projection import project
 from twin.errors import FrameError
+from twin.fit.camera_pose import PARAMETERS, fit_camera, nearest_order
 from twin.geometry.pins import rest_pins
-from twin.projection import project
 
 NOISE_PX = 0.05
 MOST_SD = 3.5  # some twenty parameters are looked at: one beyond 3 sd is not rare

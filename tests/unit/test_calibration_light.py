@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
-from twin.calibration.aligned import Aligned, levels_slope, revised, to_levels, to_light
-from twin.calibration.caps import ORDERS, fit_caps, outline_steps
-from twin.calibration.photometry import fit_photometry
-from twin.calibration.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_noise, fit_response, sharpness
-from twin.calibration.rim import fit_rim
-from twin.camera import expose
+from twin.camera.capture import expose
+from twin.camera.projection import lens_disc, project
+from twin.fit.caps import ORDERS, fit_caps, outline_steps
+from twin.fit.photometry import fit_photometry
+from twin.fit.response import apparent_mm, defocus_px, fit_blur, fit_focus, fit_noise, fit_response, sharpness
+from twin.fit.rim import fit_rim
+from twin.frames.forms import gray_levels
 from twin.geometry.pins import rest_pins
-from twin.geometry.skin_fit import FittedPins
+from twin.judge.pictures.aligned import Aligned, levels_slope, revised, to_levels, to_light
+from twin.judge.pictures.spectra import noise_sd
+from twin.judge.pictures.statistics import bare_skin
+from twin.mechanics.skin_fit import FittedPins
 from twin.optics.render import Renderer
-from twin.projection import project
-from twin.realism.disc import lens_disc
-from twin.realism.spectra import noise_sd
-from twin.realism.statistics import bare_skin
-from twin.recordings.forms import gray_levels
 
 SPP = 64
 
@@ -166,7 +165,7 @@ def test_aperture_and_focus_follow_from_edges_that_widen_with_distance(known):
 
 
 def sharpness_of(distance):
-    from twin.calibration.response import Sharpness
+    from twin.fit.response import Sharpness
 
     return Sharpness(distance, np.full(len(distance), 1.5), np.full(len(distance), 1.5))
 

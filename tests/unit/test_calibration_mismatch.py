@@ -5,16 +5,15 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
-from twin.calibration.aligned import Aligned, read_frames, require_cameras_own, revised
-from twin.calibration.photometry import fit_photometry
-from twin.calibration.surroundings import fit_surroundings
-from twin.camera import expose
+from twin.camera.capture import expose
+from twin.camera.projection import lens_disc, project
 from twin.errors import FrameError
+from twin.fit.photometry import fit_photometry
+from twin.fit.surroundings import fit_surroundings
 from twin.geometry.pins import rest_pins
-from twin.geometry.skin_fit import FittedPins
+from twin.judge.pictures.aligned import Aligned, read_frames, require_cameras_own, revised
+from twin.mechanics.skin_fit import FittedPins
 from twin.optics.preview import Preview
-from twin.projection import project
-from twin.realism.disc import lens_disc
 
 
 def quiet(*_):

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
-from twin.calibration.aligned import SATURATED, revised
-from twin.calibration.surroundings import fit_surroundings
-from twin.camera import expose
+from twin.camera.capture import expose
+from twin.camera.projection import project
 from twin.errors import FrameError
+from twin.fit.surroundings import fit_surroundings
 from twin.geometry.pins import rest_pins
+from twin.judge.pictures.aligned import SATURATED, revised
 from twin.optics.static_layer import static_layer
-from twin.projection import project
 
 SIZE = 0.6  # of the shipped camera's frames: fast, and still sharp enough
 FRAMES = 20

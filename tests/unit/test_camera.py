@@ -6,7 +6,7 @@ import pytest
 from plain_sensor import changed, plain
 
 from scenes.sensor import RecordingSpec
-from twin.camera import (
+from twin.camera.capture import (
     amplified,
     blurred,
     compressed,

@@ -13,7 +13,7 @@ from hardware.collect import COLUMNS, Collection, WorkFrame, collect, draw_conta
 from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject, matrix_of
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
-from twin.recordings import open_recording, read_image
+from twin.frames import open_recording, read_image
 from twin.rig.mounting import Mounting
 from twin.types import Form
 

@@ -5,13 +5,13 @@ import pytest
 from small_generation import EXPERIMENT, small_config
 
 from scenes import load_experiment
-from training.contact_calibration import PARAMETERS, fit_contact
-from training.contact_calibration.fit import expect, held_out_px
-from training.contact_calibration.parameters import changed, values_of
-from training.contact_calibration.simulate import Setup
 from training.generation.config import draw_label
-from training.validation.model import ContactModel, MeasuredFrames
 from twin.errors import FrameError
+from twin.fit.contact import PARAMETERS, fit_contact
+from twin.fit.contact.fit import expect, held_out_px
+from twin.fit.contact.parameters import changed, values_of
+from twin.fit.contact.simulate import Setup
+from twin.judge.labelled.model import ContactModel, MeasuredFrames
 from twin.types import Form
 
 FITTED = tuple(p for p in PARAMETERS if p.name in ("rig.contact_offset_mm", "rig.tcp_lateral_mm", "rig.image_turn_deg"))
@@ -80,7 +80,7 @@ def test_frames_that_were_not_fitted_are_met_as_well(calibrated):
 
 def test_taken_up_again_nothing_is_computed_twice(calibrated, monkeypatch):
     setup, measured, _, fit, _ = calibrated
-    monkeypatch.setattr("training.contact_calibration.simulate._contact", None)  # not callable: a new contact would fail
+    monkeypatch.setattr("twin.fit.contact.simulate._contact", None)  # not callable: a new contact would fail
     again = fit_contact(setup, measured)
     assert np.array_equal(again.value, fit.value) and np.array_equal(again.executed, fit.executed)
 

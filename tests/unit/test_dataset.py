@@ -11,7 +11,7 @@ from scenes import load_sensor
 from training.dataset import load_dataset, split_rows
 from training.targets import corrected, unit_of
 from twin.errors import FrameError
-from twin.preprocess import make_reference, nominal_reference
+from twin.pins import make_reference, nominal_reference
 from twin.rig.labels import label_slope, plate_slope
 from twin.types import Form
 

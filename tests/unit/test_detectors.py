@@ -6,10 +6,10 @@ import pytest
 from drawn_frames import draw_discs, drawn_frame, smooth_warp
 
 from scenes import load_sensor
-from twin.detectors import METHODS, load_detector, make_detector, shipped_detector, tune, write_detector
-from twin.detectors.layout import flat_layout, see_layout
 from twin.errors import FrameError
-from twin.preprocess.reference import nominal_reference
+from twin.pins import METHODS, load_detector, make_detector, shipped_detector, tune, write_detector
+from twin.pins.layout import flat_layout, see_layout
+from twin.pins.reference import nominal_reference
 from twin.types import Form, Frame
 
 # scale spaces give whole pixels; DoH, from an integral image, is off by about one

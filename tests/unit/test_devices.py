@@ -1,6 +1,6 @@
 """What is attached is found without opening it."""
 
-from hardware.devices import Device, cameras, serial_ports
+from hardware.doctor import Device, cameras, serial_ports
 
 
 def test_cameras_are_read_from_the_kernels_list(tmp_path):

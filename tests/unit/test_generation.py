@@ -18,12 +18,12 @@ from training.generation.config import draw_contact
 from training.run import fold_rows
 from training.studies.sim_to_real.steps import arm_labels, with_missing
 from training.targets import corrected
+from twin.camera.projection import project
 from twin.errors import ContactError, RenderError, StoreError
+from twin.frames.forms import raw_to_recording
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
-from twin.preprocess import nominal_reference
-from twin.projection import project
-from twin.recordings.forms import raw_to_recording
+from twin.pins import nominal_reference
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import read_arm_labels, read_executed

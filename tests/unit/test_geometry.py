@@ -7,11 +7,9 @@ from block import rotation
 from scenes.load import list_sensors, load_sensor
 from twin.geometry.bspline import Basis
 from twin.geometry.chart import Chart, Focus, disc_points, dome_points
-from twin.geometry.export import skin_surface, to_pyvista
-from twin.geometry.mesh import GEL, SKIN, build_mesh
+from twin.geometry.mesh import GEL, SKIN, NodeView, build_mesh, skin_surface, to_pyvista
 from twin.geometry.pins import rest_pins
 from twin.geometry.solid import Resolution, body_points, build_solid, pin_pose, surface_operators
-from twin.geometry.view import NodeView
 
 ROUNDING_MM = 1e-9
 SPLINE_MM = 0.06  # how far a spline surface of 16 elements across lies from its sphere of 20 mm (measured 0.038)

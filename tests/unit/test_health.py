@@ -7,16 +7,15 @@ import pytest
 from plain_sensor import changed, plain
 
 from scenes import load_sensor
+from twin.camera.truth import cap_truth
 from twin.geometry.pins import rest_pins
-from twin.health import Grade, examine
-from twin.health.drift import drift_of
+from twin.judge.degradation.condition import Case
+from twin.judge.degradation.conditions import CONDITIONS
+from twin.judge.degradation.shots import CONTACTS, Contact, RenderedSource, pins_under
 from twin.mechanics.path import ContactPose
-from twin.preprocess.reference import nominal_reference
-from twin.robustness.condition import Case
-from twin.robustness.conditions import CONDITIONS
-from twin.robustness.contacts import CONTACTS, Contact, pins_under
-from twin.robustness.shots import RenderedSource
-from twin.truth import cap_truth
+from twin.pins import Grade, examine
+from twin.pins.check import drift_of
+from twin.pins.reference import nominal_reference
 from twin.types import Form, Frame
 
 

@@ -5,11 +5,11 @@ import pytest
 
 from scenes import RigSpec, load_experiment, load_object, load_sensor
 from twin.errors import ContactError
+from twin.objects.analytic import Plane
 from twin.rig.contact import contact_law
 from twin.rig.kinematics import TURNING, arm_path, object_pose, rig_of
 from twin.rig.labels import ArmLabel
 from twin.rig.mounting import Mounting
-from twin.stimulus.analytic import Plane
 
 EXACT_MM = 1e-9
 TOUCH_MM = 3e-3  # the dome is sampled

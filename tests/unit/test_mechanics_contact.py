@@ -5,13 +5,13 @@ import pytest
 from block import Watched, last, rotation, soft_sensor, usual_sensor
 
 from scenes.load import load_object
+from twin.camera.projection import project
 from twin.geometry.solid import Resolution
 from twin.mechanics import ContactPath, ContactPose, Friction
 from twin.mechanics.contact import STICK_CREEP_MM, contact_forces, spread_forces
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import plan_path
-from twin.projection import project
-from twin.stimulus import build_field
+from twin.objects import build_field
 
 SOLVER_MM = 1e-4  # what the residual's tolerance leaves open in a position
 BALANCE = 1e-6  # relative to the force: the residual's tolerance

@@ -12,7 +12,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics import ContactPath, ContactPose, Friction, SkinSolver
 from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
 from twin.mechanics.path import plan_path
-from twin.stimulus import build_field
+from twin.objects import build_field
 
 SOLVER_MM = 1e-4  # what the residual's tolerance leaves open in a position
 STEP_SHARE = 0.03  # of the largest motion: load steps half as large, with friction

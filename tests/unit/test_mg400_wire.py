@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from hardware.arms.dobot_alarms import ALARMS, explain
 from hardware.arms.mg400_wire import PACKET_BYTES, TEST_VALUE, Mode, newest_packet, take_reply, why_refused
 from hardware.emulators.faults import Faults
-from hardware.emulators.mg400 import FAULTS
+from hardware.emulators.mg400 import FAULTS, feedback_packet
 from hardware.emulators.mg400_commands import Mg400Commands
 from hardware.emulators.mg400_controller import Mg400Controller, PlanarFrame
-from hardware.emulators.mg400_feedback import feedback_packet
 from hardware.emulators.mg400_grammar import RefusedError, take_request
 
 

@@ -18,14 +18,13 @@ from training.estimator import PoseEstimator
 from training.evaluate import judge, predict_rows_of, rows_to_judge
 from training.models import MODELS, model_named, recipe_of, register, variant_named
 from training.models.part import PinModel
-from training.models.vgnn.modes import spanned
 from training.models.vgnn.network import mode_components
-from training.models.vgnn.registration import fit_registration
+from training.models.vgnn.registration import fit_registration, spanned
 from training.packed import SHIPPED, WEIGHTS, pack, shipped_names
 from training.recipes import Recipe, TrainingError
 from training.run import RunConfig, train_run
 from twin.errors import FrameError
-from twin.preprocess import make_graph
+from twin.pins import make_graph
 from twin.types import Form, Frame
 
 ROOT = Path(__file__).parents[2]

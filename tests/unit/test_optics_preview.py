@@ -5,12 +5,12 @@ import pytest
 from plain_sensor import changed, plain
 
 from scenes.sensor import SensorSpec
+from twin.camera.projection import pixel_rays, project
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
 from twin.optics.direct_light import DirectLight
 from twin.optics.lights import lights
 from twin.optics.preview import Preview, Shading
-from twin.projection import pixel_rays, project
 
 NOTHING = (0.0, 0.0)  # no light from elsewhere, nothing covered
 

@@ -5,11 +5,11 @@ import pytest
 from plain_sensor import changed, plain
 
 from scenes.sensor import SensorSpec
+from twin.camera.projection import project
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
-from twin.optics.placement import near_pins
 from twin.optics.render import Renderer
-from twin.projection import project
+from twin.optics.sampling import near_pins
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ import pytest
 from plain_sensor import changed, plain
 
 from scenes.sensor import RimSpec, SensorSpec, SpeckSpec
+from twin.camera.projection import project
 from twin.optics.lights import led_patches
 from twin.optics.static_layer import ACROSS, static_layer
-from twin.projection import project
 
 WINDOW = (50, 20, 255, 225)
 HALF = {"width_px": 320, "height_px": 240, "fx_px": 245.0, "fy_px": 245.0, "cx_px": 152.0, "cy_px": 124.0}

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
+from twin.camera.projection import distort
 from twin.geometry.pins import rest_pins
 from twin.optics.lens import WIDEST_FISHEYE, ray_table, valid_radius
 from twin.optics.surfaces import SkinSurface, caps, stems
-from twin.projection import distort
 
 
 def volume(vertices: np.ndarray, faces: np.ndarray) -> float:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import Voronoi
 
-from twin.preprocess import features, make_graph, nominal_reference
-from twin.preprocess.legacy import LEGACY, legacy_graph
-from twin.preprocess.voronoi import directed_edges, triangulate, voronoi
-from twin.recordings.forms import from_raw, recording_to_raw
+from twin.frames.forms import from_raw, recording_to_raw
+from twin.pins import features, make_graph, nominal_reference
+from twin.pins.legacy import LEGACY, legacy_graph
+from twin.pins.voronoi import directed_edges, triangulate, voronoi
 from twin.types import Form
 
 TILING = 1e-9  # relative: rounding of some hundred polygon cuts

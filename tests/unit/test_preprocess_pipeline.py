@@ -6,17 +6,16 @@ import pytest
 from drawn_frames import cap_radii_px, draw_discs, drawn_frame, smooth_warp
 
 from scenes import load_sensor
-from twin.camera import record
+from twin.camera.capture import record
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, measure_reference, nominal_reference
-from twin.preprocess.blobs import SPECK_LEVELS, despeckled, find_blobs
-from twin.preprocess.legacy import LegacyPipeline
-from twin.preprocess.mask import circular_mask
-from twin.preprocess.matching import match, rematch
-from twin.preprocess.reference import folded_fraction
-from twin.preprocess.split import split_chains
-from twin.recordings import open_recording
-from twin.recordings.forms import raw_to_recording
+from twin.frames import open_recording
+from twin.frames.forms import raw_to_recording
+from twin.pins import Pipeline, measure_reference, nominal_reference
+from twin.pins.blobs import SPECK_LEVELS, circular_mask, despeckled, find_blobs
+from twin.pins.legacy import LegacyPipeline
+from twin.pins.matching import match, rematch
+from twin.pins.reference import folded_fraction
+from twin.pins.split import split_chains
 from twin.types import Form, Frame
 
 CENTROID_RAW_PX = 0.05  # rms on a drawn gray cap with noise: a tenth of what rendering is held to

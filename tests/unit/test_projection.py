@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
+from twin.camera.projection import distort, pixel_rays, project, undistort
 from twin.geometry.pins import pin_lattice, rest_pins
-from twin.projection import distort, pixel_rays, project, undistort
 
 ROUND_TRIP_MM = 1e-9
 

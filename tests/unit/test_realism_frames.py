@@ -6,10 +6,10 @@ import pytest
 from drawn_frames import drawn_frame
 
 from scenes import load_sensor
+from twin.camera.projection import lens_disc
 from twin.errors import FrameError
-from twin.preprocess import nominal_reference
-from twin.realism.disc import lens_disc
-from twin.realism.frames import read_real
+from twin.judge.pictures.frames import read_real
+from twin.pins import nominal_reference
 from twin.types import Form
 
 

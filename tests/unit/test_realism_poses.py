@@ -6,8 +6,7 @@ import pytest
 from scenes import RigSpec, load_experiment, load_sensor
 from twin.errors import FrameError
 from twin.geometry.solid import Resolution
-from twin.mechanics.solver import SkinSolver
-from twin.realism.poses import (
+from twin.judge.pictures.poses import (
     EXPERIMENT,
     PlateTaps,
     TapBank,
@@ -18,6 +17,7 @@ from twin.realism.poses import (
     label_columns,
     labels_of_rows,
 )
+from twin.mechanics.solver import SkinSolver
 from twin.rig.labels import ArmLabel
 
 RADIUS_MM = 20.0

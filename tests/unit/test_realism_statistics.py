@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
+from twin.camera.projection import lens_disc, round_disc
 from twin.errors import FrameError
-from twin.realism.disc import lens_disc, round_disc
-from twin.realism.images import compare_images
-from twin.realism.radial import bin_of, equal_count_edges, radial_rows
-from twin.realism.spectra import log_distance_db, noise_sd, radial_spectrum
-from twin.realism.spots import find_spots, pair_spots, steady_spots
+from twin.judge.pictures.images import compare_images
+from twin.judge.pictures.spectra import bin_of, equal_count_edges, log_distance_db, noise_sd, radial_rows, radial_spectrum
+from twin.judge.pictures.spots import find_spots, pair_spots, steady_spots
 
 SIZE = (320, 240)
 RNG = np.random.default_rng(3)

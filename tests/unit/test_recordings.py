@@ -12,11 +12,10 @@ from drawn_frames import drawn_frame, smooth_warp
 
 from scenes import load_sensor
 from twin.errors import FrameError, StoreError
-from twin.preprocess import nominal_reference
-from twin.preprocess.batch import preprocess_recording
-from twin.preprocess.overlay import overlay_name
-from twin.recordings import natural_key, open_recording, read_image
-from twin.recordings.images import write_image
+from twin.frames import natural_key, open_recording, read_image
+from twin.frames.images import write_image
+from twin.pins import nominal_reference
+from twin.pins.batch import overlay_name, preprocess_recording
 from twin.types import Form
 
 

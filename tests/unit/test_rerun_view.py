@@ -14,7 +14,7 @@ from hardware.errors import DeviceError
 from hardware.view.rerun import RerunView
 from scenes import load_sensor
 from training.estimator import PoseEstimate
-from twin.preprocess import Pipeline
+from twin.pins import Pipeline
 from twin.types import Form
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from twin.errors import FrameError
-from twin.recordings import open_recording
+from twin.frames import open_recording
 from twin.rig.labels import read_arm_labels
 
 

@@ -8,7 +8,7 @@ import pytest
 from drawn_frames import drawn_frame
 
 from training.estimator import PoseEstimator
-from training.robustness import CHANGES, judge_changes
+from training.evaluate import CHANGES, judge_changes
 from twin.report.table import write_table
 from twin.types import Form, Frame
 

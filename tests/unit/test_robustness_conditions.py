@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from plain_sensor import changed, plain
 
-from twin.camera import expose
-from twin.detectors import shipped_detector
+from twin.camera.capture import expose
+from twin.camera.projection import project
 from twin.errors import TwinError
 from twin.geometry.pins import rest_pins
+from twin.judge.degradation.condition import Case, View
+from twin.judge.degradation.conditions import CONDITIONS, condition
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
-from twin.preprocess.reference import nominal_reference
-from twin.projection import project
-from twin.robustness.condition import Case, View
-from twin.robustness.conditions import CONDITIONS, condition
+from twin.pins import shipped_detector
+from twin.pins.reference import nominal_reference
 from twin.types import Form
 
 LADDER = (0.0, 0.1, 0.3, 0.6, 1.0)

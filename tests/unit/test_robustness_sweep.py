@@ -10,19 +10,18 @@ from plain_sensor import changed
 from sound_page import read_sound_page
 
 from scenes import load_sensor
-from twin.detectors import Found, make_detector, shipped_detector
 from twin.errors import TwinError
-from twin.preprocess.reference import nominal_reference
-from twin.robustness.condition import Case
-from twin.robustness.conditions import CONDITIONS
-from twin.robustness.envelope import Envelope, crossing, curves_of, envelopes_of, shares_of
-from twin.robustness.measures import MEASURES, judge_shot
-from twin.robustness.plan import SweepPlan, load_plan
-from twin.robustness.real import consensus
-from twin.robustness.report import _share_row, compare
-from twin.robustness.run import check_pipelines, study
-from twin.robustness.shots import DegradedShot, RealSource
-from twin.robustness.sweep import Plan, cells_of, run_sweep
+from twin.judge.degradation.condition import Case
+from twin.judge.degradation.conditions import CONDITIONS
+from twin.judge.degradation.envelope import Envelope, crossing, curves_of, envelopes_of, shares_of
+from twin.judge.degradation.measures import MEASURES, judge_shot
+from twin.judge.degradation.plan import SweepPlan, load_plan
+from twin.judge.degradation.report import _share_row, compare
+from twin.judge.degradation.shots import DegradedShot, RealSource
+from twin.judge.degradation.study import check_pipelines, consensus, study
+from twin.judge.degradation.sweep import Plan, cells_of, run_sweep
+from twin.pins import Found, make_detector, shipped_detector
+from twin.pins.reference import nominal_reference
 from twin.types import Form, Frame
 
 RECALL = next(m for m in MEASURES if m.name == "recall")

@@ -14,10 +14,9 @@ from training.gaussian_process import Points, fit_two_fidelities
 from training.models.vgnn import network as vgnn
 from training.packed import pack, shipped_names
 from training.recipes import TrainingError
-from training.run import train_run
-from training.run_files import write_tensors
+from training.run import train_run, write_tensors
 from training.studies.sim_to_real.steps import choose_frames, put_beside, quadratic_row, states_like, widen_intervals
-from twin.preprocess import make_reference
+from twin.pins import make_reference
 
 SAME = 1e-6  # mm or deg: rounding of the areas' logarithms
 HALF = 0.02  # of a label's spread: what half precision may change

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from scenes import load_object, load_sensor
+from twin.camera.projection import project
 from twin.geometry.pins import rest_pins
-from twin.geometry.skin_fit import SkinFit, centroid_offset_px
 from twin.mechanics import ContactPose, SkinSolver
-from twin.projection import project
+from twin.mechanics.skin_fit import SkinFit, centroid_offset_px
 
 POSES = {
     "tilted": ContactPose(indent_mm=3.0, tilt_deg=(8.0, 5.0)),

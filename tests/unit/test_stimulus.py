@@ -7,12 +7,11 @@ import trimesh
 from scenes.load import list_objects, load_object
 from scenes.object import MeshShape, ObjectSpec, PrismShape, TextureSpec
 from twin.errors import MeshError
-from twin.stimulus import build_field, mesh_field
-from twin.stimulus.analytic import Cylinder, Edge, Plane, Prism, Sphere
-from twin.stimulus.mesh_distance import signed_distance
-from twin.stimulus.mesh_field import MeshField, sample_mesh
-from twin.stimulus.mesh_file import place_mesh, read_mesh
-from twin.stimulus.texture import WireMesh
+from twin.objects import build_field, mesh_field
+from twin.objects.analytic import Cylinder, Edge, Plane, Prism, Sphere
+from twin.objects.build import WireMesh
+from twin.objects.mesh_distance import signed_distance
+from twin.objects.mesh_field import MeshField, place_mesh, read_mesh, sample_mesh
 
 STEP_MM = 1e-5
 EXACT = {

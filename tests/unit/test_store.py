@@ -16,10 +16,9 @@ import psutil
 import pytest
 
 from scenes import load_sensor
-from training.generation.work import outcomes
-from twin.calibration.calibrate_optics import _Log
 from twin.errors import StoreError
-from twin.geometry.skin_fit import FittedPins
+from twin.fit.optics import _Log
+from twin.mechanics.skin_fit import FittedPins
 from twin.mechanics.solver import SkinSolver
 from twin.optics import probes
 from twin.optics.probes import Verdict
@@ -43,26 +42,27 @@ from twin.store import (
     write_text,
 )
 from twin.store.fingerprint import PACKAGES, ROOT
+from twin.workers import outcomes
 
 SOLVER = "twin/mechanics/solver.py"
 KEEPERS = (  # the module of every function whose results are kept between runs
-    "training.contact_calibration.simulate",
+    "twin.fit.contact.simulate",
     "training.dataset",
     "training.estimator",
     "training.generation.make",
     "training.models.cnn.inputs",
-    "twin.calibration.calibrate_optics",
-    "twin.detectors.tune",
-    "twin.geometry.skin_fit",
+    "twin.fit.optics",
+    "twin.pins.tune",
+    "twin.mechanics.skin_fit",
     "twin.geometry.solid",
     "twin.optics.preview",
     "twin.optics.probes",
     "twin.optics.render",
-    "twin.robustness.contacts",
-    "twin.robustness.sweep",
-    "twin.stimulus.mesh_field",
+    "twin.judge.degradation.shots",
+    "twin.judge.degradation.sweep",
+    "twin.objects.mesh_field",
 )
-SOLVED = ("training.contact_calibration.simulate", "training.generation.make", "twin.robustness.contacts", "twin.robustness.sweep")
+SOLVED = ("twin.fit.contact.simulate", "training.generation.make", "twin.judge.degradation.shots", "twin.judge.degradation.sweep")
 
 
 def not_source(folder: str, names: list[str]) -> list[str]:
@@ -96,7 +96,7 @@ def prints(root: Path, names=KEEPERS) -> dict[str, str]:
 def test_a_changed_line_of_the_solver_is_other_code_for_all_that_was_solved(tree):
     before, after = prints(tree()), prints(tree(SOLVER, "\nclass SkinSolver", "\nNEW = 1\n\n\nclass SkinSolver"))
     assert all(before[name] != after[name] for name in SOLVED)
-    untouched = ("twin.geometry.solid", "twin.geometry.skin_fit", "twin.optics.render", "twin.stimulus.mesh_field", "twin.detectors.tune")
+    untouched = ("twin.geometry.solid", "twin.mechanics.skin_fit", "twin.optics.render", "twin.objects.mesh_field", "twin.pins.tune")
     assert all(before[name] == after[name] for name in untouched), "these compute nothing with the solver"
 
 
@@ -329,7 +329,7 @@ def test_frames_of_the_same_stem_do_not_share_a_fitted_skin(tmp_path, monkeypatc
         def __call__(self, pins_px):
             return FittedPins(pins_px, pins_px, pins_px, *([np.zeros(1)] * (len(FittedPins.__dataclass_fields__) - 3)))
 
-    monkeypatch.setattr("twin.calibration.calibrate_optics.SkinFit", Fit)
+    monkeypatch.setattr("twin.fit.optics.SkinFit", Fit)
     image = np.zeros((4, 4), np.uint8)
     raw = [("frame.png", image, np.zeros((3, 2))), ("frame.jpg", image, np.ones((3, 2)))]
     frames = _Log(tmp_path, sensor, raw).aligned(sensor, raw, lambda *_: None)

@@ -9,11 +9,9 @@ import torch
 
 from training.recipes import TrainingError
 from training.run import is_finished, train_run
-from training.studies.tac_vgnn.contacts import AreaChange, recorded_contacts
-from training.studies.tac_vgnn.efficiency import PeakMemory, measure_training
-from training.studies.tac_vgnn.graphs import compare_graphs
-from training.studies.tac_vgnn.models import ordering, plan_run, table_row, train_all
-from twin.preprocess import make_graph
+from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, recorded_contacts
+from training.studies.tac_vgnn.models import PeakMemory, measure_training, ordering, plan_run, table_row, train_all
+from twin.pins import make_graph
 from twin.report.table import write_table
 
 WATCHED_S = 0.1  # ten looks at the memory

@@ -5,18 +5,18 @@ import pytest
 from drawn_frames import drawn_frame
 
 from scenes import load_object, load_sensor
+from twin.camera.projection import project
 from twin.errors import FrameError
+from twin.frames import open_recording
+from twin.frames.forms import from_raw
 from twin.geometry.pins import rest_pins
 from twin.geometry.solid import Resolution
+from twin.judge.degradation.condition import altered
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.preprocess import Pipeline, nominal_reference, require_untouched
-from twin.preprocess.pressed import MOST_DENT, dent_of
-from twin.projection import project
-from twin.recordings import open_recording
-from twin.recordings.forms import from_raw
+from twin.pins import Pipeline, nominal_reference, require_untouched
+from twin.pins.pipeline import MOST_DENT, dent_of
 from twin.rig.labels import read_arm_labels
-from twin.robustness.condition import altered
 from twin.types import Form
 
 SENSORS = ("mg400-331", "mg400-127", "ur5-331")

@@ -19,7 +19,7 @@ from training.models.part import Prediction
 from training.recipes import TrainingError
 from training.run import fold_rows, train_run
 from twin.errors import FrameError
-from twin.preprocess import Pipeline, nominal_reference
+from twin.pins import Pipeline, nominal_reference
 from twin.types import Form, Frame
 
 

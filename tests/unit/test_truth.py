@@ -3,8 +3,8 @@
 import numpy as np
 
 from scenes import load_sensor
+from twin.camera.truth import cap_truth, occluded, segment_distance
 from twin.geometry.pins import rest_pins
-from twin.truth import cap_truth, occluded, segment_distance
 from twin.types import ContactState, Form
 
 

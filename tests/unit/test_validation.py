@@ -10,10 +10,10 @@ from small_generation import ACROSS, small_config
 from sound_page import read_sound_page
 
 from training.generation.config import draw_label
-from training.validation import ContactModel, compare, measure_frames, table_of
-from training.validation.report import summary_of, write_validation
 from twin.errors import FrameError
-from twin.preprocess import nominal_reference
+from twin.judge.labelled import ContactModel, compare, measure_frames, table_of
+from twin.judge.labelled.report import summary_of, write_validation
+from twin.pins import nominal_reference
 from twin.types import Form
 
 COUNT = 4

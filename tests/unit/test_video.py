@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.video import STREAMS, decoded, encoded, luma_weights, stream_of, through_stream
+from twin.camera.capture import STREAMS, decoded, encoded, luma_weights, stream_of, through_stream
 
 
 def colours(count: int = 4000, seed: int = 0) -> np.ndarray:

@@ -7,10 +7,10 @@ import pyvista as pv
 from scenes import load_sensor
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
+from twin.objects import build_field
 from twin.report import skin3d
 from twin.report.charts import new_figure
 from twin.report.plots import ENLARGEMENTS, area_surface_figure, draw_area_change, draw_displacement, enlargement
-from twin.stimulus import build_field
 
 
 def test_a_dying_vtk_leaves_a_plain_picture_and_a_reason(tmp_path, monkeypatch):
@@ -53,7 +53,7 @@ def test_the_skin_file_carries_displacement():
 
 
 def test_area_pictures_take_any_graph():
-    from twin.preprocess import make_graph
+    from twin.pins import make_graph
 
     rng = np.random.default_rng(0)
     rest = make_graph("voronoi", rng.uniform(0, 100, (40, 2)))

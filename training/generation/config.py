@@ -12,7 +12,7 @@ from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.randomisation import FrictionSpread, RandomisationSpec, number_type
 from scenes.sensor import SensorSpec
-from twin.errors import ContactError, TwinError
+from twin.errors import ContactError, DatasetError
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 from twin.types import FINE, Form
@@ -20,10 +20,6 @@ from twin.types import FINE, Form
 Images = Literal["raw", "gray", "recording", "none"]
 States = Literal["end", "all"]
 Quality = Literal["preview", "standard", "high"]
-
-
-class DatasetError(TwinError):
-    """A data set can't be made, or not gone on with."""
 
 
 class GenerationConfig(Section):

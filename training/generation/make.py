@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 
 from training.generation.config import DatasetError, Draw, GenerationConfig, draw_contact
+from twin.camera.truth import cap_truth
 from twin.errors import ContactError, MeshError
+from twin.frames.forms import gray_levels
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.optics.variant import one_thread
-from twin.recordings.forms import gray_levels
 from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel
 from twin.simulator import Simulator
-from twin.truth import cap_truth
 from twin.types import ContactState
 
 MOST_ATTEMPTS = 20  # draws for one contact

@@ -1,14 +1,21 @@
-"""Making a data set: here, in processes of this machine, or on a cluster."""
+"""Making a data set: here, in processes of this machine, or on a cluster.
+
+A simulated data set, from what a user asks for to its folder."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from training.generation.config import GenerationConfig
+from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_object
+from training.generation.config import GenerationConfig, Images, Quality, States
 from training.generation.make import REST, make_contact
 from training.generation.store import Store, refuse_foreign
-from training.generation.work import outcomes
+from twin.frames.forms import frame_size
+from twin.progress import Progress, silent, stage
+from twin.rig.contact import friction_between
 from twin.store import locked
+from twin.types import FINE
+from twin.workers import outcomes
 
 
 @dataclass(frozen=True)
@@ -64,3 +71,76 @@ def generate(
             if progress:
                 progress(made, count)
         return Summary(count, store.finish(count), before, failed)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What was made, and where."""
+
+    folder: Path
+    made: Summary
+
+    @property
+    def written(self) -> list[Path]:
+        """The folder."""
+        return [self.folder]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        lines = [f"{self.made.before} contacts were there before"] if self.made.before else []
+        if self.made.failed:
+            lines.append(f"{self.made.failed} draws failed and were drawn anew: see {self.folder / 'failures.csv'}")
+        return [*lines, f"{self.made.frames} frames of {self.made.contacts} contacts"]
+
+
+def config_for(
+    sensor: SensorSpec,
+    experiment: ExperimentSpec,
+    *,
+    touched: ObjectSpec | None = None,
+    images: Images = "raw",
+    states: States = "end",
+    randomisation: RandomisationSpec | None = None,
+    seed: int | None = None,
+    quality: Quality | None = None,
+    across: int = FINE,
+) -> GenerationConfig:
+    """The resolved configuration of a data set.
+
+    Parameters
+    ----------
+    touched : ObjectSpec, optional
+        The object. By default the experiment's own, with the friction that the sensor's rig was calibrated with, where it has a rig.
+    seed : int, optional
+        Of all that is drawn; the experiment's own by default.
+    quality : {"preview", "standard", "high"}, optional
+        By default ``preview`` for images in the recordings' form, which are thresholded, else ``standard``.
+
+    Raises
+    ------
+    FrameError
+        The sensor has not the form that is asked for.
+    """
+    thing = touched or load_object(experiment.object)
+    config = GenerationConfig(
+        sensor=sensor,
+        object=thing,
+        experiment=experiment,
+        randomisation=randomisation,
+        friction=friction_between(sensor.rig, thing).static,
+        seed=experiment.seed if seed is None else seed,
+        images=images,
+        states=states,
+        quality=quality or ("preview" if images == "recording" else "standard"),
+        across=across,
+    )
+    frame_size(sensor, config.form)
+    return config
+
+
+def simulate_dataset(
+    config: GenerationConfig, out: Path, count: int, *, workers: int = 1, scheduler: str = "", progress: Progress = silent
+) -> Simulated:
+    """Make a data set of ``count`` contacts, or go on with the one in the folder; parameters and errors as of ``generate``."""
+    with stage(progress, f"{config.experiment.name}, {config.sensor.name}") as step:
+        return Simulated(out, generate(out, config, count, workers=workers, scheduler=scheduler, progress=step))

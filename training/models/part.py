@@ -19,8 +19,8 @@ from torch import nn
 from scenes.sensor import SensorSpec
 from training.dataset import Dataset, PinTable
 from training.recipes import Recipe, TrainingError
-from twin.preprocess import Pipeline
-from twin.preprocess.reference import Reference
+from twin.pins import Pipeline
+from twin.pins.reference import Reference
 from twin.types import Frame
 
 Learnt = Mapping[str, Mapping[str, np.ndarray]]  # groups of named arrays that a model learnt before its networks did

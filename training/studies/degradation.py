@@ -10,11 +10,11 @@ import numpy as np
 
 from scenes import SensorSpec
 from training.estimator import PoseEstimator, digest_of
-from twin.camera import record
+from twin.camera.capture import record
+from twin.judge.degradation.envelope import Envelope
+from twin.judge.degradation.plan import SweepPlan
+from twin.judge.degradation.study import check_pipelines, real_study, rendered_study
 from twin.progress import Progress, silent
-from twin.robustness.envelope import Envelope
-from twin.robustness.plan import SweepPlan
-from twin.robustness.run import check_pipelines, real_study, rendered_study
 from twin.types import Form, Frame
 
 PIPELINES = ("twin", "legacy")

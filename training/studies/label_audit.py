@@ -1,18 +1,152 @@
-"""Whether a recording's labels agree with its pins, from the recording to tables and a page."""
+"""An audit's findings as files: a table of corrected labels, numbers, pictures and one page.
 
+Whether a recording's labels agree with its pins, from the recording to tables and a page."""
+
+import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from scenes import SensorSpec
-from training.audit import Audit, audit_labels
-from training.audit_page import summary_of, write_audit
-from training.dataset import load_dataset
+from training.audit import STORIES, Audit, audit_labels
+from training.dataset import Dataset, load_dataset
+from training.targets import corrected
 from twin.progress import Progress, silent, stage
+from twin.report.charts import muted, new_figure, write_chart
+from twin.report.numbers import number
+from twin.report.page import Page, Picture
+from twin.report.table import Column
+from twin.store import made_by, write_json, write_text
 from twin.types import Form
 
+NAMES = ("pose_2", "pose_6", "move_1", "move_6")
+LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")
+NAMED = 8  # frames of a list that the page names; audit.json holds all
+LARGE_MOVE = 1.0  # mm or deg: what smaller moves leave undecided changes nothing
+
+
+def summary_of(audit: Audit, data: Dataset) -> dict:
+    """The findings as numbers and lists of names."""
+    names = data.pins.image_name
+    large = np.abs(data.targets.raw[:, 2:]).max(axis=1) > LARGE_MOVE
+    undone = audit.executed < 0.5
+    second = np.sort(audit.chi2[:, :2], axis=1)
+    lost = data.pins.lost.any(axis=1)
+    return {
+        "frames": len(data),
+        "moves_not_executed": {"frames": int(undone.sum()), "of_large_moves": float(undone[large].mean()) if large.any() else None},
+        "undecided": int(((audit.executed > 0.05) & (audit.executed < 0.95)).sum()),
+        "median_chi2": {
+            "better_story": float(np.nanmedian(second[:, 0])),
+            "worse_story_large_moves": float(np.nanmedian(second[large, 1])),
+        },
+        "no_contact": names[audit.no_contact].tolist(),
+        "wrong_sign": names[audit.wrong_sign].tolist(),
+        "fit_no_story": names[audit.odd].tolist(),
+        "same_pins_as_an_earlier_frame": names[audit.twins != np.arange(len(names))].tolist(),
+        "frames_with_lost_pins": int(lost.sum()),
+        "depth_mm_per_mm_of_move_not_executed": audit.depth_per_move,
+        "drift": audit.drift,
+        "reader": data.problems,
+    }
+
+
+def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[Path]:
+    """``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``."""
+    labels = corrected(NAMES, data.targets.raw, audit.executed.round(), data.targets.raw[:, 2:], audit.depth_per_move)
+    table = write_text(out / "labels_corrected.csv", _labels_csv(audit, data, labels))
+    numbers = write_json(out / "audit.json", summary | {"made_by": made_by("training.audit")})
+    chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
+    page = Page(
+        f"Audit of {data.folder.name}",
+        "twin audit",
+        topic="TacTip twin: audit",
+        lead="From pins and labels alone. Each frame is asked whether its pins fit the label with the shear move executed, or the state "
+        "before it; labels_corrected.csv holds the answer. Laid beside the recording's targets.csv, it is what training with corrected "
+        "labels uses.",
+    )
+    page.notice("The reader says", summary["reader"])
+    page.figures(
+        Picture(chart, "Evidence for the findings: which story fits each frame, corrections of the angle, moves along the table, drift")
+    )
+    page.section("Findings")
+    page.table(_findings(summary), [Column("finding", "finding"), Column("value", "value", align="right")])
+    page.section("Frames that stand out")
+    page.table(
+        [{"finding": _title(key), "count": len(summary[key]), "frames": _some(summary[key])} for key in LISTS],
+        [Column("finding", "finding"), Column("count", "frames"), Column("frames", "which")],
+    )
+    page.download(table, "corrected labels, and what is said of each frame")
+    page.download(numbers, "all findings, with the names of all frames")
+    return [table, numbers, chart, page.write(out / "audit.html")]
+
+
+def _findings(summary: dict) -> list[dict]:
+    """The findings that are numbers, one a row; those of a group are named after it."""
+    rows = []
+    for key, value in summary.items():
+        if key in LISTS or key == "reader":
+            continue
+        parts = _flat(_title(key), value)
+        rows += [{"finding": name, "value": number(part)} for name, part in parts]
+    return rows
+
+
+def _flat(name: str, value: object) -> list[tuple[str, object]]:
+    if isinstance(value, dict):
+        return [found for key, part in value.items() for found in _flat(f"{name}: {_title(key)}", part)]
+    return [(name, value)]
+
+
+def _title(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _some(names: list[str]) -> str:
+    return f"{', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''}" or "none"
+
+
+def _labels_csv(audit: Audit, data: Dataset, labels: np.ndarray) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["image_name", "executed", *NAMES, *(f"chi2_{story.replace(' ', '_')}" for story in STORIES), "findings"])
+    for k, name in enumerate(data.pins.image_name):
+        flags = {"no contact": audit.no_contact, "wrong sign": audit.wrong_sign, "fits no story": audit.odd}
+        said = [flag for flag, rows in flags.items() if rows[k]]
+        if audit.twins[k] != k:
+            said.append(f"same pins as {data.pins.image_name[audit.twins[k]]}")
+        numbers = [f"{v:.6g}" for v in (*labels[k], *audit.chi2[k])]
+        writer.writerow([name, f"{audit.executed[k]:.4g}", *numbers, "; ".join(said)])
+    return text.getvalue()
+
+
+def _evidence_figure(audit: Audit, data: Dataset, labels: np.ndarray) -> Figure:
+    raw = data.targets.raw
+    figure, axes = new_figure(2, 2, panel_inch=4.4)
+    difference = audit.chi2[:, 1] - audit.chi2[:, 0]
+    size = np.hypot(raw[:, 2], raw[:, 3])
+    axes[0].plot(size, np.sign(difference) * np.log10(1 + np.abs(difference)), ".", markersize=2)
+    axes[0].axhline(0, color=muted(), linewidth=0.8)
+    axes[0].set(title="which story fits better", xlabel="size of the move, mm and deg", ylabel="log10 chi² for (+) executed")
+    axes[1].plot(raw[:, 1], raw[:, 1] - labels[:, 1], ".", markersize=2)
+    axes[1].set(title="angle label less what the pins say", xlabel="pose_6, deg", ylabel="deg")
+    undone = audit.executed < 0.5
+    width = max(len(raw) // 40, 1)
+    share = np.convolve(undone, np.ones(width) / width, mode="valid")
+    axes[2].plot(np.arange(len(share)) + width / 2, share)
+    axes[2].set(title="moves not executed, along the table", xlabel="row", ylabel="share", ylim=(0, 1))
+    rim = data.pins.nodes_px[:, data.pins.reference.outmost].mean(axis=1)
+    axes[3].plot(rim - rim.mean(axis=0), ".", markersize=1.5, label=["x", "y"])
+    axes[3].set(title="middle of the outmost pins, along the table", xlabel="row", ylabel="px")
+    axes[3].legend(markerscale=5)
+    return figure
+
+
 TARGET = "surface-2d-shear"  # the labels that an audit needs
-LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame", "reader")
 SHOWN = 3  # names of each list
 
 
@@ -38,7 +172,7 @@ class LabelAudit:
         """For people."""
         undone, undecided = self.summary["moves_not_executed"], self.summary["undecided"]
         lines = [f"{self.frames} frames; in {undone['frames']} the move was not executed; {undecided} undecided"]
-        for key in LISTS:
+        for key in (*LISTS, "reader"):
             if names := self.summary[key]:
                 more = ", ..." if len(names) > SHOWN else ""
                 lines.append(f"{key.replace('_', ' ')}: {len(names)} ({', '.join(names[:SHOWN])}{more})")

@@ -8,8 +8,8 @@ import numpy as np
 
 from scenes import SensorSpec
 from training.two_sample import TwoSample, two_sample
+from twin.judge.pictures.realism import run_realism
 from twin.progress import Progress, Step, silent
-from twin.realism.pictures import run_realism
 
 IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip")
 

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_object
-from training.validation import ContactModel, compare, measure_frames
-from training.validation.compare import Comparison
-from training.validation.report import summary_of, write_validation
+from twin.judge.labelled import ContactModel, compare, measure_frames
+from twin.judge.labelled.compare import Comparison
+from twin.judge.labelled.report import summary_of, write_validation
 from twin.progress import Progress, silent, stage
 from twin.types import FINE, Form
 

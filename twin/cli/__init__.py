@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from scenes.errors import SpecError
+from scenes.base import SpecError
 from twin.errors import TwinError
 
 app = typer.Typer(
@@ -22,35 +22,7 @@ app = typer.Typer(
 
 def command_line() -> typer.Typer:
     """The program with all its commands; each module registers its own when it is imported."""
-    from twin.cli import (  # noqa: F401
-        audit,
-        calibrate,
-        catalog,
-        check,
-        collect,
-        dataset,
-        demo,
-        doctor,
-        emulate,
-        emulate_camera,
-        evaluate,
-        graph,
-        live,
-        pack,
-        predict,
-        preprocess,
-        realism,
-        render,
-        robustness,
-        servo,
-        study,
-        study_objects,
-        study_sim_to_real,
-        study_tac_vgnn,
-        train,
-        tune,
-        validate,
-    )
+    from twin.cli import calibration, frames, learning, live, start, studies  # noqa: F401
 
     return app
 

@@ -1,4 +1,12 @@
-"""``twin live``: a camera through a model, shown as it comes."""
+"""``twin live``: a camera through a model, shown as it comes.
+
+``twin collect``: labelled frames from a camera and an arm.
+
+``twin servo``: follow an object's outline.
+
+``twin emulate``: devices emulated on this machine, for any client.
+
+``twin emulate camera``: the twin as a camera on the network."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,9 +14,25 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import NONE, SHIPPED_MODEL, AtRest, Camera, Model
+from twin.cli.options import (
+    FIRST,
+    NONE,
+    SHIPPED_MODEL,
+    ArmOption,
+    AtRest,
+    Camera,
+    FormOrAuto,
+    Limits,
+    Model,
+    Object,
+    Out,
+    PlainLight,
+    Sensor,
+    ServoName,
+    writable_folder,
+)
 
-HELP = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
+HELP_LIVE = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
 
 A window opens if there is a display, and an OpenCV that can open one. Otherwise a page is served for the browser; its address is
 printed. With --rerun (package rerun-sdk) it is Rerun's viewer, or its file: frame, pins, graph and pose on a time line.
@@ -23,7 +47,7 @@ no contact at the start; that frame is kept with the session.
 """
 
 
-@app.command("live", help=HELP)
+@app.command("live", help=HELP_LIVE)
 def live(
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
@@ -38,10 +62,9 @@ def live(
     at_rest: AtRest = NONE,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="of the page; 0: a free one")] = 8080,
 ) -> None:
-    from hardware.watching import WatchPlan, watch
+    from hardware.live import WatchPlan, watch
     from training.estimator import PoseEstimator
-    from twin.cli.endings import arm_let_go
-    from twin.cli.output import say
+    from twin.cli.options import arm_let_go, say
 
     plan = WatchPlan(
         camera=camera,
@@ -62,3 +85,214 @@ def live(
 def tell_view(url: str) -> None:
     """Say where the frames are shown."""
     print(f"showing in {url}; Ctrl-C ends it", flush=True)
+
+
+HELP_COLLECT = """Collect labelled frames: for each contact a random pose and shear, a tap, and one frame.
+
+A frame is taken only after the arm has said that it stands at the commanded pose, and it is exposed after that. The pose that
+the arm said is the label. The arm goes around the object to 50 mm before it. Where the object has no end (a plane, an edge), it goes
+straight, and stays in front of it. It lifts between contacts, and ends 50 mm clear, disabled. The arm's links and the object's holder
+are not known: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
+The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json);
+contacts.jsonl has the times. The same command goes on where it was ended.
+
+\b
+  twin collect --camera twin --arm simulated --sensor mg400-331 --experiment surface-2d --count 200 --out data/first
+  twin collect --camera /dev/video0 --arm mg400 --sensor mg400-331 --experiment surface-2d --count 5000 --out data/real
+"""
+
+
+@app.command("collect", help=HELP_COLLECT)
+def collect_command(
+    camera: Camera,
+    arm: ArmOption,
+    sensor: Sensor,
+    out: Out,
+    experiment: Annotated[
+        str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")
+    ] = "surface-2d",
+    count: Annotated[int, typer.Option("--count", min=1, help="contacts in the folder at the end")] = 100,
+    object_name: Annotated[str | None, typer.Option("--object", metavar="O", help="the experiment's own if not given")] = None,
+    parameters: ServoName = "surface",
+    form: FormOrAuto = None,
+    limits: Limits = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="of the draws; the experiment's own if not given")] = None,
+    plain_light: PlainLight = False,
+) -> None:
+    from hardware.collect import CollectPlan, collect_frames
+    from scenes import load_experiment, load_object, load_sensor, load_servo
+    from twin.cli.options import arm_let_go, say
+    from twin.cli.progress import shown
+
+    asked = load_experiment(experiment)
+    plan = CollectPlan(
+        sensor=load_sensor(sensor),
+        stimulus=load_object(object_name or asked.object),
+        experiment=asked,
+        servo=load_servo(parameters),
+        camera=camera,
+        arm=arm,
+        count=count,
+        seed=seed,
+        form=form,
+        limits=limits,
+        plain_light=plain_light,
+    )
+    with arm_let_go(), shown() as progress:
+        collected = collect_frames(plan, writable_folder(out), progress=progress)
+    say(collected.lines())
+
+
+HELP_SERVO = """Follow an object's outline with the sensor, frame by frame: pose-based tactile servoing.
+
+It runs in the twin unless told otherwise: the arm is simulated, and the frames are drawn for the contact that its pose makes. With
+--camera and --arm the same loop runs on devices, real or emulated. The arm goes around the object to 50 mm before it. Where the object
+has no end (a plane, an edge), it goes straight, and stays in front of it. The arm's links and the object's holder are not known.
+Whatever happens (Ctrl-C too), the arm stops, retreats along the surface's normal and is disabled. Before it touches anything, a frame
+is taken that the model counts pins from. With --at-rest none it counts from the specification's layout; models on graphs always do.
+
+\b
+  twin servo --object can --model RUN --out out/servo
+  twin emulate mg400 &  twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can --port 8081 &
+  twin servo --object can --model RUN --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1 --stream --steps 60 --out out/live
+
+\b
+Writes to --out: trajectory.csv, trajectory.png, measures.json (smoothness S as the Tac-VGNN paper defines it, path, depth
+and angle errors, jerk, share of the way, lost contacts; rate, latency and age of the frames), session/ with --record.
+Exit code 1 if it ended early.
+"""
+
+
+@app.command("servo", help=HELP_SERVO)
+def servo(
+    object_name: Annotated[str, typer.Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
+    out: Out,
+    model: Model = SHIPPED_MODEL,
+    camera: Camera = "twin",
+    arm: ArmOption = "simulated",
+    parameters: ServoName = "surface",
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="instead of once around the object")] = None,
+    stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, help="decisions a second with --stream")] = 10.0,
+    limits: Limits = None,
+    record: Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="of the twin's noise")] = 0,
+    known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo has it: measure against it")] = False,
+    plain_light: PlainLight = False,
+    at_rest: AtRest = FIRST,
+) -> None:
+    from hardware.following import FollowPlan, follow
+    from scenes import load_object, load_servo
+    from training.estimator import PoseEstimator
+    from twin.cli.options import arm_let_go, tell
+    from twin.cli.progress import shown
+
+    plan = FollowPlan(
+        stimulus=load_object(object_name),
+        servo=load_servo(parameters),
+        camera=camera,
+        arm=arm,
+        steps=steps,
+        stream_hz=rate if stream else None,
+        limits=limits,
+        record=record,
+        seed=seed,
+        plain_light=plain_light,
+        known_place=known_place,
+        at_rest=at_rest,
+    )
+    with arm_let_go(), shown() as progress:
+        followed = follow(plan, PoseEstimator.load(model), writable_folder(out), about={"model": str(model)}, progress=progress)
+    tell(followed)
+    if followed.failure:
+        raise SystemExit(1)
+
+
+emulate = typer.Typer(
+    help="Emulate a device on this machine until SIGTERM or Ctrl-C; 'ready ...' is printed when it listens.", no_args_is_help=True
+)
+app.add_typer(emulate, name="emulate")
+
+FaultOption = Annotated[
+    list[str] | None, typer.Option("--fault", metavar="NAME[=VALUE]", help="switch a fault on; '--fault help' lists them; may be repeated")
+]
+TimeScale = Annotated[float, typer.Option("--time-scale", help="how much faster than the real arm it moves", min=1e-3)]
+
+
+def faults_of(asked: list[str] | None, known: dict[str, tuple[float | None, str]]) -> tuple[str, ...]:
+    """The faults that are asked for; lists those that are known, and leaves, where that is asked for."""
+    from hardware.emulators.running import fault_lines
+    from twin.cli.options import say
+
+    if asked and "help" in asked:
+        say(fault_lines(known))
+        raise typer.Exit
+    return tuple(asked or ())
+
+
+@emulate.command("mg400")
+def mg400(
+    host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
+    port_offset: Annotated[int, typer.Option("--port-offset", help="added to 29999 and 30003 to 30006")] = 0,
+    fault: FaultOption = None,
+    firmware: Annotated[str, typer.Option("--firmware", help="version whose manners to have; below 1.5.6 bare echoes")] = "1.7.0",
+    lenient: Annotated[bool, typer.Option("--lenient", help="as firmware 1.5.5: bare echoes, no reply to moves")] = False,
+    time_scale: TimeScale = 1.0,
+) -> None:
+    """Emulate a Dobot MG400: dashboard 29999, motion 30003, feedback 30004 (8 ms), 30005 (200 ms) and 30006 (50 ms).
+
+    Try it: twin emulate mg400 &  then in Python: open_arm("mg400:127.0.0.1").
+    """
+    from hardware.emulators.mg400 import FAULTS
+    from hardware.emulators.running import emulate_mg400
+
+    faults = faults_of(fault, FAULTS)
+    emulate_mg400(host=host, port_offset=port_offset, faults=faults, firmware=firmware, lenient=lenient, time_scale=time_scale)
+
+
+@emulate.command("magician")
+def magician(
+    link: Annotated[Path | None, typer.Option("--link", help="symbolic link to make to the pseudo-terminal")] = None,
+    fault: FaultOption = None,
+    time_scale: TimeScale = 1.0,
+) -> None:
+    """Emulate a Dobot Magician on a pseudo-terminal; its device is printed.
+
+    Try it: twin emulate magician --link /tmp/magician &  then in Python: open_arm("magician:/tmp/magician").
+    """
+    from hardware.emulators.magician import FAULTS
+    from hardware.emulators.running import emulate_magician
+
+    faults = faults_of(fault, FAULTS)
+    emulate_magician(link=link, faults=faults, time_scale=time_scale)
+
+
+HELP_EMULATE_CAMERA = """Emulate the sensor's camera: a stream of JPEGs over HTTP that shows the contact at an emulated arm's pose.
+
+The pose comes from the arm's feedback ports, so that camera and arm are processes of their own.
+
+\b
+  twin emulate mg400 &
+  twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can --port 8081
+"""
+
+
+@emulate.command("camera", help=HELP_EMULATE_CAMERA)
+def camera(
+    arm: Annotated[str, typer.Option("--arm", metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
+    sensor: Sensor,
+    object_name: Object,
+    host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one")] = 8081,
+    fps: Annotated[float, typer.Option("--fps", min=0.1, help="no more pictures a second")] = 30.0,
+    parameters: ServoName = "surface",
+    fault: FaultOption = None,
+    plain_light: PlainLight = False,
+) -> None:
+    from hardware.emulators.camera import FAULTS
+    from hardware.emulators.twin_camera import emulate_camera
+    from scenes import load_object, load_sensor, load_servo
+
+    faults = faults_of(fault, FAULTS)
+    things = load_sensor(sensor), load_object(object_name), load_servo(parameters)
+    emulate_camera(arm, *things, host=host, port=port, fps=fps, faults=faults, plain_light=plain_light)

@@ -1,15 +1,57 @@
-"""Options that several commands share."""
+"""What a command prints of a result, on stdout.
+
+How a command that moves an arm may be ended.
+
+Options that several commands share."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Protocol, TypeVar
 
 import typer
 
+from twin.cli import print_notes
 from twin.errors import TwinError
 from twin.types import Form
+
+
+class Result(Protocol):
+    """What a function that does a command's work returns."""
+
+    @property
+    def written(self) -> Sequence[Path]:
+        """The files that it wrote."""
+
+    def lines(self) -> Iterable[str]:
+        """What it found, for people."""
+
+
+def say(lines: Iterable[str]) -> None:
+    """Print lines, each as soon as it is there."""
+    for line in lines:
+        print(line, flush=True)
+
+
+def tell(result: Result) -> None:
+    """Print what was found and where it was written."""
+    say(result.lines())
+    say(f"wrote {path}" for path in result.written)
+
+
+@contextmanager
+def arm_let_go() -> Iterator[None]:
+    """SIGTERM and a closed terminal end the command as Ctrl-C does. What could not be let go of is printed."""
+    from hardware.rig import signals_as_ctrl_c
+
+    with signals_as_ctrl_c():
+        try:
+            yield
+        except KeyboardInterrupt as interrupt:
+            print_notes(interrupt)  # here, because typer ends without a word
+            raise
 
 
 def usable_cores() -> int:
@@ -43,7 +85,7 @@ AtRest = Annotated[
         "or none (the specification's layout)",
     ),
 ]
-FIRST, NONE = "first", "none"  # as hardware.at_rest has them
+FIRST, NONE = "first", "none"  # as hardware.rig has them
 Given = TypeVar("Given", str, Path)
 Spec = TypeVar("Spec")
 

@@ -10,15 +10,15 @@ from time import perf_counter
 import numpy as np
 
 from scenes import load_object, load_sensor
+from twin.camera.projection import project
 from twin.demo.page import ContactContent, contact_figures, contact_pictures, motion_figure, write_page
 from twin.demo.stages import CONTACTS, MEASURED_DISPLACEMENT_PX, MOTIONS, ContactResult, DepthRow, depth_table, run_contact
+from twin.frames.forms import from_raw
+from twin.objects import build_field
 from twin.progress import Progress, silent, stage
-from twin.projection import project
-from twin.recordings.forms import from_raw
 from twin.report.charts import write_chart
 from twin.report.skin3d import draw_contact_skin
 from twin.simulator import Simulator
-from twin.stimulus import build_field
 from twin.types import Form
 
 

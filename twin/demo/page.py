@@ -8,12 +8,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from twin.demo.stages import ContactResult, DepthRow
-from twin.recordings.images import write_image
+from twin.frames.images import write_image
 from twin.report.charts import new_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, Picture, code, sentence
-from twin.report.panel import Look, area_change_at
-from twin.report.plots import area_surface_figure, draw_area_change, draw_displacement, draw_frame, draw_graph, draw_pins
+from twin.report.plots import (
+    Look,
+    area_change_at,
+    area_surface_figure,
+    draw_area_change,
+    draw_displacement,
+    draw_frame,
+    draw_graph,
+    draw_pins,
+)
 from twin.report.table import Column
 from twin.types import Form
 

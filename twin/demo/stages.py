@@ -8,13 +8,13 @@ from typing import TypeVar
 import numpy as np
 
 from scenes import load_object, load_sensor
-from twin.contact_files import look_at
+from twin.camera.projection import project
 from twin.mechanics.path import ContactPose
-from twin.preprocess.graph import make_graph
-from twin.preprocess.reference import nominal_reference
+from twin.one_contact import look_at
+from twin.pins.graph import make_graph
+from twin.pins.reference import nominal_reference
 from twin.progress import Step
-from twin.projection import project
-from twin.report.panel import Look
+from twin.report.plots import Look
 from twin.simulator import Shot, Simulator
 from twin.types import ContactState, Form
 

@@ -2,15 +2,21 @@
 
 The nodes stand on a square grid that is bent over the dome (``chart``), in straight columns through the skin and
 the gel down to the lens. The spline solid (``solid``) computes how they move.
-"""
 
+
+The mesh as VTK data sets, for views and files.
+
+The solid's motion on the nodes of the sensor's mesh, which is the same for all contacts."""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import pyvista as pv
 
 from scenes.sensor import GeometrySpec
 from twin.geometry.chart import Chart, Focus
-from twin.geometry.solid import body_points
+from twin.geometry.solid import Solid, body_points, surface_operators
 from twin.types import ComplexArray, FloatArray, IntArray
 
 SKIN, GEL = 0, 1
@@ -80,3 +86,88 @@ def build_mesh(geometry: GeometrySpec) -> SensorMesh:
         grid=grid,
         skin_layers=_SKIN_LAYERS,
     )
+
+
+def to_pyvista(
+    mesh: SensorMesh, *, nodes_mm: FloatArray | None = None, point_data: Mapping[str, FloatArray | IntArray] | None = None
+) -> pv.UnstructuredGrid:
+    """Skin and gel as one unstructured grid with cell data ``material``.
+
+    Parameters
+    ----------
+    nodes_mm : (n, 3) float, optional
+        Deformed nodes (default: at rest).
+    point_data : dict of str to (n,) or (n, 3) float, optional
+    """
+    nodes = mesh.nodes_mm if nodes_mm is None else nodes_mm
+    cells = np.column_stack([np.full(len(mesh.hexes), 8), mesh.hexes])
+    grid = pv.UnstructuredGrid(cells, np.full(len(mesh.hexes), pv.CellType.HEXAHEDRON), nodes)
+    grid.cell_data["material"] = mesh.material
+    for name, values in (point_data or {}).items():
+        grid.point_data[name] = values
+    return grid
+
+
+def skin_surface(
+    mesh: SensorMesh, *, nodes_mm: FloatArray | None = None, point_data: Mapping[str, FloatArray | IntArray] | None = None
+) -> pv.PolyData:
+    """Closed surface of the skin alone (outside, inside, rim), ready to be written as ``.vtp``.
+
+    Point data ``node`` is each point's index in ``mesh.nodes_mm``.
+    """
+    grid = to_pyvista(mesh, nodes_mm=nodes_mm, point_data={"node": np.arange(len(mesh.nodes_mm)), **(point_data or {})})
+    skin = grid.extract_cells(mesh.material == SKIN).extract_surface(algorithm="dataset_surface")
+    for name in ("vtkOriginalPointIds", "vtkOriginalCellIds"):
+        for data in (skin.point_data, skin.cell_data):
+            if name in data:
+                del data[name]
+    return skin
+
+
+@dataclass(frozen=True)
+class NodeView:
+    """Linear map from the solid's controls to the mesh's nodes.
+
+    Attributes
+    ----------
+    mesh : SensorMesh
+    rest_mm : (n, 3) float
+        The solid's controls at rest.
+    fine, coarse : (k, side^2), (k, coarse_side^2) float
+        Values of the splines at the k nodes of a layer.
+    skin, gel : (layers, functions) float
+        Values through the depth at the layers of nodes in the skin and below it.
+    """
+
+    mesh: SensorMesh
+    rest_mm: FloatArray
+    fine: FloatArray
+    coarse: FloatArray
+    skin: FloatArray
+    gel: FloatArray
+
+    @classmethod
+    def of(cls, mesh: SensorMesh, solid: Solid) -> "NodeView":
+        """The map for one solid of a sensor."""
+        at = solid.chart.square(mesh.disc)
+        layers = np.linspace(0, 1, mesh.skin_layers + 1)
+        count = solid.inner.stop // solid.basis.count**2
+        hats = np.maximum(1 - np.abs(layers[:, None] * (count - 1) - np.arange(count)), 0)
+        below = 1 + np.linspace(0, 1, mesh.grid[0] - mesh.skin_layers)[1:]
+        return cls(
+            mesh,
+            solid.control_mm,
+            surface_operators(solid.basis, at)[0],
+            surface_operators(solid.coarse, at)[0],
+            hats,
+            solid.through.values(below),
+        )
+
+    def nodes(self, control_mm: FloatArray) -> FloatArray:
+        """Nodes (n, 3) of the deformed body."""
+        moved = control_mm - self.rest_mm
+        upper = self.skin.shape[1] * self.fine.shape[1]
+        skin = np.einsum("kc,lcx->lkx", self.fine, moved[:upper].reshape(self.skin.shape[1], -1, 3), optimize=True)
+        deep = np.einsum("kc,lcx->lkx", self.coarse, moved[upper:].reshape(-1, self.coarse.shape[1], 3), optimize=True)
+        layers = np.concatenate([np.tensordot(self.skin, skin, 1), np.tensordot(self.gel, np.concatenate([skin[-1:], deep]), 1)])
+        return self.mesh.nodes_mm + layers.reshape(-1, 3)

@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from twin.geometry.solid import Solid
-from twin.stimulus import ObjectField
+from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
 SMOOTH_GAP_MM = 0.006

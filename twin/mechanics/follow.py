@@ -11,7 +11,7 @@ from twin.mechanics.law import ContactLaw
 from twin.mechanics.ongoing import OngoingContact
 from twin.mechanics.path import ContactPath, carried, deepest_mm, dome_directions
 from twin.mechanics.solver import SkinSolver
-from twin.stimulus import build_field
+from twin.objects import build_field
 from twin.types import ContactState
 
 STEP_MM = 1.2  # largest motion across the contact in one load step

@@ -13,7 +13,7 @@ from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, 
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
-from twin.stimulus import ObjectField
+from twin.objects import ObjectField
 from twin.types import FloatArray, IntArray
 
 GAP_BOUND_MM = 0.01

@@ -8,8 +8,8 @@ import numpy as np
 
 from scenes.sensor import RelaxationTerm
 from twin.errors import ContactError
+from twin.geometry.mesh import NodeView
 from twin.geometry.solid import Solid, pin_pose
-from twin.geometry.view import NodeView
 from twin.mechanics.balance import Balance, Body, LoadState
 from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
 from twin.mechanics.relaxation import History

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from scenes.sensor import GeometrySpec, SkinSpec
 from twin.errors import ContactError
-from twin.stimulus import ObjectField
+from twin.objects import ObjectField
 from twin.types import FloatArray
 
 _LARGEST_TILT_DEG = 60.0

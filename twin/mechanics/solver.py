@@ -12,9 +12,8 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError
 from twin.geometry.chart import Focus
-from twin.geometry.mesh import build_mesh
+from twin.geometry.mesh import NodeView, build_mesh
 from twin.geometry.solid import Resolution, build_solid, pin_pose
-from twin.geometry.view import NodeView
 from twin.mechanics.balance import Body, Friction
 from twin.mechanics.contact import contact_points
 from twin.mechanics.elements import Elements
@@ -24,7 +23,7 @@ from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
 from twin.mechanics.ongoing import OngoingContact, Setting
 from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, dome_directions, plan_path
-from twin.stimulus import ObjectField, build_field
+from twin.objects import ObjectField, build_field
 from twin.types import ContactState, FloatArray
 
 _STEP_MM = 0.4

@@ -1,4 +1,7 @@
-"""Light that the lamps behind the window send to places in the gel: closed forms without shadows (ray equation: ``twin.projection``)."""
+"""Light that the lamps behind the window send to places in the gel, in closed forms without shadows.
+
+The ray equation is that of ``twin.camera.projection``.
+"""
 
 from collections.abc import Sequence
 

@@ -15,19 +15,18 @@ from scipy.optimize import nnls
 from scipy.spatial import Delaunay
 
 from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
+from twin.camera.projection import project, sensor_to_camera
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.optics.direct_light import DirectLight
 from twin.optics.lens import ray_table
 from twin.optics.lights import lights
-from twin.optics.outlines import PinOutlines
-from twin.optics.raster import draw_polygons, draw_triangles
+from twin.optics.raster import PinOutlines, draw_polygons, draw_triangles
 from twin.optics.render import Renderer
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import cap_albedo
 from twin.optics.tracer import luminance
 from twin.optics.window import Window
-from twin.projection import project, sensor_to_camera
 from twin.types import FloatArray, IntArray, PinState
 
 Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]

@@ -1,10 +1,12 @@
-"""Proofs, each in a process of its own, that a Dr.Jit backend runs here.
+"""Shared libraries that Dr.Jit needs and its wheel does not bring.
+
+Proofs, each in a process of its own, that a Dr.Jit backend runs here.
 
 A backend with an unsuitable LLVM or driver ends the process instead of raising, so it is
 tried in a child. Verdicts are kept in the cache folder (see ``twin.store``), keyed by everything
-that could change them; where the cache is off, every process probes for itself.
-"""
+that could change them; where the cache is off, every process probes for itself."""
 
+import ctypes
 import importlib.metadata
 import json
 import os
@@ -17,8 +19,31 @@ from functools import cache
 from pathlib import Path
 
 from twin.errors import StoreError
-from twin.optics.native import PRIVATE_FOLDER
 from twin.store import cache_folder, fingerprint, write_json
+
+PRIVATE_FOLDER = Path(sys.prefix) / "lib" / "private"
+"""Where 'make setup' puts its own copies of libraries if it may not install them."""
+REMEDY = "install it (Debian, Ubuntu: apt-get install libatomic1)"
+
+
+def load_needed_libraries(folder: Path = PRIVATE_FOLDER) -> str:
+    """Load libatomic, the system's or else the private copy in ``folder``, so that Dr.Jit finds it.
+
+    Returns
+    -------
+    str
+        "" if it is there, else what is missing and the remedy.
+    """
+    if not sys.platform.startswith("linux"):
+        return ""
+    for library in ("libatomic.so.1", str(folder / "libatomic.so.1")):
+        try:
+            ctypes.CDLL(library, mode=ctypes.RTLD_GLOBAL)
+            return ""
+        except OSError:
+            continue
+    return f"libatomic.so.1 is missing, which Mitsuba needs: {REMEDY}"
+
 
 PROBE_TIMEOUT_S = 60.0
 

@@ -1,6 +1,9 @@
-"""From a sensor's state to the linear light on its camera's film."""
+"""Linear images on disk.
+
+From a sensor's state to the linear light on its camera's film."""
 
 from functools import cached_property
+from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
@@ -11,9 +14,8 @@ from twin.errors import RenderError
 from twin.geometry.mesh import SensorMesh
 from twin.geometry.pins import rest_pins
 from twin.optics.arrays import with_room
-from twin.optics.camera_rays import CameraRays
-from twin.optics.placement import SKIN_SAVING, near_pins
-from twin.optics.sampling import PixelSamples
+from twin.optics.lens import CameraRays
+from twin.optics.sampling import SKIN_SAVING, PixelSamples, near_pins
 from twin.optics.scalar import ScalarView
 from twin.optics.scene import build_scene, move_meshes
 from twin.optics.static_layer import static_layer
@@ -22,6 +24,22 @@ from twin.optics.tracer import GelTracer, luminance
 from twin.optics.variant import DrJit, VariantChoice, choose_variant, use_variant
 from twin.optics.window import Window
 from twin.types import FloatArray, IntArray, PinState
+
+
+def write_exr(path: Path, linear: FloatArray, choice: VariantChoice) -> None:
+    """Write linear light as a half-float OpenEXR file.
+
+    Parameters
+    ----------
+    path : Path
+    linear : (H, W, 3) or (H, W) float32
+    choice : VariantChoice
+        The variant that rendered it.
+    """
+    mi = use_variant(choice)
+    pixels = np.ascontiguousarray(linear if linear.ndim == 3 else linear[..., None])
+    mi.Bitmap(pixels).convert(component_format=mi.Struct.Type.Float16).write(str(path))
+
 
 Quality = Literal["preview", "standard", "high"]
 SAMPLES = {"preview": 4, "standard": 16, "high": 64}
@@ -49,7 +67,7 @@ class Renderer:
     window_px : (x0, y0, x1, y1), optional
         Part of the raw frame to render, end exclusive; the whole frame by default.
     spp : int, optional
-        Samples per pixel instead of the quality's: where pins are; bare skin gets a quarter (`twin.optics.placement`).
+        Samples per pixel instead of the quality's: where pins are; bare skin gets a quarter (`twin.optics.sampling`).
     bounces : int
         Scatterings of a path after its first.
     """

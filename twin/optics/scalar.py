@@ -12,12 +12,12 @@ from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import map_coordinates
 
 from scenes.sensor import SensorSpec, ViewSpec
+from twin.camera.projection import pixel_rays, project, window_tangent
 from twin.geometry.pins import rest_pins
 from twin.optics.lights import Patch, lights
 from twin.optics.scene import build_pinhole_camera, build_scene, mesh, move_meshes
 from twin.optics.surfaces import Surface
 from twin.optics.variant import DrJit
-from twin.projection import pixel_rays, project, window_tangent
 from twin.types import FloatArray, IntArray, PinState
 
 OVERSAMPLING = 1.3

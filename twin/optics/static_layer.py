@@ -10,10 +10,10 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from scenes.sensor import HousingSpec, LedRingSpec, SensorSpec, SpeckSpec, ViewSpec
+from twin.camera.projection import sensor_to_camera
 from twin.optics.lens import ray_table, subpixel_rays
 from twin.optics.lights import Patch, led_patches, lights
 from twin.optics.window import fresnel
-from twin.projection import sensor_to_camera
 from twin.types import FloatArray
 
 ACROSS = 4

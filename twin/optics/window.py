@@ -1,4 +1,4 @@
-"""The plane window between camera, LEDs and gel, in Dr.Jit's terms (see ``twin.projection`` for the ray's equation)."""
+"""The plane window between camera, LEDs and gel, in Dr.Jit's terms (see ``twin.camera.projection`` for the ray's equation)."""
 
 from dataclasses import dataclass
 from types import ModuleType

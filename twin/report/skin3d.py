@@ -17,9 +17,8 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from scenes.sensor import PinsSpec
-from twin.geometry.export import skin_surface
-from twin.geometry.mesh import SensorMesh
-from twin.stimulus import ObjectField
+from twin.geometry.mesh import SensorMesh, skin_surface
+from twin.objects import ObjectField
 from twin.types import ContactState
 
 SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)

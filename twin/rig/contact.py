@@ -24,10 +24,10 @@ from scenes.rig import RigSpec
 from twin.mechanics.balance import Friction
 from twin.mechanics.law import ContactLaw, friction_of
 from twin.mechanics.solver import SkinSolver
+from twin.objects import build_field
 from twin.rig.kinematics import ArmPath, arm_path, rig_of
 from twin.rig.labels import ArmLabel
 from twin.rig.mounting import Mounting
-from twin.stimulus import build_field
 from twin.types import ContactState
 
 

@@ -22,8 +22,8 @@ from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec, SkinSpec
 from twin.errors import ContactError
 from twin.mechanics.path import ContactPath, dome_directions
+from twin.objects import ObjectField
 from twin.rig.labels import ArmLabel
-from twin.stimulus import ObjectField
 
 MOST_TURN_DEG = 1.0  # largest turn between two poses of the path; straight pieces then miss the arm's arc by a few um
 TOUCH_TOLERANCE_MM = 1e-6  # gap that counts as a touch

@@ -12,7 +12,7 @@ import numpy as np
 
 from scenes.rig import RigSpec
 from twin.errors import FrameError
-from twin.recordings import Recording
+from twin.frames import Recording
 
 EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")  # in the order in which they are looked for
 EXECUTED_COLUMNS = ("executed", "executed_estimate")

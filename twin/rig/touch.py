@@ -13,8 +13,8 @@ import numpy as np
 
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
+from twin.objects import build_field
 from twin.rig.mounting import Mounting
-from twin.stimulus import build_field
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,20 @@
 """Keeping results: files written whole or not at all, a cache, work that can be gone on with, and what code made it all."""
 
-from twin.store.atomic import remove_parts, replace_folder, text_file, unwritten, write_bytes, write_json, write_npz, write_text, write_with
+from twin.store.atomic import (
+    locked,
+    remove_parts,
+    replace_folder,
+    text_file,
+    unwritten,
+    write_bytes,
+    write_json,
+    write_npz,
+    write_text,
+    write_with,
+)
 from twin.store.cache import cache_folder, cached_arrays
 from twin.store.fingerprint import code_of, fingerprint
-from twin.store.inputs import inputs_digest
-from twin.store.lock import locked
-from twin.store.made import made_by
+from twin.store.made import inputs_digest, made_by
 from twin.store.resume import Item, find_arrays, find_json, keep_arrays, keep_json, kept_arrays, kept_json, require_same_code
 
 __all__ = [

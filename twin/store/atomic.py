@@ -2,7 +2,9 @@
 
 The content goes to a temporary file in the same folder, is flushed to the disk, and takes the file's name in one step. A
 process that is killed meanwhile leaves the old file as it was, and beside it a temporary file that ``remove_parts`` removes.
-"""
+
+
+One run at a time in a folder."""
 
 import errno
 import io
@@ -16,6 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from twin.errors import StoreError
 
@@ -122,3 +125,29 @@ def unwritten(path: Path, error: OSError) -> StoreError:
     """The error to raise where a path can't be written: names the path, the reason and the remedy."""
     remedy = _REMEDIES.get(error.errno or 0, _ANY_REMEDY)
     return StoreError(f"{path}: can't be written ({error.strerror or error}); {remedy}")
+
+
+LOCK = ".lock"  # the file that the operating system's lock is on; it may stay behind
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold a folder (made if missing) for this run alone; a run that is killed lets go of it.
+
+    Raises
+    ------
+    StoreError
+        Another run holds it, or it can't be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / LOCK)
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise StoreError(f"{folder}: another run is at work there; wait until it has ended, or give another --out") from error
+    except OSError as error:
+        raise unwritten(folder, error) from error
+    try:
+        yield
+    finally:
+        lock.release()

@@ -19,7 +19,7 @@ import platformdirs
 from twin.errors import StoreError
 from twin.store.atomic import write_npz
 from twin.store.fingerprint import Maker, UnknownCodeError, fingerprint
-from twin.store.inputs import inputs_digest
+from twin.store.made import inputs_digest
 
 _VARIABLE = "TACTIP_CACHE"
 _FORMAT = 2  # raised whenever older files must not be read

@@ -18,8 +18,7 @@ import numpy as np
 from twin.errors import StoreError
 from twin.store.atomic import unwritten, write_json, write_npz
 from twin.store.fingerprint import Maker, code_of, fingerprint
-from twin.store.inputs import inputs_digest
-from twin.store.made import made_by
+from twin.store.made import inputs_digest, made_by
 
 MADE_BY = "made_by.json"  # in the folder of a whole
 _RECORD = "made_by"  # in the file of an item

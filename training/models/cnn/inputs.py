@@ -8,8 +8,8 @@ import torch
 
 from training.dataset import Dataset
 from training.models.cnn.network import INPUT_PX
-from twin.recordings import open_recording
-from twin.recordings.forms import gray_levels
+from twin.frames import open_recording
+from twin.frames.forms import gray_levels
 from twin.store import cached_arrays
 
 

@@ -13,7 +13,7 @@ from training.models.cnn.inputs import ImageInputs, image_inputs, small_image
 from training.models.cnn.network import Cnn
 from training.models.part import Model, Prediction, Prepared, Trained, refuse_sizes
 from training.recipes import Recipe
-from twin.preprocess.reference import Reference
+from twin.pins.reference import Reference
 from twin.types import Frame
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from training.models.graphs.network import GraphRows, graph_rows
-from twin.preprocess.graph import knn_edges
-from twin.preprocess.voronoi import directed_edges, triangulate
+from twin.pins.graph import knn_edges
+from twin.pins.voronoi import directed_edges, triangulate
 
 RELEASE_PX = 300.0  # side of the release's resized image, in whose px and px^2 its features are
 

@@ -9,8 +9,8 @@ from training.models.graphs.inputs import GraphInputs, frame_edges, pixel_featur
 from training.models.graphs.network import Gcn
 from training.models.part import Learnt, PinModel, refuse_sizes
 from training.recipes import Recipe
-from twin.preprocess.reference import Reference
-from twin.recordings.forms import frame_size
+from twin.frames.forms import frame_size
+from twin.pins.reference import Reference
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from training.models.vgnn.registration import Registration
-from twin.preprocess import make_graph
-from twin.preprocess.reference import Reference
+from twin.pins import make_graph
+from twin.pins.reference import Reference
 
 
 class PinInputs:

@@ -14,8 +14,8 @@ from training.models.vgnn.inputs import PinInputs, filled, pin_features, seated_
 from training.models.vgnn.network import Vgnn, VgnnSize
 from training.models.vgnn.registration import Registration, fit_registration
 from training.recipes import Recipe
-from twin.preprocess.reference import Reference
-from twin.preprocess.voronoi import directed_edges, triangulate
+from twin.pins.reference import Reference
+from twin.pins.voronoi import directed_edges, triangulate
 
 PROCESS_MODES = 30  # of the displacement, which the Gaussian process sees beside all modes of the areas: the finer ones are noise to it
 # Buffers that are made anew from the pins. The waves are not: those of equal frequency are any basis, and another linear algebra

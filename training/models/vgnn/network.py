@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from training.models.vgnn.modes import spanned
+from training.models.vgnn.registration import spanned
 
 FEATURES = 3  # dx, dy, log area ratio
 FILL_RIDGE = 1e-3

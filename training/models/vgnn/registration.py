@@ -1,4 +1,6 @@
-"""Whether the camera sits where it sat: a frame displaced, turned or scaled as a whole, told from one changed by contact.
+"""How many of some rows' principal components are directions, and not rounding.
+
+Whether the camera sits where it sat: a frame displaced, turned or scaled as a whole, told from one changed by contact.
 
 Contact moves the pins too, but not freely: what is left of the pins after the best similarity (shift, turn, scale) has
 been taken out tells how large that similarity has to be. Where the one observed differs from the one expected by far more
@@ -6,14 +8,23 @@ than it ever does in training, the difference is the camera's, and it is taken o
 share a camera: there the median over many frames tells its displacement far better than one frame can.
 
 What is taken out takes a little of the contact with it. A model that also learns from training frames with all of the
-difference taken out knows such frames, and loses little on them.
-"""
+difference taken out knows such frames, and loses little on them."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from training.models.vgnn.modes import spanned
+LEAST_SIZE = 1e-5  # of a mode, relative to the largest: features are in single precision, whose rounding is 1e-7 of each of their numbers
+
+
+def spanned(sizes: np.ndarray, most: int) -> int:
+    """How many modes to keep, at most ``most``, of centred rows with these singular values, largest first.
+
+    M rows span M - 1 directions at most. The modes after those are made of rounding errors: scaled to unit deviation, they would
+    turn the rounding errors of other rows into amplitudes of thousands.
+    """
+    return int((sizes[:most] > LEAST_SIZE * sizes[0]).sum())
+
 
 MODES, SQUARED = 40, 20  # modes taken linearly, and those of them whose products are taken too
 RIDGE = 0.1

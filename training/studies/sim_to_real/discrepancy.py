@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scenes.randomisation import FrictionSpread
-from training.contact_calibration.fit import expect, mean_squared, simulate
-from training.contact_calibration.parameters import PARAMETERS
-from training.contact_calibration.simulate import Setup
 from training.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points, Posterior, likeliest
 from training.recipes import TrainingError
-from training.validation.model import MeasuredFrames
+from twin.fit.contact.fit import expect, mean_squared, simulate
+from twin.fit.contact.parameters import PARAMETERS
+from twin.fit.contact.simulate import Setup
+from twin.judge.labelled.model import MeasuredFrames
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 

@@ -14,17 +14,16 @@ from training.dataset import Dataset, joined, split_rows, voronoi_areas
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_check, predict_rows_of
 from training.gaussian_process import fit_two_fidelities
+from training.loop import epoch_step
 from training.models import recipe_of
 from training.recipes import TrainingError
-from training.run import RunConfig, is_finished, train_run
-from training.run_files import write_tensors
+from training.run import RunConfig, is_finished, train_run, write_tensors
 from training.simulated import config_of, is_pins_only, open_simulated
 from training.studies.sim_to_real.discrepancy import Discrepancy
 from training.studies.sim_to_real.twins import contact_of
-from training.studies.telling import epoch_step
-from training.validation.model import MeasuredFrames
+from twin.frames import open_recording
+from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Step
-from twin.recordings import open_recording
 from twin.rig.labels import ArmLabel, read_arm_labels
 from twin.store import write_text
 

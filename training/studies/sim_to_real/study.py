@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object, load_randomisation
-from training.contact_calibration import fit_contact
-from training.contact_calibration.simulate import Setup
 from training.dataset import Dataset, joined, load_dataset
 from training.generation import generate
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
@@ -30,7 +28,9 @@ from training.studies.sim_to_real.steps import (
     with_missing,
 )
 from training.studies.sim_to_real.twins import Twin, as_mounted, contact_of, without_one_ingredient
-from training.validation.model import MeasuredFrames
+from twin.fit.contact import fit_contact
+from twin.fit.contact.simulate import Setup
+from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.types import FINE

@@ -1,10 +1,12 @@
-"""The paper's interpretability figure: where and how deep the sensor is touched, read off the Voronoi areas by eye.
+"""The paper's first table: size of each kind of graph, and the time to make it from found pins.
+
+The paper's interpretability figure: where and how deep the sensor is touched, read off the Voronoi areas by eye.
 
 Rendered in the twin: a flat surface and an edge under the middle, and a surface that reaches only the top or only the
-bottom of the sensor, each 2 and 4 mm beyond first touch. Beside them recorded frames of about these depths.
-"""
+bottom of the sensor, each 2 and 4 mm beyond first touch. Beside them recorded frames of about these depths."""
 
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -12,16 +14,56 @@ from matplotlib.figure import Figure
 
 from scenes import load_object
 from scenes.sensor import SensorSpec
-from training.dataset import Dataset
+from training.dataset import Dataset, PinTable
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
-from twin.preprocess import Pipeline, make_graph
+from twin.objects import build_field
+from twin.pins import Pipeline, make_graph
+from twin.pins.graph import GraphKind
 from twin.progress import Step
 from twin.report.charts import new_figure
 from twin.report.plots import draw_area_change
 from twin.simulator import Simulator
-from twin.stimulus import build_field
 from twin.types import Form, PinGraph
+
+KINDS: tuple[GraphKind, ...] = ("knn", "delaunay", "voronoi")
+TIMED = 200  # graphs
+# directed edges and seconds of Table I, by pins and kind
+PAPER = {
+    (127, "knn"): (762, 0.004), (127, "delaunay"): (744, 0.007), (127, "voronoi"): (744, 0.019),
+    (331, "knn"): (1986, 0.010), (331, "delaunay"): (1860, 0.008), (331, "voronoi"): (1860, 0.045),
+}  # fmt: skip
+
+
+def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
+    """One row for each kind of graph: nodes, features, directed edges without contact and over frames, ms (median, this machine)."""
+    outmost, rest = pins.reference.outmost, pins.reference.pins_px
+    chosen = np.linspace(0, len(pins) - 1, min(TIMED, len(pins))).astype(int)
+    rows = []
+    for kind in KINDS:
+        make_graph(kind, rest, outmost=outmost)  # loads the compiled code
+        taken, edges = [], []
+        for k in chosen:
+            started = perf_counter()
+            graph = make_graph(kind, pins.nodes_px[k], outmost=outmost)
+            taken.append(1e3 * (perf_counter() - started))
+            edges.append(len(graph.edges))
+        paper_edges, paper_s = PAPER.get((len(rest), kind), (None, None))
+        rows.append(
+            {
+                "graph": kind,
+                "nodes": len(rest),
+                "features": 3 if kind == "voronoi" else 2,
+                "edges_no_contact": len(make_graph(kind, rest, outmost=outmost).edges),
+                "edges_least": min(edges),
+                "edges_most": max(edges),
+                "ms": float(np.median(taken)),
+                "paper_edges": paper_edges,
+                "paper_ms": None if paper_s is None else 1e3 * paper_s,
+            }
+        )
+    return rows
+
 
 DEPTHS_MM = (2.0, 4.0)
 TAP_MM = 5.0  # of the published recordings (their meta.json: tap_move)

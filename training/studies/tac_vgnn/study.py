@@ -12,10 +12,8 @@ from training.dataset import Dataset, load_dataset
 from training.models import model_named
 from training.networks import choose_device
 from training.recipes import TrainingError
-from training.studies.tac_vgnn.contacts import AreaChange, recorded_contacts, twin_contacts
-from training.studies.tac_vgnn.efficiency import measure_training
-from training.studies.tac_vgnn.graphs import compare_graphs
-from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, plan_run, table_row, train_all
+from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, recorded_contacts, twin_contacts
+from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
 from training.studies.tac_vgnn.page import draw_contacts, draw_curves, draw_efficiency, write_page
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table

@@ -1,0 +1,280 @@
+"""Video streams of luma and colour differences, as cameras send them, and the 8-bit colours that come out of them.
+
+Studio range: luma from 16 to 235, colour differences from 16 to 240. The way back is the usual integer arithmetic
+(products with 256 times the coefficients, rounded), so that only about 18 % of all colours ever appear in such a frame.
+
+
+The capture side: from light on the film to the frames a camera and its recorder deliver."""
+
+import cv2
+import numpy as np
+
+from scenes.sensor import CameraSpec, CaptureSpec, GelSpec, RecordingSpec, ResponseSpec
+from twin.errors import FrameError
+from twin.types import BoolArray, FloatArray, ImageArray, IntArray
+
+RED_BLUE = {"rgb": (0.299, 0.114), "bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722)}
+"""Shares of red and blue in the luma, by stream (ITU-R BT.601 and BT.709)."""
+STREAMS = ("bt601", "bt709")
+"""Streams that can be told from the colours of a frame."""
+LUMA_RANGE = 219
+"""Studio range: number of steps of the luma."""
+CHROMA_RANGE = 224
+"""Studio range: number of steps of a colour difference."""
+LUMA_FLOOR = 16
+"""Studio range: luma of black."""
+CHROMA_MIDDLE = 128
+"""Studio range: colour difference of gray."""
+ON_STREAM = 0.98
+"""A frame came by a stream if at least this share of its pixels has colours that the stream can give."""
+CLIPPED = (2, 253)
+"""Pixels with a level at or beyond these are left out: their colours may have been cut off."""
+MOST_PIXELS = 20_000
+"""At most this many pixels are looked at."""
+
+
+def luma_weights(stream: str) -> FloatArray:
+    """(3,) shares of red, green and blue in the luma."""
+    red, blue = RED_BLUE[stream]
+    return np.array([red, 1 - red - blue, blue], np.float32)
+
+
+def encoded(gray: FloatArray, stream: str) -> IntArray:
+    """Whole numbers (..., 3) of luma, blue and red difference, of gray levels (..., 3)."""
+    weights = luma_weights(stream)
+    luma = gray @ weights
+    difference = [(gray[..., k] - luma) * (0.5 / (1 - weights[k]) * CHROMA_RANGE / 255) + CHROMA_MIDDLE for k in (2, 0)]
+    return np.clip(np.rint(np.stack([luma * (LUMA_RANGE / 255) + LUMA_FLOOR, *difference], axis=-1)), 0, 255).astype(np.int32)
+
+
+def decoded(numbers: IntArray, stream: str) -> ImageArray:
+    """Colours (..., 3) uint8 of luma and colour differences (..., 3)."""
+    red, green, blue = (float(w) for w in luma_weights(stream))
+    gain, difference = round(256 * 255 / LUMA_RANGE), 256 * 255 / CHROMA_RANGE
+    luma = gain * (numbers[..., 0] - LUMA_FLOOR) + 128
+    b, r = (numbers[..., k] - CHROMA_MIDDLE for k in (1, 2))
+    to_red, to_blue = 2 * (1 - red) * difference, 2 * (1 - blue) * difference
+    from_blue, from_red = round(to_blue * blue / green), round(to_red * red / green)
+    colours = np.stack([luma + round(to_red) * r, luma - from_blue * b - from_red * r, luma + round(to_blue) * b], axis=-1)
+    return np.clip(colours >> 8, 0, 255).astype(np.uint8)
+
+
+def through_stream(gray: FloatArray, stream: str) -> ImageArray:
+    """Colours (H, W, 3) uint8 that gray levels (H, W, 3) leave a stream with; "rgb": only rounded."""
+    if stream == "rgb":
+        return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    return decoded(encoded(np.clip(gray, 0, 255), stream), stream)
+
+
+def stream_of(images: list[ImageArray]) -> str:
+    """The stream that frames (H, W, 3) uint8 came by, told by which colours they have; "rgb" where none explains them."""
+    pixels = np.concatenate([image.reshape(-1, 3) for image in images if image.ndim == 3] or [np.zeros((0, 3), np.uint8)])
+    pixels = pixels[((pixels > CLIPPED[0]) & (pixels < CLIPPED[1])).all(axis=1)]
+    pixels = pixels[:: max(len(pixels) // MOST_PIXELS, 1)]
+    if not len(pixels):
+        return "rgb"
+    shares = {stream: float(_possible(pixels, stream).mean()) for stream in STREAMS}
+    best = max(shares, key=lambda stream: shares[stream])
+    return best if shares[best] >= ON_STREAM else "rgb"
+
+
+def _possible(pixels: ImageArray, stream: str) -> BoolArray:
+    """(n,) bool: colours (n, 3) that the stream can give."""
+    near = encoded(pixels.astype(np.float32), stream)
+    steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
+    return (decoded(near + steps, stream) == pixels).all(axis=2).any(axis=0)
+
+
+JPEG_BLOCK_PX = 16
+"""Side of the blocks of a JPEG whose chroma has half the resolution."""
+MEDIAN_PX = 5
+"""Width of the median filter with which the recorder removes specks before its threshold."""
+
+
+def expose(
+    linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
+) -> ImageArray:
+    """What gel, lens and camera make of the light: a raw frame.
+
+    Gel haze, lateral chromatic aberration, blur and vignetting act on light; then come gain, noise, sharpening of the luma,
+    the response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`).
+    A step whose parameter is neutral does nothing at all.
+
+    Parameters
+    ----------
+    linear : (H, W, 3) or (H, W) float
+        Chromatic aberration and white balance apply to colour only.
+    capture : CaptureSpec
+    rng : numpy.random.Generator, optional
+        Source of the frame's gain and noise; without it there is neither.
+    origin_px : (x, y)
+        Place of ``linear``'s first pixel in the camera's full frame, where only a part was rendered.
+
+    Returns
+    -------
+    (H, W, 3) or (H, W) uint8
+    """
+    camera, response = capture.camera, capture.response
+    light = hazed(np.asarray(linear, np.float32), capture.gel)
+    light = dispersed(light, camera, origin_px)
+    light = blurred(light, response.blur_sigma_px)
+    light = vignetted(light, camera, origin_px)
+    light = amplified(light, response, rng)
+    gray = developed(light, noisy(light, response, rng), response, origin_px)
+    frame = through_stream(gray, response.stream) if gray.ndim == 3 else np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    return compressed(frame, response.jpeg_quality, origin_px)
+
+
+def hazed(light: FloatArray, gel: GelSpec) -> FloatArray:
+    """A share of the light scattered forward by the gel."""
+    if gel.haze == 0:
+        return light
+    return light + np.float32(gel.haze) * (blurred(light, gel.haze_sigma_px) - light)
+
+
+def dispersed(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
+    """Lateral chromatic aberration: ``red'(c + scale (p - c) + shift) = red(p)`` with c the principal point; blue alike."""
+    own = {0: (camera.red_scale, camera.red_shift_px), 2: (camera.blue_scale, camera.blue_shift_px)}
+    if light.ndim == 2 or all(scale == 1 and not any(shift) for scale, shift in own.values()):
+        return light
+    light = light.copy()
+    for channel, (scale, shift) in own.items():
+        if scale != 1 or any(shift):
+            across = _scaled(np.ascontiguousarray(light[..., channel].T), scale, camera.cx_px - origin_px[0], shift[0])
+            light[..., channel] = _scaled(np.ascontiguousarray(across.T), scale, camera.cy_px - origin_px[1], shift[1])
+    return light
+
+
+def blurred(light: FloatArray, sigma_px: float) -> FloatArray:
+    """Gaussian blur that keeps the light's sum: the frame goes on mirrored."""
+    if sigma_px <= 0:
+        return light
+    return np.asarray(cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT), light.dtype)
+
+
+def vignetted(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
+    """Light times ``1 - vignetting r^2``, r the distance from the full frame's middle over that of its corners."""
+    if camera.vignetting == 0:
+        return light
+    x = origin_px[0] + np.arange(light.shape[1]) - (camera.width_px - 1) / 2
+    y = origin_px[1] + np.arange(light.shape[0]) - (camera.height_px - 1) / 2
+    r2 = 4 * (x**2 + y[:, None] ** 2) / (camera.width_px**2 + camera.height_px**2)
+    loss = (1 - camera.vignetting * r2).astype(np.float32)
+    return light * (loss[..., None] if light.ndim == 3 else loss)
+
+
+def amplified(light: FloatArray, response: ResponseSpec, rng: np.random.Generator | None = None) -> FloatArray:
+    """Exposure, white balance (colour only) and, with a generator, the frame's own gain."""
+    gain = response.exposure * np.array(response.white_balance if light.ndim == 3 else 1.0)
+    if rng is not None and response.brightness_drift > 0:
+        gain = gain * max(1 + response.brightness_drift * rng.standard_normal(), 0)
+    return light if np.all(gain == 1) else light * gain.astype(np.float32)
+
+
+def noisy(light: FloatArray, response: ResponseSpec, rng: np.random.Generator | None = None) -> FloatArray:
+    """Normal noise of variance ``read_noise^2 + shot_noise * light``; none without a generator."""
+    if rng is None or (response.read_noise == 0 and response.shot_noise == 0):
+        return light
+    sd = np.sqrt(np.float32(response.read_noise**2) + np.float32(response.shot_noise) * np.maximum(light, 0))
+    return light + sd * rng.standard_normal(light.shape, dtype=np.float32)
+
+
+def curve(light: FloatArray, response: ResponseSpec) -> FloatArray:
+    """Gray levels ``black + (255 - black) clip(light)^(1 / gamma)``, not rounded."""
+    shown = np.clip(light, 0, 1)
+    shown = shown if response.gamma == 1 else shown ** np.float32(1 / response.gamma)
+    return np.float32(response.black_level) + np.float32(255 - response.black_level) * shown
+
+
+def sharpened(light: FloatArray, response: ResponseSpec) -> FloatArray:
+    """Light with an unsharp mask of its luma added to every channel; the response curve then amplifies the dark side of an edge."""
+    if response.sharpening == 0:
+        return light
+    luma = light @ luma_weights(response.stream) if light.ndim == 3 else light
+    mask = np.float32(response.sharpening) * (luma - blurred(luma, response.sharpening_sigma_px))
+    return light + (mask[..., None] if light.ndim == 3 else mask)
+
+
+def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
+    """Gray levels of light, and of the same with its noise: the luma sharpened, colour taken from softer light.
+
+    A camera measures one colour at each pixel of its sensor and takes the other two from neighbouring pixels, in linear light.
+    Therefore colour is softer than luma, and the response curve moves its edges outwards. The camera's sharpening leaves out the noise.
+    Neighbouring columns of the full frame share their colour differences.
+    """
+    gray = curve(sharpened(light, response), response)
+    if grainy is not light:
+        gray = gray + blurred(curve(grainy, response) - curve(light, response), response.noise_sigma_px)
+    if gray.ndim == 2 or (response.sharpening == 0 and response.chroma_sigma_px == 0 and response.chroma_columns == 1):
+        return gray
+    weights = luma_weights(response.stream)
+    soft = curve(blurred(grainy, response.chroma_sigma_px), response)
+    chroma = shared(soft - (soft @ weights)[..., None], response.chroma_columns, origin_px[0])
+    return chroma + (gray @ weights)[..., None]
+
+
+def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
+    """Chroma (H, W, 3) with that of the first of every ``columns`` neighbouring columns in all of them, as 4:2:2 streams sample it.
+
+    Groups begin at the full frame's first column; ``left_px`` is this part's place in it.
+    """
+    if columns == 1:
+        return chroma
+    group = (left_px + np.arange(chroma.shape[1])) // columns
+    first = np.searchsorted(group, group)
+    return chroma[:, first]
+
+
+def compressed(frame: ImageArray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:
+    """A frame after JPEG compression with halved chroma (quality 0: not compressed). Blocks lie where those of the full frame lie."""
+    if quality == 0:
+        return frame
+    left, top = (place % JPEG_BLOCK_PX for place in origin_px)
+    whole = cv2.copyMakeBorder(frame, top, 0, left, 0, cv2.BORDER_REPLICATE)
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    _, stream = cv2.imencode(".jpg", whole[..., ::-1] if frame.ndim == 3 else whole, options)
+    decoded = cv2.imdecode(stream, cv2.IMREAD_UNCHANGED)
+    assert decoded is not None, "OpenCV decodes what it has just encoded"
+    back = decoded.astype(np.uint8, copy=False)[top:, left:]
+    return np.ascontiguousarray(back[..., ::-1] if frame.ndim == 3 else back)
+
+
+def record(raw: ImageArray, recording: RecordingSpec, *, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:
+    """A raw frame as the recorder stores it: crop, gray, median, adaptive Gaussian threshold, area resize.
+
+    This is the preprocessing camera of the makers' capture software (``CvPreprocVideoCamera``). Where the
+    stored size differs from the crop's, the binary image gets gray edges from the resize.
+
+    Parameters
+    ----------
+    raw : (H, W, 3) or (H, W) uint8
+        RGB or gray.
+    recording : RecordingSpec
+    origin_px : (x, y)
+        Place of ``raw``'s first pixel in the camera's full frame, where only a part was rendered.
+
+    Raises
+    ------
+    FrameError
+        If the crop does not lie within the frame.
+    """
+    x0, y0, x1, y1 = np.array(recording.crop_px) - [*origin_px, *origin_px]
+    height, width = raw.shape[:2]
+    if x0 < 0 or y0 < 0 or x1 > width or y1 > height:
+        raise FrameError(f"recording.crop_px {recording.crop_px} does not fit a {width} x {height} px frame that starts at {origin_px}")
+    gray = cv2.cvtColor(raw, cv2.COLOR_RGB2GRAY) if raw.ndim == 3 else raw
+    calm = cv2.medianBlur(np.ascontiguousarray(gray[y0:y1, x0:x1]), MEDIAN_PX)
+    block, offset = recording.threshold_block_px, recording.threshold_offset
+    binary = cv2.adaptiveThreshold(calm, 255, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, block, offset)
+    size = (recording.width_px, recording.height_px)
+    stored = binary if binary.shape[::-1] == size else cv2.resize(binary, size, interpolation=cv2.INTER_AREA)
+    return stored.astype(np.uint8, copy=False)
+
+
+def _scaled(plane: FloatArray, scale: float, centre: float, shift: float) -> FloatArray:
+    """Rows of a plane (n, m) drawn apart about row ``centre`` and shifted: cubic convolution (Keys 1981), which keeps centroids exactly."""
+    place = centre + (np.arange(len(plane)) - shift - centre) / scale
+    first = np.floor(place).astype(int)
+    t = (place - first)[:, None].astype(np.float32)
+    taps = (((2 - t) * t - 1) * t / 2, ((3 * t - 5) * t * t + 2) / 2, ((4 - 3 * t) * t + 1) * t / 2, (t - 1) * t * t / 2)
+    return sum(tap * plane[np.clip(first + k - 1, 0, len(plane) - 1)] for k, tap in enumerate(taps))

@@ -1,0 +1,195 @@
+"""The camera's projection: sensor-frame points to raw-frame pixels and back to rays, through the window.
+
+The camera stands in air behind a plane window (acrylic); in front of the window is gel. All planes are normal to z, so a ray stays
+in one plane through the axis of the pupil and obeys n sin(theta) = const. With u the tangent of the ray's angle in air and h_k the
+height that it crosses in layer k, its distance
+
+    rho(u) = sum_k h_k tan(theta_k),   sin(theta_k) = u / (n_k sqrt(1 + u^2))
+
+from that axis follows. rho grows with u and is concave, so Newton's method from the left converges monotonically.
+
+Distortion: Brown-Conrady (Brown 1966) with x = X / Z, y = Y / Z, r^2 = x^2 + y^2,
+x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),
+y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y;
+or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 + k2 theta^4).
+
+
+The part of the raw frame that shows the gel: the housing's aperture."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.sensor import CameraSpec, SensorSpec, ViewSpec
+from twin.types import FloatArray
+
+NEWTON_STEPS = 12
+"""Steps of Newton's method; it converges quadratically, so that the last steps change only the last digits."""
+MOST_NEWTON_MOVE = 0.1
+"""Largest change of a normalised coordinate in one step: a start far from the solution does not jump past the distortion's fold."""
+GRAZING = 1e6
+"""Tangent beyond which a ray counts as parallel to the window."""
+LEAST_FISHEYE_SLOPE = 0.05
+"""Slope of the fisheye's radius by the angle that Newton's method assumes at least, near the distortion's fold."""
+
+
+def sensor_to_camera(camera: CameraSpec) -> FloatArray:
+    """``T_camera_sensor`` (4, 4): camera looks along +z with x right and y down.
+
+    The entrance pupil is at (0, 0, -distance) of the sensor frame; the camera is turned about it
+    by tilt_x (about x), then tilt_y (about y).
+    """
+    ax, ay = np.radians([camera.tilt_x_deg, camera.tilt_y_deg])
+    rot_x = np.array([[1, 0, 0], [0, np.cos(ax), np.sin(ax)], [0, -np.sin(ax), np.cos(ax)]])
+    rot_y = np.array([[np.cos(ay), 0, np.sin(ay)], [0, 1, 0], [-np.sin(ay), 0, np.cos(ay)]])
+    T_camera_sensor = np.eye(4)
+    T_camera_sensor[:3, :3] = rot_y @ rot_x
+    T_camera_sensor[:3, 3] = rot_y @ rot_x @ [0, 0, camera.distance_mm]
+    return T_camera_sensor
+
+
+def distort(camera: CameraSpec, xy: FloatArray) -> FloatArray:
+    """Tangents (..., 2) of rays in the camera frame to normalised image coordinates."""
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    if camera.projection == "fisheye":
+        radius = np.sqrt(r2)
+        scale = _fisheye(camera, np.arctan(radius)) / np.maximum(radius, 1e-12)
+        return xy * np.where(radius > 1e-12, scale, 1.0)[..., None]
+    radial = 1 + camera.k1 * r2 + camera.k2 * r2 * r2
+    return np.stack(
+        [
+            x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x),
+            y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None = None) -> FloatArray:
+    """Normalised image coordinates (..., 2) to tangents: Newton's method on ``distort(ideal) = seen``.
+
+    Starts at ``guess`` (default: ``seen``). Meaningless where the distortion folds back, outside its valid field.
+    """
+    if camera.projection == "fisheye":
+        radius = np.linalg.norm(seen, axis=-1)
+        angle = radius if guess is None else np.arctan(np.linalg.norm(guess, axis=-1))
+        for _ in range(NEWTON_STEPS):
+            slope = 1 + 3 * camera.k1 * angle**2 + 5 * camera.k2 * angle**4
+            angle = np.clip(angle - (_fisheye(camera, angle) - radius) / np.maximum(slope, LEAST_FISHEYE_SLOPE), 0, np.pi / 2 - 1e-6)
+        return seen * (np.tan(angle) / np.maximum(radius, 1e-12))[..., None]
+    ideal, step = np.array(seen if guess is None else guess, float), 1e-6
+    for _ in range(NEWTON_STEPS):
+        along_x, along_y = ((distort(camera, ideal + d) - distort(camera, ideal - d)) / (2 * step) for d in ([step, 0.0], [0.0, step]))
+        miss = seen - distort(camera, ideal)
+        area = _cross(along_x, along_y)
+        move = np.stack([_cross(miss, along_y), _cross(along_x, miss)], axis=-1)
+        ideal = ideal + np.clip(move / np.where(np.abs(area) > 1e-6, area, 1e-6)[..., None], -MOST_NEWTON_MOVE, MOST_NEWTON_MOVE)
+    return ideal
+
+
+def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
+    """Sensor-frame points (..., 3) in front of the camera to raw-frame pixels (..., 2), pixel centres at integers.
+
+    A point's height decides the layers its ray passes: points behind the window are seen straight.
+    """
+    camera = view.camera
+    rho = np.linalg.norm(points_mm[..., :2], axis=-1)
+    tangent = window_tangent(view, rho, points_mm[..., 2])
+    across = points_mm[..., :2] * (tangent / np.maximum(rho, 1e-12))[..., None]
+    in_sensor = np.concatenate([across, np.ones_like(across[..., :1])], axis=-1)
+    in_camera = in_sensor @ sensor_to_camera(camera)[:3, :3].T
+    return distort(camera, in_camera[..., :2] / in_camera[..., 2:]) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+
+
+def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
+    """Tangent u of the angle in air of the rays that join (0, z0) to (rho, z), z0 the pupil's or ``behind_mm``."""
+    heights, indices = _layers(view, z_mm, -view.camera.distance_mm if behind_mm is None else behind_mm)
+    u = rho_mm / sum(h / n for h, n in zip(heights, indices, strict=True))
+    for _ in range(NEWTON_STEPS):
+        reach, slope = 0.0, 0.0
+        for h, n in zip(heights, indices, strict=True):
+            rest = n * n + (n * n - 1) * u * u  # tan(theta) = u / sqrt(rest)
+            reach = reach + h * u / np.sqrt(rest)
+            slope = slope + h * n * n / rest**1.5
+        u = np.clip(u + (rho_mm - reach) / slope, 0, GRAZING)
+    return u
+
+
+def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where the rays of raw-frame pixels (..., 2) enter the gel, (..., 3) mm, and their unit directions (..., 3) in it."""
+    camera = view.camera
+    ideal = undistort(camera, (np.asarray(pixels, float) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px])
+    in_camera = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
+    direction = in_camera @ sensor_to_camera(camera)[:3, :3]
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    place = np.zeros_like(direction)
+    place[..., 2] = -camera.distance_mm
+    for index, before, height in (
+        (1.0, 1.0, view.lens.back_mm + camera.distance_mm),
+        (view.lens.refractive_index, 1.0, view.lens.thickness_mm),
+        (view.gel_index, view.lens.refractive_index, 0.0),
+    ):
+        across = direction[..., :2] * before / index
+        up = np.sqrt(np.maximum(1 - np.sum(across**2, axis=-1, keepdims=True), 0))
+        direction = np.concatenate([across, up], axis=-1)
+        place = place + direction * height / np.maximum(up, 1e-12)
+    return place, direction
+
+
+def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:
+    """Heights of air, window and gel between the planes ``from_mm`` (in the air) and ``z_mm``, and their indices."""
+    back, front = view.lens.back_mm, view.lens.z_mm
+    z = np.asarray(z_mm, float)
+    heights = np.minimum(z, back) - from_mm, np.clip(z, back, front) - back, np.maximum(z - front, 0)
+    return heights, (1.0, view.lens.refractive_index, view.gel_index)
+
+
+def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:
+    return angle * (1 + camera.k1 * angle**2 + camera.k2 * angle**4)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+# Corners of the polygon that stands for the aperture's rim.
+CORNERS = 360
+
+
+@dataclass(frozen=True)
+class Disc:
+    """The lens disc in the raw frame.
+
+    Attributes
+    ----------
+    center_px : (2,) float
+    radius_px : float
+    inside : (H, W) bool
+        Pixels whose centre lies in it.
+    """
+
+    center_px: np.ndarray
+    radius_px: float
+    inside: np.ndarray
+
+    def distance_px(self, points_px: np.ndarray) -> np.ndarray:
+        """Distance (...,) of points (..., 2) from the disc's centre, px."""
+        return np.linalg.norm(np.asarray(points_px, float) - self.center_px, axis=-1)
+
+
+def round_disc(size_px: tuple[int, int], center_px: np.ndarray, radius_px: float) -> Disc:
+    """A disc in a (width, height) frame."""
+    y, x = np.mgrid[: size_px[1], : size_px[0]]
+    inside = (x - center_px[0]) ** 2 + (y - center_px[1]) ** 2 <= radius_px**2
+    return Disc(np.asarray(center_px, float), float(radius_px), inside)
+
+
+def lens_disc(spec: SensorSpec) -> Disc:
+    """The housing's aperture as the specification's camera sees it: centre and mean radius of its projected rim."""
+    turn, housing = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False), spec.housing
+    rim = np.column_stack([housing.aperture_radius_mm * np.cos(turn), housing.aperture_radius_mm * np.sin(turn), np.zeros(CORNERS)])
+    rim_px = project(spec.view, rim + [*housing.center_mm, housing.z_mm])
+    center = rim_px.mean(axis=0)
+    radius = float(np.linalg.norm(rim_px - center, axis=1).mean())
+    return round_disc((spec.camera.width_px, spec.camera.height_px), center, radius)

@@ -1,0 +1,353 @@
+"""``twin calibrate``: a specification fitted to frames of a real sensor.
+
+``twin validate``: the twin's pins against those of labelled real frames.
+
+``twin realism``: how close the renders of a sensor come to its real frames.
+
+``twin robustness``: how far a sensor may degrade before its pins are lost.
+
+``twin audit``: whether a recording's labels agree with its pins."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.cli import app
+from twin.cli.options import CORES, Across, FormOrAuto, Out, Quality, Sensor, Workers, if_given, writable_folder
+from twin.types import FINE
+
+calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(calibrate_app, name="calibrate")
+
+HELP_CALIBRATE = """Fit light, colours, sharpness and noise of a specification to raw frames of the real sensor.
+
+Start from the shipped specification that is most like your sensor. The frames may show any contact: their pins are found,
+the skin is fitted to them, the twin renders the same state, and its parameters are moved until both agree, by
+differentiating the path tracer (LEDs, reflectances, haze) and by least squares (ring, reflections, specks, each cap's own
+reflectance and outline, blur, aperture, sharpening, colour fringes, compression, noise). With --no-contact one frame without
+contact fits the camera first.
+
+\b
+Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-calibration/ with
+index.html (before, after, what is left, what changed) and the stages' results: an interrupted
+run goes on where it was.
+
+\b
+What frames cannot tell is held at the starting values, and named: the response curve (gamma) and the
+product of LED power and exposure always, distance and focal length with no-contact frames only.
+
+\b
+Example:
+  twin calibrate optics --sensor ur5-331 --frames recordings/my-tactip --out my-tactip.toml
+"""
+
+
+@calibrate_app.command("optics", help=HELP_CALIBRATE)
+def optics(
+    sensor: Sensor,
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of raw frames, in contact or not")],
+    out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
+    no_contact: Annotated[
+        Path | None, typer.Option("--no-contact", metavar="FRAME", help="a raw frame without contact: fits the camera")
+    ] = None,
+    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
+) -> None:
+    from scenes import load_sensor
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+    from twin.fit.optics import calibrate_optics
+
+    with shown() as progress:
+        found = calibrate_optics(frames, load_sensor(sensor), out, limit=limit, no_contact=no_contact, progress=progress)
+    tell(found)
+
+
+CONTACT_HELP = """Fit the contact of a specification to labelled frames of the real sensor on its robot.
+
+From the no-contact frame (init_0.png) and N labelled frames: contact offset, tool point, angle offset and sign, tilt of the
+surface, direction of the robot's axes in the image, friction, how far the arm gives way and turns, stiffness of the gel relative to
+the skin and how much its volume yields, thickness of the skin, length of the pins. Whether each frame's move had been executed
+when it was taken is found along with them, and frames that fit no story lose their weight. As many frames again, at most 20, are
+kept out of the fit to state the error.
+
+\b
+Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/ with index.html (parameters with their
+uncertainty and what the frames tell of them, frames with their probabilities, before and after), calibration.json and
+contacts/: an interrupted run goes on where it was.
+
+\b
+It simulates about 50 + 60 N contacts, of 1 to 3 s each on one core; --workers divides that.
+
+\b
+Example:
+  twin calibrate contact --sensor mg400-331 --frames recordings/my-surface --labels 20 --out my-tactip.toml
+"""
+
+
+@calibrate_app.command("contact", help=CONTACT_HELP)
+def contact(
+    sensor: Sensor,
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with its no-contact frame")],
+    out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
+    labels: Annotated[int, typer.Option("--labels", min=4, metavar="N", help="frames to fit to, chosen at random")] = 20,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the choice of frames")] = 0,
+    experiment: Annotated[
+        str, typer.Option("--experiment", metavar="E", help="how they were recorded ('twin experiments')")
+    ] = "surface-2d",
+    object_: Annotated[
+        str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
+    ] = None,
+    hold: Annotated[list[str] | None, typer.Option("--hold", metavar="KEY", help="leave this parameter as it is; may be repeated")] = None,
+    workers: Workers = CORES,
+    across: Across = FINE,
+    form: FormOrAuto = None,
+) -> None:
+    from scenes import load_experiment, load_object, load_sensor
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+    from twin.fit.contact.calibrate import calibrate_to_file
+
+    with shown() as progress:
+        found = calibrate_to_file(
+            frames,
+            load_sensor(sensor),
+            load_experiment(experiment),
+            out,
+            touched=if_given(load_object, object_),
+            labels=labels,
+            seed=seed,
+            hold=hold or (),
+            workers=workers,
+            across=across,
+            form=form,
+            progress=progress,
+        )
+    tell(found)
+
+
+HELP_VALIDATE = """Compare the twin's pins with those of labelled real frames.
+
+Each frame's contact is simulated along the arm's own way, from its label and the sensor's [rig] alone ('twin calibrate
+contact' fits one), and the simulated displacement is added to the recorded no-contact pins (init_0.png). Moves that
+move_executed.csv or labels_corrected.csv ('twin audit') calls not executed are left out. Errors are stated apart for executed and
+not executed moves, by depth, angle and shear. For some frames with an executed move they are also stated with one friction a frame.
+
+\b
+Writes index.html, frames.csv (a row a frame), validation.json.
+
+\b
+Example:
+  twin validate --sensor mg400-331 --frames recordings/surface --limit 40 --out out/validate
+"""
+
+
+@app.command("validate", help=HELP_VALIDATE)
+def validate(
+    sensor: Sensor,
+    frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording")],
+    out: Out,
+    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how it was recorded ('twin experiments')")] = "surface-2d",
+    object_: Annotated[
+        str | None, typer.Option("--object", metavar="O", help="what was touched; the experiment's own if not given")
+    ] = None,
+    limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="N frames, chosen at random")] = None,
+    friction_frames: Annotated[
+        int, typer.Option("--friction-frames", min=0, metavar="N", help="frames for which their own friction is sought, 9 contacts each")
+    ] = 5,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the choice of frames")] = 0,
+    across: Across = FINE,
+    form: FormOrAuto = None,
+) -> None:
+    from scenes import load_experiment, load_object, load_sensor
+    from training.studies.validation import validate_contacts
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+
+    with shown() as progress:
+        found = validate_contacts(
+            load_sensor(sensor),
+            frames,
+            load_experiment(experiment),
+            writable_folder(out),
+            touched=if_given(load_object, object_),
+            limit=limit,
+            friction_frames=friction_frames,
+            seed=seed,
+            across=across,
+            form=form,
+            progress=progress,
+        )
+    tell(found)
+
+
+HELP_REALISM = """Compare a folder of real raw frames with their renders, pair by pair and as two sets.
+
+Each real frame's pins are found, the skin is fitted to them, and the sensor in that state is rendered and captured. Every
+cap stands where it stood in the real frame, so what differs is camera and light. With --pose-aligned the whole twin is
+judged as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5 turns in deg, a tap on a flat plate) become
+contacts. The arm's kinematics is fitted to the pins of one half of the frames, and the error is stated on the other half.
+
+\b
+Reads: a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder).
+Frames that are black, saturated, of another size or without all their pins are
+refused by name; exit code 0 if at least one frame was good.
+
+\b
+Writes:
+  index.html      pictures side by side, all figures, plots
+  metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; differences by
+                  radius; spots; spectra; two-sample accuracy; pin errors
+  frames.csv      figures of each frame
+  radial.csv      caps in 8 bins of the distance from the disc's centre
+  spectrum.csv    radial power spectra
+  spots.csv       bright spots that stay in place (LED reflections, bubbles)
+  pictures/       real, rendered and difference of each frame
+
+\b
+How to read it: PSNR and SSIM of two real frames with the same contact are the best that can
+be reached. Two-sample accuracy is the share of patches of unseen frames that a small network
+puts into the right set: at 100 % they are always told apart, at 50 % never.
+
+\b
+Example:
+  twin realism recordings/my-tactip --sensor ur5-331 --limit 10 --out out/realism
+"""
+
+
+@app.command("realism", help=HELP_REALISM)
+def realism(
+    path: Annotated[Path, typer.Argument(help="folder of real raw frames")],
+    sensor: Sensor,
+    out: Out,
+    pose_aligned: Annotated[bool, typer.Option("--pose-aligned", help="also render from the labels alone")] = False,
+    limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = None,
+    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = Quality.STANDARD,
+    two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
+) -> None:
+    from scenes import load_sensor
+    from training.studies.realism import compare_with_renders
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+
+    with shown() as progress:
+        found = compare_with_renders(
+            path,
+            load_sensor(sensor),
+            writable_folder(out),
+            pose_aligned=pose_aligned,
+            limit=limit,
+            quality=quality.value,
+            test=two_sample,
+            progress=progress,
+        )
+    tell(found)
+
+
+HELP_ROBUSTNESS = """How far may the sensor degrade before preprocessing fails?
+
+Sweeps each condition (dim or dead LEDs, room light, glare, defocus, motion, dirt, scratches, bubbles, haze, lost and faded
+caps, torn skin, a displaced camera, noise, JPEG, lost rows, wrong settings, ...; --list names them) from nothing to severe
+over a set of contacts, runs pipelines and models on every frame, and compares with where the pins truly are.
+
+\b
+Writes:
+  index.html      envelope (where each pipeline fails), ranking, plots, worst frames
+  envelope.csv    severity and parameter at which each measure's limit is crossed
+  curves.csv      every measure against severity, with its 90 % interval
+  frames.csv      every frame
+  real-on-rendered.csv  with --frames: where real and rendered frames fail, and their ratio
+  cells/          finished work: an interrupted run goes on where it was; work from another sensor, other weights or another
+                  version is not used
+
+\b
+With --frames DIR real frames take the place of rendered ones. Only conditions that act on a
+frame are swept, and the truth is the pins on which several detectors agree. Raw frames are shown
+on the envelope of rendered ones: how much of a sound sensor's margin has this one left? For that
+rendered frames are swept too; --no-rendered leaves it out.
+
+\b
+A file for --conditions:
+  steps = [0.1, 0.3, 1.0]               # severities
+  pairs = [["leds-dim", "noise"]]       # grow together
+  [[condition]]
+  name = "noise"
+  severe = 0.2                          # the parameter at severity 1
+
+\b
+Examples:
+  twin robustness --sensor ur5-331 --pipeline twin --pipeline legacy --out out/robustness
+  twin robustness --sensor ur5-331 --frames recordings/mine --pipeline mine.toml --out out/mine
+"""
+
+
+@app.command("robustness", help=HELP_ROBUSTNESS)
+def robustness(
+    sensor: Sensor = "ur5-331",
+    out: Out = Path("out/robustness"),
+    pipeline: Annotated[
+        list[str] | None,
+        typer.Option("--pipeline", metavar="P", help="twin, legacy, adaptive, fixed, simple, log, dog, doh, or a file of 'twin tune'"),
+    ] = None,
+    model: Annotated[list[Path] | None, typer.Option("--model", metavar="RUN", help="folder of a trained model")] = None,
+    conditions: Annotated[
+        Path | None, typer.Option("--conditions", metavar="FILE", help="TOML file: which conditions, ranges, steps, pairs")
+    ] = None,
+    frames: Annotated[Path | None, typer.Option("--frames", metavar="DIR", help="real frames instead of rendered ones")] = None,
+    limit: Annotated[int, typer.Option("--limit", min=2, metavar="N", help="at most N of the real frames, evenly spread")] = 12,
+    rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = CORES,
+    show: Annotated[bool, typer.Option("--list", help="list the conditions and stop")] = False,
+) -> None:
+    from scenes import load_sensor
+    from training.studies import degradation
+    from twin.cli.options import say, tell
+    from twin.cli.progress import shown
+    from twin.judge.degradation.conditions import condition_lines
+    from twin.judge.degradation.plan import SweepPlan, load_plan
+
+    if show:
+        say(condition_lines())
+        raise typer.Exit
+    plan = degradation.Plan(
+        load_sensor(sensor),
+        pipelines=tuple(pipeline or degradation.PIPELINES),
+        models=tuple(model or ()),
+        sweep=if_given(load_plan, conditions) or SweepPlan(),
+        frames=frames,
+        limit=limit,
+        rendered=rendered,
+        jobs=jobs,
+    )
+    with shown() as progress:
+        found = degradation.run(plan, writable_folder(out), progress=progress)
+    tell(found)
+
+
+HELP_AUDIT = """Find what is wrong with the labels of a flat-surface recording, from its pins and targets.csv alone.
+
+It looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames that fit no label,
+frames that occur twice, drift along the table, and anything odd about the files. It needs pose_2, pose_6, move_1, move_6.
+
+\b
+Writes labels_corrected.csv (image_name, executed, the four labels corrected, misfit to each story, findings),
+audit.json, audit.png, audit.html. Copy labels_corrected.csv beside targets.csv, and 'twin train' corrects the labels by it.
+"""
+
+
+@app.command("audit", help=HELP_AUDIT)
+def audit(
+    data: Annotated[Path, typer.Argument(help="labelled recording")],
+    sensor: Sensor,
+    out: Out,
+    form: FormOrAuto = None,
+) -> None:
+    from scenes import load_sensor
+    from training.studies.label_audit import audit_recording
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+
+    spec = load_sensor(sensor)
+    with shown() as progress:
+        found = audit_recording(data, spec, writable_folder(out), form=form, progress=progress)
+    tell(found)

@@ -1,0 +1,266 @@
+"""``twin dataset``: simulated recordings with ground truth.
+
+``twin train``: a model from a labelled recording.
+
+``twin evaluate``: how good a trained model is.
+
+``twin predict``: the pose in one frame.
+
+``twin pack``: a small copy of a run."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.cli import app
+from twin.cli.options import CORES, Across, Device, FormOrAuto, Out, Quality, Sensor, Target, Workers, if_given, writable_folder
+from twin.types import FINE
+
+HELP_DATASET = """Simulate a labelled data set: the contacts of an experiment, in the recordings' own format, with ground truth.
+
+For each contact a pose and a move are drawn from the experiment's ranges ('twin experiments' lists them; robot coordinates).
+The arm's way is followed by finite elements, and the last state, or every converged one, becomes a frame. A contact that
+does not converge is listed, and drawn anew.
+
+\b
+--images raw        the camera's frames
+         gray       their luminance
+         recording  cropped and thresholded, as the recordings are
+         none       pins alone, without rendering (vgnn and the other graph
+                    networks train on them; 'twin train' reads them like frames)
+--states all        also the states on the way, labelled by how far tap and move have
+                    gone; all states of a contact share a path_id, and training and
+                    validation parts are split by it
+--randomise R       what differs from contact to contact ('twin randomisations')
+
+\b
+Writes:
+  images/ or frames_bw/, init_0.png, targets.csv, meta.json   as in a recording
+  move_executed.csv   whether each frame's move had been made
+  truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in contact
+                      and sliding, the object's pose: one row a frame
+  draws.csv           what was drawn for each contact; failures.csv: draws that failed
+  generation.json     everything resolved
+  made_by.json        the code that makes it; a version whose code for contacts differs
+                      does not go on with it, as its frames would differ
+  records/            one for each finished contact; with them the same command goes on
+                      after any end, or to a larger --count
+
+The result depends on the options alone. It is the same, byte by byte, with any number of workers and after any interruption.
+
+\b
+Examples:
+  twin dataset --experiment surface-2d --sensor mg400-331 --count 1000 --images none \\
+      --randomise contact --workers 8 --out sim/surface
+  twin dataset --experiment edge-2d --sensor ur5-331 --count 200 --out sim/edge \\
+      --scheduler tcp://192.168.0.10:8786
+"""
+
+
+class Images(StrEnum):
+    """What pictures a data set holds."""
+
+    RAW = "raw"
+    GRAY = "gray"
+    RECORDING = "recording"
+    NONE = "none"
+
+
+class States(StrEnum):
+    """Which states of a contact become frames."""
+
+    ALL = "all"
+    END = "end"
+
+
+@app.command("dataset", help=HELP_DATASET)
+def dataset(
+    experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="experiment name ('twin experiments') or file")],
+    sensor: Sensor,
+    count: Annotated[int, typer.Option("--count", min=1, metavar="N", help="contacts")],
+    out: Out,
+    object_: Annotated[
+        str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
+    ] = None,
+    images: Annotated[Images, typer.Option("--images", help="what pictures to make")] = Images.RAW,
+    states: Annotated[States, typer.Option("--states", help="which states of a contact become frames")] = States.END,
+    randomise: Annotated[
+        str | None, typer.Option("--randomise", metavar="R", help="randomisation name or file; nothing if not given")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="of all that is drawn; the experiment's own if not given")] = None,
+    workers: Workers = CORES,
+    scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="of a running Dask scheduler, whose workers do it")] = "",
+    quality: Annotated[
+        Quality | None, typer.Option(help="samples per pixel", show_default="preview for --images recording, else standard")
+    ] = None,
+    across: Across = FINE,
+) -> None:
+    from scenes import load_experiment, load_object, load_randomisation, load_sensor
+    from training.generation.run import config_for, simulate_dataset
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+
+    config = config_for(
+        load_sensor(sensor),
+        load_experiment(experiment),
+        touched=if_given(load_object, object_),
+        images=images.value,
+        states=states.value,
+        randomisation=if_given(load_randomisation, randomise),
+        seed=seed,
+        quality=quality.value if quality else None,
+        across=across,
+    )
+    with shown() as progress:
+        made = simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, progress=progress)
+    tell(made)
+
+
+HELP_TRAIN = """Train a model that tells the pose from a frame.
+
+\b
+vgnn              ours: Voronoi graph network on matched pins, ensemble, calibrated 90 % intervals
+tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense layers 96, 64
+tac-vgnn-release  the same with the dense layers of the published code: 128, 96
+gnn               the paper's graph network on 6 nearest neighbours, without areas
+cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters on 128 x 128 px
+
+Labels are columns of the recording's table: a preset (surface-2d: pose_2 pose_6; surface-2d-shear: also move_1 move_6;
+surface-3d: pose_3 pose_4 pose_5; edge-2d, edge-3d) or names with commas between. With --labels corrected, moves that
+were not executed are taken out, where move_executed.csv or labels_corrected.csv beside the table tells which.
+
+Depth and angle of simulated contacts are those of the surface that was touched, whatever its shape: indentation along its normal
+at the nearest place, and the angle from that normal. So data sets of several objects can be joined: give --data once for each.
+
+A random fifth of the rows is kept out of training for 'twin evaluate'; of simulated data a fifth of the contacts, with all their
+states. --split gives its seed; --split -1 trains on all.
+
+\b
+Writes to --out: config.json (resolved, with the sensor and the pipeline's parameters), curves.csv, weights.pt, and
+while it runs checkpoint.pt. A run that was ended goes on where it was when it is started again with the same options.
+"""
+
+
+@app.command("train", help=HELP_TRAIN)
+def train(
+    model: Annotated[str, typer.Option("--model", help="vgnn, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
+    sensor: Sensor,
+    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give it once for each of several")],
+    out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
+    target: Target = "surface-2d",
+    labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
+    seed: Annotated[int, typer.Option("--seed", help="of weights and order")] = 0,
+    split: Annotated[int, typer.Option("--split", help="seed of the fifth kept out of training; -1: none")] = 0,
+    epochs: Annotated[int | None, typer.Option("--epochs", help="instead of the model's own number")] = None,
+    batch: Annotated[int | None, typer.Option("--batch", help="instead of the model's own size")] = None,
+    members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
+    kernel: Annotated[
+        bool | None,
+        typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows"),
+    ] = None,
+    max_minutes: Annotated[float | None, typer.Option("--max-minutes", help="stop after the epoch that passes this time")] = None,
+    threads: Annotated[int | None, typer.Option("--threads", help="CPU threads")] = None,
+    device: Device = "auto",
+    form: FormOrAuto = None,
+) -> None:
+    from scenes import load_sensor
+    from training.train import train_model
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+
+    with shown() as progress:
+        made = train_model(
+            model,
+            load_sensor(sensor),
+            data,
+            out,
+            target=target,
+            labels=labels,
+            seed=seed,
+            split=None if split < 0 else split,
+            epochs=epochs,
+            batch=batch,
+            members=members,
+            kernel=kernel,
+            max_minutes=max_minutes,
+            threads=threads,
+            device=device,
+            form=form,
+            progress=progress,
+        )
+    tell(made)
+
+
+HELP_EVALUATE = """Judge a trained model on a labelled recording.
+
+\b
+--rows validation  the fifth of the run's own recording that was kept out of its training
+--rows all         every row: for a recording that the model has not seen
+
+\b
+Writes predictions.csv (image_name, and for every label <label>_true, _pred, _lo90, _hi90; executed_probability, valid),
+metrics.json (mean absolute errors against raw and corrected labels, overall and by depth, angle and shear; coverage of the
+90 % intervals; slope of the angle's error on move_6 over frames whose move was not executed; ms per frame), errors.png.
+
+With --robustness it also writes robustness.csv: errors of single frames whose image is changed (1 % scale, 2 px shift, 1 deg
+turn, 5 pins erased, each in a random direction), and how much larger they are than those of the same frames unchanged.
+"""
+
+
+@app.command("evaluate", help=HELP_EVALUATE)
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights go with the package")],
+    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; all that the run was trained on")],
+    out: Out,
+    rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
+    labels: Annotated[str, typer.Option("--labels", help="truth in predictions.csv and errors.png: corrected or raw")] = "corrected",
+    robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
+) -> None:
+    from training.studies.evaluation import evaluate_run
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+
+    with shown() as progress:
+        found = evaluate_run(run, data, writable_folder(out), rows=rows, labels=labels, robustness=robustness, progress=progress)
+    tell(found)
+
+
+HELP_PREDICT = """Tell the pose in a frame, or in every frame of a folder or video, with its 90 % interval.
+
+The model carries its sensor and pipeline; a frame of another sensor is refused. A recording with a
+frame without contact (init_0.png) tells where its pins are at rest.
+"""
+
+
+@app.command("predict", help=HELP_PREDICT)
+def predict(
+    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights go with the package")],
+    frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
+) -> None:
+    from training.studies.evaluation import predict_frames
+    from twin.cli.options import say
+
+    say(predict_frames(run, frame).lines())
+
+
+HELP_PACK = """Write a small copy of a finished training run, half as precise and less than a tenth as large.
+
+It serves wherever a RUN does. Those that go with the package, below training/weights, were made so:
+
+\b
+  twin study sim-to-real --sensor mg400-331 --frames DIR --contacts surface-2d-wide --draws 2 --epochs 60 --out study
+  twin pack study/sim_only --out training/weights/mg400-331
+"""
+
+
+@app.command("pack", help=HELP_PACK)
+def pack(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, trained with --no-kernel")], out: Out) -> None:
+    from training.estimator import PoseEstimator
+    from training.packed import WEIGHTS, pack
+    from twin.cli.options import say
+
+    PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
+    size = pack(run, writable_folder(out))
+    say([f"wrote {out / WEIGHTS} ({size / 1e3:.0f} kB), {out / 'config.json'}"])

@@ -1,0 +1,138 @@
+"""``twin sensors``, ``twin objects``, ``twin experiments`` and ``twin randomisations``: what is shipped, and where one's own go.
+
+``twin doctor``: what is there, what is missing, and the remedy.
+
+``twin demo``: the main job on the shipped specifications.
+
+``twin render``: one contact, rendered, with its exact ground truth."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scenes import catalog
+from twin.cli import app
+from twin.cli.options import Object, Out, Pair, Quality, Sensor, say, writable_folder
+from twin.types import Form
+
+
+@app.command("sensors")
+def sensors() -> None:
+    """List the sensor specifications, and where to put one's own."""
+    say(catalog.sensors().lines())
+
+
+@app.command("objects")
+def objects() -> None:
+    """List the object specifications, and where to put one's own."""
+    say([*catalog.objects().lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
+
+
+@app.command("experiments")
+def experiments() -> None:
+    """List the experiments (which contacts are made, in the robot's coordinates), and where to put one's own."""
+    say(catalog.experiments().lines())
+
+
+@app.command("randomisations")
+def randomisations() -> None:
+    """List what can differ from one simulated frame to the next, and where to put one's own."""
+    say(catalog.randomisations().lines())
+
+
+@app.command("doctor")
+def doctor() -> None:
+    """Say what is there and what is missing, with the remedy.
+
+    Covers Mitsuba's variants and which one will be used and why, LLVM, GPU, offscreen 3D, camera and serial devices. Exit
+    code 1 if nothing can be rendered on this machine.
+    """
+    from hardware.doctor import examine_machine
+    from twin.cli.options import say
+
+    machine = examine_machine()
+    say(machine.lines())
+    if not machine.can_render:
+        raise SystemExit(1)
+
+
+@app.command("demo")
+def demo(out: Out = Path("out/demo")) -> None:
+    """Press, render, detect, graph: two sensors and more, as pictures and one page (index.html)."""
+    from twin.cli.options import say, tell
+    from twin.cli.progress import shown
+    from twin.demo.make_demo import run_demo
+
+    with shown() as progress:
+        made = run_demo(writable_folder(out), progress=progress)
+    tell(made)
+    say([f"open {out / 'index.html'} in a browser"])
+
+
+HELP_RENDER = """Press an object against a sensor and render what the camera inside sees.
+
+The pose is the OBJECT's, relative to the sensor. The image shows the sensor's x to the right and y down; z points out of
+the tip at the object. Angles turn right-handed about those axes.
+
+\b
+        image                        side view (y towards you)
+      +----------> x                        camera
+      |   . . .                       ___ (       ) ___  lens
+      |  . . . .                     |     gel         |
+      |   . . .                       \\_             _/   skin, pins inside
+      v                                  '---. .---'        O----> x
+      y  (z into the page,            ========v=========    |
+          towards the object)            object             v z
+
+\b
+--indent-mm D     object pushed by D along -z, counted from first touch
+--tilt-deg RX RY  object first turned about x by RX, then about y by RY, through the
+                  tip: RX > 0 brings the object closer where y < 0, RY > 0 where x > 0
+--shear-mm X Y    then dragged by X along x and Y along y (+X drags the pins right,
+                  +Y drags them down)
+--twist-deg RZ    and turned about z by RZ (RZ > 0 turns the pins from x to y,
+                  clockwise in the image)
+--offset-mm X Y   where on the object it is touched: the object is shifted by this
+                  before it approaches
+
+\b
+Writes: frame.png, frame.exr (linear light on the whole raw frame), truth.npz (caps_mm,
+caps_px, rest_px, visible: one row a pin, specification's order), truth.json (force_n of the
+skin on the object in the sensor's axes, so z > 0 when pressed; torque_nmm about the
+sensor's origin, area_mm2, pose, everything resolved), skin.vtp, skin.png, panel.png.
+
+\b
+Example:
+  twin render --sensor ur5-331 --object edge --indent-mm 3 --out out/edge
+"""
+
+
+@app.command("render", help=HELP_RENDER)
+def render(
+    sensor: Sensor,
+    object_: Object,
+    indent_mm: Annotated[float, typer.Option("--indent-mm", metavar="D", help="indentation from first touch; 0: no contact")],
+    out: Out,
+    tilt_deg: Annotated[Pair, typer.Option("--tilt-deg", metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
+    shear_mm: Annotated[Pair, typer.Option("--shear-mm", metavar="X Y", help="drag after the press")] = (0.0, 0.0),
+    twist_deg: Annotated[float, typer.Option("--twist-deg", metavar="RZ", help="turn about z during the drag")] = 0.0,
+    offset_mm: Annotated[Pair, typer.Option("--offset-mm", metavar="X Y", help="sideways place of the object before it approaches")] = (
+        0.0,
+        0.0,
+    ),
+    form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
+    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = Quality.STANDARD,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
+) -> None:
+    from scenes import load_object, load_sensor
+    from twin.cli.options import tell
+    from twin.cli.progress import shown
+    from twin.mechanics.path import ContactPose
+    from twin.one_contact import render_contact
+
+    spec, stimulus = load_sensor(sensor), load_object(object_)
+    pose = ContactPose(indent_mm=indent_mm, tilt_deg=tilt_deg, shear_mm=shear_mm, twist_deg=twist_deg, offset_mm=offset_mm)
+    with shown() as progress:
+        made = render_contact(spec, stimulus, pose, writable_folder(out), form=form, quality=quality.value, seed=seed, progress=progress)
+    tell(made)

@@ -1,0 +1,269 @@
+"""Camera and pin pattern from the pins of one no-contact frame, and which of their parameters such a frame cannot tell.
+
+A camera that looks along the axis of a dome sees rings of pins, and little but the rings' radii tells anything. A longer focal
+length, a greater distance, a wider pattern and a stronger distortion change these radii alike. Only what the pins determine is
+fitted.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from scenes.sensor import SensorSpec
+from twin.camera.projection import project
+from twin.errors import FrameError
+from twin.geometry.pins import rest_pins
+from twin.judge.pictures.aligned import revised
+
+# Rms distance, px, by which real pins at rest miss every dome and camera, all pins of a ring alike. A parameter that moves the pins
+# by less is not determined.
+MODEL_PX = 0.4
+# A parameter is not determined if its sd is larger than this share of its plausible range.
+UNSURE = 1 / 3
+# Only one of two parameters is determined if their correlation is larger than this.
+CORRELATED = 0.99
+# Residual, px, beyond which a pin counts less (soft L1).
+ROBUST_PX = 1.0
+# Step for slopes, as a share of the plausible range.
+STEP = 1e-4
+# Rounds of matching and fitting, and steps of each fit.
+ROUNDS, MOST_STEPS = 6, 20
+# Turns that are tried, deg: layouts repeat every 60 deg.
+TURNS_DEG = np.arange(-30.0, 30.0)
+# Fewest pins that a camera is fitted to.
+LEAST_PINS = 20
+# The pupil stays at least this far behind the window's back, mm.
+BEHIND_WINDOW_MM = 0.5
+
+
+@dataclass(frozen=True)
+class CameraParameter:
+    """A parameter that pins at rest may tell.
+
+    Attributes
+    ----------
+    section : str
+        Section of the specification that holds it.
+    plausible : float
+        Sd of its plausible values, in its own unit; relative to its value where ``relative``.
+    relative : bool
+    bounds : (float, float)
+    instead : str
+        What tells it where the pins do not.
+    """
+
+    section: str
+    plausible: float
+    relative: bool
+    bounds: tuple[float, float]
+    instead: str
+
+
+CONTACT = "contact frames, or a fixed value"
+BOARD = "frames of a chequerboard without the tip, or a fixed value"
+# in the order in which they are held, where several cannot be told apart
+PARAMETERS = {
+    "max_polar_deg": CameraParameter("pins", 5.0, False, (10.0, 88.0), f"{CONTACT} from the tip's drawing"),
+    "distance_mm": CameraParameter("camera", 0.1, True, (1.0, 1000.0), f"{CONTACT} measured with a ruler"),
+    "k2": CameraParameter("camera", 0.1, False, (-2.0, 2.0), BOARD),
+    "tilt_x_deg": CameraParameter("camera", 3.0, False, (-30.0, 30.0), BOARD),
+    "tilt_y_deg": CameraParameter("camera", 3.0, False, (-30.0, 30.0), BOARD),
+    "k1": CameraParameter("camera", 0.2, False, (-2.0, 2.0), BOARD),
+    "fx_px": CameraParameter("camera", 0.1, True, (5.0, 20000.0), BOARD),
+    "cx_px": CameraParameter("camera", 10.0, False, (-1e4, 1e4), BOARD),
+    "cy_px": CameraParameter("camera", 10.0, False, (-1e4, 1e4), BOARD),
+    "phase_deg": CameraParameter("pins", 2.0, False, (-360.0, 360.0), "a frame with more pins found"),
+}
+FREE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
+
+
+@dataclass(frozen=True)
+class CameraReport:
+    """How well the pins are met, and what they tell.
+
+    Attributes
+    ----------
+    rms_px : float
+        Of the distances between pins and projected caps, raw-frame px.
+    pins : int
+        Pins used.
+    sd : dict of str to float
+        Standard deviation of each fitted parameter, in its own unit, from the Jacobian and the residuals.
+    held : dict of str to str
+        Parameters that were asked for but are not determined: why, and what to give in addition. They keep the specification's value.
+    """
+
+    rms_px: float
+    pins: int
+    sd: dict[str, float]
+    held: dict[str, str]
+
+
+def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] = FREE) -> tuple[SensorSpec, CameraReport]:
+    """Least squares of camera and pin pattern on the caps' projections through the window.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+        The start, and the value of all that is not free. ``fy_px`` follows ``fx_px`` in proportion.
+    pins_px : (N, 2) float
+        Raw-frame px of a no-contact frame, in any order; NaN where not found.
+    free : tuple of str
+        Of ``PARAMETERS``.
+
+    Returns
+    -------
+    spec : SensorSpec
+    report : CameraReport
+
+    Raises
+    ------
+    FrameError
+        An unknown parameter, or too few pins.
+    """
+    if unknown := set(free) - set(PARAMETERS):
+        raise FrameError(f"{sorted(unknown)[0]} is not a parameter of the camera's fit; choose of {', '.join(PARAMETERS)}")
+    pins_px = np.asarray(pins_px, float).reshape(-1, 2)
+    pins_px = pins_px[np.isfinite(pins_px).all(axis=1)]
+    if not LEAST_PINS <= len(pins_px) <= spec.pins.count:
+        raise FrameError(
+            f"{len(pins_px)} pins found of {spec.pins.count}; between {LEAST_PINS} and all are needed: give another no-contact frame"
+        )
+    names, held = [name for name in PARAMETERS if name in free], {}
+    order = nearest_order(spec, pins_px)
+    for _ in range(len(free) + 1):
+        found, order, residual, slopes = _fit(spec, pins_px, order, names)
+        sd, correlation = _certainty(residual, slopes)
+        alike = np.sqrt(len(pins_px) / spec.pins.rings)  # the pins of a ring share one error
+        doubtful = _undetermined(_values(spec, names), sd * alike * max(MODEL_PX / _rms(residual), 1), correlation)
+        if not doubtful:
+            break
+        name = next(name for name in names if name in doubtful)
+        held[name] = doubtful[name]
+        names.remove(name)
+    fitted = _with(spec, dict(zip(names, found.tolist(), strict=True)))
+    spec = revised(spec, camera=fitted.camera.model_dump(), pins=fitted.pins.model_dump())
+    return spec, CameraReport(_rms(residual), len(pins_px), dict(zip(names, sd.tolist(), strict=True)), held)
+
+
+def nearest_order(spec: SensorSpec, pins_px: np.ndarray) -> np.ndarray:
+    """Index (n,) of the specification's pin that each of the pins (n, 2) is, whatever the camera's place, scale and turn.
+
+    The projected caps are laid over the pins by centre and size, turned until they fit best, and assigned.
+    """
+    best_miss, best = np.inf, np.zeros((0, 2))
+    for turn in sorted(TURNS_DEG, key=abs):
+        ours = project(spec.view, rest_pins(_with(spec, {"phase_deg": spec.pins.phase_deg + turn}).geometry).caps_mm)
+        middle, size = ours.mean(axis=0), np.sqrt(np.mean(np.sum((ours - ours.mean(axis=0)) ** 2, axis=1)))
+        center = pins_px.mean(axis=0)
+        laid = (ours - middle) / size * np.sqrt(np.mean(np.sum((pins_px - center) ** 2, axis=1))) + center
+        miss = float(np.mean(cKDTree(laid).query(pins_px)[0]))
+        if miss < best_miss - 1e-9:
+            best_miss, best = miss, laid
+    return _assigned(pins_px, best)
+
+
+def _assigned(pins_px: np.ndarray, caps_px: np.ndarray) -> np.ndarray:
+    """Index (n,) of a different cap for each pin, with the least sum of squared distances."""
+    return linear_sum_assignment(np.sum((pins_px[:, None] - caps_px) ** 2, axis=2))[1]
+
+
+def _with(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
+    """A copy, not validated, with values of ``PARAMETERS``."""
+    sections: dict[str, dict[str, Any]] = {"camera": {}, "pins": {}}
+    for name, value in values.items():
+        sections[PARAMETERS[name].section][name] = value
+    if "fx_px" in values:
+        sections["camera"]["fy_px"] = spec.camera.fy_px * values["fx_px"] / spec.camera.fx_px
+    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=given) for name, given in sections.items()})
+
+
+def _values(spec: SensorSpec, names: list[str]) -> dict[str, float]:
+    """The specification's values of ``PARAMETERS``."""
+    return {name: getattr(getattr(spec, PARAMETERS[name].section), name) for name in names}
+
+
+def _range(name: str, value: float) -> float:
+    """Plausible range of a parameter, in its unit, about the specification's value."""
+    parameter = PARAMETERS[name]
+    return parameter.plausible * (value if parameter.relative else 1.0)
+
+
+def _fit(
+    spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Values (p,), order (n,), residual (2 n,) px and its slopes (2 n, p) by the values, after matching and fitting in turn."""
+    known = _values(spec, names)
+    start = np.array(list(known.values()))
+    ranges = np.array([_range(name, value) for name, value in known.items()])
+    low, high = np.array([PARAMETERS[name].bounds for name in names]).T.copy()
+    if "distance_mm" in names:
+        low[names.index("distance_mm")] = -spec.lens.back_mm + BEHIND_WINDOW_MM
+
+    def caps_px(values: np.ndarray) -> np.ndarray:
+        trial = _with(spec, dict(zip(names, values.tolist(), strict=True)))
+        return project(trial.view, rest_pins(trial.geometry).caps_mm)
+
+    def residual(values: np.ndarray, order: np.ndarray) -> np.ndarray:
+        return (caps_px(values)[order] - pins_px).ravel()
+
+    def slopes(values: np.ndarray, order: np.ndarray) -> np.ndarray:
+        steps = STEP * ranges * np.eye(len(ranges))
+        return np.column_stack([(residual(values + d, order) - residual(values - d, order)) / (2 * np.abs(d).max()) for d in steps])
+
+    values = start
+    for _ in range(ROUNDS):
+        before = order
+        fit = least_squares(
+            residual,
+            np.clip(values, low, high),
+            slopes,
+            (low, high),
+            x_scale=ranges,
+            loss="soft_l1",
+            f_scale=ROBUST_PX,
+            max_nfev=MOST_STEPS,
+            args=(order,),
+        )
+        values = fit.x
+        order = _assigned(pins_px, caps_px(values))
+        if np.array_equal(order, before):
+            break
+    return values, order, residual(values, before), slopes(values, before)
+
+
+def _rms(residual: np.ndarray) -> float:
+    """Rms of the distances (n,) whose components (2 n,) are given."""
+    return float(np.sqrt(2 * np.mean(residual**2)))
+
+
+def _certainty(residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations (p,) and correlations (p, p) of the values: ``s^2 (J^T J)^-1``; infinite and 1 along what changes nothing."""
+    scale = np.linalg.norm(slopes, axis=0)
+    _, size, axes = np.linalg.svd(slopes / np.maximum(scale, 1e-300), full_matrices=False)
+    covariance = (axes.T / np.maximum(size, 1e-9) ** 2) @ axes
+    unit = np.sqrt(np.diag(covariance))
+    freedom = max(len(residual) - slopes.shape[1], 1)
+    return unit / np.maximum(scale, 1e-300) * np.sqrt(np.sum(residual**2) / freedom), covariance / np.outer(unit, unit)
+
+
+def _undetermined(known: dict[str, float], sd: np.ndarray, correlation: np.ndarray) -> dict[str, str]:
+    """Parameters that the pins do not determine, and in words why; ``known`` holds the specification's values."""
+    doubtful: dict[str, str] = {}
+    names = list(known)
+    for k, (name, value) in enumerate(known.items()):
+        plausible = _range(name, value)
+        twins = [f"{names[j]} ({correlation[k, j]:+.3f})" for j in range(len(names)) if j != k and abs(correlation[k, j]) > CORRELATED]
+        unsure = sd[k] > UNSURE * plausible
+        if not twins and not unsure:
+            continue
+        why = [f"its effect is that of {', '.join(twins)} (correlation)"] if twins else []
+        why += [f"its standard deviation would be {sd[k]:.2g}, of a plausible range of {plausible:.2g}"] if unsure else []
+        doubtful[name] = (
+            f"{name} is not determined by this no-contact frame: {'; '.join(why)}. "
+            f"Held at the specification's {value:g}; to find it give in addition {PARAMETERS[name].instead}"
+        )
+    return doubtful

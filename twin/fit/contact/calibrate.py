@@ -1,0 +1,155 @@
+"""A contact calibration from a folder of frames to a page."""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes import load_object
+from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.fit.contact.fit import fit_contact, held_out_px, simulate
+from twin.fit.contact.parameters import PARAMETERS
+from twin.fit.contact.report import summary_of, write_calibration
+from twin.fit.contact.simulate import Setup
+from twin.fit.optics import folder_beside
+from twin.fit.sensor_file import write_sensor
+from twin.judge.labelled.model import MeasuredFrames, measure_frames
+from twin.progress import Progress, silent, stage
+from twin.rig.kinematics import rig_of
+from twin.types import FINE, Form
+
+LABELS = 20  # frames that are fitted to
+MOST_HELD_OUT = 20  # frames that are kept out of the fit to state its error
+
+
+def calibrate_contact(
+    folder: Path,
+    frames: Path,
+    spec: SensorSpec,
+    experiment: ExperimentSpec,
+    touched: ObjectSpec,
+    count: int,
+    seed: int,
+    *,
+    parameters: tuple = PARAMETERS,
+    workers: int = 1,
+    across: int = FINE,
+    form: Form | None = None,
+    progress: Callable | None = None,
+) -> tuple[SensorSpec, dict, Path]:
+    """Fit ``parameters`` to ``count`` random frames of a recording, and judge the result on others.
+
+    Everything is written to ``folder``; contacts that lie there from an earlier run are not computed again.
+
+    Returns
+    -------
+    SensorSpec, dict, Path
+        The fitted sensor, all figures, the page.
+
+    Raises
+    ------
+    FrameError
+        No labels, no pins, too few frames.
+    """
+    measured = measure_frames(frames, spec, count + min(count, MOST_HELD_OUT), seed, form=form)
+    order = np.random.default_rng(seed).permutation(len(measured))  # they come in the table's order
+    fitted, held = _part(measured, np.sort(order[:count])), _part(measured, np.sort(order[count:]))
+    setup = Setup(spec, experiment, touched, measured.form, across, folder / "contacts", workers, parameters)
+    fit = fit_contact(setup, fitted, progress=progress)
+    error = held_out_px(setup, fit, held, progress=progress) if len(held) else None
+    summary = summary_of(setup, fitted, fit, error, len(held))
+    pairs = ((fit.start, rig_of(spec).turn_sign), (fit.value, fit.sensor.rig.turn_sign))
+    moved = np.stack([simulate(setup, fitted, [values], sign)[0] for values, sign in pairs]).swapaxes(1, 2)
+    return fit.sensor, summary, write_calibration(folder, fitted, moved, fit, summary)
+
+
+def _part(measured: MeasuredFrames, rows: np.ndarray) -> MeasuredFrames:
+    names, labels = [measured.names[k] for k in rows], [measured.labels[k] for k in rows]
+    return replace(measured, names=names, labels=labels, pins_px=measured.pins_px[rows])
+
+
+@dataclass(frozen=True)
+class ContactCalibration:
+    """What was fitted.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    summary : dict
+        All figures, as ``calibration.json`` holds them.
+    written : list of Path
+        The specification, then the page.
+    """
+
+    sensor: SensorSpec
+    summary: dict[str, Any]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """The parameters with their uncertainty, and the errors before and after; for people."""
+        lines = [f"note: {problem}" for problem in self.summary["problems"]]
+        for p in self.summary["parameters"]:
+            doubt = "" if p["known"] else "  (not told by these frames)"
+            lines.append(f"{p['name']:26s} {p['start']:9.4g} -> {p['value']:9.4g} +- {p['sd']:.2g}{doubt}")
+        for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
+            if part := self.summary[key]:
+                lines.append(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
+        if self.summary["distrusted"]:
+            lines.append(f"not trusted: {', '.join(self.summary['distrusted'])}")
+        return lines
+
+
+def calibrate_to_file(
+    frames: Path,
+    sensor: SensorSpec,
+    experiment: ExperimentSpec,
+    out: Path,
+    *,
+    touched: ObjectSpec | None = None,
+    labels: int = LABELS,
+    seed: int = 0,
+    hold: Collection[str] = (),
+    workers: int = 1,
+    across: int = FINE,
+    form: Form | None = None,
+    progress: Progress = silent,
+) -> ContactCalibration:
+    """Fit the contact of a specification to labelled frames, and write it.
+
+    Beside the specification a folder ``NAME-contact`` holds the page and the simulated contacts: an interrupted run goes on there.
+
+    Parameters
+    ----------
+    frames : Path
+        A labelled recording with its no-contact frame.
+    out : Path
+        The ``.toml`` file to write.
+    touched : ObjectSpec, optional
+        The experiment's own object by default.
+    labels : int
+        Frames to fit to, chosen at random with ``seed``.
+    hold : collection of str
+        Names of parameters that stay as they are.
+
+    Raises
+    ------
+    FrameError
+        No labels, no pins, too few frames, an unknown parameter, or ``out`` is no name of a ``.toml`` file.
+    """
+    names = [parameter.name for parameter in PARAMETERS]
+    if unknown := set(hold) - set(names):
+        raise FrameError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
+    folder = folder_beside(out, "contact")
+    parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
+    how = {"parameters": parameters, "workers": workers, "across": across, "form": form}
+    with stage(progress, "contacts") as step:
+        thing = touched or load_object(experiment.object)
+        fitted, summary, page = calibrate_contact(folder, frames, sensor, experiment, thing, labels, seed, progress=step, **how)
+    said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
+    write_sensor(out, fitted, said)
+    return ContactCalibration(fitted, summary, [out, page])

@@ -1,0 +1,226 @@
+"""Fitting contacts to labelled frames when it is not known whether each frame's move had been executed.
+
+With d_k1, d_k0 the mean squared pin errors of frame k after the move and after the tap alone, s^2 the median squared
+error, w the share of executed moves and theta the parameters with their prior,
+
+    E-step:  p_k = w exp(-n d_k1 / 2 s^2) / (w exp(-n d_k1 / 2 s^2) + (1 - w) exp(-n d_k0 / 2 s^2))
+    M-step:  theta minimises sum_k c_k n (p_k d_k1 + (1 - p_k) d_k0) / s^2 + sum ((theta - theta_0) / prior)^2
+
+n is how many independent numbers a frame's pins stand for: errors of the model are shared by all of them. c_k falls for
+frames that neither story fits. The M-step is one Gauss-Newton step by differences; the uncertainty is the inverse of its
+matrix at the end.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.fit.contact.parameters import changed, values_of
+from twin.fit.contact.simulate import Setup
+from twin.judge.labelled.model import MeasuredFrames
+from twin.rig.kinematics import rig_of
+
+INDEPENDENT = 6.0  # n above: modes of the displacement that carry nearly all of it
+ROUNDS = 3
+SHORTEST = 1 / 8  # of a Gauss-Newton step, before it is given up
+DISTRUST = 9.0  # times the median squared error: 3 sd
+START_FRAMES = 3  # those with the largest turns, and as many with the largest moves, tell the signs
+TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+FEWEST = 4
+LEAST_PX2 = 0.01  # of the squared error: pins are not measured better
+SMALLEST_SHARE, LARGEST_SHARE = 0.05, 0.95
+
+
+@dataclass(frozen=True)
+class ContactFit:
+    """What a calibration found.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    start, value, sd : (P,) float
+        What is fitted of the setup's parameters (``Parameter.scale``).
+    told : (P,) float
+        Share of the prior's variance that the frames removed: 1 is told by the frames, 0 is the start as it was.
+    correlation : (P, P) float
+    executed : (M,) float
+        Probability that each frame's move was executed.
+    trust : (M,) float
+        1 for a frame that one story fits, towards 0 for one that none does.
+    before_px, after_px : (M,) float
+        Mean pin error of each frame under its likelier story.
+    share : float
+        Of executed moves.
+    """
+
+    sensor: SensorSpec
+    start: np.ndarray
+    value: np.ndarray
+    sd: np.ndarray
+    told: np.ndarray
+    correlation: np.ndarray
+    executed: np.ndarray
+    trust: np.ndarray
+    before_px: np.ndarray
+    after_px: np.ndarray
+    share: float
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The E-step's result for M frames."""
+
+    executed: np.ndarray
+    trust: np.ndarray
+    share: float
+    variance_px2: float
+
+    def cost(self, squared_px2: np.ndarray) -> float:
+        """Of squared errors (M, 2), after tap and move; a failed contact (NaN) costs nothing."""
+        squared = np.nan_to_num(squared_px2)
+        each = (1 - self.executed) * squared[:, 0] + self.executed * squared[:, 1]
+        return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
+
+
+def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Callable | None = None) -> ContactFit:
+    """Fit the setup's parameters and the sign of the turns.
+
+    Raises
+    ------
+    FrameError
+        Too few frames, or no contact of theirs can be simulated.
+    """
+    if len(measured) < FEWEST:
+        raise FrameError(f"{len(measured)} frames with pins are too few; give --labels {FEWEST} or more")
+    target = measured.pins_px - measured.no_contact_px
+    start, sign = _start(setup, measured, target, progress)
+    prior = np.array([p.prior for p in setup.parameters])
+    value = start.copy()
+    moved = simulate(setup, measured, [value], sign, progress)[0]
+    weights = expect(mean_squared(moved, target))
+    for _ in range(ROUNDS):
+        slopes = _slopes(setup, measured, value, sign, moved, progress)
+        matrix, force = _normal(slopes, target[:, None] - moved, weights)
+        step = np.linalg.solve(matrix + np.diag(prior**-2), force + (start - value) / prior**2)
+        squared = mean_squared(moved, target)
+        now, solved = weights.cost(squared) + np.sum(((value - start) / prior) ** 2), np.isfinite(squared).sum()
+        length = 1.0
+        while length >= SHORTEST:
+            tried = value + length * step
+            there = simulate(setup, measured, [tried], sign, progress)[0]
+            squared = mean_squared(there, target)
+            cost = weights.cost(squared) + np.sum(((tried - start) / prior) ** 2)
+            if cost < now and np.isfinite(squared).sum() >= solved:
+                value, moved = tried, there
+                break
+            length /= 2
+        weights = expect(mean_squared(moved, target))
+        if length < SHORTEST:
+            break
+    slopes = _slopes(setup, measured, value, sign, moved, progress)
+    matrix, _ = _normal(slopes, target[:, None] - moved, weights)
+    covariance = np.linalg.inv(matrix + np.diag(prior**-2))
+    sd = np.sqrt(np.diag(covariance))
+    shipped = values_of(setup.sensor, setup.experiment, setup.parameters)
+    first = simulate(setup, measured, [shipped], rig_of(setup.sensor).turn_sign, progress)[0]
+    return ContactFit(
+        changed(setup.sensor, setup.experiment, value, sign, setup.parameters),
+        shipped,
+        value,
+        sd,
+        1 - (sd / prior) ** 2,
+        covariance / np.outer(sd, sd),
+        weights.executed,
+        weights.trust,
+        likelier_px(first, target),
+        likelier_px(moved, target),
+        weights.share,
+    )
+
+
+def held_out_px(setup: Setup, fit: ContactFit, measured: MeasuredFrames, *, progress: Callable | None = None) -> tuple[float, float]:
+    """Mean pin error, before and after, on frames that were not fitted; each under its likelier story."""
+    target = measured.pins_px - measured.no_contact_px
+    errors = []
+    for values, sign in ((fit.start, rig_of(setup.sensor).turn_sign), (fit.value, fit.sensor.rig.turn_sign)):
+        errors.append(float(np.nanmean(likelier_px(simulate(setup, measured, [values], sign, progress)[0], target))))
+    return errors[0], errors[1]
+
+
+def likelier_px(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(M,) mean pin error under the story that leaves less, of displacements (M, 2, N, 2) against (M, N, 2)."""
+    seen = np.isfinite(target[:, None, :, 0])
+    each = np.where(seen, np.linalg.norm(moved - target[:, None], axis=-1), 0.0)
+    return np.fmin(*(each.sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)).T)
+
+
+def expect(squared_px2: np.ndarray) -> Weights:
+    """The E-step from squared errors (M, 2), after tap and move: turns to and fro until the shares stay."""
+    failed = ~np.isfinite(squared_px2).all(axis=1)
+    squared = np.where(failed[:, None], 0.0, squared_px2)
+    best, share = squared.min(axis=1), 0.5
+    variance = max(float(np.median(best[~failed])), LEAST_PX2) if (~failed).any() else LEAST_PX2
+    for _ in range(20):
+        odds = INDEPENDENT * (squared[:, 0] - squared[:, 1]) / (2 * variance) + np.log(share / (1 - share))
+        executed = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
+        trust = np.where(failed, 0.0, np.minimum(1.0, DISTRUST * variance / np.maximum(best, 1e-12)) ** 2)
+        each = (1 - executed) * squared[:, 0] + executed * squared[:, 1]
+        if trust.sum() == 0:
+            break
+        variance = max(float(np.median(each[~failed])), LEAST_PX2)  # a median: one frame that nothing fits must not widen it
+        share = float(np.clip(trust @ executed / trust.sum(), SMALLEST_SHARE, LARGEST_SHARE))
+    return Weights(executed, trust, share, variance)
+
+
+def _start(setup: Setup, measured: MeasuredFrames, target: np.ndarray, progress) -> tuple[np.ndarray, int]:
+    """Parameters and the sign of the turns to start from: of all signs and quarter turns of the image, those that fit best."""
+    value = values_of(setup.sensor, setup.experiment, setup.parameters)
+    by_turn = np.argsort([-np.abs(label.pose[3:] - label.move[3:]).max() for label in measured.labels])[:START_FRAMES]
+    by_move = np.argsort([-np.abs(label.move[:3]).max() for label in measured.labels])[:START_FRAMES]
+    telling = np.union1d(by_turn, by_move)
+    turns = np.array([p.name == "rig.image_turn_deg" for p in setup.parameters])
+    tries = []
+    for degrees, sign in product(TURNS_DEG if turns.any() else (0.0,), (1, -1)):
+        tried = value + degrees * turns
+        tries.append((tried, sign * rig_of(setup.sensor).turn_sign))
+    jobs = [(tried, sign, int(row)) for tried, sign in tries for row in telling]
+    moved = setup.displacements(jobs, measured.labels, progress).reshape(len(tries), len(telling), 2, -1, 2)
+    errors = [np.mean(likelier_px(each, target[telling])) for each in moved]
+    if not np.isfinite(errors).any():
+        raise FrameError("none of the first contacts can be simulated; are --experiment and --sensor those of the frames?")
+    return tries[int(np.nanargmin(errors))]
+
+
+def simulate(setup: Setup, measured: MeasuredFrames, values: list, sign: int, progress: Callable | None = None) -> np.ndarray:
+    """(V, M, 2, N, 2) px for V vectors of values."""
+    jobs = [(each, sign, row) for each in values for row in range(len(measured))]
+    return setup.displacements(jobs, measured.labels, progress).reshape(len(values), len(measured), 2, -1, 2)
+
+
+def _slopes(setup: Setup, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress) -> np.ndarray:
+    """(P, M, 2, N, 2) px for a unit of each parameter; 0 where a contact failed."""
+    steps = np.diag([p.step for p in setup.parameters])
+    there = simulate(setup, measured, [value + step for step in steps], sign, progress)
+    return np.nan_to_num((there - moved) / np.diag(steps)[:, None, None, None, None])
+
+
+def mean_squared(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(M, 2) mean squared pin error, px^2, of displacements (M, 2, N, 2); lost pins are left out, a failed contact is NaN."""
+    seen = np.isfinite(target[:, None, :, 0])
+    each = np.sum((moved - target[:, None]) ** 2, axis=-1)
+    return np.where(seen, each, 0.0).sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
+
+
+def _normal(slopes: np.ndarray, missing: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton's matrix (P, P) and right-hand side (P,); lost pins count for nothing."""
+    seen = np.isfinite(missing)
+    share = np.stack([1 - weights.executed, weights.executed], axis=1) * weights.trust[:, None]
+    pins = np.maximum(seen[..., 0].sum(axis=-1), 1)
+    each = (INDEPENDENT / weights.variance_px2 * share / pins)[..., None, None] * seen
+    weighted = slopes * each
+    rows = slopes.reshape(len(slopes), -1)
+    return weighted.reshape(len(slopes), -1) @ rows.T, weighted.reshape(len(slopes), -1) @ np.nan_to_num(missing).ravel()

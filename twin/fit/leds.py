@@ -1,0 +1,214 @@
+"""The LEDs: their azimuths from the glow they throw on the ring, their place and shape from their reflections in the window."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from scenes.sensor import HousingSpec, LedRingSpec, ResponseSpec, SensorSpec
+from twin.camera.capture import blurred
+from twin.camera.projection import Disc, lens_disc
+from twin.fit.still import Still, fit_bounded, level_misfit, sampled, subpixel_offsets
+from twin.judge.pictures.aligned import revised, to_light
+from twin.optics.static_layer import reflections
+
+# Width of the part of the ring whose brightness tells the LEDs' azimuths, as a share of the disc's radius.
+GLOW_SHARE = 0.12
+# Sd of the Gaussian that smooths the brightness over the azimuth, deg.
+GLOW_SMOOTH_DEG = 4.0
+# A ring of like LEDs looks alike when it is turned by one LED. Of all turns that reach this share of the best one's brightness
+# the smallest is right.
+ALIKE = 0.97
+# An LED's glow and reflection are looked for this far from its azimuth, deg.
+SECTOR_DEG = 13.0
+# A reflection is looked for outside this share of the disc's radius.
+SECTOR_SHARE = 0.88
+# Nothing is looked for this close to the disc's edge, px: the edge itself is blurred.
+RIM_PX = 3.0
+# Sd of the Gaussian that is laid over the picture before the brightest place is taken, px.
+HEART_SMOOTH_PX = 1.5
+# Radius of a reflection's bright middle, px.
+HEART_PX = 6.0
+# A reflection rises by at least this many gray levels above its surroundings.
+LEAST_RISE_LEVELS = 40.0
+# Half a side of the square in which a reflection is compared, px.
+PATCH_PX = 11
+# Percentile of the gray levels in that square that is taken as the background.
+BACKGROUND_PERCENTILE = 25
+# Least and largest distance of the LEDs behind the window's back, mm.
+BEHIND_MM = (0.2, 4.0)
+# Bounds of what is fitted, as logarithms: the LED's side in mm, the share of its light outside the core (1 - core_share),
+# the core's sd in mm, and the radius relative to that of the reflections' middles.
+BOUNDS = {"size_mm": (0.3, 5.0), "rest": (5e-4, 1.0), "core_mm": (0.04, 2.0), "radius": (0.98, 1.02)}
+# Starting values of the first three; each combination is tried, and the best one is refined.
+START_SIZES_MM = (0.7, 1.0, 1.4, 2.0)
+START_RESTS = (0.005, 0.02, 0.1, 0.4)
+START_CORES_MM = (0.06, 0.2, 0.4)
+# An LED may turn by this much from the azimuth of its reflection's middle, rad.
+MOST_TURN_RAD = 0.06
+
+
+def turn_leds(spec: SensorSpec, still: Still) -> SensorSpec:
+    """The specification with the LEDs' azimuths as the brightness just outside the disc shows them.
+
+    All LEDs are turned together first; then each goes to the middle of its own glow.
+    """
+    lit = lit_leds(spec.leds)
+    glow = _glow_by_degree(still, spec.housing, spec.camera.distance_mm, spec.response)
+    degrees, azimuth_deg = np.arange(360) + 0.5, np.array(spec.leds.azimuth_deg)
+    turns = np.array(sorted(range(-180, 180), key=abs))
+    total = np.array([np.interp(azimuth_deg[lit] + turn, degrees, glow, period=360).sum() for turn in turns])
+    azimuth_deg = azimuth_deg + turns[np.argmax(total > ALIKE * total.max())]
+    for k in lit:
+        apart = (degrees - azimuth_deg[k] + 180) % 360 - 180
+        weight = np.where(np.abs(apart) < SECTOR_DEG, glow, np.inf)
+        weight = np.where(np.isfinite(weight), weight - weight.min(), 0)
+        azimuth_deg[k] += np.average(apart, weights=weight) if weight.any() else 0.0
+    return revised(spec, leds={"azimuth_deg": tuple(azimuth_deg % 360)})
+
+
+def lit_leds(leds: LedRingSpec) -> list[int]:
+    """Indices of the LEDs that give light."""
+    balance = leds.balance or (1.0,) * len(leds.azimuth_deg)
+    return [k for k, share in enumerate(balance) if share > 0 and k not in leds.off]
+
+
+def _glow_by_degree(still: Still, housing: HousingSpec, pupil_mm: float, response: ResponseSpec) -> np.ndarray:
+    """Mean light (360,) of the ring's innermost part in each degree of azimuth, smoothed; ``pupil_mm`` behind the dome's centre."""
+    out_mm = still.tangents * (housing.z_mm + pupil_mm) - housing.center_mm
+    beyond_mm = np.linalg.norm(out_mm, axis=-1) - housing.aperture_radius_mm
+    near = (beyond_mm > 0) & (beyond_mm < GLOW_SHARE * housing.aperture_radius_mm)
+    azimuth = np.degrees(np.arctan2(out_mm[near][:, 1], out_mm[near][:, 0])) % 360
+    degree = np.minimum(azimuth.astype(int), 359)  # the remainder of a tiny negative angle rounds to 360
+    sums = np.bincount(degree, to_light(still.gray[near], response), minlength=360)
+    glow = sums / np.maximum(np.bincount(degree, minlength=360), 1)
+    return gaussian_filter1d(glow, GLOW_SMOOTH_DEG, mode="wrap")
+
+
+@dataclass(frozen=True)
+class _Reflections:
+    """Reflections of n LEDs that are seen, and what their fit holds fixed.
+
+    Attributes
+    ----------
+    leds : list of int
+        Index of each one's LED.
+    azimuth_rad : (n,) float
+        Of each reflection's middle, and so of its LED.
+    radius_mm, z_mm : float
+        Of the LEDs, as the reflections' middles give it; their height, which is held.
+    rays : (n, s, s, SUBPIXELS, SUBPIXELS, 2) float
+        Tangents in air of the places in the squares that are compared.
+    used : (n, s, s) bool
+        Pixels of the squares that lie in the disc.
+    levels : (n, s, s, 3) float
+        Gray levels of the squares.
+    background : list of (3,) float
+        Light around each reflection.
+    """
+
+    leds: list[int]
+    azimuth_rad: np.ndarray
+    radius_mm: float
+    z_mm: float
+    rays: np.ndarray
+    used: np.ndarray
+    levels: np.ndarray
+    background: list[np.ndarray]
+
+
+def fit_reflections(spec: SensorSpec, still: Still) -> SensorSpec:
+    """The specification with LEDs whose images in the window's back lie where the real ones do, and look like them.
+
+    Radius, size, core and azimuths are fitted. An LED that shows no reflection keeps its azimuth; where none shows one,
+    the specification is returned as it is.
+    """
+    seen = _seen_reflections(spec, still)
+    if seen is None:
+        return spec
+
+    def residual(values: np.ndarray) -> np.ndarray:
+        return _reflection_misfit(spec, seen, values)
+
+    low, high = np.array([*np.log(list(BOUNDS.values())), *[(-MOST_TURN_RAD, MOST_TURN_RAD)] * len(seen.leds)]).T
+    no_turn = np.zeros(len(seen.leds))
+    starts = [np.append(np.log([*start, 1.0]), no_turn) for start in product(START_SIZES_MM, START_RESTS, START_CORES_MM)]
+    first = min(starts, key=lambda values: float(np.abs(residual(values)).sum()))
+    found = fit_bounded(residual, first, low, high)
+    azimuth_deg = np.array(spec.leds.azimuth_deg)
+    azimuth_deg[seen.leds] = np.degrees(seen.azimuth_rad + found[4:])
+    return revised(spec, leds=_led_shape(seen, found) | {"azimuth_deg": tuple((azimuth_deg % 360).tolist())})
+
+
+def _seen_reflections(spec: SensorSpec, still: Still) -> _Reflections | None:
+    """The reflections in the still picture; None where there is none.
+
+    The mirror image of an LED at height z_led lies at ``2 back - z_led``. A ray of tangent t from the pupil meets that plane
+    at ``t (2 back - z_led + distance)`` from the axis. So only radius over that height is seen: the height is held (behind the
+    window), and the radius follows.
+    """
+    lens = spec.lens
+    z_mm = float(np.clip(spec.leds.z_mm, lens.back_mm - BEHIND_MM[1], lens.back_mm - BEHIND_MM[0]))
+    straight_mm = 2 * lens.back_mm - z_mm + spec.camera.distance_mm
+    disc = lens_disc(spec)
+    hearts = {k: at for k in lit_leds(spec.leds) if (at := _heart_px(still, disc, spec.leds.azimuth_deg[k])) is not None}
+    if not hearts:
+        return None
+    at_px = np.array(list(hearts.values()))
+    tangents = sampled(still.tangents, at_px)
+    side = np.arange(-PATCH_PX, PATCH_PX + 1)
+    patches = np.rint(at_px).astype(int)[:, None, None] + np.stack(np.meshgrid(side, side), axis=-1)
+    patches = np.clip(patches, 0, np.array(still.gray.shape[::-1]) - 1)  # (n, s, s, 2)
+    used = disc.distance_px(patches) < disc.radius_px - RIM_PX
+    levels = still.image[patches[..., 1], patches[..., 0]]
+    return _Reflections(
+        leds=list(hearts),
+        azimuth_rad=np.arctan2(tangents[:, 1], tangents[:, 0]),
+        radius_mm=float(straight_mm * np.median(np.linalg.norm(tangents, axis=1))),
+        z_mm=z_mm,
+        rays=sampled(still.tangents, patches[..., None, None, :] + subpixel_offsets()),
+        used=used,
+        levels=levels,
+        background=[
+            to_light(np.percentile(level[inside], BACKGROUND_PERCENTILE, axis=0), spec.response)
+            for level, inside in zip(levels, used, strict=True)
+        ],
+    )
+
+
+def _heart_px(still: Still, disc: Disc, azimuth_deg: float) -> np.ndarray | None:
+    """Place (2,) px of the bright middle of an LED's reflection just inside the rim; None where there is none."""
+    smooth = cv2.GaussianBlur(still.gray, (0, 0), HEART_SMOOTH_PX)
+    apart = np.degrees(np.arctan2(still.tangents[..., 1], still.tangents[..., 0])) - azimuth_deg
+    y, x = np.mgrid[: still.gray.shape[0], : still.gray.shape[1]]
+    out = disc.distance_px(np.stack([x, y], axis=-1))
+    sector = (np.abs((apart + 180) % 360 - 180) < SECTOR_DEG) & (out > SECTOR_SHARE * disc.radius_px) & (out < disc.radius_px - RIM_PX)
+    if not sector.any():
+        return None
+    around = np.median(still.gray[sector])
+    row, column = np.unravel_index(np.argmax(np.where(sector, smooth, -1)), smooth.shape)
+    if smooth[row, column] < around + LEAST_RISE_LEVELS:
+        return None
+    bright = sector & (np.hypot(x - column, y - row) < HEART_PX) & (still.gray > 0.5 * (around + still.gray[row, column]))
+    return np.array([x[bright].mean(), y[bright].mean()])
+
+
+def _led_shape(seen: _Reflections, values: np.ndarray) -> dict[str, float]:
+    """Fields of ``[leds]`` for the fit's first four values."""
+    size_mm, rest, core_mm, off = np.exp(values[:4]).tolist()
+    return {"radius_mm": seen.radius_mm * off, "z_mm": seen.z_mm, "size_mm": size_mm, "core_share": 1 - rest, "core_mm": core_mm}
+
+
+def _reflection_misfit(spec: SensorSpec, seen: _Reflections, values: np.ndarray) -> np.ndarray:
+    """Gray levels by which modelled reflections miss the real ones, over all squares; LED by LED, so that each is judged alone."""
+    leds, misses = spec.leds, []
+    shape = _led_shape(seen, values) | {"off": ()}
+    for n, k in enumerate(seen.leds):
+        azimuth_deg = np.degrees(seen.azimuth_rad[n] + values[4 + n])
+        one = shape | {"azimuth_deg": (azimuth_deg,), "balance": (leds.balance[k],) if leds.balance else ()}
+        light = reflections(spec.view, leds.model_copy(update=one), spec.housing, seen.rays[n]).mean(axis=(2, 3))
+        light = blurred(light + seen.background[n], spec.response.blur_sigma_px)
+        misses.append(level_misfit(light, seen.levels[n], spec.response)[seen.used[n]].ravel())
+    return np.concatenate(misses)

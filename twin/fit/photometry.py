@@ -1,0 +1,330 @@
+"""The light of chosen pixels of real frames as a differentiable function of what lights and colours the sensor.
+
+Lights and colours from the gray levels of caps and skin, by Gauss-Newton on the differentiable renderer.
+
+Only the product of LED power, exposure and reflectance is seen. Therefore the caps' largest reflectance is held at ``CAP_ALBEDO``
+(printed white) and the exposure as it is; the power follows. Caps that differ from the others count less (robust weights);
+``caps`` finds their own reflectance afterwards."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from scenes.sensor import BlobSpec, GelSpec, ResponseSpec, SensorSpec
+from twin.camera.capture import blurred
+from twin.errors import RenderError
+from twin.judge.pictures.aligned import SATURATED, Aligned, levels_slope, require_cameras_own, revised, to_levels, to_light
+from twin.judge.pictures.spots import clear_of_pins, pin_spacing_px
+from twin.optics.arrays import with_room
+from twin.optics.render import BOUNCES, GelView, Renderer
+from twin.optics.tracer import spectrum
+from twin.optics.variant import DrJit, use_variant
+from twin.progress import Step
+from twin.types import FloatArray, IntArray, PinState
+
+SAMPLES = 32
+"""Samples per pixel."""
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """What the fit turns: factors on the specification's light and reflectances, (3,) linear RGB where coloured.
+
+    Attributes
+    ----------
+    leds : (k,) float
+        Of each lit LED.
+    fill : float
+        Of the ring's light into the gel.
+    skin, caps, stems : (3,) float
+    """
+
+    leds: FloatArray
+    fill: float
+    skin: FloatArray
+    caps: FloatArray
+    stems: FloatArray
+
+    @classmethod
+    def neutral(cls, leds: int) -> "Knobs":
+        """Every factor 1."""
+        return cls(np.ones(leds), 1.0, np.ones(3), np.ones(3), np.ones(3))
+
+
+class LightModel:
+    """Light in the gel at chosen pixels of one state, and its derivatives by forward differentiation.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Of the specification where the fit starts, the whole frame, with a variant that differentiates.
+    state : object
+        As ``Renderer.render`` takes it.
+    pixels : (n,) int
+        Of the raw frame, row by row.
+    seed : int
+
+    Raises
+    ------
+    RenderError
+        Where only the scalar variant works.
+    """
+
+    def __init__(self, renderer: Renderer, state: PinState, pixels: IntArray, seed: int) -> None:
+        if renderer.choice.backend == "scalar":
+            raise RenderError(
+                "calibration differentiates the renderer, which the scalar variant can't: run 'twin doctor' for what is missing"
+            )
+        import drjit as dr
+
+        self._mi, self._dr, self._seed = use_variant(renderer.choice), dr, seed
+        mi = self._mi
+        self._view = GelView(mi, renderer.spec, renderer.window_px, renderer.surfaces(state), BOUNCES)
+        self._pixels = mi.UInt32(with_room(pixels, np.uint32))
+        emitters = self._view.tracer.emitters
+        self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
+        self._radiance = [mi.Spectrum(r) for r in emitters.radiance]
+        self._shapes = {shape.id(): mi.ShapePtr(shape) for shape in self._view.tracer.scene.shapes()}
+
+    @property
+    def led_count(self) -> int:
+        """Lit LEDs."""
+        return self._led_count
+
+    def light(self, knobs: Knobs) -> FloatArray:
+        """(n, channels) light of the gel on the film."""
+        self._turn(knobs, {})
+        return np.array(self._view.trace(self._pixels, SAMPLES, self._seed)).T
+
+    def slopes(self, knobs: Knobs) -> dict[str, FloatArray]:
+        """Derivatives (n, channels) by the logarithm of each knob: ``led0``..., ``fill``, ``skin``, ``caps``, ``stems``.
+
+        A coloured knob acts on each channel alone, so that one pass serves all channels; all passes share one kernel.
+        """
+        mi, dr = self._mi, self._dr
+        names = [*(f"led{k}" for k in range(self._led_count)), "skin", "caps", "stems"]
+        if len(self._radiance) > self._led_count:
+            names.append("fill")
+        found = {}
+        for name in names:
+            steps = {each: mi.Float(0.0) for each in names}
+            dr.enable_grad(steps)
+            for each, step in steps.items():
+                dr.set_grad(step, dr.opaque(mi.Float, float(each == name)))
+            self._turn(knobs, steps)
+            image = self._view.trace(self._pixels, SAMPLES, self._seed)
+            found[name] = np.array(dr.forward_to(image)).T
+        return found
+
+    def _turn(self, knobs: Knobs, steps: dict[str, DrJit]) -> None:
+        """Set the knobs, each with its step (zero, but with a gradient) in its logarithm."""
+        mi, dr, tracer = self._mi, self._dr, self._view.tracer
+
+        def factor(knob: str, value: DrJit) -> DrJit:
+            return value * (1 + steps[knob]) if knob in steps else value
+
+        leds = [*((f"led{k}", float(v)) for k, v in enumerate(knobs.leds)), ("fill", float(knobs.fill))]
+        tracer.emitters.radiance[:] = [
+            base * factor(knob, dr.opaque(mi.Float, v)) for base, (knob, v) in zip(self._radiance, leds, strict=False)
+        ]
+        tracer.tints[:] = []
+        for part, shape in self._shapes.items():
+            tint = spectrum(mi, getattr(knobs, part))
+            dr.make_opaque(tint)
+            tracer.tints.append((shape, factor(part, tint)))
+
+
+# Reflectance of the caps' brightest channel. Assumed: white printing resin.
+CAP_ALBEDO = 0.8
+# Pixels of bare skin that are taken from a frame.
+SKIN_SAMPLES = 250
+# Bare skin is farther from every cap's middle than this share of the pins' spacing.
+SKIN_CLEARANCE = 0.6
+# Pixels outside this share of the mask's radius are left out: light from the rim reaches them.
+DISC_SHARE = 0.9
+# Gauss-Newton steps.
+STEPS = 6
+# Slopes are computed anew at one step in this many: the light is nearly linear in the unknowns.
+SLOPES_EVERY = 2
+# Residual, gray levels, beyond which a sample counts less (Cauchy).
+ROBUST_LEVELS = 12.0
+# Sd of the logarithm of an LED's share before the frames are seen.
+BALANCE_SD = 0.3
+# Largest change of an unknown (a logarithm) in one step.
+LARGEST_STEP = 0.7
+# Damping of the normal equations, relative to their trace: keeps them solvable.
+DAMPING = 1e-9
+# Largest haze that is allowed.
+MOST_HAZE = 0.5
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Places in one frame: pixels (n, 2), levels (n, channels), light of the blurred frame there, and which are caps (n,)."""
+
+    pixels: np.ndarray
+    levels: np.ndarray
+    veil: np.ndarray
+    caps: np.ndarray
+
+
+@dataclass(frozen=True)
+class PhotometryFit:
+    """What was found: rms in gray levels of caps and skin, first and last."""
+
+    spec: SensorSpec
+    caps_rms: tuple[float, float]
+    skin_rms: tuple[float, float]
+
+
+def sample_frame(
+    frame: Aligned, around: tuple[np.ndarray, np.ndarray], response: ResponseSpec, gel: GelSpec, blob: BlobSpec, rng: np.random.Generator
+) -> Samples:
+    """Caps' middles and bare skin of a frame, each the mean of 3 x 3 px.
+
+    The veil is the light that haze spreads: the frame's own light, blurred. Where the static layer covers the gel, the frame is often
+    saturated and the layer's own light is taken instead.
+
+    Parameters
+    ----------
+    frame : Aligned
+    around : (H, W[, 3]) float, (H, W) float
+        The static layer's light, and the share of the gel's light that it lets through.
+    response : ResponseSpec
+    gel : GelSpec
+        Its haze's width.
+    blob : BlobSpec
+        Its mask.
+    rng : numpy.random.Generator
+        Chooses the pixels of bare skin.
+    """
+    image = frame.image if frame.image.ndim == 3 else frame.image[..., None]
+    mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)
+    outside, through = around
+    light = np.where(through[..., None] > 0, to_light(image, response), outside.reshape(image.shape)).astype(np.float32)
+    veil = blurred(light, gel.haze_sigma_px).reshape(image.shape)
+    caps = np.rint(frame.pins_px[np.isfinite(frame.pins_px).all(axis=1)]).astype(int)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    bare = np.hypot(x - blob.mask_center_px[0], y - blob.mask_center_px[1]) < DISC_SHARE * blob.mask_radius_px
+    bare &= clear_of_pins(image.shape, caps, round(SKIN_CLEARANCE * pin_spacing_px(caps)))
+    rows, columns = np.nonzero(bare)
+    chosen = rng.permutation(len(rows))[:SKIN_SAMPLES]
+    pixels = np.concatenate([caps, np.column_stack([columns[chosen], rows[chosen]])])
+    at = pixels[:, 1], pixels[:, 0]
+    return Samples(pixels, mean[at], veil[at], np.arange(len(pixels)) < len(caps))
+
+
+def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> PhotometryFit:
+    """Recover LED powers, colours of caps and skin, and the gel's haze.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+        Where the fit starts; its geometry and response stay.
+    frames : list of Aligned
+    progress : callable
+        ``progress(done, total)``.
+
+    Raises
+    ------
+    FrameError
+        A frame does not have the camera's size and channels.
+    """
+    for frame in frames:
+        require_cameras_own(frame.image, frame.name, spec.camera)
+    rng = np.random.default_rng(0)
+    renderer = Renderer(spec)
+    samples = [sample_frame(frame, renderer.static, spec.response, spec.gel, spec.pipeline.raw, rng) for frame in frames]
+    width = spec.camera.width_px
+    models = [
+        LightModel(renderer, f.state, s.pixels[:, 1] * width + s.pixels[:, 0], seed)
+        for seed, (f, s) in enumerate(zip(frames, samples, strict=True))
+    ]
+    levels, veil, caps = (np.concatenate([getattr(s, name) for s in samples]) for name in ("levels", "veil", "caps"))
+    useful = np.all(levels < SATURATED, axis=1)
+    channels, leds = levels.shape[1], models[0].led_count
+    layout = _Layout(leds, channels)
+    x = layout.start(models, to_light(levels[caps & useful], spec.response), caps & useful, spec.gel.haze)
+    slopes: dict[str, np.ndarray] = {}
+    rms: list[tuple[float, float]] = []
+    for step in range(STEPS):
+        light = np.concatenate([m.light(layout.knobs(x)) for m in models])
+        if step % SLOPES_EVERY == 0:
+            found = [m.slopes(layout.knobs(x)) for m in models]
+            slopes = {name: np.concatenate([f[name] for f in found]) for name in found[0]}
+        seen = (1 - x[-1]) * light + x[-1] * veil
+        residual = np.where(useful[:, None], levels - to_levels(seen, spec.response), 0.0)
+        jacobian = layout.jacobian(slopes, light, veil, x[-1], levels_slope(seen, spec.response)) * useful[:, None, None]
+        weight = 1 / (1 + (residual / ROBUST_LEVELS) ** 2)
+        a = jacobian.reshape(-1, len(x))
+        hessian = (a * weight.reshape(-1, 1)).T @ a
+        prior = np.zeros(len(x))
+        prior[:leds] = weight.sum() / len(frames) / leds * (1.0 / BALANCE_SD) ** 2
+        move = np.linalg.solve(hessian + np.diag(prior + DAMPING * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
+        x = x + np.clip(move, -LARGEST_STEP, LARGEST_STEP)
+        x[-1] = np.clip(x[-1], 0, MOST_HAZE)
+        rms.append((_rms(residual[caps & useful]), _rms(residual[~caps & useful])))
+        progress(step + 1, STEPS)
+    first, last = rms[0], rms[-1]
+    return PhotometryFit(layout.applied(spec, x), (first[0], last[0]), (first[1], last[1]))
+
+
+def _rms(residual: np.ndarray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(residual**2)))
+
+
+class _Layout:
+    """Where each knob stands in the vector of unknowns: logarithms of LEDs, skin, caps; then the haze."""
+
+    def __init__(self, leds: int, channels: int):
+        self.leds, self.channels = leds, channels
+        self.count = leds + 2 * channels + 1
+        self.skin, self.caps = slice(leds, leds + channels), slice(leds + channels, leds + 2 * channels)
+
+    def start(self, models: list[LightModel], cap_light: np.ndarray, caps: np.ndarray, haze: float) -> np.ndarray:
+        """Unknowns to start from: neutral, but caps (and skin alike) scaled to the median of the real ``cap_light`` (n, channels)."""
+        x = np.zeros(self.count)
+        light = np.concatenate([m.light(self.knobs(x)) for m in models])
+        ratio = np.median(cap_light, axis=0) / np.median(light[caps], axis=0)
+        x[self.caps] = x[self.skin] = np.log(ratio)
+        x[-1] = haze
+        return x
+
+    def knobs(self, x: np.ndarray) -> Knobs:
+        """The light model's knobs; stems go with the skin."""
+        skin, caps = (np.broadcast_to(np.exp(x[part]), 3) for part in (self.skin, self.caps))
+        return Knobs(np.exp(x[: self.leds]), 1.0, skin, caps, skin)
+
+    def jacobian(self, slopes: dict[str, np.ndarray], light: np.ndarray, veil: np.ndarray, haze: float, curve: np.ndarray) -> np.ndarray:
+        """Derivatives (n, channels, unknowns) of the gray levels."""
+        result = np.zeros((*light.shape, self.count))
+        for k in range(self.leds):
+            result[..., k] = slopes[f"led{k}"]
+        for c in range(self.channels):
+            result[:, c, self.skin.start + c] = (slopes["skin"] + slopes["stems"])[:, c]
+            result[:, c, self.caps.start + c] = slopes["caps"][:, c]
+        result *= (1 - haze) * curve[..., None]
+        result[..., -1] = (veil - light) * curve
+        return result
+
+    def applied(self, spec: SensorSpec, x: np.ndarray) -> SensorSpec:
+        """The specification with the unknowns put in; the ring's own look keeps its brightness."""
+        lit = [k for k in range(len(spec.leds.azimuth_deg)) if k not in spec.leds.off]
+        balance = np.array(spec.leds.balance or np.ones(len(spec.leds.azimuth_deg)))
+        balance[lit] *= np.exp(x[: self.leds])
+        knobs, look = self.knobs(x), spec.appearance
+        caps = knobs.caps * look.cap_albedo
+        scale = CAP_ALBEDO / caps.max()
+        power = float(balance[lit].mean() / scale)
+        dark = {
+            name: tuple((knobs.skin * scale * getattr(look, name)).clip(0, 1).round(6).tolist()) for name in ("skin_albedo", "pin_albedo")
+        }
+        return revised(
+            spec,
+            leds={"balance": tuple((balance / balance[lit].mean()).round(4).tolist()), "power": round(spec.leds.power * power, 6)},
+            housing={"ambient": spec.housing.ambient / power, "glow": spec.housing.glow / power, "fill": spec.housing.fill / power},
+            appearance={"cap_albedo": tuple((scale * caps).round(5).tolist())} | dark,
+            gel={"haze": round(float(x[-1]), 5)},
+        )

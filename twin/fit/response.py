@@ -1,0 +1,217 @@
+"""Sharpness, colour fringes, compression and noise of the camera, from whole frames with the light already right."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from scenes.sensor import CameraSpec, LensSpec, ResponseSpec, SensorSpec
+from twin.camera.capture import expose, hazed, luma_weights, stream_of
+from twin.camera.projection import lens_disc, project
+from twin.frames.forms import gray_levels
+from twin.judge.pictures.aligned import SATURATED, Aligned, revised
+from twin.judge.pictures.spectra import bin_of, equal_count_edges, noise_sd
+from twin.judge.pictures.statistics import bare_skin
+from twin.pins.caps import measure_caps
+
+# Least value, largest value and step for slopes of what is fitted: in ``[response]``, ...
+BOUNDS = {
+    "blur_sigma_px": (0.05, 4.0, 0.03),
+    "sharpening": (0.0, 4.0, 0.05),
+    "sharpening_sigma_px": (0.5, 4.0, 0.05),
+}
+# ... of colour cameras also the softness of colour (``[response]``) and the fringes (``[camera]``).
+CHROMA = {"chroma_sigma_px": (0.05, 4.0, 0.05)}
+FRINGES = {"red_scale": (0.985, 1.015, 0.0003), "blue_scale": (0.985, 1.015, 0.0003)}
+SHIFTS = {f"{colour}_shift_px.{axis}": (-3.0, 3.0, 0.03) for colour in ("red", "blue") for axis in (0, 1)}
+# Least sharpening to start from: without sharpening its width has no effect.
+LEAST_SHARPENING = 0.2
+# Columns share their colour if the step inside a pair is less than this share of the step to the next pair.
+SAME_CHROMA = 0.5
+# JPEG qualities that are tried (0: not compressed).
+QUALITIES = (0, 95, 90, 80, 70)
+# Residual, gray levels, beyond which a pixel counts less (soft L1).
+ROBUST_LEVELS = 10.0
+# Evaluations of the least squares.
+MOST_TRIES = 10
+# Frames that the sharpness is fitted to, and pixels of them: one in this many, in both directions.
+MOST_FRAMES, EVERY = 3, 3
+# Largest aperture, mm: a larger one would need more samples a pixel than frames for learning have.
+MOST_APERTURE_MM = 3.0
+# Range of the focus, relative to the nearest and farthest caps, and values that are tried of focus and aperture.
+FOCUS_RANGE, TRIED = (0.85, 1.15), 31
+# 10-90 % edge width of a Gaussian blur relative to its sd.
+GAUSSIAN_WIDTH = 2.563
+# 10-90 % edge width of a uniform disc relative to its diameter.
+DISC_WIDTH = 0.69
+# Least squared noise of a render, gray levels^2, to divide by; and least share of it that the real noise may have.
+LEAST_NOISE2, LEAST_NOISE_SHARE = 1e-4, 0.01
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """Cap edge widths (10-90 %, px) by distance to the pupil: real and rendered medians of each of ``distance_mm``'s bins."""
+
+    distance_mm: np.ndarray
+    real_px: np.ndarray
+    rendered_px: np.ndarray
+
+
+def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], inside: np.ndarray) -> SensorSpec:
+    """Blur, sharpening and colour fringes by least squares over the disc, then the compression that fits best.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    frames : list of Aligned
+    light : list of (H, W, 3) or (H, W) float
+        Rendered light of each frame's state.
+    inside : (H, W) bool
+        The disc.
+    """
+    bounds = BOUNDS | (CHROMA | FRINGES | SHIFTS if spec.camera.channels == "color" else {})
+    names = list(bounds)
+    pick = np.zeros_like(inside)
+    pick[::EVERY, ::EVERY] = True
+    frames, light = frames[:MOST_FRAMES], [hazed(np.asarray(x, np.float32), spec.gel) for x in light[:MOST_FRAMES]]
+    useful = [inside & pick & (gray_levels(f.image) < SATURATED) for f in frames]
+    real = np.concatenate([f.image[u].astype(float).ravel() for f, u in zip(frames, useful, strict=True)])
+    images = [f.image for f in frames]
+    stream = {"stream": stream_of(images), "chroma_columns": chroma_columns(images)}
+    flat = revised(spec, response={"jpeg_quality": 0} | stream, gel={"haze": 0.0})  # the light is hazed already
+
+    def with_values(values: np.ndarray) -> SensorSpec:
+        return _changed(flat, dict(zip(names, map(float, values), strict=True)))
+
+    def misfit(shown: SensorSpec) -> np.ndarray:
+        return np.concatenate([expose(x, shown.capture)[u].astype(float).ravel() for x, u in zip(light, useful, strict=True)]) - real
+
+    def residual(values: np.ndarray) -> np.ndarray:
+        return misfit(with_values(values))
+
+    low, high, unit = np.array([bounds[name] for name in names]).T
+    start = np.clip([_value(spec.response, spec.camera, name) for name in names], low + 1e-6, high - 1e-6)
+    start[names.index("sharpening")] = max(spec.response.sharpening, LEAST_SHARPENING)
+
+    def slopes(values: np.ndarray) -> np.ndarray:
+        at = residual(values)
+        steps = np.where(values + unit <= high, unit, -unit)
+        return np.stack([(residual(values + step * row) - at) / step for step, row in zip(steps, np.eye(len(names)), strict=True)], axis=1)
+
+    fit = least_squares(
+        residual, start, slopes, bounds=(low, high), x_scale=unit, loss="soft_l1", f_scale=ROBUST_LEVELS, max_nfev=MOST_TRIES
+    )
+    best = with_values(fit.x)
+    errors = {q: float(np.mean(np.abs(misfit(revised(best, response={"jpeg_quality": q}))))) for q in QUALITIES}
+    return revised(best, response={"jpeg_quality": min(QUALITIES, key=lambda q: errors[q])}, gel={"haze": spec.gel.haze})
+
+
+def chroma_columns(images: list[np.ndarray]) -> int:
+    """2 if frames (H, W, 3) come from a 4:2:2 stream, in which columns 2k and 2k + 1 share their colour differences; else 1."""
+    steps, weights = np.zeros(2), luma_weights(stream_of(images))
+    for image in images:
+        if image.ndim == 3:
+            levels = image.astype(np.float32)
+            chroma = levels - (levels @ weights)[..., None]
+            step = np.abs(np.diff(chroma, axis=1)).mean(axis=(0, 2))
+            steps += step[0::2].mean(), step[1::2].mean()
+    return 2 if steps[0] < SAME_CHROMA * steps[1] else 1
+
+
+def _value(response: ResponseSpec, camera: CameraSpec, name: str) -> float:
+    """Value of what is fitted, by its name in the tables above; ``.0`` and ``.1`` are x and y of a shift."""
+    field, _, index = name.partition(".")
+    value = getattr(response if field in BOUNDS | CHROMA else camera, field)
+    return value[int(index)] if index else value
+
+
+def _changed(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
+    """The specification with values of what is fitted."""
+    response = {name: value for name, value in values.items() if name in BOUNDS | CHROMA}
+    camera: dict[str, Any] = {name: value for name, value in values.items() if name in FRINGES}
+    for name in values.keys() & SHIFTS.keys():
+        field = name.partition(".")[0]
+        camera[field] = (values[f"{field}.0"], values[f"{field}.1"])
+    return revised(spec, response=response, camera=camera)
+
+
+def sharpness(spec: SensorSpec, frames: list[Aligned], rendered: Sequence[np.ndarray], bins: int = 5) -> Sharpness:
+    """Edge widths of caps in real and rendered frames, by their apparent distance from the pupil (in air)."""
+    distances, reals, rendereds = [], [], []
+    for frame, image in zip(frames, rendered, strict=True):
+        distances.append(apparent_mm(frame.state.caps_mm[:, 2], spec.camera.distance_mm, spec.lens, spec.gel.refractive_index))
+        reals.append(measure_caps(gray_levels(frame.image), frame.pins_px).edge_px)
+        rendereds.append(measure_caps(gray_levels(image), project(spec.view, frame.state.caps_mm)).edge_px)
+    distance, real, ours = np.concatenate(distances), np.concatenate(reals), np.concatenate(rendereds)
+    good = np.isfinite(real) & np.isfinite(ours)
+    which = bin_of(distance, equal_count_edges(distance[good], bins))
+    parts = [good & (which == k) for k in range(bins)]
+    return Sharpness(*(np.array([np.median(values[p]) for p in parts]) for values in (distance, real, ours)))
+
+
+def fit_blur(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], rounds: int = 3) -> SensorSpec:
+    """The specification with the blur that makes rendered edges as wide as real ones, all caps together.
+
+    Least squares on gray levels would find too much blur, because real and rendered edges do not lie exactly on each other.
+    """
+    for _ in range(rounds):
+        seen = sharpness(spec, frames, [expose(x, spec.capture) for x in light], bins=1)
+        lacking = float((seen.real_px**2 - seen.rendered_px**2)[0]) / GAUSSIAN_WIDTH**2
+        blur = np.sqrt(max(spec.response.blur_sigma_px**2 + lacking, BOUNDS["blur_sigma_px"][0] ** 2))
+        spec = revised(spec, response={"blur_sigma_px": round(float(blur), 4)})
+    return spec
+
+
+def fit_focus(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
+    """Aperture and focus whose defocus explains how the edges' width changes with distance.
+
+    The circle of confusion of a point at d with the focus at d0 is ``f a |1/d - 1/d0|`` px, and squares of widths add. Both values
+    are found on a grid. A part of the width that is the same at all distances is left to the blur.
+    """
+    before = defocus_px(spec.camera.fx_px, spec.camera.aperture_mm, spec.camera.focus_mm, seen.distance_mm)
+    wanted = seen.real_px**2 - seen.rendered_px**2 + (DISC_WIDTH * before) ** 2
+    best = (np.inf, 0.0, spec.camera.focus_mm)
+    for focus in np.linspace(FOCUS_RANGE[0] * seen.distance_mm.min(), FOCUS_RANGE[1] * seen.distance_mm.max(), TRIED):
+        for aperture in np.linspace(0, MOST_APERTURE_MM, TRIED):
+            grown = (DISC_WIDTH * defocus_px(spec.camera.fx_px, aperture, focus, seen.distance_mm)) ** 2
+            miss = float(np.var(wanted - grown))
+            if miss < best[0]:
+                best = miss, aperture, focus
+    return revised(spec, camera={"aperture_mm": round(best[1], 3), "focus_mm": round(float(best[2]), 2)})
+
+
+def defocus_px(focal_px: float, aperture_mm: float, focus_mm: float, distance_mm: np.ndarray) -> np.ndarray:
+    """Diameter of the circle of confusion, px, of what lies at ``distance_mm`` from the pupil."""
+    return focal_px * aperture_mm * np.abs(1 / distance_mm - 1 / focus_mm)
+
+
+def apparent_mm(z_mm: np.ndarray, pupil_mm: float, lens: LensSpec, gel_index: float) -> np.ndarray:
+    """Distance from the pupil, in air, at which what lies at ``z_mm`` in the gel seems to be, near the axis.
+
+    A layer of thickness h and index n looks h / n thick (paraxial). ``pupil_mm``: distance of the pupil from the dome's centre.
+    """
+    return lens.back_mm + pupil_mm + lens.thickness_mm / lens.refractive_index + (z_mm - lens.z_mm) / gel_index
+
+
+def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], rounds: int = 3) -> SensorSpec:
+    """The specification with its noise scaled until bare skin is as rough in renders as in the real frames."""
+    disc, scale = lens_disc(spec), 1.0
+    bare = [bare_skin(f.image.shape, f.pins_px, disc) for f in frames]
+
+    def roughness(images: Iterable[np.ndarray]) -> float:
+        return float(np.median([noise_sd(gray_levels(image), skin) for image, skin in zip(images, bare, strict=True)]))
+
+    real, still = roughness(f.image for f in frames), roughness(expose(x, spec.capture) for x in light)
+    for _ in range(rounds):
+        noisy = revised(spec, response=_noise(spec.response, scale))
+        ours = roughness(expose(x, noisy.capture, np.random.default_rng(k)) for k, x in enumerate(light))
+        grown = max(ours**2 - still**2, LEAST_NOISE2)
+        scale *= float(np.sqrt(max(real**2 - still**2, LEAST_NOISE_SHARE * grown) / grown))
+    return revised(spec, response=_noise(spec.response, scale))
+
+
+def _noise(response: ResponseSpec, scale: float) -> dict[str, float]:
+    """Fields of ``[response]`` for its noise with the sd times ``scale``."""
+    return {"read_noise": response.read_noise * scale, "shot_noise": response.shot_noise * scale**2}

@@ -1,0 +1,208 @@
+"""The edge of the disc through which the gel is seen: where the housing's opening lies, from the still picture.
+
+The bright ring and wall around the disc: their light, from the still picture."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from scenes.sensor import GelSpec, HousingSpec, SensorSpec
+from twin.camera.capture import hazed, vignetted
+from twin.camera.projection import lens_disc, round_disc
+from twin.errors import FrameError
+from twin.fit.still import ROBUST_LEVELS, Still, fit_bounded, level_misfit, sampled
+from twin.judge.pictures.aligned import revised, to_light
+from twin.optics.static_layer import housing_light
+
+# Rays from the disc's centre along which the edge is looked for.
+RAYS = 720
+# Where the edge is looked for in each pass, as shares of the radius found so far: the first pass forgives a wrong specification.
+REACHES = ((0.75, 1.3), (0.9, 1.1), (0.9, 1.1))
+# Step along a ray, px.
+STEP_PX = 0.25
+# The ring's light is read this far outside the place where the ring begins, px.
+TOP_PX = 4.0
+# Share of the brightest mean light along a ray at which the ring begins.
+RING_BEGINS = 0.9
+# Half of the width over which the ring's light is averaged, in steps along a ray.
+TOP_HALF_STEPS = 4
+# Residual, px, beyond which a place of the edge counts less: cables and flaws of the rim stand out by more.
+EDGE_PX = 0.5
+# Least share of the rays that must cross an edge.
+LEAST_RAYS = 0.5
+
+
+def fit_disc_edge(spec: SensorSpec, still: Still) -> SensorSpec:
+    """The specification with the centre and radius of the housing's opening as the still picture shows them.
+
+    The edge is a circle in the housing's plane. It is found in the picture, pass by pass, and then carried into that plane.
+
+    Raises
+    ------
+    FrameError
+        There is no bright ring around a darker disc.
+    """
+    light = to_light(still.gray, spec.response)
+    disc = lens_disc(spec)
+    for reach in REACHES:
+        edge_px = _edge_places(light, disc.center_px, disc.radius_px, reach, spec.name)
+        x, y, radius = _circle_through(edge_px, [*disc.center_px, disc.radius_px], EDGE_PX)
+        disc = round_disc(still.gray.shape[::-1], np.array([x, y]), radius)
+    edge_mm = sampled(still.tangents, edge_px) * (spec.housing.z_mm + spec.camera.distance_mm)
+    start = [*spec.housing.center_mm, spec.housing.aperture_radius_mm]
+    x, y, radius = _circle_through(edge_mm, start, EDGE_PX * spec.housing.aperture_radius_mm / disc.radius_px)
+    return revised(spec, housing={"center_mm": (x, y), "aperture_radius_mm": radius})
+
+
+def _edge_places(light: np.ndarray, center_px: np.ndarray, radius_px: float, reach: tuple[float, float], name: str) -> np.ndarray:
+    """Places (n, 2) px of the edge on rays from a centre.
+
+    The edge of a ray is the outermost place where its light crosses the level half way between the disc's and the ring's.
+    """
+    turn, each = np.linspace(0, 2 * np.pi, RAYS, endpoint=False), np.arange(RAYS)
+    outward = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    along_px = radius_px * np.arange(*reach, STEP_PX / radius_px)
+    seen = sampled(light, center_px + along_px[:, None] * outward[:, None])  # (rays, steps)
+    mean = np.median(seen, axis=0)
+    top = int(np.argmax(mean > RING_BEGINS * mean.max())) + round(TOP_PX / STEP_PX)
+    no_ring = FrameError(
+        f"{name}: no bright ring around the disc, {along_px[0]:.0f} to {along_px[-1]:.0f} px from its centre; "
+        "check [camera] and [housing] of the specification, or the frames"
+    )
+    if top > len(along_px):  # still growing brighter where the search ends
+        raise no_ring
+    ring = np.median(seen[:, top - TOP_HALF_STEPS : top + TOP_HALF_STEPS + 1], axis=1)
+    level = 0.5 * (np.median(seen[:, : top // 2], axis=1) + ring)
+    last = top - 1 - np.argmax((seen[:, :top] < level[:, None])[:, ::-1], axis=1)  # last step below the level
+    below, above = seen[each, last], seen[each, np.minimum(last + 1, len(along_px) - 1)]
+    good = (below < level) & (above >= level)
+    if good.mean() < LEAST_RAYS:
+        raise no_ring
+    crossing_px = along_px[last[good]] + STEP_PX * ((level - below) / np.where(good, above - below, 1))[good]
+    return center_px + crossing_px[:, None] * outward[good]
+
+
+def _circle_through(points: np.ndarray, start: list[float], scale: float) -> tuple[float, float, float]:
+    """Centre and radius of the circle through most of the points (n, 2); residuals beyond ``scale`` count less (Cauchy)."""
+    fit = least_squares(lambda c: np.linalg.norm(points - c[:2], axis=1) - c[2], start, loss="cauchy", f_scale=scale)
+    x, y, radius = fit.x.tolist()
+    return x, y, radius
+
+
+# One pixel in this many, in both directions, is compared: the ring's light is smooth.
+EVERY = 6
+# Pixels this close to the disc's edge are left out, px: the edge itself is blurred.
+RIM_PX = 3.0
+# Least and largest value of what is fitted, as logarithms. ``glow_radius_mm`` is relative to the opening's radius; ``red`` and ``blue``
+# are the wall's reflectance relative to green.
+BOUNDS = {
+    "ambient": (0.01, 50.0),
+    "ambient_falloff_mm": (1.0, 300.0),
+    "glow": (0.01, 300.0),
+    "glow_radius_mm": (0.9, 1.25),
+    "glow_height_mm": (0.2, 15.0),
+    "glow_exponent": (0.7, 10.0),
+    "wall_fraction": (0.01, 1.0),
+    "lip_width_mm": (0.05, 6.0),
+    "red": (0.1, 3.0),
+    "blue": (0.1, 3.0),
+}
+# Starting values of the lip's width, mm. The step at the lip makes local optima: each start is tried, and the best one is refined.
+START_LIPS_MM = (0.4, 1.0, 2.0, 3.5)
+# Steps of the fit from each of these starts, and of the fit without a step at the lip.
+TRIAL_STEPS, SMOOTH_STEPS = 8, 40
+# A step at the lip must lower the misfit by this share against the fit without one: else there is none.
+LEAST_STEP_GAIN = 0.05
+# A starting value is at least this large, because its logarithm is taken.
+LEAST_START = 1e-3
+
+
+@dataclass(frozen=True)
+class _Wall:
+    """Pixels of the still picture that are compared, thinned out, and what lies behind their light.
+
+    Attributes
+    ----------
+    at_mm : (h, w, 2) float
+        Where each pixel's ray meets the housing's plane.
+    wall, compared : (h, w) bool
+        Pixels that show the wall; those whose misfit counts.
+    levels, inside : (h, w, 3) float
+        Gray levels; their light, which stays as it is inside the disc.
+    loss : (h, w, 1) float
+        Vignetting.
+    haze : GelSpec
+        Haze, its width in thinned-out pixels.
+    """
+
+    at_mm: np.ndarray
+    wall: np.ndarray
+    compared: np.ndarray
+    levels: np.ndarray
+    inside: np.ndarray
+    loss: np.ndarray
+    haze: GelSpec
+
+
+def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
+    """The specification with the light of ring and wall outside the disc.
+
+    Only the product of ``housing.albedo`` and light is seen, so the albedo's largest channel stays as it is.
+    """
+    seen, start, names = _thinned(spec, still), _start_values(spec.housing), list(BOUNDS)
+    low, high = np.log(np.array(list(BOUNDS.values())).T)
+
+    def residual(values: np.ndarray) -> np.ndarray:
+        trial = spec.model_copy(update={"housing": spec.housing.model_copy(update=_housing_values(spec.housing, values))})
+        light = seen.inside.copy()
+        light[seen.wall] = housing_light(trial.leds, trial.housing, seen.at_mm[seen.wall])
+        return level_misfit(hazed(light, seen.haze) * seen.loss, seen.levels, spec.response)[seen.compared].ravel()
+
+    def fitted(changed: dict[str, float], least: np.ndarray, most_steps: int) -> tuple[float, np.ndarray]:
+        """Misfit and values from one start."""
+        first = np.log(np.maximum(list((start | changed).values()), LEAST_START))
+        found = fit_bounded(residual, first, least, high, most_steps=most_steps)
+        return float(np.sum(np.log1p((residual(found) / ROBUST_LEVELS) ** 2))), found
+
+    without_step = low.copy()
+    without_step[names.index("wall_fraction")] = -1e-6  # logarithm: the wall is as bright as the lip
+    smooth_misfit, smooth = fitted({"wall_fraction": 1.0}, without_step, SMOOTH_STEPS)
+    tried = [fitted({"lip_width_mm": width_mm}, low, TRIAL_STEPS) for width_mm in START_LIPS_MM]
+    step_misfit, stepped = min(tried, key=lambda fit: fit[0])
+    if step_misfit > (1 - LEAST_STEP_GAIN) * smooth_misfit:
+        no_lip = {"lip_width_mm": spec.housing.lip_width_mm, "wall_fraction": 1.0}
+        return revised(spec, housing=_housing_values(spec.housing, smooth) | no_lip)
+    return revised(spec, housing=_housing_values(spec.housing, fit_bounded(residual, stepped, low, high)))
+
+
+def _thinned(spec: SensorSpec, still: Still) -> _Wall:
+    """What is compared of the still picture."""
+    ring, few = spec.housing, (slice(None, None, EVERY),) * 2
+    at_mm = still.tangents[few] * (ring.z_mm + spec.camera.distance_mm)
+    margin_mm = RIM_PX * ring.aperture_radius_mm / lens_disc(spec).radius_px
+    beyond_mm = np.linalg.norm(at_mm - ring.center_mm, axis=-1) - ring.aperture_radius_mm
+    return _Wall(
+        at_mm=at_mm,
+        wall=beyond_mm >= 0,
+        compared=beyond_mm > margin_mm,
+        levels=still.image[few],
+        inside=to_light(still.image, spec.response)[few].astype(np.float32),
+        loss=vignetted(np.ones((*still.gray.shape, 1), np.float32), spec.camera)[few],
+        haze=spec.gel.model_copy(update={"haze_sigma_px": spec.gel.haze_sigma_px / EVERY}),
+    )
+
+
+def _start_values(ring: HousingSpec) -> dict[str, float]:
+    """The specification's values of what is fitted, in the order of ``BOUNDS``."""
+    red, green, blue = ring.albedo
+    start = {name: getattr(ring, name) for name in BOUNDS if hasattr(ring, name)} | {"red": red / green, "blue": blue / green}
+    return start | {"glow_radius_mm": start["glow_radius_mm"] / ring.aperture_radius_mm}
+
+
+def _housing_values(ring: HousingSpec, values: np.ndarray) -> dict[str, float | tuple[float, ...]]:
+    """Fields of ``[housing]`` for the fit's values, which are logarithms."""
+    found = dict(zip(BOUNDS, np.exp(values).tolist(), strict=True))
+    colour = np.array([found.pop("red"), 1.0, found.pop("blue")])
+    found["glow_radius_mm"] *= ring.aperture_radius_mm
+    return {**found, "albedo": tuple((colour * max(ring.albedo) / colour.max()).tolist())}

@@ -1,0 +1,12 @@
+"""Recorded frames from disk: a picture, a folder, a video, or a recording with its table and metadata.
+
+Understands the folder formats of the sensor's users: ``frames_bw/`` with ``init_0.png``, ``images/``, and ``sensor_images/`` or
+``processed_images/``, each with ``targets.csv`` and JSON metadata. Whatever is odd in them is listed, and what is readable is
+read.
+"""
+
+from twin.frames.folders import natural_key
+from twin.frames.images import read_image
+from twin.frames.recording import Recording, evenly_read, open_recording
+
+__all__ = ["Recording", "evenly_read", "natural_key", "open_recording", "read_image"]

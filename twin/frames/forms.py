@@ -1,0 +1,222 @@
+"""The two forms of a sensor's frames: their sizes, the way between their pixel coordinates, and which form a frame has.
+
+A recording is the camera's frame cropped, thresholded and resized at capture. With the crop (x0, y0, x1, y1) and the recorded
+size (w, h), and pixel centres at integers, ``x_rec = (x_raw - x0 + 0.5) w / (x1 - x0) - 0.5``; likewise for y.
+"""
+
+from collections import Counter
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from scenes.sensor import BlobSpec, PipelineSpec, RecordingSpec, SensorSpec
+from twin.errors import FrameError
+from twin.frames.images import bits_used, decode, to_eight_bits
+from twin.types import Form
+
+# Share of black and white pixels above which a frame was thresholded. It is below 1, because resizing leaves grays at the edges.
+TWO_LEVEL_SHARE = 0.9
+# Least share of black and of white pixels in a thresholded frame: both occur.
+LEAST_OF_EACH_LEVEL = 0.005
+# Gray levels below which a pixel counts as black, and above which it counts as white.
+BLACK_BELOW, WHITE_ABOVE = 16, 239
+# Frames that decide on a recording's size and form.
+VOTES = 25
+
+Thing = TypeVar("Thing", bound=Hashable)
+
+
+def raw_to_recording(recording: RecordingSpec | None, raw_px: np.ndarray) -> np.ndarray:
+    """Pixels (..., 2) of the camera's frame to pixels of the recording.
+
+    Raises
+    ------
+    FrameError
+        The sensor has no recording form.
+    """
+    corner, scale = _corner_and_scale(recording)
+    return (np.asarray(raw_px, float) - corner + 0.5) * scale - 0.5
+
+
+def recording_to_raw(recording: RecordingSpec | None, recording_px: np.ndarray) -> np.ndarray:
+    """Pixels (..., 2) of the recording to pixels of the camera's frame; raises as ``raw_to_recording``."""
+    corner, scale = _corner_and_scale(recording)
+    return (np.asarray(recording_px, float) + 0.5) / scale + corner - 0.5
+
+
+def from_raw(recording: RecordingSpec | None, form: Form, raw_px: np.ndarray) -> np.ndarray:
+    """Pixels (..., 2) of the camera's frame to pixels of the given form; raises as ``raw_to_recording``."""
+    return raw_to_recording(recording, raw_px) if form == Form.RECORDING else np.asarray(raw_px, float)
+
+
+def frame_size(spec: SensorSpec, form: Form) -> tuple[int, int]:
+    """(width, height) in px of the sensor's frames of a form.
+
+    Raises
+    ------
+    FrameError
+        The sensor has no recording form.
+    """
+    known = known_frames(spec)
+    if form not in known.size_px:
+        raise FrameError(f"sensor '{spec.name}' has no recording form: its recordings are raw frames; use the raw form")
+    return known.size_px[form]
+
+
+def blob_spec(pipeline: PipelineSpec, form: Form) -> BlobSpec:
+    """How pins are found in frames of a form.
+
+    Raises
+    ------
+    FrameError
+        The sensor has no recording form.
+    """
+    found = pipeline.raw if form == Form.RAW else pipeline.recording
+    if found is None:
+        raise FrameError("the sensor has no recording form ([pipeline.recording]): its recordings are raw frames; use the raw form")
+    return found
+
+
+def gray_levels(image: np.ndarray) -> np.ndarray:
+    """(H, W) luminance of a gray (H, W), one-channel (H, W, 1) or RGB (H, W, 3) image, in the image's own type."""
+    if image.ndim == 2:
+        return image
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.shape[2] == 3 else image[..., 0]
+
+
+@dataclass(frozen=True)
+class KnownFrames:
+    """What the frames of a sensor look like: its name, and (width, height) px of each form that it has."""
+
+    sensor: str
+    size_px: Mapping[Form, tuple[int, int]]
+
+
+def known_frames(spec: SensorSpec) -> KnownFrames:
+    """The frames of the sensor that a specification describes."""
+    sizes = {Form.RAW: (spec.camera.width_px, spec.camera.height_px)}
+    if spec.recording:
+        sizes[Form.RECORDING] = (spec.recording.width_px, spec.recording.height_px)
+    return KnownFrames(spec.name, sizes)
+
+
+@dataclass(frozen=True)
+class FrameKind:
+    """What the frames of a recording have in common.
+
+    Attributes
+    ----------
+    form : Form
+    size_px : (int, int)
+        Width and height.
+    bits : int
+        Bits in use in 16-bit files; 0 for 8-bit files.
+    """
+
+    form: Form
+    size_px: tuple[int, int]
+    bits: int = 0
+
+
+def times(size_px: Sequence[int]) -> str:
+    """A size as people write it: 640x480."""
+    return f"{size_px[0]}x{size_px[1]}"
+
+
+def is_two_level(image: np.ndarray) -> bool:
+    """Whether a picture was thresholded at capture: nearly all of it is black or white, and both occur."""
+    low, high = float(np.mean(image < BLACK_BELOW)), float(np.mean(image > WHITE_ABOVE))
+    return low + high > TWO_LEVEL_SHARE and min(low, high) > LEAST_OF_EACH_LEVEL
+
+
+def tell_form(known: KnownFrames, image: np.ndarray) -> Form:
+    """Form of a sensor's frame, by its size; where both forms have that size, by its content.
+
+    Raises
+    ------
+    FrameError
+        It has neither form's size.
+    """
+    size = _size_px(image)
+    fitting = [form for form, expected in known.size_px.items() if expected == size]
+    if not fitting:
+        expected = " or ".join(f"{times(expected)} ({form})" for form, expected in known.size_px.items())
+        raise FrameError(f"expected {expected} for {known.sensor}, got {times(size)}; use the matching --sensor or the unresized frame")
+    if len(fitting) == 1:
+        return fitting[0]
+    return Form.RECORDING if is_two_level(image) else Form.RAW
+
+
+def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form | None) -> Form:
+    """Form of a frame: the given one if its size allows that, else told by size and content.
+
+    Raises
+    ------
+    FrameError
+        The size is not one of the sensor's, or not that of the given form.
+    """
+    if form is not None:
+        form = Form(form)
+    if known is None:
+        return form or (Form.RECORDING if is_two_level(image) else Form.RAW)
+    try:
+        told = tell_form(known, image)
+    except FrameError as error:
+        raise FrameError(f"{name}: {error}") from None
+    if form is None:
+        return told
+    expected = known.size_px.get(form)
+    if expected is None:
+        raise FrameError(f"{name}: sensor {known.sensor} has no {form} form (no [{form}] section); leave out --form")
+    if expected != _size_px(image):
+        raise FrameError(f"{name}: expected {times(expected)} ({form}) for {known.sensor}, got {times(_size_px(image))}; leave out --form")
+    return form
+
+
+def common_kind(files: list[Path], known: KnownFrames | None, form: Form | None) -> FrameKind:
+    """Kind of most of a recording's frames, by up to ``VOTES`` usable ones spread over it; on a tie that of the first.
+
+    Raises
+    ------
+    FrameError
+        No frame is usable.
+    """
+    spread = dict.fromkeys(np.linspace(0, len(files) - 1, min(VOTES, len(files))).astype(int).tolist())
+    votes: dict[int, FrameKind] = {}
+    reasons: dict[int, str] = {}
+    for k in [*spread, *(k for k in range(len(files)) if k not in spread)]:
+        try:
+            stored = decode(files[k])
+            votes[k] = FrameKind(form_of(to_eight_bits(stored)[0], files[k].name, known, form), _size_px(stored), bits_used(stored))
+        except FrameError as error:
+            reasons[k] = str(error)
+        if len(votes) == VOTES:
+            break
+    if not votes:
+        raise FrameError(f"no usable frame among {len(files)}; the first: {reasons[0]}")
+    kinds = [votes[k] for k in sorted(votes)]
+    size = _most([kind.size_px for kind in kinds])
+    kinds = [kind for kind in kinds if kind.size_px == size]
+    return FrameKind(_most([kind.form for kind in kinds]), size, max(kind.bits for kind in kinds))
+
+
+def _corner_and_scale(recording: RecordingSpec | None) -> tuple[np.ndarray, np.ndarray]:
+    """First pixel (x, y) of the crop in the camera's frame, and recorded pixels for one of the camera's, in x and y."""
+    if recording is None:
+        raise FrameError("the sensor has no recording form ([recording]): its recordings are raw frames; use the raw form")
+    x0, y0, x1, y1 = recording.crop_px
+    return np.array([x0, y0], float), np.array([recording.width_px / (x1 - x0), recording.height_px / (y1 - y0)])
+
+
+def _size_px(image: np.ndarray) -> tuple[int, int]:
+    """(width, height) of an image."""
+    return image.shape[1], image.shape[0]
+
+
+def _most(things: list[Thing]) -> Thing:
+    """The most frequent thing; of equally frequent ones the first."""
+    return Counter(things).most_common(1)[0][0]

@@ -1,0 +1,155 @@
+"""Silence for the libraries below OpenCV: they print their messages to the process's stderr, where no Python code can catch them.
+
+One picture from a file, as 8-bit levels."""
+
+import contextlib
+import os
+import threading
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from twin.errors import FrameError
+from twin.store import write_bytes
+
+# File descriptor of the process's stderr.
+STDERR = 2
+_lock = threading.Lock()
+_inside = 0
+_kept: int | None = None  # the real stderr while it is turned away
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET; read by OpenCV when it opens its first video
+
+
+def _turn_away() -> None:
+    global _inside, _kept
+    with _lock:
+        _inside += 1
+        if _inside > 1:
+            return
+        try:
+            _kept = os.dup(STDERR)
+        except OSError:  # no stderr at all
+            return
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, STDERR)
+        os.close(nowhere)
+
+
+def _turn_back() -> None:
+    global _inside, _kept
+    with _lock:
+        _inside -= 1
+        if _inside == 0 and _kept is not None:
+            os.dup2(_kept, STDERR)
+            os.close(_kept)
+            _kept = None
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Drop what any thread prints to stderr inside. Use it for the length of one decoder call only."""
+    _turn_away()
+    try:
+        yield
+    finally:
+        _turn_back()
+
+
+PNG_START = b"\x89PNG\r\n\x1a\n"
+# Bits that cameras deliver in 16-bit files.
+DEPTHS = (8, 10, 12, 14, 16)
+
+
+def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
+    """A picture as (H, W) or (H, W, 3) uint8 RGB, and a note on what was converted ("" if nothing).
+
+    Parameters
+    ----------
+    bits : int
+        At least so many bits of a 16-bit file are in use (of the recording it belongs to); its own levels may show more.
+
+    Raises
+    ------
+    FrameError
+        It can't be read: missing, empty, truncated, not a picture.
+    """
+    image, note = to_eight_bits(decode(path), bits)
+    if image.ndim == 3:
+        image = image[..., 0] if image.shape[2] < 3 else cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2RGB)
+    return np.ascontiguousarray(image), note
+
+
+def write_image(path: Path, image: np.ndarray) -> Path:
+    """Write a gray or RGB frame as PNG, whole or not at all; the path.
+
+    Raises
+    ------
+    StoreError
+        It can't be written.
+    """
+    return write_bytes(path, cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes())
+
+
+def decode(path: Path) -> np.ndarray:
+    """Levels of a picture as stored, (H, W) or (H, W, C) in OpenCV's channel order, uint8 or uint16.
+
+    Raises
+    ------
+    FrameError
+        It can't be read: missing, empty, truncated, not a picture.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FrameError(f"{path.name}: can't be read ({error.strerror})") from error
+    if not data:
+        raise FrameError(f"{path.name}: the file is empty; copy it again")
+    if data.startswith(PNG_START) and (fault := _png_fault(data)):
+        raise FrameError(f"{path.name}: {fault}; copy it again")
+    try:
+        with quiet():
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise FrameError(f"{path.name}: not a readable picture (broken or unknown format); copy or convert it again")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FrameError(f"{path.name}: expected 8-bit levels, got {image.dtype}; convert it to 8 bits")
+    return image
+
+
+def _png_fault(data: bytes) -> str:
+    """What is wrong with the chunks of a PNG; "" if they are whole. Data after its end does not matter."""
+    start = len(PNG_START)
+    while start + 12 <= len(data):
+        end = start + 12 + int.from_bytes(data[start : start + 4], "big")
+        kind = data[start + 4 : start + 8]
+        if end > len(data):
+            break
+        critical = kind[:1].isupper()
+        if critical and zlib.crc32(data[start + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return f"damaged PNG (checksum of its {kind.decode('ascii', 'replace')} chunk)"
+        if kind == b"IEND":
+            return ""
+        start = end
+    return f"truncated PNG ({len(data)} bytes, its end is missing)"
+
+
+def bits_used(image: np.ndarray) -> int:
+    """Smallest usual bit depth that holds the brightest level; 0 for 8-bit pictures."""
+    if image.dtype == np.uint8:
+        return 0
+    brightest = int(image.max())
+    return next(bits for bits in DEPTHS if brightest < 1 << bits)
+
+
+def to_eight_bits(image: np.ndarray, bits: int = 0) -> tuple[np.ndarray, str]:
+    """8-bit levels, and a note on how they were scaled; ``bits`` as for ``read_image``."""
+    if image.dtype == np.uint8:
+        return image, ""
+    bits = max(bits, bits_used(image))
+    return np.round(image * (255.0 / ((1 << bits) - 1))).astype(np.uint8), f"16-bit levels taken as {bits}-bit data and scaled to 8 bits"

@@ -1,0 +1,255 @@
+"""A recording, opened from whatever the user gives and read frame by frame."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypedDict
+
+import cv2
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, references_in, the_video_in
+from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_of, known_frames, times
+from twin.frames.images import quiet, read_image
+from twin.frames.tables import TABLES, order_by_table, read_metadata
+from twin.types import Form, Frame
+
+
+class BadFrame(TypedDict):
+    """A frame that could not be used, and why."""
+
+    image_name: str
+    reason: str
+
+
+@dataclass
+class Recording:
+    """Recorded frames, read one at a time when asked for.
+
+    Iterating gives the readable frames in order. A frame that cannot be read is added to ``failed`` and skipped.
+
+    Attributes
+    ----------
+    path : Path
+    form : Form
+    names : list of str
+        Base names of the frames, in the table's order, those without a row last; naturally sorted without a table.
+    size_px : (int, int)
+        Width and height every frame must have.
+    labels : dict of str to (M,) array
+        The table's columns, in the order of ``names``. A column is float if all its cells are numbers, else text. A frame without
+        a row has NaN or "". There are no columns without a table.
+    metadata : dict of str to object
+        Content of the JSON files, by file name.
+    reference : Frame or None
+        The no-contact frame (``init_*``).
+    problems : list of str
+        What was odd, one line each.
+    failed : list of BadFrame
+        Each frame that could not be read so far, and why.
+    """
+
+    path: Path
+    form: Form
+    names: list[str]
+    size_px: tuple[int, int]
+    labels: dict[str, np.ndarray] = field(default_factory=dict)
+    metadata: dict[str, object] = field(default_factory=dict)
+    reference: Frame | None = None
+    problems: list[str] = field(default_factory=list)
+    failed: list[BadFrame] = field(default_factory=list)
+    _files: list[Path] = field(default_factory=list, repr=False)
+    _bits: int = field(default=0, repr=False)
+    _noted: set[str] = field(default_factory=set, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[Frame]:
+        self.failed.clear()
+        if not self._files:
+            yield from self._video_frames()
+            return
+        for index, name in enumerate(self.names):
+            try:
+                yield self.read(index)
+            except FrameError as error:
+                self.failed.append({"image_name": name, "reason": str(error).removeprefix(f"{name}: ")})
+
+    def read(self, index: int) -> Frame:
+        """Frame ``index`` of ``names`` (of a video: by seeking through it).
+
+        Raises
+        ------
+        FrameError
+            It can't be read, or has another size than the recording's.
+        """
+        if not self._files:
+            for frame in self._video_frames():
+                if frame.sequence == index:
+                    return frame
+            raise FrameError(f"{self.path.name}: has no frame {index}; it ends after {len(self)}")
+        return self._frame(self._image(self._files[index]), index)
+
+    def _image(self, file: Path) -> np.ndarray:
+        image, note = read_image(file, self._bits)
+        if note and note not in self._noted:
+            self._noted.add(note)
+            self.problems.append(f"{file.name}: {note} (the first such frame)")
+        return image
+
+    def _frame(self, image: np.ndarray, index: int, time_s: float = 0.0) -> Frame:
+        name = self.names[index]
+        if image.shape[1::-1] != tuple(self.size_px):
+            expected, got = times(self.size_px), times(image.shape[1::-1])
+            raise FrameError(f"{name}: expected {expected} as the recording's other frames, got {got}; leave it out or record it again")
+        return Frame(image, self.form, name, time_s, index)
+
+    def _video_frames(self) -> Iterator[Frame]:
+        with quiet():
+            capture = cv2.VideoCapture(str(self.path))
+        try:
+            for index in range(len(self.names)):
+                time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+                image = _next_image(capture)
+                if image is None:
+                    break
+                yield self._frame(image, index, time_s)
+        finally:
+            capture.release()
+
+    def take_reference(self, candidates: list[Path]) -> None:
+        """Take the first readable picture of the frames' size as the no-contact frame."""
+        for candidate in candidates:
+            try:
+                image = self._image(candidate)
+            except FrameError as error:
+                self.problems.append(f"no-contact frame {error}")
+                continue
+            got = image.shape[1::-1]
+            if got == tuple(self.size_px):
+                self.reference = Frame(image, self.form, candidate.name)
+                return
+            self.problems.append(f"no-contact frame {candidate.name}: {times(got)}, the frames are {times(self.size_px)}; ignored")
+
+    def take_metadata(self, homes: list[Path]) -> None:
+        """Read the JSON files of folders."""
+        for file in (file for home in homes for file in sorted(home.glob("*.json"))):
+            if (content := read_metadata(file, self.problems)) is not None:
+                self.metadata[file.name] = content
+
+
+def _video_image(image: np.ndarray) -> np.ndarray:
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _next_image(capture: cv2.VideoCapture) -> np.ndarray | None:
+    with quiet():
+        good, image = capture.read()
+    return _video_image(image) if good else None
+
+
+def _count_frames(path: Path) -> tuple[int, int, np.ndarray]:
+    """Frames that can be decoded, frames that the file promises, and the first (RGB)."""
+    with quiet():
+        capture = cv2.VideoCapture(str(path))
+    try:
+        promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+        first = _next_image(capture)
+        if first is None:
+            raise FrameError(f"{path}: no frame can be decoded; check that it is a video, or record it again")
+        count = 1
+        while _next_image(capture) is not None:
+            count += 1
+    finally:
+        capture.release()
+    return count, promised, first
+
+
+def _open_video(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
+    count, promised, first = _count_frames(path)
+    problems: list[str] = []
+    if promised > count:
+        problems.append(f"{path.name}: ends early, {count} of {promised} frames can be decoded")
+    names = [f"{path.stem}_{k:06d}" for k in range(count)]
+    return Recording(path, form_of(first, path.name, known, form), names, (first.shape[1], first.shape[0]), problems=problems)
+
+
+def _choose_folder(
+    path: Path, folders: list[Path], known: KnownFrames | None, form: Form | None, problems: list[str]
+) -> tuple[Path, list[Path], FrameKind]:
+    """The first folder with a usable frame, its frames and their kind."""
+    reasons = []
+    for folder in folders:
+        files = frames_in(folder)
+        try:
+            kind = common_kind(files, known, form)
+        except FrameError as error:
+            reasons.append((folder, error))
+            continue
+        others = [f.name + "/" for f in folders if f not in (folder, path)]
+        if others:
+            problems.append(f"{path.name}: read {folder.name}/, not {', '.join(others)}")
+        problems += [f"{unusable.name}: {error}" for unusable, error in reasons]
+        return folder, files, kind
+    first, reason = reasons[0]
+    raise FrameError(f"{first}: {reason}")
+
+
+def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
+    if not any(path.iterdir()):
+        raise FrameError(f"{path}: the folder is empty; give a folder of frames")
+    problems: list[str] = []
+    folders = image_folders(path, form)
+    if folders:
+        folder, files, kind = _choose_folder(path, folders, known, form, problems)
+        # given the inner folder of a recording, its table and no-contact frame lie beside it
+        inner = folder == path and path.name in IMAGE_FOLDERS
+        homes = list(dict.fromkeys([path, folder] + ([path.parent] if inner else [])))
+        tables = [home / table for home in homes for table in TABLES if (home / table).is_file()]
+        files, labels = order_by_table(tables, files, problems)
+        names = [p.name for p in files]
+        recording = Recording(path, kind.form, names, kind.size_px, labels, problems=problems, _files=files, _bits=kind.bits)
+    else:
+        homes = [path]
+        recording = _open_video(the_video_in(path), known, form)
+    recording.take_metadata(homes)
+    recording.take_reference([file for home in homes for file in references_in(home)])
+    return recording
+
+
+def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> Recording:
+    """Open recorded frames.
+
+    Parameters
+    ----------
+    path : path
+        A picture, a folder of pictures, a recording's folder, or a video or a folder with one.
+    spec : SensorSpec, optional
+        The sensor; frames must have the size of one of its forms. The size of most frames is the recording's.
+    form : Form, optional
+        The frames' form; told by size and content if not given.
+
+    Raises
+    ------
+    FrameError
+        Nothing there, or no usable frame.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FrameError(f"{path}: no such file or folder; give a picture, a folder of frames, a recording or a video")
+    known = None if spec is None else known_frames(spec)
+    if path.is_dir():
+        return _open_folder(path, known, form)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return _open_video(path, known, form)
+    kind = common_kind([path], known, form)
+    return Recording(path, kind.form, [path.name], kind.size_px, _files=[path], _bits=kind.bits)
+
+
+def evenly_read(recording: Recording, limit: int) -> list[Frame]:
+    """At most ``limit`` frames of a recording, evenly spread from its first to its last."""
+    chosen = np.linspace(0, len(recording) - 1, min(limit, len(recording))).round()
+    return [recording.read(int(index)) for index in np.unique(chosen)]

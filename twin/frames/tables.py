@@ -1,0 +1,232 @@
+"""What lies beside the frames: the table with their labels, and metadata in JSON."""
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from twin.frames.folders import IMAGE_SUFFIXES
+
+# Names of a recording's table, the likelier first.
+TABLES = ("targets.csv", "targets_images.csv")
+# Names of the columns that hold pictures' names, in any case.
+NAME_COLUMNS = ("image_name", "sensor_image")
+# What may stand between the cells of a row; the one that is most frequent in the header counts.
+SEPARATORS = (",", ";", "\t")
+# Characters that are taken away around a cell.
+AROUND_CELLS = " \t\"'"
+
+
+def base_name(path: str) -> str:
+    """The last part of a path written on any system."""
+    return re.split(r"[\\/]", path.strip(AROUND_CELLS))[-1]
+
+
+def _bare_name(name: str) -> str:
+    """A picture's name without its suffix, if it has one, and without regard to case."""
+    stem, dot, suffix = name.casefold().rpartition(".")
+    return stem if dot + suffix in IMAGE_SUFFIXES else name.casefold()
+
+
+def _text(path: Path) -> str:
+    data = path.read_bytes()
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", "replace")
+    if b"\0" in data[:2]:
+        return data.decode("utf-16-be" if data[0] == 0 else "utf-16-le", "replace")
+    return data.decode("utf-8-sig", "replace")
+
+
+@dataclass
+class Table:
+    """A table: its file's name, its cells by column, and the columns that name pictures, as base names."""
+
+    name: str
+    columns: dict[str, list[str]]
+    name_lists: list[list[str]]
+
+
+def _cells(path: Path) -> list[list[str]]:
+    lines = [line for line in _text(path).splitlines() if line.strip()]
+    separator = max(SEPARATORS, key=lines[0].count) if lines else ","
+    rows = []
+    for line in lines:
+        unclosed = line.count('"') % 2 == 1  # read as quoted, such a line would take in the lines after it
+        if unclosed:
+            (row,) = csv.reader([line], delimiter=separator, quoting=csv.QUOTE_NONE, skipinitialspace=True)
+        else:
+            (row,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        row = [cell.strip(AROUND_CELLS) for cell in row]
+        if separator == ";":
+            row = [re.sub(r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$", r"\1.\2", cell) for cell in row]
+        if any(row):
+            rows.append(row)
+    return rows
+
+
+def _distinct(header: list[str]) -> list[str]:
+    """Column names, those that came before with _2, _3, ... appended."""
+    distinct: list[str] = []
+    for name in header:
+        tries = 2
+        new = name
+        while new and new in distinct:
+            new, tries = f"{name}_{tries}", tries + 1
+        distinct.append(new)
+    return distinct
+
+
+def read_table(path: Path, problems: list[str]) -> Table | None:
+    """A table; None, with the reason added to ``problems``, if it names no pictures."""
+    try:
+        rows = _cells(path)
+    except (OSError, csv.Error) as error:
+        problems.append(f"{path.name}: can't be read ({error}); frames are taken in natural order")
+        return None
+    header = rows[0] if rows else []
+    name_columns = [k for k, column in enumerate(header) if column.casefold() in NAME_COLUMNS]
+    if not name_columns:
+        problems.append(f"{path.name}: no column {' or '.join(NAME_COLUMNS)}; frames are taken in natural order")
+        return None
+    ragged = sum(len(row) != len(header) for row in rows[1:])
+    if ragged:
+        problems.append(f"{path.name}: {ragged} rows don't have the header's {len(header)} cells and are left out")
+    distinct = _distinct(header)
+    if renamed := [new for new, old in zip(distinct, header, strict=True) if new != old]:
+        problems.append(f"{path.name}: {counted(len(renamed), 'columns have the name of another', renamed)}")
+    rows = [row for row in rows[1:] if len(row) == len(header)]
+    columns = {column: [row[k] for row in rows] for k, column in enumerate(distinct) if column}
+    return Table(path.name, columns, [[base_name(row[k]) for row in rows] for k in name_columns])
+
+
+def counted(count: int, things: str, names: list[str]) -> str:
+    """How many of what, with the first three named."""
+    return f"{count} {things} ({', '.join(names[:3])}{', ...' if count > 3 else ''})"
+
+
+@dataclass
+class Pairing:
+    """Rows of a table and pictures that belong together.
+
+    Attributes
+    ----------
+    files : dict of int to Path
+        The picture of each row that has one of its own.
+    loose : list of int
+        Those of these rows whose name differs in case or suffix.
+    doubled, missing : list of int
+        Rows whose picture belongs to an earlier row; rows without a picture.
+    """
+
+    files: dict[int, Path]
+    loose: list[int]
+    doubled: list[int]
+    missing: list[int]
+
+
+def pair_rows(names: list[str], files: list[Path]) -> Pairing:
+    """Pair names and pictures: as written, then without regard to case, then without suffix."""
+    pairing = Pairing({}, [], [], list(range(len(names))))
+    for key in (str, str.casefold, _bare_name):
+        taken = set(pairing.files.values())
+        free: dict[str, Path] = {}
+        for file in files:
+            if file not in taken:
+                free.setdefault(key(file.name), file)
+        missing: list[int] = []
+        for row in pairing.missing:
+            found = free.get(key(names[row]))
+            if found is None:
+                missing.append(row)
+            elif found in taken:
+                pairing.doubled.append(row)
+            else:
+                pairing.files[row] = found
+                taken.add(found)
+                pairing.loose += [row] * (key is not str)
+        pairing.missing = missing
+    return pairing
+
+
+def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -> tuple[list[Path], dict[str, np.ndarray]]:
+    """Frames in the order of the table that names most of them, those it doesn't name last, and its columns in that order.
+
+    Columns are empty for frames without a row. If no table names a frame, the order stays and there are no columns.
+    """
+    readable = [table for path in tables if (table := read_table(path, problems))]
+    pairs = [(table, names, pair_rows(names, files)) for table in readable for names in table.name_lists]
+    if not pairs:
+        return files, {}
+    table, names, pairing = max(pairs, key=lambda pair: len(pair[2].files))
+    if not pairing.files:
+        problems.append(f"{table.name}: no row names a picture here; frames are taken in natural order")
+        return files, {}
+    named = set(pairing.files.values())
+    unlisted = [file for file in files if file not in named]
+    odd = {
+        "rows name a picture with another suffix or case": pairing.loose,
+        "rows for a picture that has one before, left out": pairing.doubled,
+        "rows without a picture": pairing.missing,
+    }
+    problems += [f"{table.name}: {counted(len(rows), what, [names[k] for k in rows])}" for what, rows in odd.items() if rows]
+    if unlisted:
+        what = "pictures without a row, placed after the others"
+        problems.append(f"{table.name}: {counted(len(unlisted), what, [p.name for p in unlisted])}")
+    rows = sorted(pairing.files)
+    labels = {c: _as_array([cells[k] for k in rows] + [""] * len(unlisted)) for c, cells in table.columns.items()}
+    return [pairing.files[k] for k in rows] + unlisted, labels
+
+
+def _as_array(cells: list[str]) -> np.ndarray:
+    """A column as float if every cell is a number (an empty cell is NaN), else as text."""
+    try:
+        return np.array([float(cell) if cell else np.nan for cell in cells])
+    except ValueError:
+        return np.array(cells, str)
+
+
+def read_metadata(path: Path, problems: list[str]) -> object | None:
+    """Content of a JSON file; None, with the reason in ``problems``, if it cannot be read.
+
+    Files in use hold Windows paths with single backslashes, and NaN or Infinity: both are accepted and noted.
+    """
+    try:
+        text = _text(path)
+    except OSError as error:
+        problems.append(f"{path.name}: can't be read ({error.strerror}); ignored")
+        return None
+    odd: set[str] = set()
+
+    def constant(name: str) -> float:
+        odd.add(name)
+        return float(name)
+
+    try:
+        content = _parsed_or_mended(path.name, text, constant, problems)
+    except ValueError as error:
+        problems.append(f"{path.name}: invalid JSON ({error}); ignored")
+        return None
+    except RecursionError:
+        problems.append(f"{path.name}: nested too deeply to be metadata; ignored")
+        return None
+    if odd:
+        problems.append(f"{path.name}: holds {', '.join(sorted(odd))}, which isn't JSON")
+    return content
+
+
+def _parsed_or_mended(name: str, text: str, constant: Callable[[str], float], problems: list[str]) -> object:
+    """Content of JSON text, if need be with its lone backslashes doubled; ``constant`` reads NaN and Infinity."""
+    try:
+        return json.loads(text, parse_constant=constant)
+    except ValueError as error:
+        mended = re.sub(r'\\(?!["\\/bfnrt]|u[0-9a-fA-F]{4})', r"\\\\", text)
+        try:
+            content = json.loads(mended, parse_constant=constant)
+        except ValueError:
+            raise error from None
+        problems.append(f"{name}: invalid JSON ({error}); read with its backslashes doubled")
+        return content

@@ -1,0 +1,1 @@
+"""How good it is: pictures against real frames, pins against labelled frames, and how far a sensor may degrade."""

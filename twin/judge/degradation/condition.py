@@ -1,0 +1,240 @@
+"""A condition: one way in which a sensor degrades, as frozen data, and where in the chain it acts.
+
+The chain is specification, contact, light on the film, camera response, frame, and the pipeline's own settings. Every hook
+returns its input unchanged, bit for bit, where the value is the nominal one.
+"""
+
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scenes.base import Section
+from scenes.sensor import SensorSpec
+from twin.camera.projection import lens_disc, project
+from twin.geometry.pins import rest_pins
+from twin.pins import DetectorSpec
+
+
+@dataclass(frozen=True)
+class View:
+    """What a condition may know of the picture it degrades.
+
+    Attributes
+    ----------
+    spec : SensorSpec
+        As it is rendered, degradations of the specification included.
+    center_px : (2,) float
+    radius_px : float
+        Of the disc through which the gel is seen.
+    px_per_mm : float
+        At the caps at rest.
+    caps_px : (N, 2) float
+        Where the caps are in this frame.
+    """
+
+    spec: SensorSpec
+    center_px: np.ndarray
+    radius_px: float
+    px_per_mm: float
+    caps_px: np.ndarray
+
+    @classmethod
+    def of(cls, spec: SensorSpec, caps_px: np.ndarray) -> "View":
+        """The view of a sensor whose caps are at ``caps_px`` (N, 2), raw-frame px."""
+        disc = lens_disc(spec)
+        caps_mm = rest_pins(spec.geometry).caps_mm
+        apart = [cKDTree(points).query(points, k=2)[0][:, 1] for points in (project(spec.view, caps_mm), caps_mm)]
+        return cls(spec, disc.center_px, disc.radius_px, float(np.median(apart[0] / apart[1])), caps_px)
+
+    @property
+    def cap_radius_px(self) -> float:
+        """Radius of a cap that faces the camera."""
+        return 0.5 * self.spec.pins.cap_diameter_mm * self.px_per_mm
+
+    @property
+    def saturation(self) -> float:
+        """Linear light that the camera shows as white."""
+        return 1.0 / self.spec.response.exposure
+
+    def grid(self, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """x and y (H, W) of a frame's pixels from the disc's centre, in its radius."""
+        y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+        return (x - np.float32(self.center_px[0])) / self.radius_px, (y - np.float32(self.center_px[1])) / self.radius_px
+
+
+SpecChange = Callable[[SensorSpec, float, np.random.Generator], SensorSpec]
+ImageChange = Callable[[np.ndarray, float, View, np.random.Generator], np.ndarray]
+PointMove = Callable[[np.ndarray, float, View], np.ndarray]
+CapsGone = Callable[[float, View, np.random.Generator], np.ndarray]
+SettingChange = Callable[[DetectorSpec, float], DetectorSpec]
+
+
+S = TypeVar("S", bound=Section)
+
+
+class SectionChange(Protocol[S]):
+    """Degrades one section of a specification: ``change(section, value, rng)``."""
+
+    def __call__(self, section: S, value: float, rng: np.random.Generator, /) -> S: ...
+
+
+@dataclass(frozen=True)
+class OnSection(Generic[S]):
+    """A change of one section, as a change of the specification. (A class, not a closure: conditions travel between processes.)"""
+
+    section: str
+    change: SectionChange[S]
+
+    def __call__(self, spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
+        return spec.model_copy(update={self.section: self.change(getattr(spec, self.section), value, rng)})
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One way in which a sensor degrades.
+
+    The parameter is ``nominal`` at severity 0 and ``severe`` at severity 1, and linear between them.
+
+    Attributes
+    ----------
+    name, title, family : str
+    parameter, unit : str
+        What ``nominal`` and ``severe`` are values of.
+    nominal, severe : float
+    spec : callable, optional
+        ``spec(spec, value, rng)``: the degraded specification, before anything is rendered; ``OnSection`` where one section changes.
+    solves : bool
+        The specification's mechanics change: contacts are solved anew.
+    light : callable, optional
+        ``light(light, value, view, rng)``: linear light on the film, before the camera's response.
+    frame : callable, optional
+        ``frame(image, value, view, rng)``: gray levels or RGB (uint8).
+    moves : callable, optional
+        ``moves(px, value, view)``: where ``light`` or ``frame`` moves points (n, 2) of the picture.
+    hides : callable, optional
+        ``hides(value, view, rng)``: (N,) bool, caps that are gone.
+    setting : callable, optional
+        ``setting(detector, value)``: a `DetectorSpec` that is set wrongly.
+    image_level : bool
+        Acts on a frame alone, so that a real frame can be degraded, too.
+    """
+
+    name: str
+    title: str
+    family: str
+    parameter: str
+    unit: str
+    severe: float
+    nominal: float = 0.0
+    spec: SpecChange | None = field(default=None, repr=False)
+    solves: bool = False
+    light: ImageChange | None = field(default=None, repr=False)
+    frame: ImageChange | None = field(default=None, repr=False)
+    moves: PointMove | None = field(default=None, repr=False)
+    hides: CapsGone | None = field(default=None, repr=False)
+    setting: SettingChange | None = field(default=None, repr=False)
+    image_level: bool = False
+
+    def value(self, severity: float) -> float:
+        """The parameter at a severity in [0, 1]."""
+        return self.nominal + severity * (self.severe - self.nominal)
+
+    def rng(self, draw: int = 0) -> np.random.Generator:
+        """The condition's own random numbers, the same at every severity, so that a degradation grows and does not move."""
+        return np.random.default_rng([zlib.crc32(self.name.encode()), draw])
+
+
+@dataclass(frozen=True)
+class Case:
+    """One condition, or several at the same severity."""
+
+    conditions: tuple[Condition, ...]
+
+    @property
+    def name(self) -> str:
+        """Names of the conditions, joined by '+'."""
+        return "+".join(c.name for c in self.conditions)
+
+    @property
+    def title(self) -> str:
+        """Titles of the conditions."""
+        return " and ".join(c.title for c in self.conditions)
+
+    @property
+    def solves(self) -> bool:
+        """Contacts are solved anew."""
+        return any(c.solves for c in self.conditions)
+
+    @property
+    def image_level(self) -> bool:
+        """Acts on frames alone."""
+        return all(c.image_level for c in self.conditions)
+
+    def label(self, severity: float) -> str:
+        """The parameters' values in words."""
+        return ", ".join(f"{c.value(severity):.3g} {c.unit}".strip() for c in self.conditions)
+
+    def on_spec(self, spec: SensorSpec, severity: float) -> SensorSpec:
+        """The degraded specification."""
+        for c in self.conditions:
+            if c.spec is not None:
+                spec = c.spec(spec, c.value(severity), c.rng())
+        return spec
+
+    def on_light(self, light: np.ndarray, severity: float, view: View, draw: int) -> np.ndarray:
+        """Degraded linear light."""
+        for c in self.conditions:
+            if c.light is not None:
+                light = c.light(light, c.value(severity), view, c.rng(draw))
+        return light
+
+    def on_frame(self, image: np.ndarray, severity: float, view: View, draw: int) -> np.ndarray:
+        """A degraded frame."""
+        for c in self.conditions:
+            if c.frame is not None:
+                image = c.frame(image, c.value(severity), view, c.rng(draw))
+        return image
+
+    def on_points(self, px: np.ndarray, severity: float, view: View) -> np.ndarray:
+        """Where points (n, 2) go."""
+        for c in self.conditions:
+            if c.moves is not None:
+                px = c.moves(px, c.value(severity), view)
+        return px
+
+    def gone(self, severity: float, view: View) -> np.ndarray:
+        """(N,) bool: caps that are no longer there."""
+        gone = np.zeros(len(view.caps_px), bool)
+        for c in self.conditions:
+            if c.hides is not None:
+                gone |= c.hides(c.value(severity), view, c.rng())
+        return gone
+
+    def on_setting(self, detector: DetectorSpec, severity: float) -> DetectorSpec:
+        """The detector with wrong settings."""
+        for c in self.conditions:
+            if c.setting is not None:
+                detector = c.setting(detector, c.value(severity))
+        return detector
+
+
+def altered(spec: SensorSpec, **sections: Mapping[str, Any]) -> SensorSpec:
+    """A copy of a specification with values changed, section by section. Values are not validated: they are computed in range."""
+    return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
+
+
+def chosen(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
+    """(count,) bool: a random share of the places. A larger share, drawn with the same numbers, holds the smaller one."""
+    mask = np.zeros(count, bool)
+    mask[rng.permutation(count)[: round(share * count)]] = True
+    return mask
+
+
+def over_channels(plane: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """A plane (H, W) as float32 that broadcasts over light (H, W) or (H, W, 3)."""
+    plane = np.asarray(plane, np.float32)
+    return plane[..., None] if light.ndim == 3 else plane

@@ -1,0 +1,30 @@
+"""Every known condition, by name."""
+
+import difflib
+
+from twin.errors import TwinError
+from twin.judge.degradation.condition import Condition
+from twin.judge.degradation.conditions import electronics, gel, lighting, optics, placement, settings, skin
+
+FAMILIES = (lighting, optics, gel, skin, placement, electronics, settings)
+CONDITIONS: dict[str, Condition] = {c.name: c for family in FAMILIES for c in family.CONDITIONS}
+
+
+def condition(name: str) -> Condition:
+    """A condition by its name.
+
+    Raises
+    ------
+    TwinError
+        There is none of that name; names the nearest.
+    """
+    if name in CONDITIONS:
+        return CONDITIONS[name]
+    near = difflib.get_close_matches(name, CONDITIONS, n=1)
+    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(CONDITIONS)}"
+    raise TwinError(f"no condition named '{name}': {hint}")
+
+
+def condition_lines() -> list[str]:
+    """Every condition with its parameter, and the value of it that is severe; for people."""
+    return [f"{c.name:18} {c.family:12} {c.title}: {c.parameter}, up to {c.severe:g} {c.unit}".rstrip() for c in CONDITIONS.values()]

@@ -1,0 +1,90 @@
+"""What goes wrong with the camera's place and lens."""
+
+import cv2
+import numpy as np
+
+from scenes.sensor import CameraSpec, SensorSpec
+from twin.judge.degradation.condition import Condition, OnSection, View, altered
+
+# Direction of a shift in the picture (unit vector, 30 deg from x towards y).
+AWAY = (np.cos(np.radians(30.0)), np.sin(np.radians(30.0)))
+
+
+def shifted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
+    """The chip sits beside the lens' axis."""
+    if not value:
+        return spec
+    by = value * View.of(spec, np.zeros((0, 2))).px_per_mm
+    return altered(spec, camera={"cx_px": spec.camera.cx_px + AWAY[0] * by, "cy_px": spec.camera.cy_px + AWAY[1] * by})
+
+
+def tilted(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
+    return camera.model_copy(update={"tilt_x_deg": camera.tilt_x_deg + value})
+
+
+def zoomed(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
+    return camera.model_copy(update={"fx_px": camera.fx_px * (1 + value), "fy_px": camera.fy_px * (1 + value)})
+
+
+def distorted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
+    """Another lens: barrel distortion that draws the disc's rim in by a share of its radius."""
+    if not value:
+        return spec
+    rim = View.of(spec, np.zeros((0, 2))).radius_px / spec.camera.fx_px
+    return altered(spec, camera={"k1": spec.camera.k1 - value / rim**2})
+
+
+def vignetted(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
+    return camera.model_copy(update={"vignetting": camera.vignetting + value * (1 - camera.vignetting)})
+
+
+def roll(degrees: float, view: View) -> np.ndarray:
+    """(2, 3) map of pixels of a camera turned about its axis."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn, about = np.array([[c, -s], [s, c]]), np.array([view.spec.camera.cx_px, view.spec.camera.cy_px])
+    return np.column_stack([turn, about - turn @ about])
+
+
+def skew(rise: float, view: View) -> np.ndarray:
+    """(2, 3) map of pixels of a rolling shutter: rows are shifted in proportion to their distance from the disc's centre."""
+    return np.array([[1.0, rise, -rise * view.center_px[1]], [0.0, 1.0, 0.0]])
+
+
+def warped(light: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Light (H, W[, 3]) with its pixels moved by a map (2, 3); beyond the border its last row or column goes on."""
+    return cv2.warpAffine(light, matrix, light.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def rolled(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    return warped(light, roll(value, view)) if value else light
+
+
+def rolled_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
+    matrix = roll(value, view)
+    return px @ matrix[:, :2].T + matrix[:, 2] if value else px
+
+
+def sheared(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    return warped(light, skew(0.5 * value * view.px_per_mm / view.radius_px, view)) if value else light
+
+
+def sheared_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
+    matrix = skew(0.5 * value * view.px_per_mm / view.radius_px, view)
+    return px @ matrix[:, :2].T + matrix[:, 2] if value else px
+
+
+CONDITIONS = (
+    Condition("camera-shifted", "camera shifted", "camera", "shift at the caps", "mm", 16.0, spec=shifted),
+    Condition("camera-rolled", "camera rotated", "camera", "angle", "deg", 60.0, light=rolled, moves=rolled_points, image_level=True),
+    Condition("camera-tilted", "camera tilted", "camera", "angle", "deg", 24.0, spec=OnSection("camera", tilted)),
+    Condition("camera-zoomed", "camera zoomed in", "camera", "growth of the picture", "", 0.4, spec=OnSection("camera", zoomed)),
+    Condition("camera-distorted", "another camera's distortion", "camera", "rim drawn in, of its radius", "", 0.3, spec=distorted),
+    Condition(
+        "vignetting", "vignetting", "camera", "share of light lost at the corners", "", 1.0, spec=OnSection("camera", vignetted),
+        image_level=True,
+    ),
+    Condition(
+        "rolling-shutter", "rolling shutter in motion", "camera", "motion over the disc's height", "mm", 24.0, light=sheared,
+        moves=sheared_points, image_level=True,
+    ),
+)  # fmt: skip

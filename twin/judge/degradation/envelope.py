@@ -1,0 +1,214 @@
+"""How severe a condition may grow before a measure crosses its limit.
+
+A sweep that has been run, and what its rows say."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from twin.judge.degradation.condition import Case
+from twin.judge.degradation.measures import MEASURES, POSE_MEASURES, Measure
+from twin.judge.degradation.sweep import Plan, run_sweep
+from twin.pins.reference import nominal_reference
+
+# Draws of the bootstrap over the frames.
+DRAWS = 400
+# Percentiles of these draws that bound the band: a 90 % interval.
+BAND = (5, 95)
+# A real sensor with less than this share of the rendered margin has lost some of it. Chosen.
+SHORT = 0.75
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One measure of one pipeline under one case.
+
+    Attributes
+    ----------
+    case, pipeline : str
+    measure : Measure
+    limit : float
+    severity, mean, low, high : (S,) float
+        NaN where the measure has no meaning in any frame; the band is a 90 % bootstrap interval over the frames.
+    crossing : float
+        Severity at which the mean crosses the limit, linear between the steps; inf if it never does.
+    """
+
+    case: str
+    pipeline: str
+    measure: Measure
+    limit: float
+    severity: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    crossing: float
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """How far one pipeline goes under one case.
+
+    Attributes
+    ----------
+    case : Case
+    pipeline : str
+    severity : float
+        Severity at which the first measure crosses its limit; inf if none does up to the severest step.
+    measure : str
+        Name of that measure; "" if none.
+    looked : float
+        Severity of the severest step.
+    interval : (2,) float
+        Severities at which the ends of that measure's 90 % band cross; inf where one does not.
+    """
+
+    case: Case
+    pipeline: str
+    severity: float
+    measure: str
+    looked: float = 1.0
+    interval: tuple[float, float] = (np.inf, np.inf)
+
+    @property
+    def reached(self) -> bool:
+        """Whether it fails within the range looked at."""
+        return np.isfinite(self.severity)
+
+    @property
+    def width(self) -> float:
+        """Severity, at most the severest step: a lower bound where it does not fail."""
+        return min(self.severity, self.looked)
+
+    @property
+    def label(self) -> str:
+        """In the parameter's unit."""
+        if not self.reached:
+            return f"> {self.case.label(self.looked)}"
+        return self.case.label(self.severity) if self.severity > 0 else "fails undegraded"
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of the margin that rendered frames have the real ones of a sensor have."""
+
+    real: Envelope
+    rendered: Envelope
+
+    @property
+    def value(self) -> float:
+        """Ratio of the severities; a bound where either does not fail within the range."""
+        if self.rendered.width > 0:
+            return self.real.width / self.rendered.width
+        return np.inf if self.real.width > 0 else 1.0
+
+    @property
+    def short(self) -> bool:
+        """Whether the real sensor has clearly less margin than the rendered one."""
+        return self.value < SHORT
+
+
+def crossing(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndarray) -> float:
+    """Severity at which a mean crosses its limit for the first time, linear between steps; inf if it never does."""
+    known = np.isfinite(mean)
+    severity, mean = severity[known], mean[known]
+    for k, value in enumerate(mean):
+        if measure.failed(value, limit):
+            if k == 0:
+                return 0.0
+            return float(severity[k - 1] + (severity[k] - severity[k - 1]) * (limit - mean[k - 1]) / (value - mean[k - 1]))
+    return np.inf
+
+
+def curves_of(rows: list[dict], cases: tuple[Case, ...], pitch_px: float) -> list[Curve]:
+    """Curves of all measures, pipelines and models; rows as `run_sweep` gives them."""
+    table = _poses_against_nominal(rows)
+    curves = []
+    for case in cases:
+        mine = [row for row in table if row["case"] == case.name]
+        for pipeline in dict.fromkeys(row["pipeline"] for row in mine):
+            own = [row for row in mine if row["pipeline"] == pipeline]
+            for measure in POSE_MEASURES if "pose_valid" in own[0] else MEASURES:
+                limit = measure.limit * pitch_px if measure.in_pitches else measure.limit
+                curves.append(_curve(case.name, pipeline, measure, limit, own))
+    return curves
+
+
+def envelopes_of(curves: list[Curve], cases: tuple[Case, ...]) -> list[Envelope]:
+    """The first crossing of each case and pipeline."""
+    found = []
+    for case in cases:
+        for pipeline in dict.fromkeys(c.pipeline for c in curves if c.case == case.name):
+            first = min((c for c in curves if c.case == case.name and c.pipeline == pipeline), key=lambda c: c.crossing)
+            reached = np.isfinite(first.crossing)
+            sooner, later = sorted(crossing(first.measure, first.limit, first.severity, edge) for edge in (first.low, first.high))
+            looked = float(first.severity.max())
+            found.append(Envelope(case, pipeline, first.crossing, first.measure.name if reached else "", looked, (sooner, later)))
+    return found
+
+
+def shares_of(real: list[Envelope], rendered: list[Envelope], pipeline: str) -> list[Share]:
+    """Real envelopes of one pipeline beside the rendered ones of the same cases, least share first."""
+    beside = {e.case.name: e for e in rendered if e.pipeline == pipeline}
+    return sorted((Share(e, beside[e.case.name]) for e in real if e.pipeline == pipeline), key=lambda share: share.value)
+
+
+def _curve(case: str, pipeline: str, measure: Measure, limit: float, rows: list[dict]) -> Curve:
+    severities = np.array(sorted({row["severity"] for row in rows}))
+    mean, low, high = (np.full(len(severities), np.nan) for _ in range(3))
+    rng = np.random.default_rng(0)
+    for k, severity in enumerate(severities):
+        values = np.array([row[measure.name] for row in rows if row["severity"] == severity], float)
+        values = values[np.isfinite(values)]
+        if len(values):
+            draws = values[rng.integers(0, len(values), (DRAWS, len(values)))].mean(axis=1)
+            mean[k], (low[k], high[k]) = values.mean(), np.percentile(draws, BAND)
+    return Curve(case, pipeline, measure, limit, severities, mean, low, high, crossing(measure, limit, severities, mean))
+
+
+def _poses_against_nominal(rows: list[dict]) -> list[dict]:
+    """Rows of models with the mean absolute change of their lengths and angles against the same frame undegraded.
+
+    A frame without contact has no pose that could be wrong: NaN.
+    """
+    nominal = {(r["case"], r["pipeline"], r["frame"]): r["pose"] for r in rows if "pose" in r and r["severity"] == 0}
+    table = []
+    for row in rows:
+        if "pose" in row:
+            first, now = nominal[row["case"], row["pipeline"], row["frame"]], row["pose"]
+            change = np.abs(np.array(now["values"]) - np.array(first["values"]))
+            row = row | {"pose_valid": float(now["valid"])}
+            for unit in ("mm", "deg"):
+                of_unit = [c for c, u in zip(change, now["units"], strict=True) if u == unit and now["touched"]]
+                row[f"pose_{unit}"] = float(np.mean(of_unit)) if of_unit else np.nan
+        table.append(row)
+    return table
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Rows of a sweep, its curves and envelopes.
+
+    Attributes
+    ----------
+    plan : Plan
+    rows : list of dict
+        As `run_sweep` gives them.
+    curves : list of Curve
+    envelopes : list of Envelope
+    """
+
+    plan: Plan
+    rows: list[dict]
+    curves: list[Curve]
+    envelopes: list[Envelope]
+
+
+def judge_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> Judgement:
+    """Run a sweep, or what is left of it, and judge it."""
+    rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
+    pitch_px = float(np.mean(nominal_reference(plan.source.spec, plan.source.form).spacing_px))
+    curves = curves_of(rows, plan.cases, pitch_px)
+    return Judgement(plan, rows, curves, envelopes_of(curves, plan.cases))

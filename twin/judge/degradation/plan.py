@@ -1,0 +1,95 @@
+"""A sweep as a file: which conditions, how far, in which steps, which pairs."""
+
+import tomllib
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, ValidationError
+
+from scenes.base import Section
+from twin.errors import TwinError
+from twin.judge.degradation.condition import Case, Condition
+from twin.judge.degradation.conditions import CONDITIONS, condition
+from twin.judge.degradation.sweep import SEVERITIES
+
+
+class ConditionPlan(Section):
+    """``severe``: the parameter's value at severity 1, in the condition's unit; its own one, which is the most, where not given."""
+
+    name: str
+    severe: float | None = None
+
+    def condition(self) -> Condition:
+        """The condition with its range.
+
+        Raises
+        ------
+        TwinError
+            It is unknown, or the range is none of its own.
+        """
+        known = condition(self.name)
+        if self.severe is None:
+            return known
+        if not 0 < (self.severe - known.nominal) / (known.severe - known.nominal) <= 1:
+            raise TwinError(
+                f"{self.name}: severe = {self.severe:g} is not between {known.nominal:g} (where nothing is degraded) and"
+                f" {known.severe:g} {known.unit}".rstrip()
+            )
+        return replace(known, severe=self.severe)
+
+
+class SweepPlan(Section):
+    """A user's sweep.
+
+    ``steps``: severities between 0 and 1, rising (0 is always looked at). ``condition``: those to sweep (none: all).
+    ``pairs``: two names each, both growing together.
+    """
+
+    steps: Annotated[tuple[Annotated[float, Field(gt=0, le=1)], ...], Field(min_length=1)] = SEVERITIES[1:]
+    condition: tuple[ConditionPlan, ...] = ()
+    pairs: tuple[tuple[str, str], ...] = ()
+
+    def severities(self) -> tuple[float, ...]:
+        """All of them, from 0 up."""
+        return (0.0, *sorted(set(self.steps)))
+
+    def cases(self) -> tuple[Case, ...]:
+        """Single conditions, then pairs.
+
+        Raises
+        ------
+        TwinError
+            A condition is unknown, has an impossible range, or is named twice.
+        """
+        asked = self.condition or (() if self.pairs else tuple(ConditionPlan(name=name) for name in CONDITIONS))
+        named = {each.name: each.condition() for each in asked}
+        singles = tuple(Case((named[each.name],)) for each in asked)
+        pairs = tuple(Case(tuple(named.get(name) or condition(name) for name in pair)) for pair in self.pairs)
+        cases = Counter("+".join(sorted(c.name for c in case.conditions)) for case in singles + pairs)
+        if twice := [name for name, count in cases.items() if count > 1]:
+            raise TwinError(f"named twice: {', '.join(twice)}; name each condition and each pair once")
+        if alone := [a for a, b in self.pairs if a == b]:
+            raise TwinError(f"a pair needs two conditions, got {alone[0]} with itself")
+        return singles + pairs
+
+
+def load_plan(path: Path) -> SweepPlan:
+    """Read a sweep's file.
+
+    Raises
+    ------
+    TwinError
+        It can't be read, or a key or name is unknown.
+    """
+    try:
+        return SweepPlan.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise TwinError(f"{path}: can't be read ({error.strerror}); give a TOML file as 'twin robustness --help' shows it") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise TwinError(f"{path}: not readable as TOML: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise TwinError(f"{path}: {key}: {first['msg']}; known: steps, pairs, and [[condition]] with name and severe") from error

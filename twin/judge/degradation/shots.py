@@ -1,0 +1,244 @@
+"""The contacts over which a sweep judges: solved once, kept, and shared by all conditions that leave the mechanics alone.
+
+Degraded frames with known pins: rendered frames, or real ones whose pins several detectors agree on."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from scenes import load_object
+from scenes.sensor import SensorSpec
+from twin.camera.capture import expose
+from twin.camera.truth import CapTruth, cap_truth
+from twin.errors import ContactError
+from twin.geometry.pins import rest_pins
+from twin.judge.degradation.condition import Case, View, altered
+from twin.judge.pictures.aligned import to_light
+from twin.mechanics.path import ContactPose
+from twin.mechanics.solver import SkinSolver
+from twin.optics.preview import Preview
+from twin.optics.static_layer import static_layer
+from twin.store import cached_arrays
+from twin.types import Form, Frame
+
+
+@dataclass(frozen=True)
+class Contact:
+    """An object of `scenes` and how the sensor is pressed against it."""
+
+    name: str
+    stimulus: str
+    pose: ContactPose
+
+
+@dataclass(frozen=True)
+class PinState:
+    """Pins of a contact: feet, axes and caps, (N, 3) each, mm, sensor frame."""
+
+    base_mm: np.ndarray
+    axis: np.ndarray
+    caps_mm: np.ndarray
+
+
+CONTACTS = (
+    Contact("none", "plane", ContactPose(0.0)),
+    Contact("flat", "plane", ContactPose(2.5)),
+    Contact("tilted", "plane", ContactPose(4.0, tilt_deg=(8.0, -5.0))),
+    Contact("sheared", "plane", ContactPose(3.0, shear_mm=(2.0, 1.0))),
+    Contact("edge", "edge", ContactPose(3.5, twist_deg=15.0)),
+    Contact("cylinder", "cylinder", ContactPose(3.0, offset_mm=(3.0, 2.0))),
+)
+
+
+def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
+    """The pins under a contact, from the cache where it has been solved before.
+
+    Raises
+    ------
+    ContactError
+        The contact can't be solved.
+    """
+    if contact.pose.indent_mm <= 0:
+        rest = rest_pins(spec.geometry)
+        return PinState(rest.base_mm, rest.axis, rest.caps_mm)
+
+    def solve():
+        state = SkinSolver(spec).press(load_object(contact.stimulus), contact.pose)
+        return {"base_mm": state.base_mm, "axis": state.axis, "caps_mm": state.caps_mm}
+
+    optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px"}
+    key = {part: getattr(spec, part).model_dump(mode="json", exclude=optical) for part in ("skin", "gel", "lens", "pins")}
+    key |= {"stimulus": load_object(contact.stimulus).model_dump(mode="json"), "pose": vars(contact.pose)}
+    return PinState(**cached_arrays("pins-under-contact", key, solve))
+
+
+# A specification whose camera neither blurs, colours nor disturbs: a real frame has gone through a camera already.
+NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...]]] = {
+    "response": {
+        "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "blur_sigma_px": 0.0, "brightness_drift": 0.0, "read_noise": 0.0,
+        "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0, "chroma_columns": 1, "stream": "rgb", "jpeg_quality": 0,
+    },
+    "camera": {"vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0)},
+    "gel": {"haze": 0.0},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DegradedShot:
+    """A degraded frame and where its pins truly are.
+
+    Attributes
+    ----------
+    name : str
+        Of the contact, or of the real frame.
+    frame : Frame
+    caps_px : (N, 2) float
+    visible : (N,) bool
+        The cap is there, within the frame, and nothing stands before it.
+    touched : bool
+        Something is in contact. Real frames are assumed to show a contact.
+    """
+
+    name: str
+    frame: Frame
+    caps_px: np.ndarray
+    visible: np.ndarray
+    touched: bool = True
+
+
+@dataclass(frozen=True)
+class RenderedSource:
+    """Frames of a sensor drawn by `Preview` over contacts; every pin's place is known."""
+
+    spec: SensorSpec
+    contacts: tuple[Contact, ...]
+
+    @property
+    def form(self) -> Form:
+        """Form of the frames."""
+        return Form.RAW
+
+    def names(self) -> list[str]:
+        """Names of the frames."""
+        return [contact.name for contact in self.contacts]
+
+    def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
+        """The frames under a case; contacts that can't be solved are left out."""
+        spec = case.on_spec(self.spec, severity)
+        view = View.of(spec, np.zeros((spec.pins.count, 2)))
+        geometry = _with_light_of(self.spec, spec)
+        shots = []
+        for film in _films(
+            spec.model_copy(update={"response": self.spec.response}), geometry, geometry if case.solves else self.spec, self.contacts
+        ):
+            view = replace(view, caps_px=film.truth.caps_px)
+            light = case.on_light(film.light, severity, view, film.draw)
+            image = case.on_frame(expose(light, spec.capture, np.random.default_rng(film.draw)), severity, view, film.draw)
+            shot = _degraded(film.contact.name, image, self.form, case, severity, view, film.truth.visible)
+            shots.append(replace(shot, touched=film.contact.pose.indent_mm > 0))
+        return shots
+
+
+@dataclass(frozen=True)
+class RealSource:
+    """Real frames; truth is where several detectors agree that the pins are (`consensus`).
+
+    Attributes
+    ----------
+    spec : SensorSpec
+    frames : tuple of Frame
+    caps_px : (M, N, 2) float
+        NaN where no agreement tells a pin's place.
+    """
+
+    spec: SensorSpec
+    frames: tuple[Frame, ...]
+    caps_px: np.ndarray
+
+    @property
+    def form(self) -> Form:
+        """Form of the frames."""
+        return self.frames[0].form
+
+    def names(self) -> list[str]:
+        """Names of the frames."""
+        return [frame.name for frame in self.frames]
+
+    def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
+        """The frames under a case, which must be `image_level`."""
+        neutral = altered(self.spec, **NEUTRAL)
+        spec = case.on_spec(neutral, severity)
+        in_light = severity > 0 and self.form == Form.RAW and any(c.spec is not None or c.light is not None for c in case.conditions)
+        view = View.of(neutral, self.caps_px[0])
+        shots = []
+        for draw, (frame, caps_px) in enumerate(zip(self.frames, self.caps_px, strict=True)):
+            view, image = replace(view, caps_px=caps_px), frame.image
+            if in_light:
+                light = to_light(image, neutral.response).astype(np.float32)
+                image = expose(case.on_light(light, severity, view, draw), spec.capture, np.random.default_rng(draw))
+            image = case.on_frame(image, severity, view, draw)
+            shots.append(_degraded(frame.name, image, self.form, case, severity, view, np.isfinite(caps_px[:, 0])))
+        return shots
+
+
+def _degraded(name: str, image: np.ndarray, form: Form, case: Case, severity: float, view: View, visible: np.ndarray) -> DegradedShot:
+    caps_px = case.on_points(view.caps_px, severity, view)
+    inside = np.all((caps_px >= 0) & (caps_px <= np.array(image.shape[1::-1]) - 1), axis=1)
+    return DegradedShot(name, Frame(image, form, name), caps_px, visible & inside & ~case.gone(severity, view))
+
+
+def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
+    """``spec`` with those values of ``base`` that move no pin in the picture. Under most conditions the result equals ``base``."""
+    gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
+    alike = altered(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
+    return alike.model_copy(update={name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
+
+
+@dataclass(frozen=True)
+class _Film:
+    """Linear light of one contact before the camera's response, and its true pins; ``draw`` is the seed of its random numbers."""
+
+    draw: int
+    contact: Contact
+    light: np.ndarray
+    truth: CapTruth
+
+
+@lru_cache(maxsize=2)
+def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contacts: tuple[Contact, ...]) -> tuple[_Film, ...]:
+    """Films of contacts of the sensor ``mechanics``, seen by the camera of ``geometry`` and lit as ``spec``.
+
+    All conditions that act behind the film share these films. Contacts that cannot be solved are left out.
+    """
+    preview, films = Preview(spec, static=_static(spec)), []
+    for draw, contact in enumerate(contacts):
+        try:
+            state, truth = _pressed(geometry, mechanics, contact)
+        except ContactError:
+            continue
+        light = preview.render(state)
+        light.flags.writeable = False  # it is shared
+        films.append(_Film(draw, contact, light, truth))
+    return tuple(films)
+
+
+@lru_cache(maxsize=32)
+def _pressed(spec: SensorSpec, mechanics: SensorSpec, contact: Contact) -> tuple[PinState, CapTruth]:
+    """Pins under a contact of the sensor ``mechanics``, and where the camera of ``spec`` sees them."""
+    state = pins_under(mechanics, contact)
+    return state, cap_truth(spec, rest_pins(spec.geometry), state, Form.RAW)
+
+
+def _static(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Light and cover of what contact does not change. Most conditions leave it alone, so it is kept."""
+    plain = spec.model_copy(update={"gel": spec.gel.model_copy(update={"haze": 0.0, "absorption_per_mm": (0.0, 0.0, 0.0)})})
+    bare = {"cap_albedo": (1.0, 1.0, 1.0), "cap_levels": (), "cap_shapes": (), "skin_albedo": (0.0, 0.0, 0.0)}
+    plain = altered(plain, appearance=bare, camera={"vignetting": 0.0}, response=NEUTRAL["response"])
+    return _static_layer(plain.model_dump_json())
+
+
+@lru_cache(maxsize=2)
+def _static_layer(spec_json: str) -> tuple[np.ndarray, np.ndarray]:
+    spec = SensorSpec.model_validate_json(spec_json)
+    return static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))

@@ -1,0 +1,202 @@
+"""Real frames as a source: pins that several detectors agree on are taken as the truth.
+
+A whole robustness study into one folder."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError, TwinError
+from twin.frames import evenly_read, open_recording
+from twin.judge.degradation.condition import Case
+from twin.judge.degradation.envelope import Envelope, judge_sweep
+from twin.judge.degradation.report import write_report
+from twin.judge.degradation.shots import CONTACTS, RealSource, RenderedSource
+from twin.judge.degradation.sweep import Models, Plan
+from twin.pins import METHODS, DetectorSpec, load_detector, make_detector, shipped_detector, tune, write_detector
+from twin.progress import Progress, silent, stage
+from twin.store import Item, inputs_digest
+from twin.types import Form, Frame
+
+# Two detectors agree on a pin if their places differ by less than this share of the pins' median spacing. Chosen.
+AGREE = 0.15
+# Least share of the pins that must be agreed on: else the frame is refused.
+LEAST_KNOWN = 0.97
+# Detectors that must agree on a pin.
+LEAST_AGREEING = 2
+
+
+def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpec]) -> tuple[RealSource, list[str]]:
+    """Frames whose pins at least two detectors see at the same places, and why others were refused.
+
+    Raises
+    ------
+    FrameError
+        No frame is left.
+    """
+    finders = [make_detector(spec, detector) for detector in detectors]
+    kept, truth, refused = [], [], []
+    for frame in frames:
+        seen = np.stack([found.pins_px for found in (find(frame) for find in finders) if found.pins_px is not None])
+        middle, agreeing = _agreed(seen)
+        known = agreeing >= LEAST_AGREEING
+        if known.mean() < LEAST_KNOWN:
+            refused.append(f"{frame.name}: the detectors agree on {int(known.sum())} of {len(known)} pins only")
+            continue
+        kept.append(frame)
+        truth.append(np.where(known[:, None], middle, np.nan))
+    if not kept:
+        raise FrameError(
+            f"none of {len(frames)} frames is good enough to start from; the first: {refused[0]}; try 'twin tune', then 'twin check'"
+        )
+    return RealSource(spec, tuple(kept), np.stack(truth)), refused
+
+
+def _agreed(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place (N, 2) of each pin, the first detector's among those that agree with it, and how many (N,) agree, by D detectors (D, N, 2)."""
+    pitch = np.nanmedian(np.sort(np.linalg.norm(seen[0][:, None] - seen[0][None], axis=2), axis=1)[:, 1])
+    near = np.linalg.norm(seen - seen[0], axis=2) < AGREE * pitch
+    return np.where(np.isfinite(seen[0]), seen[0], np.nan), near.sum(axis=0)
+
+
+def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress) -> tuple[DetectorSpec, ...]:
+    """Detectors by file, or by method: ours as the specification has it, others tuned on undegraded frames and kept in ``folder``.
+
+    Raises
+    ------
+    TwinError
+        A file can't be read; `check_pipelines` tells so sooner.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
+    for k, name in enumerate(names):
+        progress(k, len(names))
+        if name == "twin":
+            chosen.append(shipped_detector(spec, frames[0].form))
+        elif name in METHODS:
+            item = Item(f"{name}-{spec.name}", (tune,), [name, inputs])
+            kept = folder / f"{item.file}.toml"
+            if not kept.is_file():
+                write_detector(
+                    kept, tune(frames, spec, name).detector, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}"
+                )
+            chosen.append(load_detector(kept).model_copy(update={"name": name}))
+        else:
+            chosen.append(load_detector(Path(name)))
+        progress(k + 1, len(names))
+    return tuple(chosen)
+
+
+def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
+    """Raise ``TwinError`` where a name is neither a method nor a readable file, or two are alike: before anything is solved or drawn.
+
+    ``models``: names of the models whose rows stand beside those of the pipelines.
+    """
+    for name in names:
+        if name not in METHODS and Path(name).suffix != ".toml":
+            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
+    called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
+    if len(set(called)) < len(called):
+        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
+    if len({*called, *models}) < len(called) + len(models):
+        raise TwinError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
+
+
+def rendered_study(
+    spec: SensorSpec,
+    pipelines: list[str],
+    cases: tuple[Case, ...],
+    severities: tuple,
+    out: Path,
+    *,
+    progress: Progress = silent,
+    **options,
+) -> tuple[list[Envelope], list[Path]]:
+    """A study on rendered frames; options and results as `study`."""
+    source, bar = RenderedSource(spec, CONTACTS), partial(stage, progress)
+    with bar("contacts, undegraded"):
+        frames = [shot.frame for shot in source.shoot(cases[0], 0.0)]
+    with bar("tuning") as step:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
+    return study(Plan(source, detectors, cases, severities), "rendered", out, progress=progress, **options)
+
+
+def real_study(
+    spec: SensorSpec,
+    path: Path,
+    limit: int,
+    pipelines: list[str],
+    cases: tuple[Case, ...],
+    severities: tuple,
+    out: Path,
+    *,
+    beside: bool = True,
+    progress: Progress = silent,
+    **options,
+) -> tuple[list[Envelope], list[Path]]:
+    """A study on a folder of real frames: image-level conditions only; options and results as `study`.
+
+    ``beside``: raw frames are shown on the envelope of rendered ones, which are swept too.
+    """
+    recording = open_recording(path, spec)
+    frames, bar = evenly_read(recording, limit), partial(stage, progress)
+    with bar("tuning") as step:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
+        judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
+    source, notes = consensus(spec, frames, list(dict.fromkeys((*detectors, *judges))))
+    usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
+    if not usable:
+        raise TwinError("none of the conditions can be applied to frames that are already there; leave --frames out to render them")
+    if left := [c.name for c in cases if c not in usable]:
+        notes.append(f"left out, as they can't be applied to frames that are already there: {', '.join(left)}")
+    rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
+    return study(Plan(source, detectors, usable, severities), path.name, out, progress=progress, notes=notes, rendered=rendered, **options)
+
+
+def _on_frames(case: Case) -> bool:
+    """Acts on gray levels or settings, not on light: all that is left of a thresholded frame."""
+    return all(c.light is None and c.spec is None for c in case.conditions)
+
+
+def study(
+    plan: Plan,
+    source: str,
+    out: Path,
+    *,
+    progress: Progress = silent,
+    jobs: int = 1,
+    models: Models | None = None,
+    model_digests: dict[str, str] | None = None,
+    notes: list[str] | None = None,
+    rendered: RenderedSource | None = None,
+) -> tuple[list[Envelope], list[Path]]:
+    """Sweep, judge and write; the envelopes and the files written, the page first.
+
+    Parameters
+    ----------
+    plan : Plan
+    source : str
+        Name of the frames for the page.
+    out : Path
+    progress : Progress
+    jobs : int
+        Processes.
+    models, model_digests : callable, dict of str to str
+        As `Plan` takes them.
+    notes : list of str, optional
+        For the page.
+    rendered : RenderedSource, optional
+        Frames of the same sensor to sweep likewise (in ``out/rendered``) and to show the plan's beside.
+    """
+    plan = replace(plan, models=models, model_digests=model_digests or {})
+    with stage(progress, "conditions x steps") as step:
+        judged = judge_sweep(plan, out, jobs=jobs, progress=step)
+    beside = None
+    if rendered is not None:
+        with stage(progress, "the same, rendered") as step:
+            beside = judge_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=step)
+    return judged.envelopes, write_report(out, judged, source=source, notes=notes or [], rendered=beside)

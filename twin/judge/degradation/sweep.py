@@ -1,0 +1,173 @@
+"""Every case at every severity: cells that are computed in parallel, kept one by one, and never computed twice."""
+
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scenes import load_object
+from twin.errors import TwinError
+from twin.judge.degradation.condition import Case, Condition
+from twin.judge.degradation.measures import judge_shot
+from twin.judge.degradation.shots import DegradedShot, RealSource, RenderedSource
+from twin.pins import DetectorSpec, Found, make_detector
+from twin.store import Item, find_json, inputs_digest, keep_json, write_bytes
+
+SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+CELLS = "cells"  # folder of the finished ones
+Models = Callable[[], dict]  # gives {name: estimate}, estimate(frame) -> (values, units, valid)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a sweep runs through.
+
+    Attributes
+    ----------
+    source : RenderedSource or RealSource
+    detectors : tuple of DetectorSpec
+        The first one is the one whose pictures are kept.
+    cases : tuple of Case
+    severities : tuple of float
+        From 0 up.
+    models : callable, optional
+        Gives estimators by name; called in each process.
+    model_digests : dict of str to str
+        By their names: digests of all that their answers depend on.
+    """
+
+    source: RenderedSource | RealSource
+    detectors: tuple[DetectorSpec, ...]
+    cases: tuple[Case, ...]
+    severities: tuple[float, ...] = SEVERITIES
+    models: Models | None = None
+    model_digests: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One case at one severity."""
+
+    case: Case
+    severity: float
+    item: Item
+
+    @property
+    def file(self) -> str:
+        """Name of its files, without suffix."""
+        return self.item.file
+
+
+def cells_of(plan: Plan) -> list[Cell]:
+    """All cells; severity 0 is one cell that all cases share, its case the first one."""
+    base = inputs_digest(_inputs(plan))
+    cells = []
+    for case in plan.cases:
+        for severity in plan.severities:
+            degrading = () if severity == 0 else case.conditions
+            name = case.name if degrading else "nominal"
+            values = [[c.name, c.value(severity)] for c in degrading]
+            item = Item(f"{name}-{round(1000 * severity):04d}", (__name__, *_hooks(degrading)), [base, values])
+            cells.append(Cell(case, severity, item))
+    return cells
+
+
+def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> list[dict]:
+    """All rows of a sweep: one for each case, severity, frame and detector (or model).
+
+    Finished cells lie in ``folder/cells``; what lies there, computed from the same sensor, pipelines, models and code, is not
+    computed again.
+    """
+    cells = cells_of(plan)
+    (folder / "pictures").mkdir(parents=True, exist_ok=True)
+    open_cells = {cell.file: cell for cell in cells if find_json(folder / CELLS, cell.item) is None}
+    total = len({cell.file for cell in cells})
+    progress(total - len(open_cells), total)
+    if open_cells:
+        _compute(plan, folder, list(open_cells.values()), jobs, lambda done: progress(total - len(open_cells) + done, total))
+    return [
+        row | {"case": cell.case.name, "severity": cell.severity} for cell in cells for row in find_json(folder / CELLS, cell.item) or []
+    ]
+
+
+def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress) -> None:
+    if jobs == 1:
+        _begin(plan, folder)
+        for done, cell in enumerate(cells):
+            _run(cell)
+            progress(done + 1)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin, initargs=(plan, folder)) as pool:
+        running = [pool.submit(_run, cell) for cell in cells]
+        try:
+            for done, future in enumerate(as_completed(running)):
+                future.result()
+                progress(done + 1)
+        except BrokenProcessPool as error:
+            raise TwinError("a process of the sweep ended before its time, for want of memory perhaps; go on with --jobs 1") from error
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+_WORK: dict = {}  # of this process: what `_begin` was given, built once
+
+
+def _begin(plan: Plan, folder: Path) -> None:
+    cv2.setNumThreads(1)
+    _WORK.update(plan=plan, folder=folder, models=plan.models() if plan.models else {})
+
+
+def _run(cell: Cell) -> None:
+    plan, folder = _WORK["plan"], _WORK["folder"]
+    rows, worst = [], None
+    detectors = [make_detector(plan.source.spec, cell.case.on_setting(spec, cell.severity)) for spec in plan.detectors]
+    for shot in plan.source.shoot(cell.case, cell.severity):
+        for place, detector in enumerate(detectors):
+            found = detector(shot.frame)
+            rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | judge_shot(detector, found, shot))
+            if place == 0 and (worst is None or rows[-1]["recall"] < worst[0]):
+                worst = rows[-1]["recall"], shot, found
+        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in _WORK["models"].items()]
+    if worst is not None:
+        picture = cv2.imencode(".jpg", overlay(worst[1], worst[2]))[1].tobytes()
+        write_bytes(folder / "pictures" / f"{cell.file}.jpg", picture)
+    keep_json(folder / CELLS, cell.item, rows, default=float)
+
+
+def _pose(estimate, shot: DegradedShot) -> dict:
+    values, units, valid = estimate(shot.frame)
+    return {"values": [float(v) for v in values], "units": list(units), "valid": bool(valid), "touched": shot.touched}
+
+
+def overlay(shot: DegradedShot, found: Found) -> np.ndarray:
+    """The frame (H, W, 3) uint8 BGR: true pins that are seen in green, missed ones in red, claims as dots."""
+    image = shot.frame.image
+    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
+    claims = found.claims_px
+    for px, visible in zip(shot.caps_px, shot.visible, strict=True):
+        if visible:
+            near = len(claims) and np.linalg.norm(claims - px, axis=1).min() < 3
+            cv2.circle(picture, tuple(int(round(v)) for v in px), 6, (90, 200, 90) if near else (60, 60, 255), 1, cv2.LINE_AA)
+    for px in claims:
+        cv2.circle(picture, tuple(int(round(v)) for v in px), 1, (0, 220, 255), -1)
+    return picture
+
+
+def _hooks(conditions: tuple[Condition, ...]) -> list[Callable]:
+    """The functions by which conditions degrade: a cell depends on the code of its own conditions, not on that of all."""
+    return [hook for c in conditions for hook in (c.spec, c.light, c.frame, c.moves, c.hides, c.setting) if hook is not None]
+
+
+def _inputs(plan: Plan) -> list[object]:
+    """Everything that all cells are made of."""
+    source = plan.source
+    shared = [source.spec, plan.detectors, plan.model_digests]
+    if isinstance(source, RenderedSource):
+        return [*shared, [[c.name, load_object(c.stimulus), c.pose] for c in source.contacts]]
+    return [*shared, [[frame.name, frame.image] for frame in source.frames], source.caps_px]

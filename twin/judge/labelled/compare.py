@@ -1,0 +1,144 @@
+"""How far simulated pins are from recorded ones.
+
+Pin errors of the twin on labelled frames: with nothing free, and with one friction a frame."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.errors import ContactError
+from twin.judge.labelled.model import ContactModel, MeasuredFrames
+
+
+def pin_errors(simulated_px: np.ndarray, measured_px: np.ndarray) -> np.ndarray:
+    """Mean over the pins of their distance, for each frame: (..., M) of (..., M, N, 2); lost pins (NaN) are left out."""
+    return np.nanmean(np.linalg.norm(simulated_px - measured_px, axis=-1), axis=-1)
+
+
+def ring_bias(rest_px: np.ndarray, simulated_px: np.ndarray, measured_px: np.ndarray, rings: int) -> np.ndarray:
+    """Mean outward error of each ring of pins, from the innermost.
+
+    Parameters
+    ----------
+    rest_px : (N, 2) float
+        No contact, in the specification's pin order.
+    simulated_px, measured_px : (M, N, 2) float
+    rings : int
+
+    Returns
+    -------
+    (rings,) float
+        px; positive: the simulated pins lie too far out.
+    """
+    across = rest_px - rest_px[0]
+    outward = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    error = np.nanmean(np.sum((simulated_px - measured_px) * outward, axis=2), axis=0)
+    first = [1 + 3 * ring * (ring - 1) for ring in range(1, rings + 2)]
+    return np.array([error[start:stop].mean() for start, stop in zip(first[:-1], first[1:], strict=True)])
+
+
+def binned_means(values: np.ndarray, by: np.ndarray, edges: Sequence[float]) -> np.ndarray:
+    """Mean of the values whose ``by`` lies in each bin (the last one closed); NaN where a bin is empty."""
+    where = np.clip(np.searchsorted(edges, by, side="right") - 1, 0, len(edges) - 2)
+    return np.array([values[where == k].mean() if (where == k).any() else np.nan for k in range(len(edges) - 1)])
+
+
+FRICTIONS = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.65, 1.0, 2.0)  # tried for a frame of its own
+BINS = 4
+MEASURES = {"depth_mm": "depth, mm", "angle_deg": "turn, deg", "shear_mm": "shear, mm"}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What came of M frames with N pins.
+
+    Attributes
+    ----------
+    measured : MeasuredFrames
+    simulated_px : (M, N, 2) float
+        NaN where the contact failed.
+    error_px : (M,) float
+        Mean over the pins; NaN where the contact failed.
+    executed : (M,) bool
+    by : dict of str to (M,) float
+        ``depth_mm`` (the label along the approach), ``angle_deg`` (size of all turns), ``shear_mm`` (size of the executed move).
+    friction, friction_error_px : (M,) float
+        The frame's own friction and its error; NaN where it was not sought.
+    failures : dict of str to str
+        Why a contact failed, by image name.
+    """
+
+    measured: MeasuredFrames
+    simulated_px: np.ndarray
+    error_px: np.ndarray
+    executed: np.ndarray
+    by: dict
+    friction: np.ndarray
+    friction_error_px: np.ndarray
+    failures: dict
+
+
+def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: int = 0, progress: Callable | None = None) -> Comparison:
+    """Simulate every frame's contact; for ``friction_frames`` of those with an executed move, seek their own friction, too."""
+    executed = np.array([label.executed for label in measured.labels])
+    moved = np.flatnonzero(executed)
+    sought = (
+        moved[np.linspace(0, len(moved) - 1, min(friction_frames, len(moved))).astype(int)] if friction_frames and len(moved) else moved[:0]
+    )
+    total, done = len(measured) + len(sought) * len(FRICTIONS), 0
+    simulated, failures = np.full(measured.pins_px.shape, np.nan), {}
+
+    def simulate(row, friction=None):
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done, total)
+        return measured.no_contact_px + model.displacement_px(measured.labels[row], friction)
+
+    for row, name in enumerate(measured.names):
+        try:
+            simulated[row] = simulate(row)
+        except ContactError as error:
+            failures[name] = str(error)
+    errors = np.full(len(measured), np.nan)
+    solved = ~np.isnan(simulated[:, 0, 0])
+    errors[solved] = pin_errors(simulated[solved], measured.pins_px[solved])
+    best, best_error = np.full(len(measured), np.nan), np.full(len(measured), np.nan)
+    best[sought], best_error[sought] = model.rig.friction, errors[sought]
+    for row in sought:
+        for friction in FRICTIONS:
+            try:
+                error = float(pin_errors(simulate(row, friction), measured.pins_px[row]))
+            except ContactError:
+                continue
+            if not error >= best_error[row]:
+                best[row], best_error[row] = friction, error
+    return Comparison(measured, simulated, errors, executed, _measures(model, measured), best, best_error, failures)
+
+
+def table_of(found: Comparison) -> list[dict]:
+    """Mean errors of executed, not executed and all moves: ``group``, ``frames``, ``error_px`` and ``by`` each measure."""
+    rows = []
+    for group, chosen in (("move executed", found.executed), ("move not executed", ~found.executed), ("all", np.ones_like(found.executed))):
+        solved = chosen & np.isfinite(found.error_px)
+        if not solved.any():
+            continue
+        row = {"group": group, "frames": int(solved.sum()), "error_px": float(found.error_px[solved].mean()), "by": {}}
+        for key, values in found.by.items():
+            edges = np.linspace(values.min(), values.max(), BINS + 1)
+            if edges[0] < edges[-1]:
+                row["by"][key] = {"edges": edges.tolist(), "means": binned_means(found.error_px[solved], values[solved], edges).tolist()}
+        rows.append(row)
+    return rows
+
+
+def _measures(model: ContactModel, measured: MeasuredFrames) -> dict[str, np.ndarray]:
+    axis = model.experiment.axis
+    poses = np.array([label.pose - (0 if label.executed else label.move) for label in measured.labels])
+    moves = np.array([label.move * label.executed for label in measured.labels])
+    return {
+        "depth_mm": poses[:, axis],
+        "angle_deg": np.linalg.norm(poses[:, 3:], axis=1),
+        "shear_mm": np.linalg.norm(np.delete(moves[:, :3], axis, axis=1), axis=1),
+    }

@@ -1,0 +1,137 @@
+"""Labelled real frames, and the twin's pins for their labels.
+
+Pins are compared in px of the frames as they are. A simulated pin is the recorded no-contact pin plus the simulated
+displacement: where each pin of a printed sensor really sits is not the mechanics' matter.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
+from scenes.sensor import SensorSpec
+from twin.camera.projection import project
+from twin.errors import FrameError
+from twin.frames import open_recording
+from twin.frames.forms import from_raw
+from twin.geometry.solid import Resolution
+from twin.mechanics.solver import SkinSolver
+from twin.pins import Pipeline
+from twin.pins.batch import recording_reference
+from twin.rig.contact import RigContact
+from twin.rig.kinematics import rig_of
+from twin.rig.labels import ArmLabel, read_arm_labels
+from twin.types import FINE, Form
+
+_SAME = 1e-9  # of the way: fractions that mean the same pose
+
+
+@dataclass(frozen=True)
+class MeasuredFrames:
+    """Pins of M labelled frames of one recording, N each.
+
+    Attributes
+    ----------
+    form : Form
+    names : list of str
+    labels : list of ArmLabel
+    pins_px : (M, N, 2) float
+        NaN for lost pins.
+    no_contact_px : (N, 2) float
+    problems : list of str
+        What was odd or left out, one line each.
+    """
+
+    form: Form
+    names: list
+    labels: list
+    pins_px: np.ndarray
+    no_contact_px: np.ndarray
+    problems: list
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def measure_frames(
+    folder: Path, spec: SensorSpec, count: int | None, seed: int, *, form: Form | None = None, progress: Callable | None = None
+) -> MeasuredFrames:
+    """The pins of ``count`` frames of a labelled recording, chosen at random (None: of all), in the table's order.
+
+    Raises
+    ------
+    FrameError
+        No labels, or no frame with pins.
+    """
+    recording = open_recording(folder, spec, form)
+    labels, problems = read_arm_labels(recording), list(recording.problems)
+    reference, _ = recording_reference(spec, recording, problems)
+    if recording.reference is None:
+        problems.append("no no-contact frame (init_0.png): the specification's own layout stands for it")
+    pipeline = Pipeline(spec, recording.form, reference)
+    chosen = np.random.default_rng(seed).permutation(len(recording))[:count]
+    kept, pins = [], []
+    for done, row in enumerate(np.sort(chosen)):
+        try:
+            seen = pipeline(recording.read(int(row)))
+            reason = seen.reason
+        except FrameError as error:
+            seen, reason = None, str(error)
+        if reason:
+            problems.append(f"{recording.names[row]}: left out: {reason}")
+        else:
+            kept.append(int(row))
+            pins.append(seen.pins_px)
+        if progress:
+            progress(done + 1, len(chosen))
+    if not kept:
+        raise FrameError(f"{folder}: no frame with pins among {len(chosen)}; {problems[-1] if problems else 'is it the right --sensor?'}")
+    names = [recording.names[row] for row in kept]
+    return MeasuredFrames(recording.form, names, [labels[row] for row in kept], np.stack(pins), reference.pins_px, problems)
+
+
+class ContactModel:
+    """Displacements of a sensor's pins for labels of an experiment.
+
+    Parameters
+    ----------
+    form : Form
+        Whose pixels the pins are in.
+    across : int
+        Elements along each side of the skin's grid.
+    """
+
+    def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
+        self.spec, self.experiment, self.form = spec, experiment, form
+        self.rig = rig_of(spec)
+        self.solver = SkinSolver(spec, resolution=Resolution(across), keep=False)
+        self.contact = RigContact(self.solver, experiment, touched)
+        self.rest_px = self._pixels(self.solver.rest().caps_mm)
+
+    def displacement_px(self, label: ArmLabel, friction: float | None = None) -> np.ndarray:
+        """(N, 2) px, from no contact; with the rig's friction unless another is given.
+
+        Raises
+        ------
+        ContactError
+            The contact does not converge, or can't be.
+        """
+        return self.displacements_px(label, friction)[1]
+
+    def displacements_px(self, label: ArmLabel, friction: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The same after the tap, and at the end: after the move, if it was executed."""
+        way = self.contact.way(label)
+        if not way.touches and not label.executed:
+            return np.zeros_like(self.rest_px), np.zeros_like(self.rest_px)
+        tap_ends = 1 / (len(way.labels) - 1) if way.touches else 0.0
+        tapped_mm = self.solver.rest().caps_mm
+        for fraction, state in self.contact.along(way, friction=friction):
+            if fraction <= tap_ends + _SAME:
+                tapped_mm = state.caps_mm
+        return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px
+
+    def _pixels(self, caps_mm: np.ndarray) -> np.ndarray:
+        return from_raw(self.spec.recording, self.form, project(self.spec.view, caps_mm))

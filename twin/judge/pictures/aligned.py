@@ -1,0 +1,107 @@
+"""Real frames with the skin fitted to their pins: what every stage of the calibration works on."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes.sensor import CameraSpec, ResponseSpec, SensorSpec
+from twin.camera.projection import lens_disc
+from twin.errors import FrameError
+from twin.judge.pictures.frames import read_real
+from twin.mechanics.skin_fit import FittedPins
+from twin.progress import Step
+
+# Gray level from which on a pixel tells nothing: the camera's curve ends there.
+SATURATED = 250
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A real frame and the pins in space that it shows.
+
+    Attributes
+    ----------
+    name : str
+    image : (H, W, 3) or (H, W) uint8
+    pins_px : (N, 2) float
+        Raw-frame px, specification's order.
+    state : FittedPins
+    """
+
+    name: str
+    image: np.ndarray
+    pins_px: np.ndarray
+    state: FittedPins
+
+
+def read_frames(folder: Path, spec: SensorSpec, limit: int, progress: Step) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Usable frames of a folder, evenly spread: name, image (H, W[, 3]) uint8 and pins (N, 2) px of each.
+
+    Raises
+    ------
+    FrameError
+        No frame can be used, or one does not fit the camera: it has another size, or is in colour where the camera is mono
+        (or the other way round). Names the first and why.
+    """
+    real = read_real(folder, spec, lens_disc(spec), limit=limit, progress=progress)
+    for found in real.frames:
+        require_cameras_own(found.frame.image, found.frame.name, spec.camera)
+    return [(found.frame.name, found.frame.image, found.pins_px) for found in real.frames]
+
+
+def require_cameras_own(image: np.ndarray, name: str, camera: CameraSpec) -> None:
+    """Raise ``FrameError`` where an image does not have the camera's size and channels: what is rendered could not be compared with it."""
+    height, width = image.shape[:2]
+    if (height, width) != (camera.height_px, camera.width_px):
+        raise FrameError(
+            f"{name}: {width} x {height} px, the specification's camera has {camera.width_px} x {camera.height_px}; "
+            "give frames as they come"
+        )
+    colour = image.ndim == 3 and image.shape[2] == 3
+    if colour and camera.channels == "mono":
+        raise FrameError(
+            f'{name}: a colour frame, but the specification\'s camera is mono; set channels = "color" under [camera], '
+            "or convert the frames to gray"
+        )
+    if not colour and camera.channels == "color":
+        raise FrameError(
+            f'{name}: a gray frame, but the specification\'s camera has colour; set channels = "mono" under [camera], '
+            "or give the colour frames"
+        )
+
+
+def to_light(levels: np.ndarray, response: ResponseSpec) -> np.ndarray:
+    """Light in the renderer's unit from gray levels: the response curve, white balance and exposure undone."""
+    share = np.clip((np.asarray(levels, float) - response.black_level) / (255 - response.black_level), 0, 1)
+    gain = _gain(levels, response)
+    return share**response.gamma / gain
+
+
+def to_levels(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
+    """Gray levels (float, not rounded) from light: the inverse of ``to_light``."""
+    gain = _gain(light, response)
+    return response.black_level + (255 - response.black_level) * np.clip(gain * light, 0, 1) ** (1 / response.gamma)
+
+
+def levels_slope(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
+    """Derivative of ``to_levels`` by the light, finite in the dark."""
+    gain = _gain(light, response)
+    share = np.clip(gain * light, 1e-6, 1)
+    return (255 - response.black_level) / response.gamma * share ** (1 / response.gamma - 1) * gain
+
+
+def _gain(values: np.ndarray, response: ResponseSpec) -> float | np.ndarray:
+    """Factor on the light before the curve: exposure, and white balance where the last axis is colour (3 long)."""
+    colour = np.ndim(values) and np.shape(values)[-1] == 3
+    return response.exposure * (np.array(response.white_balance) if colour else 1.0)
+
+
+def revised(spec: SensorSpec, **sections: Mapping[str, Any]) -> SensorSpec:
+    """A copy with values changed section by section (``camera={"k1": 0.1}``), validated again."""
+    data = spec.model_dump()
+    for name, values in sections.items():
+        data[name] = data[name] | values
+    return SensorSpec.model_validate(data)

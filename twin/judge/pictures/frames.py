@@ -1,0 +1,108 @@
+"""Reading real frames. They must be raw, of one size, neither dark nor saturated, and show every pin."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.camera.projection import Disc
+from twin.errors import FrameError
+from twin.frames import open_recording
+from twin.frames.forms import gray_levels
+from twin.frames.recording import BadFrame
+from twin.pins.pipeline import Pipeline
+from twin.progress import Step
+from twin.types import Form, Frame, Observation
+
+# A lit frame is brighter than this gray level at this percentile of the disc.
+DARK_LEVEL, BRIGHT_PERCENTILE = 40.0, 99.0
+# Gray level from which on a pixel is saturated, and largest share of the disc that may be.
+SATURATED_LEVEL, MOST_SATURATED = 250, 0.1
+
+
+@dataclass(frozen=True)
+class RealFrame:
+    """A real frame and the pins found in it.
+
+    Attributes
+    ----------
+    frame : Frame
+    pins_px : (N, 2) float
+        Raw-frame px, specification's order.
+    label : dict of str to float
+        The frame's row of the recording's table (its numbers).
+    """
+
+    frame: Frame
+    pins_px: np.ndarray
+    label: dict[str, float]
+
+    @property
+    def gray(self) -> np.ndarray:
+        """(H, W) uint8."""
+        return gray_levels(self.frame.image)
+
+
+@dataclass(frozen=True)
+class RealFrames:
+    """The usable frames of a folder; ``refused``: ``image_name`` and ``reason`` of the others."""
+
+    frames: list[RealFrame]
+    refused: list[BadFrame] = field(default_factory=list)
+
+
+def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, progress: Step | None = None) -> RealFrames:
+    """Read raw frames, evenly spread over the recording if there are more than ``limit``.
+
+    Raises
+    ------
+    FrameError
+        No folder, not raw frames, or none that can be used: names the first and why.
+    """
+    recording = open_recording(path, spec)
+    if recording.form is not Form.RAW:
+        raise FrameError(f"{path}: these are thresholded recordings; realism is judged on raw camera frames, give a folder of those")
+    pipeline, count = Pipeline(spec, Form.RAW), len(recording)
+    chosen = np.unique(np.linspace(0, count - 1, min(limit or count, count)).round().astype(int)).tolist()
+    frames: list[RealFrame] = []
+    refused: list[BadFrame] = []
+    for done, index in enumerate(chosen):
+        name = recording.names[index]
+        try:
+            frame = recording.read(index)
+            observation = check_frame(frame, pipeline, disc)
+        except FrameError as error:
+            refused.append({"image_name": name, "reason": str(error).removeprefix(f"{name}: ")})
+        else:
+            numbers = {key: float(c[index]) for key, c in recording.labels.items() if c.dtype.kind == "f"}
+            frames.append(RealFrame(frame, observation.pins_px, numbers))
+        if progress:
+            progress(done + 1, len(chosen))
+    if not frames:
+        first = refused[0]
+        raise FrameError(f"{path}: none of {len(chosen)} frames can be used; the first, {first['image_name']}: {first['reason']}")
+    return RealFrames(frames, refused)
+
+
+def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc) -> Observation:
+    """The observation of a frame that is fit to be compared.
+
+    Raises
+    ------
+    FrameError
+        Too dark, saturated, or pins missing: names the frame and says which.
+    """
+    if frame.image.shape[:2] == disc.inside.shape:
+        levels = gray_levels(frame.image)[disc.inside]
+        bright, saturated = np.percentile(levels, BRIGHT_PERCENTILE), float(np.mean(levels >= SATURATED_LEVEL))
+        if bright < DARK_LEVEL:
+            raise FrameError(f"{frame.name}: black (99 % of the disc is below level {bright:.0f}); check the LEDs and the exposure")
+        if saturated > MOST_SATURATED:
+            raise FrameError(f"{frame.name}: saturated ({saturated:.0%} of the disc); record it with a shorter exposure")
+    observation = pipeline(frame)
+    count = len(observation.pins_px)
+    if observation.found != count or not observation.valid:
+        why = observation.reason or f"{observation.found} of {count} pins found, all are needed"
+        raise FrameError(f"{frame.name}: {why}; leave it out, or give the right --sensor")
+    return observation

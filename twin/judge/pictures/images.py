@@ -1,0 +1,81 @@
+"""A real frame against its render, pixel by pixel, over the lens disc.
+
+The figures are PSNR, SSIM (Wang et al. 2004, as scikit-image computes it) and FLIP (Andersson et al. 2020): the difference, from 0 to 1,
+that an eye sees when the two alternate on a usual screen (67 px per degree). Outside the disc the real frame takes the render's place,
+so that nothing from there enters the windows of SSIM and FLIP.
+"""
+
+from dataclasses import asdict, dataclass
+
+import flip_evaluator
+import numpy as np
+from skimage.metrics import structural_similarity
+
+from twin.errors import FrameError
+from twin.frames.forms import gray_levels
+
+# Range of 8-bit gray levels.
+LEVELS = 255.0
+# Amplification of the difference picture.
+CHANGE_GAIN = 2
+
+
+@dataclass(frozen=True)
+class ImageFigures:
+    """Likeness of one pair: PSNR in dB (inf: identical), SSIM (1: identical), FLIP (0: identical)."""
+
+    psnr_db: float
+    psnr_gray_db: float
+    ssim: float
+    ssim_gray: float
+    flip: float
+
+    def as_dict(self) -> dict[str, float]:
+        """Figures by name."""
+        return asdict(self)
+
+
+def compare_images(real: np.ndarray, rendered: np.ndarray, inside: np.ndarray) -> ImageFigures:
+    """Figures of a pair of 8-bit frames, (H, W) or (H, W, 3), over the pixels ``inside`` (H, W) bool.
+
+    Raises
+    ------
+    FrameError
+        They differ in shape or aren't 8-bit.
+    """
+    if real.shape != rendered.shape or real.dtype != np.uint8 or rendered.dtype != np.uint8:
+        raise FrameError(
+            f"can't compare {rendered.dtype} {rendered.shape} with {real.dtype} {real.shape}; give two 8-bit frames of one sensor"
+        )
+    masked = np.where(inside if real.ndim == 2 else inside[..., None], rendered, real)
+    gray, masked_gray = gray_levels(real), gray_levels(masked)
+    return ImageFigures(
+        psnr_db=_psnr_db(real[inside], masked[inside]),
+        psnr_gray_db=_psnr_db(gray[inside], masked_gray[inside]),
+        ssim=_ssim(real, masked, inside),
+        ssim_gray=_ssim(gray, masked_gray, inside),
+        flip=float(flip_map(real, masked)[inside].mean()),
+    )
+
+
+def flip_map(real: np.ndarray, rendered: np.ndarray) -> np.ndarray:
+    """(H, W) FLIP of two 8-bit frames."""
+    pair = (np.repeat(a[..., None], 3, axis=2) if a.ndim == 2 else a for a in (real, rendered))
+    reference, test = (np.ascontiguousarray(a, np.float32) / np.float32(LEVELS) for a in pair)
+    return flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, computeMeanError=False)[0][..., 0]
+
+
+def difference_picture(real: np.ndarray, rendered: np.ndarray) -> np.ndarray:
+    """Where the render is brighter (above middle gray) or darker, twice amplified; uint8."""
+    return np.clip(127.5 + CHANGE_GAIN * (rendered.astype(float) - real), 0, 255).astype(np.uint8)
+
+
+def _psnr_db(real: np.ndarray, rendered: np.ndarray) -> float:
+    mean_square = np.mean((real.astype(float) - rendered) ** 2)
+    return float("inf") if mean_square == 0 else float(10 * np.log10(LEVELS**2 / mean_square))
+
+
+def _ssim(real: np.ndarray, rendered: np.ndarray, inside: np.ndarray) -> float:
+    axis = 2 if real.ndim == 3 else None
+    _, local = structural_similarity(real, rendered, data_range=LEVELS, channel_axis=axis, full=True)
+    return float(local[inside].mean())

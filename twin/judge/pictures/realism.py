@@ -1,0 +1,114 @@
+"""The whole comparison of a folder of real frames with their renders, into one folder."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.camera.projection import lens_disc
+from twin.judge.pictures.compare import Quality, pin_aligned, pose_aligned, statistics
+from twin.judge.pictures.frames import read_real
+from twin.judge.pictures.report import (
+    image_summary,
+    pose_summary,
+    statistics_summary,
+    write_metrics,
+    write_page,
+    write_pictures,
+    write_plots,
+    write_tables,
+)
+from twin.progress import Progress, Step, silent, stage
+
+
+class TwoSample(Protocol):
+    """Outcome of a two-sample test: share of the images told right, and its interval."""
+
+    @property
+    def accuracy(self) -> float: ...
+
+    @property
+    def low(self) -> float: ...
+
+    @property
+    def high(self) -> float: ...
+
+
+# test(real images, rendered images, inside, progress)
+Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Step], TwoSample]
+
+
+def run_realism(
+    folder: Path,
+    spec: SensorSpec,
+    out: Path,
+    *,
+    with_poses: bool = False,
+    limit: int | None = None,
+    quality: Quality = "standard",
+    test: Test | None = None,
+    progress: Progress = silent,
+) -> tuple[dict[str, Any], list[Path]]:
+    """Compare and write everything.
+
+    Parameters
+    ----------
+    folder : Path
+        Raw frames, with ``targets.csv`` where the labels are needed.
+    spec : SensorSpec
+    out : Path
+    with_poses : bool
+        Also render from the labels alone.
+    limit : int, optional
+        Most frames, evenly spread.
+    quality : {"preview", "standard", "high"}
+    test : callable, optional
+        The two-sample test.
+    progress : Progress
+
+    Returns
+    -------
+    metrics : dict
+        Content of metrics.json.
+    written : list of Path
+        The page first.
+
+    Raises
+    ------
+    FrameError
+        No frame can be used, or the labels are missing.
+    RenderError
+        Nothing can be rendered here.
+    """
+    disc, bar = lens_disc(spec), partial(stage, progress)
+    with bar("read the real frames, find their pins") as step:
+        real = read_real(folder, spec, disc, limit=limit, progress=step)
+    with bar("fit the skin to the pins, render") as step:
+        pairs = pin_aligned(spec, real.frames, disc, quality=quality, progress=step)
+    poses = pose_aligned(spec, real.frames, disc, quality=quality, bar=bar) if with_poses else None
+    with bar("measure caps, skin, noise, spectra") as step:
+        found = statistics(pairs, disc, progress=step)
+    outcome = None
+    if test is not None and len(pairs) > 1:
+        with bar("train the two-sample test") as step:
+            outcome = test([pair.real.frame.image for pair in pairs], [pair.image for pair in pairs], disc.inside, step)
+    metrics = {
+        "sensor": spec.name,
+        "quality": quality,
+        "frames": len(pairs),
+        "refused": real.refused,
+        "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
+        "pin_aligned": image_summary(pairs),
+        "statistics": statistics_summary(found),
+        "two_sample": outcome and {"accuracy": outcome.accuracy, "low": outcome.low, "high": outcome.high},
+        "pose_aligned": poses and pose_summary(poses),
+    }
+    pictures = out / "pictures"
+    rows = write_pictures(pictures, pairs, "pins")
+    pose_rows = write_pictures(pictures, poses.pairs, "pose") if poses else []
+    page = write_page(out / "index.html", spec, metrics, write_plots(pictures, found), rows, pose_rows, found)
+    written = [page, write_metrics(out / "metrics.json", metrics), *write_tables(out, pairs, found, poses)]
+    return metrics, written

@@ -1,0 +1,114 @@
+"""Measures of caps by their distance from the disc's centre, real and rendered side by side.
+
+Noise floor and radial power spectrum of gray frames."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+# Bins of the distance from the disc's centre.
+BINS = 8
+
+
+@dataclass(frozen=True)
+class RadialRow:
+    """One measure in one bin: mean of the real and of the rendered caps, and the relative difference."""
+
+    measure: str
+    inner_px: float
+    outer_px: float
+    real: float
+    rendered: float
+
+    @property
+    def difference(self) -> float:
+        """Rendered against real, relative."""
+        return self.rendered / self.real - 1
+
+
+def equal_count_edges(distance_px: np.ndarray, bins: int = BINS) -> np.ndarray:
+    """(bins + 1,) edges between which there are equally many of the distances."""
+    return np.quantile(distance_px[np.isfinite(distance_px)], np.linspace(0, 1, bins + 1))
+
+
+def bin_of(distance_px: np.ndarray, edges_px: np.ndarray) -> np.ndarray:
+    """Index of each distance's bin. A distance beyond the edges belongs to the outer bins; NaN to none (-1)."""
+    index = np.clip(np.searchsorted(edges_px, distance_px, side="right") - 1, 0, len(edges_px) - 2)
+    return np.where(np.isfinite(distance_px), index, -1)
+
+
+def radial_rows(
+    measure: str, real: tuple[np.ndarray, np.ndarray], rendered: tuple[np.ndarray, np.ndarray], edges_px: np.ndarray
+) -> list[RadialRow]:
+    """A measure in every bin. ``real`` and ``rendered`` are distances, px, and values, (n,) each; NaN values are left out."""
+    means = []
+    for distance, values in (real, rendered):
+        where = bin_of(distance, edges_px)
+        each = [values[(where == k) & np.isfinite(values)] for k in range(len(edges_px) - 1)]
+        means.append([float(v.mean()) if len(v) else np.nan for v in each])
+    pairs = zip(edges_px[:-1], edges_px[1:], *means, strict=True)
+    return [RadialRow(measure, float(inner), float(outer), a, b) for inner, outer, a, b in pairs]
+
+
+# Rings of the spectrum.
+SPECTRUM_BINS = 24
+# Lowest frequency, cycles for each diameter of the disc: below it the Hann window's own spectrum is seen.
+LOWEST_CYCLES = 4.0
+# Sd of a Gaussian relative to its median absolute deviation.
+GAUSSIAN_MAD = 1.4826
+# Rounds of leaving out what lies beyond three sd.
+CLIP_ROUNDS = 3
+# Kernel that leaves nothing of constant, linear and twisted surfaces and has unit gain for white noise (Immerkaer 1996).
+NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+
+
+def noise_sd(gray: np.ndarray, where: np.ndarray) -> float:
+    """Sd of the noise in gray levels, over the pixels ``where`` (H, W) bool.
+
+    Immerkaer's kernel (1996) takes constant, linear and twisted surfaces away. Edges are left out: residuals beyond three sd do not
+    count, and the first sd is that of the median absolute deviation.
+    """
+    residual = cv2.filter2D(gray.astype(np.float32), cv2.CV_32F, NOISE_KERNEL)[where]
+    sd = GAUSSIAN_MAD * float(np.median(np.abs(residual)))
+    for _ in range(CLIP_ROUNDS):
+        sd = float(np.sqrt(np.mean(residual[np.abs(residual) <= 3 * sd] ** 2)))
+    return sd
+
+
+def radial_spectrum(gray: np.ndarray, center_px: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Power against spatial frequency inside a disc.
+
+    The disc's mean is subtracted, a round Hann window is applied, and the power of the discrete Fourier transform is averaged over
+    rings of even width in log frequency. White noise of sd s has power s^2 everywhere.
+
+    Returns
+    -------
+    frequency : (b,) float
+        Cycles per px, up to 0.5; rings without a sample are left out.
+    power : (b,) float
+        Squared gray levels.
+    """
+    half = int(radius_px)
+    x, y = np.rint(center_px).astype(int)
+    if min(x, y) < half or x + half >= gray.shape[1] or y + half >= gray.shape[0]:
+        half = int(min(x, y, gray.shape[1] - 1 - x, gray.shape[0] - 1 - y))
+    patch = gray[y - half : y + half + 1, x - half : x + half + 1].astype(float)
+    v, u = np.mgrid[-half : half + 1, -half : half + 1] / half
+    r = np.hypot(u, v)
+    window = np.where(r < 1, np.cos(0.5 * np.pi * r) ** 2, 0.0)
+    patch = (patch - (patch * window).sum() / window.sum()) * window
+    power = np.abs(np.fft.fft2(patch)) ** 2 / (window**2).sum()
+    f = np.hypot(*np.meshgrid(np.fft.fftfreq(len(patch)), np.fft.fftfreq(len(patch))))
+    edges = np.geomspace(LOWEST_CYCLES / (2 * half), 0.5, SPECTRUM_BINS + 1)
+    ring = np.digitize(f.ravel(), edges) - 1
+    inside = (ring >= 0) & (ring < SPECTRUM_BINS)
+    count = np.bincount(ring[inside], minlength=SPECTRUM_BINS)
+    total = np.bincount(ring[inside], power.ravel()[inside], SPECTRUM_BINS)
+    used = count > 0
+    return np.sqrt(edges[:-1] * edges[1:])[used], total[used] / count[used]
+
+
+def log_distance_db(real: np.ndarray, rendered: np.ndarray) -> float:
+    """Rms over the rings of the ratio of two spectra, in dB."""
+    return float(np.sqrt(np.mean((10 * np.log10(rendered / real)) ** 2)))

@@ -1,0 +1,292 @@
+"""Skin and gel as one dense system: forces and a factor of the stiffness about any shape.
+
+The pins in space that one frame shows, found without knowing what touched the sensor.
+
+A frame gives the pixel of each cap, and with it the cap's ray in the gel, but not its depth along the ray. The sensor's body
+gives the depth: skin and gel are in equilibrium under some traction t on the outer skin. With x(t) the body's shape,
+Gauss-Newton minimises
+
+    sum_pins |project(cap(x)) - seen|^2 / sigma^2  +  integral over the skin at rest of t_n^2 / s_n^2 + |t_t|^2 / s_t^2
+
+over t and x together. Each step solves the equilibrium that is linearised about the present shape. The scale s_n^2 grows with
+the pressure found in the step before, and s_t^2 with a share of it (iteratively reweighted least squares: Daubechies et al. 2010).
+This states what a touch is like: it presses and does not pull, it is confined to a part of the skin, and friction needs pressure.
+A difference of a fraction of a pixel remains; each pin is moved parallel to the image to remove it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from threadpoolctl import ThreadpoolController
+
+from scenes.sensor import GelSpec, GeometrySpec, SensorSpec, ViewSpec
+from twin.camera.projection import pixel_rays, project
+from twin.geometry.solid import build_solid, pin_pose, surface_operators
+from twin.mechanics.elements import PAIRS, Elements
+from twin.mechanics.material import law_coefficients
+from twin.types import BoolArray, FloatArray, IntArray
+
+NO_STRESS = np.zeros((0, 8, 3, 3))
+"""Given stress of an elastic body: none (see ``Elements.add_forces``)."""
+SHIFT_SHARE = 1e-3
+"""A tangent that is not positive definite gets this share of its mean diagonal added, and four times more each time that is too little."""
+
+
+class SoftBody:
+    """The elastic body of one sensor.
+
+    Attributes
+    ----------
+    solid : Solid
+    free : (f,) int
+        Controls that are not clamped.
+    unknown : (n, 3) int
+        Number of each control's unknowns, control by control; -1 where clamped.
+    """
+
+    def __init__(self, geometry: GeometrySpec, gel: GelSpec) -> None:
+        solid = self.solid = build_solid(geometry)
+        soft = law_coefficients(gel, layer=False)
+        skin = Elements(solid.skin, law_coefficients(geometry.skin, layer=True), layer=True)
+        self._kinds = skin, Elements(solid.gel_top, soft), Elements(solid.gel_deep, soft)
+        self.free = np.flatnonzero(~solid.fixed)
+        self.unknown = np.full((len(solid.fixed), 3), -1)
+        self.unknown[self.free] = np.arange(3 * len(self.free)).reshape(-1, 3)
+        self._entries = [_entries(self.unknown, kind.cells.controls) for kind in self._kinds]
+
+    def forces(self, control_mm: FloatArray) -> FloatArray:
+        """Gradient of the elastic energy (3 f,) in N, by the free controls."""
+        force = np.zeros_like(control_mm)
+        for kind in self._kinds:
+            kind.add_forces(control_mm, NO_STRESS, force)
+        return force[self.free].ravel()
+
+    def factor(self, control_mm: FloatArray) -> tuple[FloatArray, bool]:
+        """Cholesky factor (single precision, as ``scipy.linalg.cho_solve`` takes it) of the tangent, made positive where it is not."""
+        size = 3 * len(self.free)
+        total = np.zeros(size * size)
+        for kind, (where, from_block) in zip(self._kinds, self._entries, strict=True):
+            controls = kind.cells.controls
+            block = np.zeros((len(controls), 6, controls.shape[1], controls.shape[1]))
+            kind.stiffness(control_mm, NO_STRESS, 0.0, block)
+            total += np.bincount(where, block.ravel()[from_block], size * size)
+        matrix, shift = total.reshape(size, size).astype(np.float32), 0.0
+        while True:
+            try:
+                return cho_factor(matrix, lower=True)
+            except LinAlgError:
+                shift = 4 * shift or SHIFT_SHARE * float(np.mean(np.diag(matrix)))
+                matrix[np.diag_indices(size)] += shift
+
+    def moved(self, control_mm: FloatArray, move_mm: FloatArray) -> FloatArray:
+        """The shape (n, 3) after a move (f, 3) of the free controls, shortened until no element is inside out."""
+        while True:
+            moved = control_mm.copy()
+            moved[self.free] += move_mm
+            if np.isfinite(sum(kind.add_forces(moved, NO_STRESS, np.zeros_like(moved)) for kind in self._kinds)):
+                return moved
+            move_mm = move_mm / 2
+
+
+def _entries(unknown: IntArray, controls: IntArray) -> tuple[IntArray, IntArray]:
+    """Where each entry of the elements' stiffness blocks goes: flat places in the lower triangle, and flat places in the blocks."""
+    m, b = controls.shape
+    size = unknown.max() + 1
+    where = np.empty((m, 6, b, b), np.int64)
+    for p, (i, k) in enumerate(PAIRS):
+        row, column = np.broadcast_arrays(unknown[controls, i][:, :, None], unknown[controls, k][:, None, :])
+        low = np.maximum(row, column) * size + np.minimum(row, column)
+        where[:, p] = np.where((row < 0) | (column < 0) | ((i == k) & (row < column)), -1, low)
+    used = np.flatnonzero(where.ravel() >= 0)
+    return where.ravel()[used], used
+
+
+STEPS = 14
+"""Most steps of Gauss-Newton."""
+SETTLED_MM = 0.01
+"""The fit ends after a step in which no control moves farther than this."""
+LARGEST_MOVE_MM = 2.0
+"""No control moves farther than this in one step: the linearised equilibrium is trusted no farther."""
+EVEN_STEPS = 2
+"""The first steps take the same s everywhere, because there is no estimate of the pressure yet."""
+OUTLINE_CORNERS = 48
+"""Corners of the polygon that stands for a cap's outline."""
+PROBE_MM = 1e-4
+"""Step of the difference quotient that gives the derivative of the projection."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed before a frame is seen.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Error of a pin in the image: of its detection, and of the specification's layout and camera.
+    traction_mpa : float
+        A usual traction: over 1 mm^2 of skin it counts as much as an error of ``sigma_px`` of one coordinate.
+    floor_mpa : float
+        Pressure that counts as none.
+    friction : float
+        Tangential traction relative to the pressure.
+    """
+
+    sigma_px: float = 0.1
+    traction_mpa: float = 0.02
+    floor_mpa: float = 0.001
+    friction: float = 0.5
+
+
+@dataclass(frozen=True)
+class FittedPins:
+    """Pins of a fitted skin, in the sensor frame and the specification's order: a state for the renderer.
+
+    Attributes
+    ----------
+    base_mm, axis, caps_mm : (N, 3) float
+        As ``PinRest``.
+    remainder_px : (N,) float
+        By how much the smooth skin misses each pin in the image; NaN for lost pins.
+    force_n : (3,) float
+        Sum of the tractions found, on the skin.
+    """
+
+    base_mm: FloatArray
+    axis: FloatArray
+    caps_mm: FloatArray
+    remainder_px: FloatArray
+    force_n: FloatArray
+
+
+def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArray, axis: FloatArray) -> FloatArray:
+    """(N, 2) px from the projected centre of each cap's disc to the centroid of its projected outline (polygon area formula)."""
+    turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS + 1)[:, None, None]
+    u = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    rim = caps_mm + 0.5 * cap_diameter_mm * (np.cos(turn) * u + np.sin(turn) * np.cross(axis, u))
+    p = project(view, rim) - project(view, caps_mm)
+    twice = p[:-1, :, 0] * p[1:, :, 1] - p[1:, :, 0] * p[:-1, :, 1]
+    return ((p[:-1] + p[1:]) * twice[..., None]).sum(axis=0) / (3 * twice.sum(axis=0))[:, None]
+
+
+class SkinFit:
+    """Fits pins of one sensor to frames; what depends on the sensor alone is computed once, when it is made.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    prior : Prior, optional
+    """
+
+    def __init__(self, spec: SensorSpec, *, prior: Prior | None = None) -> None:
+        self.spec, self.prior = spec, prior or Prior()
+        self._blas = ThreadpoolController()
+        self._view = spec.view
+        self._body = SoftBody(spec.geometry, spec.gel)
+        solid = self._solid = self._body.solid
+        at, weights = (a.ravel() for a in solid.basis.gauss(2))
+        v, u = (g.ravel() for g in np.meshgrid(at, at, indexing="ij"))
+        value, *slopes = surface_operators(solid.basis, np.column_stack([u, v]))
+        self._outer = slice(solid.basis.count**2)
+        moving = ~solid.fixed[self._outer]
+        self._value, self._slopes = sparse.csr_array(value[:, moving]), [sparse.csr_array(s) for s in slopes]
+        across = np.cross(*(s @ solid.control_mm[self._outer] for s in self._slopes))
+        self._area_mm2 = np.linalg.norm(across, axis=1) * np.outer(weights, weights).ravel()
+        self._mass = (self._value.T @ (self._area_mm2[:, None] * self._value)).toarray()  # traction coefficients to forces
+        self._loaded = self._body.unknown[self._outer][moving]  # (m, 3) unknowns that carry the traction
+
+    def __call__(self, pins_px: FloatArray, *, centroids: bool = True) -> FittedPins:
+        """Fit one frame.
+
+        Parameters
+        ----------
+        pins_px : (N, 2) float
+            Raw-frame px, specification's order; NaN where lost: such pins follow the skin.
+        centroids : bool
+            ``pins_px`` are centroids of caps as seen, not projections of their centres.
+
+        Raises
+        ------
+        ValueError
+            Not N pins, or fewer than half of them seen.
+        """
+        pins_px = np.asarray(pins_px, float)
+        count = self.spec.pins.count
+        if pins_px.shape != (count, 2):
+            raise ValueError(f"expected pins_px of shape ({count}, 2) for {self.spec.name}, got {pins_px.shape}")
+        seen: BoolArray = np.all(np.isfinite(pins_px), axis=1)
+        if 2 * seen.sum() < count:
+            raise ValueError(f"{seen.sum()} of {count} pins are too few to fit a skin to; at least half are needed")
+        control, traction = self._solid.control_mm.copy(), np.zeros(self._area_mm2.shape + (3,))
+        with self._blas.limit(limits=1, user_api="blas"):  # many threads are slower on matrices this small
+            for step in range(STEPS):
+                target_px = pins_px - self._offset_px(control) * centroids
+                move, traction = self._step(control, target_px, seen, traction, even=step < EVEN_STEPS)
+                largest = np.abs(move).max()
+                control = self._body.moved(control, move * min(1.0, LARGEST_MOVE_MM / largest))
+                if step >= EVEN_STEPS and largest < SETTLED_MM:
+                    break
+            pins = self._on_rays(control, pins_px - self._offset_px(control) * centroids, seen)
+        return replace(pins, force_n=self._area_mm2 @ traction)
+
+    def _offset_px(self, control: FloatArray) -> FloatArray:
+        _, axis, cap = pin_pose(self._solid, control)
+        return centroid_offset_px(self._view, self.spec.pins.cap_diameter_mm, cap, axis)
+
+    def _on_rays(self, control: FloatArray, target_px: FloatArray, seen: BoolArray) -> FittedPins:
+        """Pins of a shape, the seen ones shifted parallel to the image onto their rays."""
+        base, axis, cap = pin_pose(self._solid, control)
+        remainder = np.where(seen, np.linalg.norm(project(self._view, cap) - target_px, axis=1), np.nan)
+        place, along = pixel_rays(self._view, np.where(seen[:, None], target_px, 0.0))
+        on_ray = place + along * ((cap[:, 2] - place[:, 2]) / along[:, 2])[:, None]
+        shift = np.where(seen[:, None], on_ray - cap, 0.0)
+        return FittedPins(base + shift, axis, cap + shift, remainder, np.zeros(3))
+
+    def _step(
+        self, control: FloatArray, target_px: FloatArray, seen: BoolArray, traction: FloatArray, *, even: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        """Move (f, 3) of the free controls, and the traction (q, 3) in MPa at the skin's points that goes with it."""
+        factor, force = self._body.factor(control), self._body.forces(control)
+        seen_px, per_control = self._pin_rows(control, seen)
+        reach = cho_solve(factor, per_control.T)  # (unknowns, 2 pins): how far a force moves the pins
+        rows = np.einsum("ab,bip->pai", self._mass, reach[self._loaded], optimize=True).reshape(len(per_control), -1)
+        wanted = (target_px[seen] - seen_px).ravel() + reach.T @ force
+        sigma2 = self.prior.sigma_px**2
+        normal = rows.T @ rows / sigma2 + self._cost(control, traction, even=even)
+        coefficients = cho_solve(cho_factor(normal), rows.T @ wanted / sigma2).reshape(-1, 3)
+        load = -force
+        load[self._loaded] += self._mass @ coefficients
+        return cho_solve(factor, load).reshape(-1, 3), self._value @ coefficients
+
+    def _cost(self, control: FloatArray, traction: FloatArray, *, even: bool) -> FloatArray:
+        """Quadratic form (3 m, 3 m) of the traction's coefficients, weighted by the traction (q, 3) of the step before."""
+        prior = self.prior
+        outward = np.cross(*(s @ control[self._outer] for s in self._slopes))
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        pressure = np.full(len(outward), prior.traction_mpa) if even else np.maximum(-(traction * outward).sum(axis=1), 0)
+        across = self._area_mm2 / (prior.traction_mpa * (prior.friction * pressure + prior.floor_mpa))
+        along = self._area_mm2 / (prior.traction_mpa * (pressure + prior.floor_mpa)) - across
+        count = len(self._loaded)
+        form = np.zeros((count, 3, count, 3))
+        for i, j in PAIRS:
+            weight = along * outward[:, i] * outward[:, j] + across * (i == j)
+            form[:, i, :, j] = form[:, j, :, i] = (self._value.T @ (weight[:, None] * self._value)).toarray()
+        return form.reshape(3 * count, 3 * count)
+
+    def _pin_rows(self, control: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Projections (s, 2) of the seen caps, and their derivative (2 s, unknowns) by the free controls."""
+        solid, inner = self._solid, control[self._solid.inner]
+        _, axis, cap = pin_pose(solid, control)
+        slopes = solid.pin_slope_u, solid.pin_slope_v
+        t = np.stack([s @ inner for s in slopes], axis=1)
+        dual = np.linalg.inv(t @ t.swapaxes(1, 2)) @ t
+        here = project(self._view, cap)
+        per_mm = np.stack([(project(self._view, cap + PROBE_MM * unit) - here) / PROBE_MM for unit in np.eye(3)], axis=2)
+        rows = np.zeros((seen.sum(), 2, len(control), 3))
+        part = solid.pin_value[seen, None, :, None] * per_mm[seen, :, None, :]
+        for slope, toward in zip(slopes, dual.swapaxes(0, 1), strict=True):  # the axis turns as the normal: d a = -t^c (a . d t_c)
+            lever = -solid.pin_cap_length_mm * np.einsum("pki,pi->pk", per_mm, toward)
+            part += slope[seen, None, :, None] * (lever[..., None] * axis[:, None])[seen, :, None, :]
+        rows[:, :, solid.inner] = part
+        return here[seen], rows[:, :, self._body.free].reshape(2 * seen.sum(), -1)

@@ -1,0 +1,91 @@
+"""Exact signed distances of simple solids.
+
+Every solid has ``probe`` (so ``distance`` and ``gradient``) and ``unroll``: two coordinates (k, 2) in mm along the
+surface below a point, with their gradients (k, 2, 3) and Hessians (k, 2, 3, 3) in 1/mm, on which a texture is wrapped.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.objects import kernels
+from twin.objects.level_set import Probe, Wrapped, rows
+from twin.types import FloatArray
+
+
+def project_on_xy(points_mm: FloatArray) -> Probe:
+    """Texture coordinates of a pattern projected along z."""
+    slopes = np.zeros((len(points_mm), 2, 3))
+    slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
+    return points_mm[:, :2].copy(), slopes, np.zeros((len(points_mm), 2, 3, 3))
+
+
+@dataclass(frozen=True)
+class Plane(Wrapped):
+    """Half space z >= 0."""
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        return kernels.plane(rows(points_mm))
+
+    def unroll(self, points_mm: FloatArray) -> Probe:
+        return project_on_xy(points_mm)
+
+
+@dataclass(frozen=True)
+class Sphere(Wrapped):
+    """Ball behind its pole at the origin. A texture is projected along z."""
+
+    radius_mm: float
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        return kernels.round_solid(rows(points_mm), self.radius_mm, 0.0)
+
+    def unroll(self, points_mm: FloatArray) -> Probe:
+        return project_on_xy(points_mm)
+
+
+@dataclass(frozen=True)
+class Cylinder(Wrapped):
+    """Cylinder along y that touches the origin from z > 0."""
+
+    radius_mm: float
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        return kernels.round_solid(rows(points_mm), self.radius_mm, 1.0)
+
+    def unroll(self, points_mm: FloatArray) -> Probe:
+        return kernels.unroll_cylinder(rows(points_mm), self.radius_mm)
+
+
+@dataclass(frozen=True)
+class Edge(Wrapped):
+    """Quarter space x >= 0, z >= 0, its edge rounded by a fillet (which takes the edge back from the origin)."""
+
+    fillet_mm: float
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        return kernels.edge(rows(points_mm), self.fillet_mm)
+
+    def unroll(self, points_mm: FloatArray) -> Probe:
+        return project_on_xy(points_mm)
+
+
+@dataclass(frozen=True)
+class Prism(Wrapped):
+    """Regular polygon in x-z extruded along y, edges rounded, faces leaning by a taper about x.
+
+    Face 0 passes through the origin and looks to -z; with a positive taper its normal leans to +y
+    (the prism narrows towards +y). The rounded solid is the polyhedron moved in by the fillet,
+    grown by the fillet.
+    """
+
+    sides: int
+    inradius_mm: float
+    fillet_mm: float
+    taper_rad: float
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        return kernels.prism(rows(points_mm), self.sides, self.inradius_mm, self.fillet_mm, self.taper_rad)
+
+    def unroll(self, points_mm: FloatArray) -> Probe:
+        return kernels.unroll_prism(rows(points_mm), self.sides, self.inradius_mm)

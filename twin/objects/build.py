@@ -1,0 +1,132 @@
+"""A wire mesh wrapped on a solid.
+
+From an object's specification to its signed-distance field."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numba
+import numpy as np
+
+from scenes.object import CylinderShape, EdgeShape, MeshShape, ObjectSpec, PlaneShape, PrismShape, SphereShape
+from twin.objects.analytic import Cylinder, Edge, Plane, Prism, Sphere
+from twin.objects.level_set import Probe, Probed, Wrapped, unit_normals
+from twin.objects.mesh_field import load_mesh_field
+from twin.types import FloatArray
+
+_BLEND = 0.15
+"""Length over which wires and base are blended into each other, as a share of the wire's diameter."""
+_CREASE_MM = 1e-3
+"""Nearer to a wire's axis than this the field counts as not curved."""
+
+
+@dataclass(frozen=True)
+class WireMesh(Probed):
+    """Round wires that lie on the base's surface in two crossing families; one wire of each family passes over the origin.
+
+    A wire's distance is sqrt((D - d/2)^2 + s^2) - d/2 with the base's distance D, the wire's
+    diameter d and the distance s along the surface to the nearest wire; base and wires are joined
+    by the polynomial smooth minimum (Quilez), which only adds material.
+    """
+
+    base: Wrapped
+    pitch_mm: float
+    wire_diameter_mm: float
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        distance, slope, hessian = self.base.probe(points_mm)
+        along, along_slope, along_bend = self.base.unroll(points_mm)
+        _lay_wires(distance, slope, hessian, along, along_slope, along_bend, self.pitch_mm, self.wire_diameter_mm)
+        unit_normals(slope, hessian)
+        return distance, slope, hessian
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _lay_wires(
+    distance: FloatArray,
+    slope: FloatArray,
+    hessian: FloatArray,
+    along: FloatArray,
+    along_slope: FloatArray,
+    along_bend: FloatArray,
+    pitch: float,
+    diameter: float,
+) -> None:
+    """Join both families of wires to the base's distance (k,), slope (k, 3) and Hessian (k, 3, 3), in place."""
+    radius, blend = diameter / 2, _BLEND * diameter
+    base, base_bend, wire = np.empty(3), np.empty((3, 3)), np.empty(3)
+    for k in range(len(distance)):
+        lift = distance[k] - radius
+        for i in range(3):
+            base[i] = slope[k, i]
+            for j in range(3):
+                base_bend[i, j] = hessian[k, i, j]
+        for family in range(2):
+            s = along[k, family] - pitch * np.floor(along[k, family] / pitch + 0.5)
+            away = max(np.sqrt(lift * lift + s * s), 1e-9)
+            # smooth minimum of a, b: (1 - w) a + w b - blend w (1 - w), w = (1 + (a - b) / blend) / 2 kept in 0..1
+            w = min(0.5 + (distance[k] - away + radius) / (2 * blend), 1.0)
+            if w <= 0:
+                continue
+            distance[k] = (1 - w) * distance[k] + w * (away - radius) - blend * w * (1 - w)
+            for i in range(3):
+                wire[i] = (lift * base[i] + s * along_slope[k, family, i]) / away
+            turning = w / away if away > _CREASE_MM else 0.0
+            joining = 1 / (2 * blend) if w < 1 else 0.0
+            for i in range(3):
+                for j in range(i, 3):
+                    bend = base[i] * base[j] + lift * base_bend[i, j] - wire[i] * wire[j]
+                    bend += along_slope[k, family, i] * along_slope[k, family, j] + s * along_bend[k, family, i, j]
+                    bend = (1 - w) * hessian[k, i, j] + turning * bend
+                    hessian[k, i, j] = bend - joining * (slope[k, i] - wire[i]) * (slope[k, j] - wire[j])
+                    hessian[k, j, i] = hessian[k, i, j]
+            for i in range(3):
+                slope[k, i] = (1 - w) * slope[k, i] + w * wire[i]
+
+
+class ObjectField(Protocol):
+    """A solid in the object frame, as a signed-distance field at points (k, 3) in mm."""
+
+    def distance(self, points_mm: FloatArray) -> FloatArray:
+        """(k,) in mm, positive outside."""
+        ...
+
+    def gradient(self, points_mm: FloatArray) -> FloatArray:
+        """(k, 3) unit, outwards."""
+        ...
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        """Distance (k,), gradient (k, 3) and Hessian (k, 3, 3) in 1/mm, in one evaluation.
+
+        The Hessian is the second derivative of the distance: symmetric, with the gradient in its null space, zero across
+        creases. Where a field is no exact distance it is the derivative of the unit gradient along the level set.
+        """
+        ...
+
+
+def build_field(spec: ObjectSpec) -> ObjectField:
+    """The signed-distance field of an object, with its texture.
+
+    Raises
+    ------
+    MeshError
+        If a mesh file is not closed, in the wrong unit, empty or unreadable.
+    """
+    shape = spec.shape
+    base: Wrapped
+    match shape:
+        case PlaneShape():
+            base = Plane()
+        case SphereShape():
+            base = Sphere(shape.radius_mm)
+        case CylinderShape():
+            base = Cylinder(shape.radius_mm)
+        case EdgeShape():
+            base = Edge(shape.fillet_mm)
+        case PrismShape():
+            base = Prism(shape.sides, shape.inradius_mm, shape.fillet_mm, np.radians(shape.taper_deg))
+        case MeshShape():
+            base = load_mesh_field(shape)
+    if spec.texture is not None:
+        return WireMesh(base, spec.texture.pitch_mm, spec.texture.wire_diameter_mm)
+    return base

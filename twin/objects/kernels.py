@@ -1,0 +1,143 @@
+"""Exact distance (k,), unit gradient (k, 3) and Hessian (k, 3, 3) of simple solids at points (k, 3), one pass each.
+
+Around a point, a sphere or a straight line at a distance r, the Hessian of the distance is (I - n n - a a) / r
+with the normal n and the line's direction a (none for a point); over a flat face it is zero.
+"""
+
+import numba
+import numpy as np
+
+from twin.objects.level_set import Probe, Triple
+from twin.types import FloatArray
+
+_CREASE_MM = 1e-3
+"""A surface with a smaller radius of curvature counts as a crease, which has no Hessian."""
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _results(count: int) -> Probe:
+    return np.empty(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple, radius: float) -> None:
+    """Point k's normal n and (I - n n - a a) / radius; plain numbers, since slices of arrays cost more than the sums."""
+    normal[k, 0], normal[k, 1], normal[k, 2] = n
+    if radius > _CREASE_MM:
+        r = 1 / radius
+        hessian[k, 0, 0] = r * (1 - n[0] * n[0] - a[0] * a[0])
+        hessian[k, 1, 1] = r * (1 - n[1] * n[1] - a[1] * a[1])
+        hessian[k, 2, 2] = r * (1 - n[2] * n[2] - a[2] * a[2])
+        hessian[k, 0, 1] = hessian[k, 1, 0] = -r * (n[0] * n[1] + a[0] * a[1])
+        hessian[k, 0, 2] = hessian[k, 2, 0] = -r * (n[0] * n[2] + a[0] * a[2])
+        hessian[k, 1, 2] = hessian[k, 2, 1] = -r * (n[1] * n[2] + a[1] * a[2])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def plane(points: FloatArray) -> Probe:
+    distance, normal, hessian = _results(len(points))
+    for k in range(len(points)):
+        distance[k] = -points[k, 2]
+        normal[k, 2] = -1.0
+    return distance, normal, hessian
+
+
+@numba.njit(cache=True, error_model="numpy")
+def round_solid(points: FloatArray, radius: float, along_y: float) -> Probe:
+    """Ball, or cylinder along y (``along_y`` 1.0, for the ball 0.0), behind the origin."""
+    distance, normal, hessian = _results(len(points))
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1] * (1 - along_y), points[k, 2] - radius
+        away = np.sqrt(x * x + y * y + z * z)
+        distance[k] = away - radius
+        n = (x / away, y / away, z / away) if away > 0 else (0.0, 0.0, -1.0)
+        _write(normal, hessian, k, n, (0.0, along_y, 0.0), away)
+    return distance, normal, hessian
+
+
+@numba.njit(cache=True, error_model="numpy")
+def edge(points: FloatArray, fillet: float) -> Probe:
+    distance, normal, hessian = _results(len(points))
+    for k in range(len(points)):
+        # how far the point lies in front of the faces moved in by the fillet
+        x, z = fillet - points[k, 0], fillet - points[k, 2]
+        if x > 0 and z > 0:
+            away = np.sqrt(x * x + z * z)
+            distance[k] = away - fillet
+            _write(normal, hessian, k, (-x / away, 0.0, -z / away), (0.0, 1.0, 0.0), away)
+        else:
+            face = 0 if x >= z else 2
+            distance[k] = -points[k, face]
+            normal[k, face] = -1.0
+    return distance, normal, hessian
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sector(x: float, z: float, sides: int) -> int:
+    """Number of the nearest face around the axis."""
+    return int(np.floor(np.arctan2(x, -z) * sides / (2 * np.pi) + 0.5))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper: float) -> Probe:
+    """A point is folded into the sector of its nearest face, into coordinates out, along the face, y.
+
+    There the nearest point of the polyhedron moved in by the fillet lies on that face or on the edge between two faces.
+    """
+    distance, normal, hessian = _results(len(points))
+    lean_out, lean_y = np.cos(taper), np.sin(taper)
+    half = np.tan(np.pi / sides)
+    size = np.sqrt(1 + (lean_y * half) ** 2)
+    edge_out, edge_along, edge_y = -lean_y / size, -lean_y * half / size, lean_out / size
+    corner = inradius - fillet / lean_out
+    turns = [(np.cos(2 * np.pi / sides * face), np.sin(2 * np.pi / sides * face)) for face in range(sides)]
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2] - inradius
+        cos, sin = turns[_sector(x, z, sides) % sides]
+        out, along = x * sin - z * cos, x * cos + z * sin
+        mirror = -1.0 if along < 0 else 1.0
+        along = abs(along)
+        height = out * lean_out + y * lean_y - (inradius * lean_out - fillet)
+        p, q, r = lean_out, 0.0, lean_y
+        away = 0.0
+        distance[k] = height - fillet
+        if height > 0 and along > (out - height * lean_out) * half:
+            p, q, r = out - corner, along - corner * half, y
+            slide = p * edge_out + q * edge_along + r * edge_y
+            p, q, r = p - slide * edge_out, q - slide * edge_along, r - slide * edge_y
+            away = np.sqrt(p * p + q * q + r * r)
+            distance[k] = away - fillet
+            p, q, r = p / away, q / away, r / away
+        n = (p * sin + q * mirror * cos, r, -p * cos + q * mirror * sin)
+        a = (edge_out * sin + edge_along * mirror * cos, edge_y, -edge_out * cos + edge_along * mirror * sin)
+        _write(normal, hessian, k, n, a, away)
+    return distance, normal, hessian
+
+
+@numba.njit(cache=True, error_model="numpy")
+def unroll_cylinder(points: FloatArray, radius: float) -> Probe:
+    along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
+    for k in range(len(points)):
+        x, z = points[k, 0], points[k, 2] - radius
+        square = max(x * x + z * z, _CREASE_MM**2)
+        along[k, 0], along[k, 1] = radius * np.arctan2(x, -z), points[k, 1]
+        slope[k, 0, 0], slope[k, 0, 2] = -z * radius / square, x * radius / square
+        slope[k, 1, 1] = 1.0
+        bend[k, 0, 0, 0] = 2 * x * z * radius / square**2
+        bend[k, 0, 2, 2] = -bend[k, 0, 0, 0]
+        bend[k, 0, 0, 2] = bend[k, 0, 2, 0] = (z * z - x * x) * radius / square**2
+    return along, slope, bend
+
+
+@numba.njit(cache=True, error_model="numpy")
+def unroll_prism(points: FloatArray, sides: int, inradius: float) -> Probe:
+    along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
+    width = 2 * inradius * np.tan(np.pi / sides)
+    for k in range(len(points)):
+        x, z = points[k, 0], points[k, 2] - inradius
+        number = _sector(x, z, sides)
+        face = 2 * np.pi / sides * number
+        cos, sin = np.cos(face), np.sin(face)
+        along[k, 0], along[k, 1] = x * cos + z * sin + number * width, points[k, 1]
+        slope[k, 0, 0], slope[k, 0, 2], slope[k, 1, 1] = cos, sin, 1.0
+    return along, slope, bend

@@ -1,0 +1,174 @@
+"""Triangle meshes from files: read, checked, in mm, put down on the origin.
+
+Closed triangle meshes as smooth signed-distance fields: sampled once, read by a tricubic spline."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.ndimage import spline_filter
+
+from scenes.object import MeshShape
+from twin.errors import MeshError
+from twin.objects.analytic import project_on_xy
+from twin.objects.level_set import Probe, Wrapped, rows, unit_normals
+from twin.objects.mesh_distance import signed_distance
+from twin.objects.spline import spline_probe, spline_value
+from twin.store import cached_arrays
+from twin.types import FloatArray
+
+_UNIT_REMEDY = "scale the file to mm, or name its unit in a TOML: shape = { kind = 'mesh', file = ..., unit = ... } (mm, cm, m or inch)"
+_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+_SMALLEST_MM = 1.0
+"""An object whose largest side is shorter was most likely given in another unit."""
+_LARGEST_MM = 2000.0
+"""An object whose largest side is longer was most likely given in another unit."""
+
+
+def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:
+    """A closed mesh in mm, faces wound outwards; errors as ``load_mesh_field``."""
+    try:
+        mesh = trimesh.load(file, force="mesh", process=True)
+    except Exception as error:  # trimesh's readers raise whatever their parsers raise
+        raise MeshError(f"{file}: not readable as a triangle mesh ({error}); give an STL, OBJ or PLY file") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise MeshError(f"{file}: no triangles in it; export a closed surface")
+    mesh.apply_scale(_MM[unit])
+    size_mm = float(mesh.extents.max())
+    if not np.isfinite(size_mm) or size_mm < _SMALLEST_MM:
+        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too small; {_UNIT_REMEDY}")
+    if size_mm > _LARGEST_MM:
+        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too large; {_UNIT_REMEDY}")
+    if not mesh.is_watertight:
+        _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+        raise MeshError(
+            f"{file}: not watertight: {np.count_nonzero(uses != 2)} open edges; close it (Blender: 3D-Print toolbox > Make Manifold; "
+            f"or trimesh.repair.fill_holes) and try again"
+        )
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
+
+
+def place_mesh(mesh: trimesh.Trimesh, *, rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    """Turn a mesh (intrinsic x, y, z), then centre it in x and y and put its lowest point over x = y = 0 at the origin.
+
+    A mesh with a hole there is put down on its lowest vertex.
+    """
+    mesh = mesh.copy()
+    x, y, z = np.radians(rotation_deg)
+    mesh.apply_transform(trimesh.transformations.euler_matrix(x, y, z, axes="rxyz"))
+    middle = mesh.bounds.mean(axis=0)
+    mesh.apply_translation([-middle[0], -middle[1], 0.0])
+    triangles = mesh.triangles
+    lowest = triangles[:, :, 2].min()
+    crossing = _heights_at_origin(triangles)
+    mesh.apply_translation([0.0, 0.0, -(crossing.min() if len(crossing) else lowest)])
+    return mesh
+
+
+def _heights_at_origin(triangles: FloatArray) -> FloatArray:
+    """z where the line x = y = 0 crosses the triangles (k, 3, 3)."""
+    a, b, c = triangles[:, 0, :2], triangles[:, 1, :2], triangles[:, 2, :2]
+
+    def cross(p: FloatArray, q: FloatArray) -> FloatArray:
+        return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+
+    shares = np.stack([cross(b, c), cross(c, a), cross(a, b)], axis=1)
+    area = shares.sum(axis=1)
+    scale = np.abs(area) > 1e-12
+    shares = shares[scale] / area[scale, None]
+    hit = (shares >= -1e-9).all(axis=1)
+    return (shares[hit] * triangles[scale][hit][:, :, 2]).sum(axis=1)
+
+
+_REACH_MM = 40.0
+"""The mesh is sampled up to this far from the origin along each axis: the dome, and how far it is sheared."""
+_MARGIN_MM = 4.0
+"""The grid goes on this far beyond the sampled part of the mesh."""
+_NODES = 250_000
+"""Nodes of the grid: sampling takes about 1 s, and the grid 2 MB."""
+_FINEST_MM = 0.25
+"""The grid's lines are never closer than this."""
+
+
+@dataclass(frozen=True)
+class MeshField(Wrapped):
+    """Signed distance on a regular grid, interpolated by the tricubic B-spline through its nodes (C2).
+
+    Outside the grid the distance to the grid is added: positive, and never too small.
+
+    Attributes
+    ----------
+    corner_mm : (3,) float
+        First node.
+    spacing_mm : float
+    coefficients : (a, b, c) float
+        B-spline coefficients.
+    """
+
+    corner_mm: FloatArray
+    spacing_mm: float
+    coefficients: FloatArray
+
+    def distance(self, points_mm: FloatArray) -> FloatArray:
+        return spline_value(self.coefficients, self.corner_mm, self.spacing_mm, rows(points_mm))
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        distance, slope, hessian = spline_probe(self.coefficients, self.corner_mm, self.spacing_mm, rows(points_mm))
+        unit_normals(slope, hessian)
+        return distance, slope, hessian
+
+    def unroll(self, points_mm: FloatArray) -> Probe:
+        return project_on_xy(points_mm)
+
+
+def load_mesh_field(shape: MeshShape) -> MeshField:
+    """Read, check, place and sample a mesh; the same file and placement is sampled only once, and kept on disk.
+
+    Raises
+    ------
+    MeshError
+        If the file is unreadable, empty, not closed, or its size suggests another unit.
+    """
+    path = Path(shape.file)
+    if not path.is_file():
+        raise MeshError(f"{path}: no such mesh file; give the path of an existing STL, OBJ or PLY")
+    try:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise MeshError(f"{path}: not readable ({error.strerror}); give a file that may be read") from error
+    return _sampled(str(path), digest, shape.unit, shape.rotation_deg)
+
+
+@lru_cache(maxsize=8)
+def _sampled(file: str, digest: str, unit: str, rotation_deg: tuple[float, float, float]) -> MeshField:
+    key = {
+        "file": [digest, Path(file).suffix.lower()],
+        "placement": [unit, list(rotation_deg)],
+        "grid": [_REACH_MM, _MARGIN_MM, _NODES, _FINEST_MM],
+    }
+
+    def sample() -> dict[str, FloatArray]:
+        field = sample_mesh(place_mesh(read_mesh(file, unit=unit), rotation_deg=rotation_deg))
+        return {"corner_mm": field.corner_mm, "spacing_mm": np.array(field.spacing_mm), "coefficients": field.coefficients}
+
+    kept = cached_arrays("mesh-field", key, sample)
+    return MeshField(kept["corner_mm"], float(kept["spacing_mm"]), kept["coefficients"])
+
+
+def sample_mesh(mesh: trimesh.Trimesh) -> MeshField:
+    """Sample a placed mesh around the origin, as fine as ``_NODES`` allows."""
+    low = np.maximum(mesh.bounds[0], [-_REACH_MM, -_REACH_MM, -_REACH_MM]) - _MARGIN_MM
+    high = np.minimum(mesh.bounds[1], [_REACH_MM, _REACH_MM, _REACH_MM]) + _MARGIN_MM
+    spacing = max(_FINEST_MM, float(np.prod(high - low) / _NODES) ** (1 / 3))
+    counts = np.ceil((high - low) / spacing).astype(int) + 1
+    axes = [low[k] + spacing * np.arange(counts[k]) for k in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    coefficients = spline_filter(signed_distance(mesh, points).reshape(counts), order=3, mode="mirror")
+    return MeshField(low, spacing, coefficients)

@@ -1,0 +1,37 @@
+"""From frames to labelled pins and their graphs.
+
+Ways to find pins, ours and others', behind one call; and their parameters found from frames.
+
+A sensor's state of health, told from a few of its frames."""
+
+from twin.pins.check import Finding, Grade, examine
+from twin.pins.detector import Detector, Found, make_detector
+from twin.pins.detector_spec import METHODS, DetectorSpec, load_detector, shipped_detector, write_detector
+from twin.pins.graph import features, make_graph
+from twin.pins.pipeline import Pipeline, measure_reference, require_untouched
+from twin.pins.reference import Reference, make_reference, nominal_reference
+from twin.pins.tune import Tuned, tune
+
+__all__ = [
+    "Detector",
+    "DetectorSpec",
+    "Finding",
+    "Found",
+    "Grade",
+    "METHODS",
+    "Pipeline",
+    "Reference",
+    "Tuned",
+    "examine",
+    "features",
+    "load_detector",
+    "make_detector",
+    "make_graph",
+    "make_reference",
+    "measure_reference",
+    "nominal_reference",
+    "require_untouched",
+    "shipped_detector",
+    "tune",
+    "write_detector",
+]

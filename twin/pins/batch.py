@@ -1,0 +1,195 @@
+"""A picture of what the pipeline saw.
+
+The pipeline over a whole recording, written to a folder."""
+
+from collections.abc import Callable
+from itertools import chain, count
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError
+from twin.frames import Recording, open_recording
+from twin.frames.forms import blob_spec, gray_levels
+from twin.frames.recording import BadFrame
+from twin.pins.pipeline import Pipeline, measure_reference
+from twin.pins.reference import Reference, nominal_reference
+from twin.store import made_by, unwritten, write_bytes, write_json, write_npz
+from twin.types import Form, Frame, Observation
+
+# Colours of edges, found pins, places of lost pins, and rejected blobs.
+EDGE_RGB, FOUND_RGB, LOST_RGB, EXTRA_RGB = (90, 110, 160), (60, 220, 60), (255, 60, 60), (255, 210, 0)
+# What is drawn is at most this far from the frame's origin, px: farther off, OpenCV's integers would overflow.
+FARTHEST_PX = 1e4
+
+
+def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
+    """(H, W, 3) uint8 RGB: the frame, its graph, found pins (green), predicted places of lost ones (red), rejected blobs (yellow)."""
+    gray = cv2.resize(gray_levels(frame.image), None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    canvas = cv2.cvtColor(gray // 2, cv2.COLOR_GRAY2RGB)
+
+    def place(px: np.ndarray) -> list[list[int]]:
+        px = px[np.isfinite(px).all(axis=1)]
+        return np.round((np.clip(px, -FARTHEST_PX, FARTHEST_PX) + 0.5) * scale - 0.5).astype(int).tolist()
+
+    if observation.graph is not None:
+        nodes = place(observation.graph.nodes_px)
+        for i, j in observation.graph.edges:
+            if i < j:
+                cv2.line(canvas, nodes[i], nodes[j], EDGE_RGB, 1, cv2.LINE_AA)
+    for px in place(observation.pins_px):
+        cv2.circle(canvas, px, 2, FOUND_RGB, -1, cv2.LINE_AA)
+    for px in place(observation.predicted_px):
+        cv2.circle(canvas, px, 5, LOST_RGB, 1, cv2.LINE_AA)
+    for px in place(observation.extra_px):
+        cv2.circle(canvas, px, 6, EXTRA_RGB, 1, cv2.LINE_AA)
+    text = f"{frame.name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
+    cv2.putText(canvas, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
+    return canvas
+
+
+def overlay_name(frame_name: str, taken: set[str]) -> str:
+    """File name for a frame's picture, distinct from those in ``taken`` (in lower case), to which it is added."""
+    stem = Path(frame_name).stem
+    tries = chain((f"{stem}.png", f"{frame_name}.png"), (f"{stem}_{k}.png" for k in count(2)))
+    name = next(name for name in tries if name.casefold() not in taken)
+    taken.add(name.casefold())
+    return name
+
+
+UNMEASURED = "specification"  # in place of a no-contact frame's name
+
+
+def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
+    """The recording's own no-contact layout and its frame's name; without a usable no-contact frame the specification's layout.
+
+    The reason why a no-contact frame cannot be used is added to ``problems``.
+    """
+    if recording.reference is not None:
+        try:
+            return measure_reference(spec, recording.form, recording.reference), recording.reference.name
+        except FrameError as error:
+            problems.append(str(error))
+    return nominal_reference(spec, recording.form), UNMEASURED
+
+
+def _timing(observations: list[Observation]) -> dict[str, dict[str, float]]:
+    """Median, 95 and 99 % of the milliseconds of each stage, without the first frame, which also loads the compiled code."""
+    if not observations:
+        return {}
+    warm = observations[1:] or observations
+    stages = {stage: [o.ms[stage] for o in warm] for stage in observations[0].ms}
+    return {s: dict(zip(("p50", "p95", "p99"), np.percentile(ms, (50, 95, 99)).round(4).tolist(), strict=True)) for s, ms in stages.items()}
+
+
+def _arrays(names: list[str], observations: list[Observation], n: int) -> dict[str, np.ndarray]:
+    """What ``pins.npz`` holds of M frames with ``n`` pins."""
+    none = np.full(n, np.nan)
+    areas = [none if o.graph is None else o.graph.area_px2 for o in observations]
+    return {
+        "image_name": np.array(names, str),
+        "pins_px": np.array([o.pins_px for o in observations], float).reshape(-1, n, 2),
+        "predicted_px": np.array([o.predicted_px for o in observations], float).reshape(-1, n, 2),
+        "area_px2": np.array(areas, float).reshape(-1, n),
+        "found": np.array([o.found for o in observations], int),
+        "valid": np.array([o.valid for o in observations], bool),
+    }
+
+
+def _nothing_found(path: str | Path, summary: dict, summary_path: Path) -> str:
+    bad = summary["invalid"] + summary["failed"]
+    return (
+        f"{path}: the pins were found in none of {len(bad)} frames; the first, {bad[0]['image_name']}: {bad[0]['reason']}; "
+        f"check --sensor, --form and the [pipeline] section of the specification (details in {summary_path})"
+    )
+
+
+def preprocess_recording(
+    path: str | Path,
+    spec: SensorSpec,
+    out_dir: str | Path,
+    form: Form | None = None,
+    overlay: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict:
+    """Observe every frame of a recording and write ``pins.npz``, ``summary.json`` and, if asked, ``overlay/``.
+
+    A frame is valid if its pins were found.
+
+    Parameters
+    ----------
+    path : path
+        Anything ``open_recording`` takes.
+    form : Form, optional
+        Told by size and content if not given.
+    progress : callable, optional
+        Called with (done, total).
+
+    Returns
+    -------
+    dict
+        The summary; ``invalid`` and ``failed`` list the frames whose pins weren't found and those that couldn't be read.
+        ``pins.npz`` has one row per readable frame, in the recording's order: ``image_name``, ``pins_px`` and
+        ``predicted_px`` (M, N, 2), ``area_px2`` (M, N), ``found`` and ``valid`` (M,).
+
+    Raises
+    ------
+    FrameError
+        No frame was readable, or none was valid (the files are written all the same).
+    StoreError
+        The folder can't be written to.
+    """
+    recording = open_recording(path, spec, form)
+    out_dir = Path(out_dir)
+    try:
+        (out_dir / "overlay" if overlay else out_dir).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritten(out_dir, error) from error
+    notes: list[str] = []
+    reference, reference_name = recording_reference(spec, recording, notes)
+    pipeline = Pipeline(spec, recording.form, reference)
+    names: list[str] = []
+    observations: list[Observation] = []
+    unfit: list[BadFrame] = []
+    pictures: set[str] = set()
+    for frame in recording:
+        try:
+            observation = pipeline(frame)
+        except FrameError as error:
+            unfit.append({"image_name": frame.name, "reason": str(error).removeprefix(f"{frame.name}: ")})
+            continue
+        names.append(frame.name)
+        observations.append(observation)
+        if overlay:
+            picture = cv2.cvtColor(draw_overlay(frame, observation), cv2.COLOR_RGB2BGR)
+            write_bytes(out_dir / "overlay" / overlay_name(frame.name, pictures), cv2.imencode(".png", picture)[1].tobytes())
+        if progress:
+            progress(frame.sequence + 1, len(recording))
+    failed = recording.failed + unfit
+    arrays = _arrays(names, observations, spec.pins.count)
+    all_found = arrays["valid"] & (arrays["found"] == spec.pins.count)
+    summary = {
+        "sensor": spec.name,
+        "frames": len(observations),
+        "exact_fraction": float(all_found.sum() / max(len(names), 1)),
+        "valid_fraction": float(arrays["valid"].sum() / max(len(names), 1)),
+        "ms": _timing(observations),
+        "parameters": {
+            "form": str(recording.form),
+            "size_px": list(recording.size_px),
+            "reference": reference_name,
+            "graph": pipeline.graph,
+            "detection": blob_spec(spec.pipeline, recording.form).model_dump(mode="json"),
+        },
+        "invalid": [{"image_name": name, "reason": o.reason} for name, o in zip(names, observations, strict=True) if not o.valid],
+        "failed": failed,
+        "problems": recording.problems + notes,
+        "made_by": made_by(preprocess_recording, inputs=[spec, recording.path.resolve(), recording.names]),
+    }
+    write_npz(out_dir / "pins.npz", arrays, compressed=True)
+    write_json(out_dir / "summary.json", summary)
+    if not arrays["valid"].any():
+        raise FrameError(_nothing_found(path, summary, out_dir / "summary.json"))
+    return summary

@@ -1,0 +1,203 @@
+"""The circular mask: only the disc with the pins is looked at.
+
+Bright blobs of a masked gray image: threshold, erosion, connected components, sub-pixel centroids."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+
+from scenes.sensor import BlobSpec
+
+
+@dataclass(frozen=True)
+class Mask:
+    """A disc in a frame, and the window of the frame that holds it.
+
+    Attributes
+    ----------
+    window : (slice, slice)
+        Rows and columns of the frame that are looked at.
+    corner_px : (2,) float
+        (x, y) of the window's first pixel.
+    disc : (h, w) uint8
+        255 inside the disc, 0 outside, over the window.
+    """
+
+    window: tuple[slice, slice]
+    corner_px: np.ndarray
+    disc: np.ndarray
+
+
+def circular_mask(size_px: tuple[int, int], center_px: tuple[float, float], radius_px: float) -> Mask:
+    """Mask of the pixels whose centre is within ``radius_px`` of ``center_px`` in a (width, height) frame."""
+    width, height = size_px
+    x, y = center_px
+    columns = slice(int(np.clip(np.ceil(x - radius_px), 0, width - 1)), int(np.clip(np.floor(x + radius_px) + 1, 1, width)))
+    rows = slice(int(np.clip(np.ceil(y - radius_px), 0, height - 1)), int(np.clip(np.floor(y + radius_px) + 1, 1, height)))
+    grid_y, grid_x = np.mgrid[rows, columns]
+    inside = (grid_x - x) ** 2 + (grid_y - y) ** 2 <= radius_px**2
+    return Mask((rows, columns), np.array([columns.start, rows.start], float), (255 * inside).astype(np.uint8))
+
+
+# A component is grown by at most this much beyond its bounding box, px.
+GROWTH_PX = 4
+# A pixel that differs from the median of its 3 x 3 neighbourhood by more gray levels than this is a fault of the chip.
+SPECK_LEVELS = 48
+# In a noisy frame that limit rises: this share of the pixels shows what difference is usual ...
+SPECK_USUAL = 0.8
+# ... and a fault differs by more than this many times the usual.
+SPECK_RATIO = 4.0
+# Percentile of the levels above the local mean to which brighter ones (glare, LEDs) are set before Otsu's method.
+MOST_ABOVE = 98
+# Sd of the smoothing before an adaptive threshold, px. It halves white noise and leaves a cap of 6 px its edge.
+NOISE_SIGMA_PX = 0.7
+# Least share of its bounding box that a cap fills. Arcs of the housing fill less.
+LEAST_FILL = 0.25
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """Connected bright components in one frame.
+
+    Attributes
+    ----------
+    px : (K, 2) float
+        Centroids, px of the frame.
+    area_px2 : (K,) float
+        Pixels of each component, as thresholded (before erosion).
+    elongation : (K,) float
+        Ratio of the larger to the smaller variance along the component's axes (1 for a disc).
+    label : (K,) int
+        Each blob's value in ``labels``.
+    label_area_px2 : (L,) float
+        Area of every component, the rejected ones too.
+    label_box : (L, 4) int
+        Every component's left, top, width, height in the window, before it is grown.
+    labels : (h, w) uint16
+        Components grown over what belongs to them, in the mask's window.
+    gray : (h, w) uint8
+        The window's gray levels.
+    corner_px : (2,) float
+        (x, y) of the window's first pixel in the frame.
+    """
+
+    px: np.ndarray
+    area_px2: np.ndarray
+    elongation: np.ndarray
+    label: np.ndarray
+    label_area_px2: np.ndarray
+    label_box: np.ndarray
+    labels: np.ndarray
+    gray: np.ndarray
+    corner_px: np.ndarray
+
+    def pixels(self, label: int) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (p, 2), px of the frame, and gray levels (p,) of the pixels of a component."""
+        left, top, width, height = self.label_box[label]
+        left, top, right, bottom = max(left - GROWTH_PX, 0), max(top - GROWTH_PX, 0), left + width + GROWTH_PX, top + height + GROWTH_PX
+        rows, columns = np.nonzero(self.labels[top:bottom, left:right] == label)
+        rows, columns = rows + top, columns + left
+        return np.stack([columns, rows], axis=1) + self.corner_px, self.gray[rows, columns]
+
+
+def despeckled(gray: np.ndarray) -> np.ndarray:
+    """Gray levels (h, w) uint8 in which hot and dead pixels take the median of their neighbourhood. Other pixels, noisy ones too, stay."""
+    median = cv2.medianBlur(gray, 3)
+    away = cv2.absdiff(gray, median)
+    usual = int(np.searchsorted(np.cumsum(cv2.calcHist([away], [0], None, [256], [0, 256])), SPECK_USUAL * gray.size))
+    _, odd = cv2.threshold(away, float(max(SPECK_LEVELS, SPECK_RATIO * usual)), 255, cv2.THRESH_BINARY)
+    return cv2.copyTo(median, odd, gray.copy())
+
+
+def threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> np.ndarray:
+    """(h, w) uint8 of 0 and 255: bright pixels inside the disc."""
+    if not blob.threshold_block_px:
+        _, binary = cv2.threshold(gray, blob.threshold, 255, cv2.THRESH_BINARY)
+        return cv2.bitwise_and(binary, disc)
+    smooth = _smoothed(gray, disc)
+    binary = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, blob.threshold_block_px | 1, blob.threshold)
+    return cv2.bitwise_and(binary, disc)
+
+
+def own_threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> float:
+    """The adaptive threshold that separates a frame's bright and dark pixels best (Otsu 1979, of the level above the local mean)."""
+    smooth = _smoothed(gray, disc)
+    block = blob.threshold_block_px | 1
+    above = cv2.subtract(smooth, cv2.blur(smooth, (block, block), borderType=cv2.BORDER_REPLICATE))[disc > 0]
+    level, _ = cv2.threshold(np.minimum(above, np.percentile(above, MOST_ABOVE)).astype(np.uint8), 0, 255, cv2.THRESH_OTSU)
+    return -max(level, 1.0)
+
+
+def _smoothed(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
+    """A window (h, w) ready for an adaptive threshold: smoothed, and without what lies outside the disc.
+
+    Housing and LEDs are set to the median inside the disc. Otherwise their light would raise the local mean near the rim.
+    """
+    histogram = cv2.calcHist([gray], [0], disc, [256], [0, 256]).ravel()
+    median = int(np.searchsorted(np.cumsum(histogram), histogram.sum() / 2))
+    smooth = cv2.GaussianBlur(gray, (3, 3), NOISE_SIGMA_PX)
+    smooth[disc == 0] = min(median, 255)
+    return smooth
+
+
+@njit(cache=True)
+def _centroids(gray: np.ndarray, labels: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, count: int) -> np.ndarray:
+    """Sums (count, 7) over the pixels of each label: weight, weight x, weight y, bright pixels, weight xx, weight xy, weight yy.
+
+    A pixel's weight is its level above the mean of the ring around its label; negative weights are left out. ``grown`` is
+    overwritten: afterwards it also holds the labels themselves.
+    """
+    height, width = gray.shape
+    ring_sum, ring_n = np.zeros(count), np.zeros(count)
+    for y in range(height):
+        for x in range(width):
+            if grown[y, x] == 0 and ringed[y, x] > 0:
+                ring_sum[ringed[y, x]] += gray[y, x]
+                ring_n[ringed[y, x]] += 1
+    sums = np.zeros((count, 7))
+    for y in range(height):
+        for x in range(width):
+            k = labels[y, x]
+            if k == 0:
+                k = grown[y, x]
+            if k > 0:
+                grown[y, x] = k
+                sums[k, 3] += bright[y, x] > 0
+                weight = gray[y, x] - ring_sum[k] / max(ring_n[k], 1.0)
+                if weight > 0:
+                    sums[k, 0] += weight
+                    sums[k, 1] += weight * x
+                    sums[k, 2] += weight * y
+                    sums[k, 4] += weight * x * x
+                    sums[k, 5] += weight * x * y
+                    sums[k, 6] += weight * y * y
+    return sums
+
+
+def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: float) -> Blobs:
+    """Blobs of the window ``gray`` (h, w) uint8 between ``blob.min_area_px2`` and ``max_area_px2``.
+
+    Components are those of the eroded bright image. A centroid weighs the pixels of the component, grown back over
+    the erosion and one pixel more, by their level above the mean of the ring around. In a two-level image it is
+    the plain centroid of the bright pixels.
+    """
+    bright = threshold(gray, mask.disc, blob)
+    eroded = bright
+    if blob.erosion_px > 1:
+        eroded = cv2.erode(bright, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=cv2.CV_16U)
+    grow = 2 * blob.erosion_px + 1
+    grown = cv2.dilate(labels, np.ones((grow, grow), np.uint8))
+    ringed = cv2.dilate(labels, np.ones((grow + 4, grow + 4), np.uint8))
+    sums = _centroids(gray, labels, grown, ringed, bright, count)
+    area = sums[:, 3]
+    keep = np.flatnonzero((area >= blob.min_area_px2) & (area <= max_area_px2) & (sums[:, 0] > 0) & (np.arange(count) > 0))
+    box = stats[keep, cv2.CC_STAT_WIDTH] * stats[keep, cv2.CC_STAT_HEIGHT].astype(float)
+    keep = keep[stats[keep, cv2.CC_STAT_AREA] >= LEAST_FILL * box]
+    mean = sums[keep, 1:3] / sums[keep, :1]
+    xx, xy, yy = (sums[keep, 4:] / sums[keep, :1] - np.stack([mean[:, 0] ** 2, mean[:, 0] * mean[:, 1], mean[:, 1] ** 2], axis=1)).T
+    root = np.hypot(xx - yy, 2 * xy)
+    elongation = (xx + yy + root) / np.maximum(xx + yy - root, 1e-3)
+    return Blobs(mean + mask.corner_px, area[keep], elongation, keep, area, stats[:, :4], grown, gray, mask.corner_px)

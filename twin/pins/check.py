@@ -1,0 +1,278 @@
+"""How far a camera has moved since its calibration, told from the outermost pins, which a contact moves least.
+
+Light, focus, pins, glare and place of a sensor's frames, against what its specification promises."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scenes.sensor import SensorSpec
+from twin.camera.capture import expose
+from twin.frames.forms import gray_levels
+from twin.optics.preview import Preview
+from twin.pins.blobs import Mask
+from twin.pins.caps import Caps, measure_caps
+from twin.pins.detector_spec import DetectorSpec, shipped_detector
+from twin.pins.pipeline import Pipeline
+from twin.pins.reference import Reference, make_reference, nominal_reference
+from twin.progress import Step
+from twin.types import Form, Frame, Observation
+
+# Least share of the outermost pins that must be seen.
+LEAST_RIM = 0.5
+# Relative growth of the rim for a contact that moves the pins by rms one radius of the rim. Measured: 0.90, 0.98 and 1.09 in recordings
+# of three sensors, 0.7 to 1.4 in the twin.
+BULGE = 1.0
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The similarity that carries the calibrated rim of pins to the one seen.
+
+    Attributes
+    ----------
+    shift_px : (2,) float
+        Shift of the rim's centre.
+    turn_deg : float
+        From x towards y.
+    scale : float
+    contact : float
+        Rms of the pins' motion without the similarity, in the rim's mean radius: how much a contact deforms the skin.
+    """
+
+    shift_px: np.ndarray
+    turn_deg: float
+    scale: float
+    contact: float
+
+    @property
+    def scale_at_rest(self) -> float:
+        """The scale without the contact's part: the gel keeps its volume, so that it bulges at the rim when it is pressed in the middle."""
+        return self.scale / (1 + BULGE * self.contact)
+
+
+def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray) -> Drift | None:
+    """Drift by least squares over the outermost pins (m,) of pins (N, 2), NaN where lost; None where too few are seen.
+
+    With complex coordinates about the means: ``a = sum conj(r) p / sum |r|^2`` (Horn 1987, in the plane).
+    """
+    rim = outmost[np.isfinite(pins_px[outmost, 0])]
+    if len(rim) < LEAST_RIM * len(outmost):
+        return None
+    seen, rest = pins_px @ [1, 1j], rest_px @ [1, 1j]
+    middle, rest_middle = seen[rim].mean(), rest[rim].mean()
+    a = np.vdot(rest[rim] - rest_middle, seen[rim] - middle) / np.vdot(rest[rim] - rest_middle, rest[rim] - rest_middle)
+    carried = middle + a * (rest - rest_middle)
+    shift = carried[outmost].mean() - rest[outmost].mean()
+    radius = np.abs(rest[outmost] - rest[outmost].mean()).mean()
+    contact = np.sqrt(np.nanmean(np.abs(seen - carried) ** 2)) / radius
+    return Drift(np.array([shift.real, shift.imag]), float(np.degrees(np.angle(a))), float(abs(a)), float(contact))
+
+
+# Gray level from which on a pixel counts as white.
+SATURATED_LEVEL = 250
+# A pin that is lost, or a spot that is seen, in this share of the frames is a fault of the sensor, not of a contact.
+STEADY = 0.5
+# Spots nearer to each other than this many spacings are the same.
+SAME_SPOT = 0.3
+# Most frames in which caps are measured, evenly spread: light and focus hardly differ between frames.
+CAPS_MEASURED = 3
+# The camera's place is told from this share of the frames, those with the least contact.
+LEAST_DEFORMED = 0.3
+# A contact that changes the rim's size by less than this share is not mentioned.
+TOLD_BULGE = 0.002
+# Most numbers of pins in a sentence.
+LISTED = 8
+# Percentile of the disc's gray levels that stands for the caps where no pin is found.
+BRIGHT_PERCENTILE = 99
+# Diameter of a cap, px, where none can be measured.
+USUAL_CAP_PX = 8.0
+# A white patch larger than this many caps is glare.
+GLARE_CAPS = 2
+
+
+class Grade(StrEnum):
+    """How good a finding is."""
+
+    GOOD = "good"
+    WATCH = "watch"
+    BAD = "bad"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at.
+
+    Attributes
+    ----------
+    name : str
+    verdict : Grade
+    value : float
+        The figure that is compared with the check's limits; NaN where it cannot be told.
+    text : str
+        What was seen, with the figure and what was expected.
+    remedy : str
+        What to do; "" if nothing.
+    """
+
+    name: str
+    verdict: Grade
+    value: float
+    text: str
+    remedy: str
+
+
+def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Step | None = None) -> list[Finding]:
+    """Findings on frames of one form, with or without contact.
+
+    Parameters
+    ----------
+    frames : list of Frame
+    spec : SensorSpec
+        What the sensor should look like.
+    detector : DetectorSpec, optional
+        What ``twin tune`` found for method ``twin``; the specification's own pipeline by default.
+
+    Raises
+    ------
+    FrameError
+        A frame is not one of this sensor's.
+    """
+    form = frames[0].form
+    detector = detector or shipped_detector(spec, form)
+    section = spec.pipeline.model_copy(update={str(form): detector.blob})
+    tuned = spec.model_copy(update={"pipeline": section})
+    reference = make_reference(np.array(detector.pins_px), spec.pins.rings) if detector.pins_px else None
+    pipeline = Pipeline(tuned, form, reference)
+    seen = []
+    for k, frame in enumerate(frames):
+        seen.append(pipeline(frame))
+        if progress:
+            progress(k + 1, len(frames))
+    findings = [_pins(seen), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
+    return findings if form == Form.RECORDING else [*_light(frames, seen, promised_caps(spec), pipeline.mask), *findings]
+
+
+def _verdict(value: float, watch: float, bad: float) -> Grade:
+    """Grade on a value by two limits. If ``bad`` is above ``watch``, large values are bad; else small ones. NaN is bad."""
+    sign = 1 if bad > watch else -1
+    if not np.isfinite(value) or sign * value > sign * bad:
+        return Grade.BAD
+    return Grade.WATCH if sign * value > sign * watch else Grade.GOOD
+
+
+def _finding(name: str, value: float, limits: tuple[float, float], text: str, remedy: str) -> Finding:
+    """A finding with its verdict by the limits (watch, bad); the remedy is left out where all is good."""
+    verdict = _verdict(value, *limits)
+    return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
+
+
+def _pins(seen: list[Observation]) -> Finding:
+    """Pins that are lost, and those lost in most frames."""
+    lost = np.isnan(np.stack([o.pins_px[:, 0] for o in seen]))
+    steady = np.flatnonzero(lost.mean(axis=0) >= STEADY)
+    text = f"{100 * lost.mean():.2f} % of the pins lost; {sum(o.valid for o in seen)} of {len(seen)} frames can be used"
+    if 0 < len(steady) < lost.shape[1] / 2:
+        text += f"; steadily lost: pin {', '.join(map(str, steady[:LISTED]))}{', ...' if len(steady) > LISTED else ''}"
+    unusable = next((o.reason for o in seen if not o.valid), "")
+    remedy = (
+        "look at these places: caps may be off, dirty or hidden by glare"
+        if not unusable
+        else f"{unusable}; run 'twin tune' on these frames"
+    )
+    return _finding("pins", float(lost.mean()), (0.002, 0.05), text, remedy)
+
+
+def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
+    """Bright spots among the pins that are no pins and stay in place from frame to frame."""
+    within = SAME_SPOT * float(np.mean(pipeline.reference.spacing_px))
+    radius = np.linalg.norm(pipeline.reference.pins_px - pipeline.reference.pins_px[0], axis=1).max()
+    places = [o.extra_px[np.linalg.norm(o.extra_px - pipeline.reference.pins_px[0], axis=1) < radius] for o in seen]
+    steady = 0
+    if len(places[0]):
+        hits = np.array([[len(p) and cKDTree(p).query(spot)[0] < within for p in places] for spot in places[0]], float)
+        steady = int((hits.mean(axis=1) >= STEADY).sum())
+    remedy = "bubbles, dust or LED reflections: clean the window, turn the sensor's LEDs, or mask them"
+    return _finding("specks", steady / len(pipeline.reference.pins_px), (0.02, 0.2), f"{steady} steady bright spots among the pins", remedy)
+
+
+def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
+    """Place of the rim of pins against the ``nominal`` one of the specification's camera, in the frames with the least contact."""
+    pitch = float(np.mean(nominal.spacing_px))
+    found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost))]
+    if not found:
+        return [
+            Finding("place", Grade.BAD, np.nan, "the camera's place can't be told: too few pins at the rim", "see the other findings first")
+        ]
+    found = sorted(found, key=lambda d: d.contact)[: max(round(LEAST_DEFORMED * len(found)), 1)]
+    shift = np.median(np.stack([d.shift_px for d in found]), axis=0)
+    turn, scale, seen_scale = (float(np.median([getattr(d, name) for d in found])) for name in ("turn_deg", "scale_at_rest", "scale"))
+    bulge = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
+    away = float(np.linalg.norm(shift))
+    again = "fix the camera, or calibrate again ('twin calibrate optics'); 'twin tune' moves the mask"
+    return [
+        _finding("shift", away / pitch, (0.2, 1.0), f"displaced by ({shift[0]:.1f}, {shift[1]:.1f}) px, {away / pitch:.2f} pitches", again),
+        _finding("turn", abs(turn), (1.5, 6.0), f"turned by {turn:.2f} deg", again),
+        _finding("scale", abs(scale - 1), (0.02, 0.1), f"{scale:.3f} times its calibrated size{bulge}", again),
+    ]
+
+
+def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: Mask) -> list[Finding]:
+    """Brightness, saturation, focus and glare of raw frames inside the mask, against the ``expected`` caps."""
+    looked = list(zip(frames, seen, strict=True))[:: -(-len(frames) // CAPS_MEASURED)]
+    caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in looked if np.isfinite(o.pins_px).any()]
+    windows = [gray_levels(np.ascontiguousarray(f.image[mask.window])) for f in frames]
+    brightest = float(np.median([np.percentile(w[mask.disc > 0], BRIGHT_PERCENTILE) for w in windows]))
+    level, contrast, edge, diameter = (
+        float(np.nanmedian([np.nanmedian(getattr(c, name)) for c in caps])) if caps else np.nan
+        for name in ("level", "contrast", "edge_px", "diameter_px")
+    )
+    promised, sharp = float(np.nanmedian(expected.contrast)), float(np.nanmedian(expected.edge_px))
+    cap_px2 = np.pi / 4 * (diameter if np.isfinite(diameter) else USUAL_CAP_PX) ** 2
+    glare = float(np.median([_glare(w, mask.disc, cap_px2) for w in windows]))
+    dark = (
+        f"caps {level:.0f} gray levels, {contrast:.0f} above the skin ({promised:.0f} expected)"
+        if caps
+        else f"brightest percent at {brightest:.0f} gray levels"
+    )
+    return [
+        _finding("brightness", contrast / promised, (0.6, 0.3), dark, "raise exposure or gain; look for dead LEDs, dirt, a foggy window"),
+        _finding("saturation", _white(caps), (0.02, 0.2), f"{100 * _white(caps):.1f} % of the caps white", "lower exposure or gain"),
+        _finding(
+            "focus",
+            edge / sharp,
+            (1.35, 2.0),
+            f"caps' edges {edge:.2f} px wide ({sharp:.2f} px expected)",
+            "focus the camera; clean the window; hold still",
+        ),
+        _finding(
+            "glare",
+            glare,
+            (0.003, 0.03),
+            f"{100 * glare:.2f} % of the disc in white patches larger than caps",
+            "shade the sensor; move or dim the LED",
+        ),
+    ]
+
+
+@lru_cache(maxsize=2)
+def promised_caps(spec: SensorSpec) -> Caps:
+    """The caps of the twin's own frame at rest."""
+    twin = expose(Preview(spec).render(), spec.capture)
+    return measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)
+
+
+def _white(caps: list[Caps]) -> float:
+    """Share of the caps that are saturated."""
+    return float(np.mean(np.concatenate([c.level for c in caps]) >= SATURATED_LEVEL)) if caps else 0.0
+
+
+def _glare(window: np.ndarray, disc: np.ndarray, cap_px2: float) -> float:
+    """Share of the disc in saturated patches larger than ``GLARE_CAPS`` caps of ``cap_px2``."""
+    white = ((window >= SATURATED_LEVEL) & (disc > 0)).astype(np.uint8)
+    area = cv2.connectedComponentsWithStats(white)[2][1:, cv2.CC_STAT_AREA]
+    return float(area[area > GLARE_CAPS * cap_px2].sum() / (disc > 0).sum())

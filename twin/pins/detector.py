@@ -1,0 +1,241 @@
+"""Other blob detectors: a masked gray window goes in, places and areas of blobs come out.
+
+Each way to find pins behind one call: a frame goes in; claimed places, pins by name and a graph come out."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from scipy.spatial import QhullError, cKDTree
+from skimage.feature import blob_dog, blob_doh, blob_log
+
+from scenes.sensor import BlobSpec, PinsSpec, RecordingSpec, SensorSpec
+from twin.camera.capture import record
+from twin.errors import FrameError
+from twin.frames.forms import frame_size, from_raw, gray_levels, recording_to_raw
+from twin.pins.blobs import Mask, circular_mask, threshold
+from twin.pins.detector_spec import DetectorSpec
+from twin.pins.graph import make_graph
+from twin.pins.legacy import LegacyPipeline, legacy_graph
+from twin.pins.matching import match
+from twin.pins.pipeline import MIN_FOUND, Pipeline
+from twin.pins.reference import Reference, make_reference, nominal_reference
+from twin.types import Form, Frame, PinGraph
+
+# Gray levels of full contrast.
+LEVELS = 255.0
+# Sizes between the smallest and the largest that the scale-space detectors look for.
+LOG_STEPS = 3
+# Response of scikit-image's blob_log (and blob_dog) to a disc of its own size and contrast 1, roughly.
+LOG_PEAK = 0.5
+# Response of blob_doh to such a disc; it grows with the contrast squared.
+DOH_PEAK = 0.05
+# Ratio of neighbouring sizes of blob_dog.
+DOG_RATIO = 1.4
+# Share of a smaller blob that may overlap with a larger one.
+OVERLAP = 0.3
+# Gray levels between the thresholds of SimpleBlobDetector, and the highest first one.
+SIMPLE_STEP, SIMPLE_HIGHEST = 10.0, 240.0
+# Largest area of a blob, in areas of the largest cap.
+MOST_CAPS = 4
+
+
+def find(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Places (K, 2), px of the frame, and areas (K,) of the blobs in a mask's window (h, w) uint8."""
+    return FINDERS[detector.method](window, mask, detector)
+
+
+def _components(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Connected components above a fixed or adaptive threshold."""
+    blob = detector.blob if detector.method == "adaptive" else _fixed(detector.blob)
+    binary = threshold(window, mask.disc, blob)
+    if blob.erosion_px > 1:
+        binary = cv2.erode(binary, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
+    _, _, stats, centroids = cv2.connectedComponentsWithStats(binary, connectivity=8)
+    area = stats[1:, cv2.CC_STAT_AREA].astype(float)
+    keep = (area >= blob.min_area_px2) & (area <= MOST_CAPS * np.pi * detector.radius_px[1] ** 2)
+    return centroids[1:][keep] + mask.corner_px, area[keep]
+
+
+def _fixed(blob: BlobSpec) -> BlobSpec:
+    """The same with a fixed threshold."""
+    return blob.model_copy(update={"threshold_block_px": 0})
+
+
+def _simple(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """OpenCV's SimpleBlobDetector."""
+    settings = cv2.SimpleBlobDetector.Params()
+    settings.blobColor = 255
+    settings.minThreshold = min(detector.blob.threshold, SIMPLE_HIGHEST)
+    settings.maxThreshold, settings.thresholdStep = 255.0, SIMPLE_STEP
+    settings.minDistBetweenBlobs, settings.minRepeatability = max(detector.radius_px[0], 1.0), 1
+    settings.filterByArea, settings.minArea = True, max(detector.blob.min_area_px2, 1.0)
+    settings.maxArea = MOST_CAPS * np.pi * detector.radius_px[1] ** 2
+    settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
+    found = cv2.SimpleBlobDetector.create(settings).detect(cv2.bitwise_and(window, mask.disc))
+    px = np.array([point.pt for point in found], float).reshape(-1, 2)
+    return px + mask.corner_px, np.array([np.pi / 4 * point.size**2 for point in found])
+
+
+def _scale_space(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """scikit-image's Laplacian or difference of Gaussians, or determinant of Hessian."""
+    contrast = detector.blob.threshold / LEVELS
+    small, large = (radius / np.sqrt(2) for radius in detector.radius_px)
+    inside = mask.disc > 0
+    image = np.where(inside, window, np.median(window[inside])) / LEVELS
+    if detector.method == "log":
+        found = blob_log(image, min_sigma=small, max_sigma=large, num_sigma=LOG_STEPS, threshold=LOG_PEAK * contrast, overlap=OVERLAP)
+    elif detector.method == "dog":
+        found = blob_dog(image, min_sigma=small, max_sigma=large, sigma_ratio=DOG_RATIO, threshold=LOG_PEAK * contrast, overlap=OVERLAP)
+    else:
+        found = blob_doh(image, min_sigma=small, max_sigma=large, num_sigma=LOG_STEPS, threshold=DOH_PEAK * contrast**2, overlap=OVERLAP)
+    rows, columns = found[:, 0].astype(int), found[:, 1].astype(int)
+    found = found[inside[rows, columns]]
+    return found[:, 1::-1] + mask.corner_px, 2 * np.pi * found[:, 2] ** 2
+
+
+FINDERS = {"adaptive": _components, "fixed": _components, "simple": _simple, "log": _scale_space, "dog": _scale_space, "doh": _scale_space}
+
+
+# A frame with more blobs than this for each pin is refused as clutter.
+MOST_BLOBS = 4
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a detector claims of one frame.
+
+    Attributes
+    ----------
+    claims_px : (K, 2) float
+        Places where it claims pins, px of the frame, in any order.
+    pins_px : (N, 2) float or None
+        The same places in the specification's pin order, NaN where lost; None if it does not tell which pin is which.
+    graph : PinGraph or None
+        In the order of ``pins_px`` if it is given, else of the claims. None if the frame is not valid.
+    valid : bool
+    reason : str
+    """
+
+    claims_px: np.ndarray
+    pins_px: np.ndarray | None
+    graph: PinGraph | None
+    valid: bool
+    reason: str = ""
+
+
+class Detector(Protocol):
+    """Finds pins in frames of one form."""
+
+    spec: DetectorSpec
+
+    def __call__(self, frame: Frame) -> Found: ...
+
+    def graph_of(self, nodes_px: np.ndarray) -> PinGraph | None:
+        """The graph that its method makes of pins (N, 2) in the specification's order, areas in its own unit."""
+
+
+def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bool = True) -> Detector:
+    """A detector ready for frames.
+
+    ``second_look`` as `Pipeline` takes it. Set it to False to judge thresholds: a second look hides what a threshold loses.
+
+    Raises
+    ------
+    FrameError
+        The method does not suit the frames' form, or the pins are another sensor's.
+    """
+    if detector.pins_px and len(detector.pins_px) != sensor.pins.count:
+        raise FrameError(
+            f"'{detector.name}' was tuned for {len(detector.pins_px)} pins, {sensor.name} has {sensor.pins.count}: tune it for this sensor"
+        )
+    if detector.method == "legacy":
+        return LegacyDetector(sensor.pins, sensor.recording, detector)
+    reference = (
+        make_reference(np.array(detector.pins_px), sensor.pins.rings) if detector.pins_px else nominal_reference(sensor, detector.form)
+    )
+    if detector.method == "twin":
+        return TwinDetector(sensor, detector, reference, second_look=second_look)
+    return PlainDetector(frame_size(sensor, detector.form), detector, reference)
+
+
+class TwinDetector:
+    """This program's pipeline."""
+
+    def __init__(self, sensor: SensorSpec, spec: DetectorSpec, reference: Reference, *, second_look: bool = True) -> None:
+        self.spec = spec
+        section = sensor.pipeline.model_copy(update={str(spec.form): spec.blob})
+        self._pipeline = Pipeline(sensor.model_copy(update={"pipeline": section}), spec.form, reference, second_look=second_look)
+
+    def __call__(self, frame: Frame) -> Found:
+        seen = self._pipeline(frame)
+        return Found(seen.pins_px[np.isfinite(seen.pins_px[:, 0])], seen.pins_px, seen.graph, seen.valid, seen.reason)
+
+    def graph_of(self, nodes_px: np.ndarray) -> PinGraph:
+        return make_graph("voronoi", nodes_px, outmost=self._pipeline.reference.outmost)
+
+
+class PlainDetector:
+    """A plain blob detector. Its blobs are matched to the pins as the pipeline's are, so that only the way to find blobs differs."""
+
+    def __init__(self, size_px: tuple[int, int], spec: DetectorSpec, reference: Reference) -> None:
+        self.spec, self._reference = spec, reference
+        self._mask = circular_mask(size_px, spec.blob.mask_center_px, spec.blob.mask_radius_px)
+
+    def __call__(self, frame: Frame) -> Found:
+        window = np.ascontiguousarray(gray_levels(np.ascontiguousarray(frame.image[self._mask.window])))
+        px, area = find(window, self._mask, self.spec)
+        count = len(self._reference.pins_px)
+        if len(px) > MOST_BLOBS * count:
+            return Found(px, np.full((count, 2), np.nan), None, False, f"too many blobs: {len(px)}")
+        found = match(self._reference, px, area)
+        paired = found.blob >= 0
+        pins_px = np.full((count, 2), np.nan)
+        pins_px[paired] = px[found.blob[paired]]
+        nodes_px = np.where(paired[:, None], pins_px, found.predicted_px)
+        valid = bool(paired.sum() >= MIN_FOUND * count) and bool(np.isfinite(nodes_px).all())
+        reason = "" if valid else f"too few pins: {int(paired.sum())} of {count}"
+        return Found(pins_px[paired], pins_px, self.graph_of(nodes_px) if valid else None, valid, reason)
+
+    def graph_of(self, nodes_px: np.ndarray) -> PinGraph:
+        return make_graph("voronoi", nodes_px, outmost=self._reference.outmost)
+
+
+class LegacyDetector:
+    """The published method; raw frames go through the published recorder first."""
+
+    def __init__(self, pins: PinsSpec, recording: RecordingSpec | None, spec: DetectorSpec) -> None:
+        recording = spec.recording or recording
+        if recording is None:
+            raise FrameError(
+                f"'{spec.name}': the published method needs a recorder's crop and threshold, the sensor has none;"
+                " run 'twin tune --method legacy'"
+            )
+        self.spec, self._recording = spec, recording
+        self._pipeline = LegacyPipeline(pins, recording)
+
+    def __call__(self, frame: Frame) -> Found:
+        raw = frame.form == Form.RAW
+        if raw:
+            frame = Frame(record(frame.image, self._recording), Form.RECORDING, frame.name)
+        seen = self._pipeline(frame)
+        px = recording_to_raw(self._recording, seen.nodes_px) if raw else seen.nodes_px
+        return Found(px, None, seen.graph, seen.valid, seen.reason)
+
+    def graph_of(self, nodes_px: np.ndarray) -> PinGraph | None:
+        size = self._pipeline.parameters.size_px
+        recorded = from_raw(self._recording, Form.RECORDING, nodes_px) if self.spec.form == Form.RAW else nodes_px
+        nodes = (recorded + 0.5) * size / np.array(self._pipeline.size_px) - 0.5
+        try:
+            return legacy_graph(nodes - np.median(nodes), self._pipeline.parameters)
+        except QhullError:
+            return None
+
+
+def named(graph: PinGraph, claims_px: np.ndarray, pins_px: np.ndarray) -> PinGraph:
+    """A graph over claims (N, 2) in the order of the pins (N, 2) that they are nearest to."""
+    _, order = cKDTree(claims_px).query(pins_px)
+    place = np.empty(len(order), int)
+    place[order] = np.arange(len(order))
+    return PinGraph(graph.kind, pins_px, place[graph.edges], graph.area_px2[order], [])

@@ -1,0 +1,66 @@
+"""Graphs over the pins: nearest neighbours, Delaunay, Voronoi; and the features of their nodes."""
+
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from twin.pins.reference import Reference
+from twin.pins.voronoi import directed_edges, triangulate, voronoi
+from twin.types import PinGraph
+
+GraphKind = Literal["knn", "delaunay", "voronoi"]
+# Neighbours of a node in the published kNN graph (Tac-VGNN, 2023): 6 N directed edges.
+KNN = 6
+
+
+def knn_edges(nodes_px: np.ndarray, k: int = KNN) -> np.ndarray:
+    """(k N, 2) directed edges from each node to its ``k`` nearest others."""
+    n = len(nodes_px)
+    k = min(k, n - 1)
+    if k < 1:
+        return np.zeros((0, 2), int)
+    _, index = cKDTree(nodes_px).query(nodes_px, k=min(k + 1, n))
+    others = index != np.arange(n)[:, None]
+    others[others.all(axis=1), -1] = False  # where nodes coincide, a node may not find itself: drop the last one instead
+    return np.stack([np.repeat(np.arange(n), k), index[others].ravel()], axis=1)
+
+
+def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | None = None) -> PinGraph:
+    """A graph over nodes (N, 2).
+
+    ``knn``: the 6 nearest others of each node. ``delaunay``: both directions of every side of the nodes' Delaunay
+    triangles. ``voronoi``: the same edges, with clipped Voronoi areas and cells (``outmost`` as in ``voronoi``).
+    Nodes without a triangulation (collinear, coincident) fall back to nearest-neighbour edges.
+    """
+    none = np.full(len(nodes_px), np.nan)
+    if kind == "knn":
+        return PinGraph(kind, nodes_px, knn_edges(nodes_px), none)
+    triangles = triangulate(nodes_px)
+    edges = None if triangles is None else directed_edges(triangles, len(nodes_px))
+    if kind == "voronoi":
+        tessellation = voronoi(nodes_px, outmost=outmost, edges=edges)
+        return PinGraph(kind, nodes_px, knn_edges(nodes_px) if edges is None else edges, tessellation.area_px2, tessellation.cells)
+    if kind == "delaunay":
+        return PinGraph(kind, nodes_px, knn_edges(nodes_px) if edges is None else edges, none)
+    raise ValueError(f"kind must be knn, delaunay or voronoi, not {kind!r}")
+
+
+def features(graph: PinGraph, reference: Reference, kind: Literal["relative", "pixels"] = "relative") -> np.ndarray:
+    """Node features (N, F) of a graph.
+
+    ``relative``, free of the image's scale: x and y, centred on their medians, and the displacement from rest in x and
+    y, all in mean rest spacings; with a tessellation also the area relative to the pin's area at rest.
+    Columns x, y, dx, dy[, area]. ``pixels``, as published: x, y (px) centred on their medians[, area (px^2)].
+    """
+    centred = graph.nodes_px - np.median(graph.nodes_px, axis=0)
+    areas = graph.kind == "voronoi"
+    if kind == "pixels":
+        return np.column_stack([centred, graph.area_px2]) if areas else centred
+    if kind != "relative":
+        raise ValueError(f"kind must be relative or pixels, not {kind!r}")
+    spacing = reference.spacing_px.mean()
+    columns = [centred / spacing, (graph.nodes_px - reference.pins_px) / spacing]
+    if areas:
+        columns.append(graph.area_px2 / reference.area_px2)
+    return np.column_stack(columns)

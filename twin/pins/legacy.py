@@ -1,0 +1,182 @@
+"""The published method, step by step, as the Tac-VGNN release (Apache-2.0) does it. It is here to compare with.
+
+Its peculiarities are kept on purpose: resizing to a fixed size, a mask about the image's centre, OpenCV's SimpleBlobDetector,
+centring by one scalar median over x and y together, hull vertices scaled about that origin, and refusing a frame whose count is
+not exactly the sensor's. Nodes come in the detector's order.
+"""
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import cv2
+import numpy as np
+from scipy.spatial import ConvexHull, Delaunay, QhullError, Voronoi
+
+from scenes.sensor import PinsSpec, RecordingSpec
+from twin.errors import FrameError
+from twin.frames.forms import gray_levels
+from twin.pins.voronoi import directed_edges
+from twin.types import Form, Frame, PinGraph
+
+# The hull's vertices are scaled by this about the origin (release).
+HULL_SCALE = 1.1
+
+
+@dataclass(frozen=True)
+class LegacyParameters:
+    """The release's constants for one layout; lengths in px of its resized image.
+
+    Attributes
+    ----------
+    size_px : int
+        Side of the square that a frame is resized to.
+    threshold : int
+        Gray level.
+    mask_offset_px : (int, int)
+        Of the mask's centre from the image's, x and y.
+    mask_margin_px : int
+        Between the mask and the image's border.
+    min_area_px2 : float
+    virtual_rotations_deg, virtual_scales : tuple of float
+        Turn and scale of the copies of the hull that fill a hexagon's inward-bowed sides.
+    """
+
+    size_px: int
+    threshold: int
+    mask_offset_px: tuple[int, int]
+    mask_margin_px: int
+    min_area_px2: float
+    virtual_rotations_deg: tuple[float, ...] = ()
+    virtual_scales: tuple[float, ...] = ()
+
+
+LEGACY = {
+    "rings": LegacyParameters(300, 100, (-1, -2), 14, 10.0),
+    "hexagon": LegacyParameters(
+        256, 80, (0, 2), 15, 1.0, (7.0, 12.0, 22.0, 30.0, 38.0, 48.0, 53.0), (0.95, 0.9, 0.85, 0.85, 0.85, 0.9, 0.95)
+    ),
+}
+
+
+@dataclass(frozen=True)
+class LegacyObservation:
+    """What the published method makes of a frame.
+
+    Attributes
+    ----------
+    nodes_px : (K, 2) float
+        Blobs in the detector's order, px of the input frame.
+    found : int
+    valid : bool
+        Exactly the sensor's number of pins was found.
+    reason : str
+    graph : PinGraph or None
+        Its nodes, cells and areas are in the release's units: px of its resized image, centred by the scalar median.
+    ms : dict of str to float
+    """
+
+    nodes_px: np.ndarray
+    found: int
+    valid: bool
+    reason: str
+    graph: PinGraph | None
+    ms: dict[str, float]
+
+
+def legacy_detector(parameters: LegacyParameters) -> cv2.SimpleBlobDetector:
+    """The release's blob detector."""
+    settings = cv2.SimpleBlobDetector.Params()
+    settings.blobColor = 255
+    settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 50, 220, 5
+    settings.minDistBetweenBlobs, settings.minRepeatability = 3, 3
+    settings.filterByArea, settings.minArea, settings.maxArea = True, parameters.min_area_px2, 5000
+    settings.filterByCircularity, settings.minCircularity = True, 0.01
+    settings.filterByConvexity, settings.minConvexity = True, 0.01
+    settings.filterByInertia, settings.minInertiaRatio = True, 0.01
+    return cv2.SimpleBlobDetector.create(settings)
+
+
+def boundary_nodes(nodes: np.ndarray, parameters: LegacyParameters) -> np.ndarray:
+    """The hull's vertices, enlarged, and for a hexagon turned and scaled copies of them, which fill its inward-bowed sides."""
+    bound = HULL_SCALE * nodes[ConvexHull(nodes).vertices]
+    nodes_around = [bound]
+    for degrees, scale in zip(parameters.virtual_rotations_deg, parameters.virtual_scales, strict=True):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        nodes_around.append(scale * bound @ [[c, s], [-s, c]])
+    return np.concatenate(nodes_around)
+
+
+def legacy_graph(nodes: np.ndarray, parameters: LegacyParameters) -> PinGraph:
+    """Delaunay edges and Voronoi areas of centred nodes (N, 2), as published (Algorithm 1 of the paper).
+
+    A convex layout's edges are its own; a hexagon's are those among its nodes in the triangulation with the boundary nodes.
+    """
+    n = len(nodes)
+    extended = np.concatenate([nodes, boundary_nodes(nodes, parameters)])
+    triangulated = extended if parameters.virtual_scales else nodes
+    edges = directed_edges(Delaunay(triangulated).simplices, len(triangulated))
+    edges = edges[(edges < n).all(axis=1)]
+    diagram = Voronoi(extended)
+    area, cells = np.full(n, np.nan), []
+    for i in range(n):
+        region = diagram.regions[diagram.point_region[i]]
+        if region and -1 not in region:
+            cell = diagram.vertices[region]
+            cell = cell[ConvexHull(cell).vertices]
+            area[i] = ConvexHull(cell).volume
+        else:
+            cell = np.empty((0, 2))
+        cells.append(cell)
+    return PinGraph("voronoi", nodes, edges, area, cells)
+
+
+class LegacyPipeline:
+    """The published preprocessing of a sensor's recordings.
+
+    Parameters
+    ----------
+    pins : PinsSpec
+        The layout chooses the release's constants; the count is the number of blobs that it accepts.
+    recording : RecordingSpec or None
+
+    Raises
+    ------
+    FrameError
+        The sensor has no recording form.
+    """
+
+    def __init__(self, pins: PinsSpec, recording: RecordingSpec | None) -> None:
+        if recording is None:
+            raise FrameError("the published method takes recordings, and the sensor has no recording form ([recording])")
+        self.count = pins.count
+        self.parameters = LEGACY[pins.layout]
+        self.size_px = recording.width_px, recording.height_px
+        self._detector = legacy_detector(self.parameters)
+        size = self.parameters.size_px
+        center = (size // 2 + self.parameters.mask_offset_px[0], size // 2 + self.parameters.mask_offset_px[1])
+        self._mask = cv2.circle(np.zeros((size, size), np.uint8), center, size // 2 - self.parameters.mask_margin_px, 255, -1)
+
+    def __call__(self, frame: Frame) -> LegacyObservation:
+        """Observe a recorded frame."""
+        if frame.form != Form.RECORDING or frame.image.shape[1::-1] != self.size_px:
+            raise FrameError(f"{frame.name or 'frame'}: the published method takes recordings of {self.size_px[0]}x{self.size_px[1]} only")
+        n, size = self.count, self.parameters.size_px
+        started = perf_counter()
+        gray = cv2.resize(gray_levels(frame.image), (size, size))
+        _, binary = cv2.threshold(gray, self.parameters.threshold, 255, cv2.THRESH_BINARY)
+        keypoints = self._detector.detect(cv2.bitwise_and(binary, self._mask))
+        nodes = np.array([point.pt for point in keypoints], float).reshape(-1, 2)
+        ms = {"detect": 1e3 * (perf_counter() - started)}
+        scale = np.array(self.size_px) / size
+        nodes_px = (nodes + 0.5) * scale - 0.5
+        reason, graph = "", None
+        if len(nodes) != n:
+            reason = f"{len(nodes)} blobs found, exactly {n} expected"
+        else:
+            try:
+                graph = legacy_graph(nodes - np.median(nodes), self.parameters)
+            except QhullError:
+                reason = "the blobs have no tessellation"
+        ms["total"] = 1e3 * (perf_counter() - started)
+        ms["graph"] = ms["total"] - ms["detect"]
+        return LegacyObservation(nodes_px, len(nodes), not reason, reason, graph, ms)

@@ -1,0 +1,555 @@
+"""The motion model: displacement is locally affine over a pin's neighbours.
+
+Which blob is which pin: grow a consistent labelling over the rest layout from a seed, keep the best of several.
+
+A pin may move by more than the distance to its neighbour, so the nearest blob is not always the right one. But neighbours
+move alike. A labelling starts from one pair of pin and blob. The local affine motion of the pairs found so far predicts the
+place of the next pin, and the labelling grows over the layout. From a wrong pair it soon finds no blobs, or only blobs far
+from the prediction. The start that explains most blobs wins.
+
+One wrong labelling is nearly as smooth as the true one: each ring of pins is shifted along itself by one pin. Ring i has
+6 i pins, so it is turned by 60 / i degrees, and only the innermost rings, which turn most, fall apart. Therefore each labelling
+is unwound: its rings are shifted back by the number of pins with which they turn most alike, before it is judged."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.optimize import linear_sum_assignment
+
+from twin.pins.reference import Reference
+
+# Pull of the local gradient towards zero, as strong as this many neighbours at one spacing.
+RIDGE = 0.25
+
+
+@njit(cache=True)
+def predict(
+    i: int, rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray
+) -> tuple[float, float, int]:
+    """Displacement of pin ``i`` from that of its neighbours alone, and how many neighbours counted.
+
+    Weighted least squares of u(x) = a + G (x - x_i) over the neighbours with ``weight`` > 0. The gradient
+    G is lightly pulled to zero, so that one neighbour is enough.
+
+    Parameters
+    ----------
+    i : int
+    rest : (N, 2) float
+    neighbours : (N, k) int
+    spacing : (N,) float
+    moved : (N, 2) float
+        Current positions, px.
+    weight : (N,) float
+        Trust in each current position, 0 where there is none.
+
+    Returns
+    -------
+    ux, uy : float
+        Displacement, px.
+    count : int
+    """
+    s2 = spacing[i] * spacing[i]
+    m00 = m01 = m02 = 0.0
+    m11 = m22 = RIDGE
+    m12 = 0.0
+    bx0 = bx1 = bx2 = by0 = by1 = by2 = 0.0
+    count = 0
+    for k in range(neighbours.shape[1]):
+        j = neighbours[i, k]
+        if weight[j] <= 0:
+            continue
+        count += 1
+        x = (rest[j, 0] - rest[i, 0]) / spacing[i]
+        y = (rest[j, 1] - rest[i, 1]) / spacing[i]
+        w = weight[j] / (0.5 + (x * x + y * y))
+        ux, uy = moved[j, 0] - rest[j, 0], moved[j, 1] - rest[j, 1]
+        m00 += w
+        m01 += w * x
+        m02 += w * y
+        m11 += w * x * x
+        m12 += w * x * y
+        m22 += w * y * y
+        bx0 += w * ux
+        bx1 += w * ux * x
+        bx2 += w * ux * y
+        by0 += w * uy
+        by1 += w * uy * x
+        by2 += w * uy * y
+    if count == 0 or s2 == 0:
+        return 0.0, 0.0, 0
+    c00 = m11 * m22 - m12 * m12
+    c01 = m02 * m12 - m01 * m22
+    c02 = m01 * m12 - m02 * m11
+    det = m00 * c00 + m01 * c01 + m02 * c02
+    return (c00 * bx0 + c01 * bx1 + c02 * bx2) / det, (c00 * by0 + c01 * by1 + c02 * by2) / det, count
+
+
+@njit(cache=True)
+def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Each pin's position (N, 2) as its neighbours predict it; NaN where no neighbour counts."""
+    out = np.empty_like(rest)
+    for i in range(len(rest)):
+        ux, uy, count = predict(i, rest, neighbours, spacing, moved, weight)
+        out[i, 0] = rest[i, 0] + ux if count else np.nan
+        out[i, 1] = rest[i, 1] + uy if count else np.nan
+    return out
+
+
+# Distances are in local spacings: the distance of a pin at rest to its nearest neighbour. All limits were chosen, not derived.
+# Largest distance from a prediction to its blob while a labelling grows: strict first, then looser.
+GROW_GATES = (0.30, 0.45)
+# Largest distance from a prediction to its blob in the final assignment.
+FINAL_GATE = 0.40
+# Largest distance from the prediction of a lost pin to a free blob, if each is the other's nearest.
+ADOPT_GATE = 0.7
+# Largest ratio, either way, of such a blob's area to that of its neighbours.
+ADOPT_AREA_RATIO = 2.0
+# Largest share of the pins that may be lost for this to be tried.
+MOST_ADOPTED = 0.2
+# Distance of a pair from the prediction at which its weight is halved.
+SOFT_RESIDUAL = 0.15
+# Cost of a squared log ratio of areas of 1, against a squared distance in spacings.
+AREA_LOG_WEIGHT = 0.02
+# A blob smaller than this share of its neighbours' mean area is a speck, not a pin.
+MIN_AREA_RATIO = 0.2
+# Cost that stands for "no pair": far above any cost of a pair, so that pairing more pins always pays.
+NO_PAIR_COST = 10.0
+# Most rounds of predicting and assigning; they end when nothing changes.
+REFINE_ROUNDS = 4
+# No further start is tried if one labelling holds this share of the pins (or its square of the blobs and MIN_SETTLED of the pins) ...
+NEARLY_ALL = 0.985
+MIN_SETTLED = 0.7
+# ... and its score is this share of their number.
+SETTLED = 0.94
+# Weight in the score, for each pin, of the rings' mean turn (1 minus its cosine).
+TURN_WEIGHT = 1.5
+# Rings may be shifted along themselves by this many pins either way.
+MAX_WINDING = 3
+# So many innermost rings are left out when the shift is found: they do not hold together in a shifted labelling.
+BROKEN_RINGS = 2
+# Share of the points on each side that is left out of an extent, whose middle tells how far the whole view is displaced.
+EXTENT_MARGIN = 0.02
+# Pins around the rim from which labellings start, and pins inside, at most about this many.
+RIM_SEEDS, INSIDE_SEEDS = 12, 6
+# Nearest blobs that are tried for each of these pins.
+SEED_RANKS = 3
+# Labellings that are refined where none settles.
+REFINED = 4
+# Neighbours around a lost pin whose labels are forgotten before they are grown anew; then all of its neighbours'.
+NEAR = 6
+# Share of the pins that must stay labelled for this, and largest share that may be lost.
+LEAST_KEPT, MOST_REGROWN = 0.5, 0.3
+
+# First blob of each square cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``).
+Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
+
+
+class Layout(NamedTuple):
+    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, ring_ends (R + 1,).
+
+    Ring i's pins are ``ring_ends[i - 1]`` to ``ring_ends[i]``, in order around the layout.
+    """
+
+    rest: np.ndarray
+    neighbours: np.ndarray
+    spacing: np.ndarray
+    ring_ends: np.ndarray
+
+
+@dataclass(frozen=True)
+class Match:
+    """A labelling of the blobs.
+
+    Attributes
+    ----------
+    blob : (N,) int
+        Blob of each pin, -1 for none.
+    predicted_px : (N, 2) float
+        Each pin's place as its neighbours' motion predicts it.
+    score : float
+        Number of pins paired, minus their squared distances from the predictions relative to the gate, minus the cost of the rings'
+        turn. Larger is better.
+    """
+
+    blob: np.ndarray
+    predicted_px: np.ndarray
+    score: float
+
+
+@njit(cache=True)
+def _buckets(px: np.ndarray, cell: float) -> Buckets:
+    """Blobs by square cell: (first blob of each cell, next blob in the same cell, x0, y0, columns, rows)."""
+    x0, y0 = px[:, 0].min(), px[:, 1].min()
+    columns = int((px[:, 0].max() - x0) / cell) + 1
+    rows = int((px[:, 1].max() - y0) / cell) + 1
+    head = np.full(columns * rows, -1)
+    following = np.full(len(px), -1)
+    for k in range(len(px)):
+        c = int((px[k, 1] - y0) / cell) * columns + int((px[k, 0] - x0) / cell)
+        following[k] = head[c]
+        head[c] = k
+    return head, following, x0, y0, columns, rows
+
+
+@njit(cache=True)
+def _nearest(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray, buckets: Buckets, cell: float) -> tuple[int, float]:
+    """Nearest free blob within ``reach`` of (x, y): (index or -1, squared distance)."""
+    head, following, x0, y0, columns, rows = buckets
+    best, best_d2 = -1, reach * reach
+    for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), rows - 1) + 1):
+        for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), columns - 1) + 1):
+            k = head[cy * columns + cx]
+            while k >= 0:
+                if not taken[k]:
+                    d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
+                    if d2 < best_d2:
+                        best, best_d2 = k, d2
+                k = following[k]
+    return best, best_d2
+
+
+@njit(cache=True)
+def _grow(
+    rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, start: np.ndarray, buckets: Buckets, cell: float
+) -> np.ndarray:
+    """Grow a labelling (N,), from ``start`` (N,) with at least one pair, round by round over the pins next to labelled ones."""
+    n = len(rest)
+    blob = start.copy()
+    moved = np.zeros((n, 2))
+    weight = np.zeros(n)
+    taken = np.zeros(len(px), np.bool_)
+    near = min(6, neighbours.shape[1])
+    labelled = 0
+    for i in range(n):
+        if blob[i] >= 0:
+            moved[i] = px[blob[i]]
+            weight[i] = 1.0
+            taken[blob[i]] = True
+            labelled += 1
+    claim = np.full(len(px), -1)
+    claim_cost = np.zeros(len(px))
+    tried = np.full(n, -1)  # neighbours that counted when a pin was last tried
+    for level in range(len(GROW_GATES)):
+        tried[:] = -1
+        least = 3 if level == 0 else 2
+        growing = True
+        while growing:
+            growing = False
+            claim[:] = -1
+            for i in range(n):
+                if blob[i] >= 0:
+                    continue
+                touching = 0
+                for k in range(near):
+                    touching += blob[neighbours[i, k]] >= 0
+                if touching == 0:
+                    continue
+                ux, uy, count = predict(i, rest, neighbours, spacing, moved, weight)
+                if count == tried[i] or count < min(least, labelled):
+                    continue
+                tried[i] = count
+                x, y = rest[i, 0] + ux, rest[i, 1] + uy
+                k, d2 = _nearest(x, y, GROW_GATES[level] * spacing[i], px, taken, buckets, cell)
+                if k >= 0:
+                    cost = d2 / (spacing[i] * spacing[i])
+                    if claim[k] < 0 or cost < claim_cost[k]:
+                        claim[k] = i
+                        claim_cost[k] = cost
+            for k in range(len(px)):
+                i = claim[k]
+                if i >= 0:
+                    blob[i] = k
+                    moved[i] = px[k]
+                    weight[i] = 1.0
+                    taken[k] = True
+                    labelled += 1
+                    growing = True
+    return blob
+
+
+@njit(cache=True)
+def _ring_turns(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.ndarray, winding: int) -> tuple[np.ndarray, int]:
+    """Turn of each ring (R,) as a unit complex number (0: unknown) after its labels are shifted back by ``winding``; number known."""
+    turns = np.zeros(len(ring_ends) - 1, np.complex128)
+    known = 0
+    for ring in range(len(turns)):
+        first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
+        count = 0
+        at, to, product = 0j, 0j, 0j
+        for k in range(size):
+            j = blob[first + (k - winding) % size]
+            if j >= 0:
+                a = complex(rest[first + k, 0], rest[first + k, 1])
+                b = complex(px[j, 0], px[j, 1])
+                at += a
+                to += b
+                product += a.conjugate() * b
+                count += 1
+        if count > 2:
+            turn = product - at.conjugate() * to / count
+            if abs(turn) > 0:
+                turns[ring] = turn / abs(turn)
+                known += 1
+    return turns, known
+
+
+@njit(cache=True)
+def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.ndarray) -> np.ndarray:
+    """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
+
+    The innermost rings lose their labels where anything is shifted.
+    """
+    best, most_alike = 0, abs(_ring_turns(rest, px, blob, ring_ends, 0)[0][BROKEN_RINGS:].sum())
+    for winding in range(-MAX_WINDING, MAX_WINDING + 1):
+        alike = abs(_ring_turns(rest, px, blob, ring_ends, winding)[0][BROKEN_RINGS:].sum())
+        if alike > most_alike:
+            best, most_alike = winding, alike
+    if best == 0:
+        return blob
+    out = np.full_like(blob, -1)
+    for ring in range(BROKEN_RINGS, len(ring_ends) - 1):
+        first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
+        for k in range(size):
+            out[first + k] = blob[first + (k - best) % size]
+    return out
+
+
+@njit(cache=True)
+def _trust(
+    rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, blob: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 2) of the pairs, and their weights (N,): less the farther a pair is from where its neighbours predict it."""
+    n = len(rest)
+    moved, weight = np.zeros((n, 2)), np.zeros(n)
+    for i in range(n):
+        if blob[i] >= 0:
+            moved[i] = px[blob[i]]
+            weight[i] = 1.0
+    predicted = predict_all(rest, neighbours, spacing, moved, weight)
+    for i in range(n):
+        if weight[i] > 0:
+            r2 = (predicted[i, 0] - moved[i, 0]) ** 2 + (predicted[i, 1] - moved[i, 1]) ** 2
+            weight[i] = 1.0 / (1.0 + r2 / (SOFT_RESIDUAL * spacing[i]) ** 2)
+            if not np.isfinite(weight[i]):
+                weight[i] = 0.0
+    return moved, weight
+
+
+@njit(cache=True)
+def _candidates(
+    predicted: np.ndarray,
+    neighbours: np.ndarray,
+    spacing: np.ndarray,
+    px: np.ndarray,
+    area: np.ndarray,
+    blob: np.ndarray,
+    buckets: Buckets,
+    cell: float,
+) -> tuple[list[int], list[int], list[float], bool]:
+    """Gated pairs: arrays of pin, blob, cost; and whether some pin or blob is in more than one."""
+    n = len(predicted)
+    # empty lists of a known type, which numba needs
+    pins: list[int] = [0 for _ in range(0)]
+    blobs: list[int] = [0 for _ in range(0)]
+    costs: list[float] = [0.0 for _ in range(0)]
+    head, following, x0, y0, columns, rows = buckets
+    uses = np.zeros(len(px), np.int64)
+    contested = False
+    for i in range(n):
+        x, y = predicted[i, 0], predicted[i, 1]
+        if not np.isfinite(x + y):
+            continue
+        total, count = 0.0, 0
+        for k in range(neighbours.shape[1]):
+            j = blob[neighbours[i, k]]
+            if j >= 0:
+                total += area[j]
+                count += 1
+        expected = total / max(count, 1)
+        reach = FINAL_GATE * spacing[i]
+        mine = 0
+        for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), rows - 1) + 1):
+            for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), columns - 1) + 1):
+                k = head[cy * columns + cx]
+                while k >= 0:
+                    d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
+                    if d2 < reach * reach and area[k] >= MIN_AREA_RATIO * expected:
+                        pins.append(i)
+                        blobs.append(k)
+                        costs.append(d2 / (spacing[i] * spacing[i]) + AREA_LOG_WEIGHT * np.log(area[k] / expected) ** 2)
+                        mine += 1
+                        uses[k] += 1
+                        contested = contested or mine > 1 or uses[k] > 1
+                    k = following[k]
+    return pins, blobs, costs, contested
+
+
+def _assign(n: int, blob_count: int, pins_list: list[int], blobs_list: list[int], costs_list: list[float], contested: bool) -> np.ndarray:
+    """One-to-one assignment (N,) over the gated pairs: most pairs, then least cost."""
+    blob = np.full(n, -1)
+    pins, blobs, costs = np.array(pins_list, int), np.array(blobs_list, int), np.array(costs_list, float)
+    if not contested:
+        blob[pins] = blobs
+        return blob
+    open_pair = (np.bincount(pins, minlength=n)[pins] > 1) | (np.bincount(blobs, minlength=blob_count)[blobs] > 1)
+    blob[pins[~open_pair]] = blobs[~open_pair]
+    row_pin, row = np.unique(pins[open_pair], return_inverse=True)
+    column_blob, column = np.unique(blobs[open_pair], return_inverse=True)
+    table = np.full((len(row_pin), len(column_blob)), NO_PAIR_COST)
+    table[row, column] = costs[open_pair]
+    for r, c in zip(*linear_sum_assignment(table), strict=True):
+        if table[r, c] < NO_PAIR_COST:
+            blob[row_pin[r]] = column_blob[c]
+    return blob
+
+
+def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: Buckets, cell: float) -> Match:
+    """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
+    rest, neighbours, spacing, ring_ends = layout
+    for _ in range(REFINE_ROUNDS):
+        moved, weight = _trust(rest, neighbours, spacing, px, blob)
+        predicted = predict_all(rest, neighbours, spacing, moved, weight)
+        before = blob
+        blob = _assign(len(rest), len(px), *_candidates(predicted, neighbours, spacing, px, area, blob, buckets, cell))
+        if np.array_equal(blob, before):
+            break
+    blob = _adopt(layout, px, area, blob, predicted)
+    found = blob >= 0
+    residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * spacing[found]) ** 2
+    turns, count = _ring_turns(rest, px, blob, ring_ends, 0)
+    turned = 1.0 - turns.real.sum() / max(count, 1)
+    return Match(blob, predicted, float(found.sum() - residual2.sum() - TURN_WEIGHT * len(rest) * turned))
+
+
+def _adopt(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Give lost pins free blobs of a cap's size a little outside the gate: at the rim the prediction extrapolates and is less exact."""
+    neighbours, spacing = layout.neighbours, layout.spacing
+    lost = np.flatnonzero((blob < 0) & np.isfinite(predicted[:, 0]))
+    free = np.setdiff1d(np.arange(len(px)), blob)
+    if not len(lost) or not len(free) or len(lost) > MOST_ADOPTED * len(blob):
+        return blob
+    distance = np.linalg.norm(px[free] - predicted[lost][:, None], axis=2) / spacing[lost][:, None]
+    around = np.where(blob[neighbours[lost]] >= 0, area[blob[neighbours[lost]]], np.nan)
+    known = np.isfinite(around).any(axis=1)
+    expected = np.full(len(lost), np.nan)
+    expected[known] = np.nanmedian(around[known], axis=1)
+    ratio = area[free] / expected[:, None]
+    distance[~((ratio > 1 / ADOPT_AREA_RATIO) & (ratio < ADOPT_AREA_RATIO))] = np.inf
+    blob = blob.copy()
+    for row, column in zip(*np.nonzero(distance < ADOPT_GATE), strict=True):
+        if distance[row, column] == distance[row].min() == distance[:, column].min():
+            blob[lost[row]] = free[column]
+    return blob
+
+
+def _middle(px: np.ndarray) -> np.ndarray:
+    """Middle (2,) of the extent of points (K, 2), without the outermost few."""
+    ordered = np.sort(px, axis=0)
+    margin = int(EXTENT_MARGIN * len(px))
+    return (ordered[margin] + ordered[-1 - margin]) / 2
+
+
+def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Pairs to start from: pins around the rim, where motion is least, then inside, with their 1st, 2nd, 3rd nearest blobs."""
+    rim, inside = reference.outmost, len(reference.pins_px) - len(reference.outmost)
+    pins = np.concatenate(
+        [rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], [*range(0, inside, max(inside // INSIDE_SEEDS, 1))]]
+    )
+    extent = _middle(px) - _middle(reference.pins_px)
+    median = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
+    seen: set[tuple[int, int]] = set()
+    for rank in range(SEED_RANKS):
+        for offset in (extent, np.zeros(2), median):
+            for pin in pins.tolist():
+                distance2 = ((px - (reference.pins_px[pin] + offset)) ** 2).sum(axis=1)
+                pair = pin, int(np.argpartition(distance2, rank)[rank])
+                if pair not in seen:
+                    seen.add(pair)
+                    yield pair
+
+
+def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buckets: Buckets, cell: float) -> Match:
+    """Forget the labels around the lost pins and grow them anew from the others."""
+    rest, neighbours = layout.rest, layout.neighbours
+    for reach in (NEAR, neighbours.shape[1]):
+        doubtful = np.zeros(len(rest), bool)
+        lost = found.blob < 0
+        doubtful[neighbours[lost, :reach].ravel()] = True
+        start = np.where(doubtful, -1, found.blob)
+        if (start >= 0).sum() < LEAST_KEPT * len(rest):
+            break
+        again = _refine(layout, px, area, _grow(*layout[:3], px, start, buckets, cell), buckets, cell)
+        if again.score > found.score:
+            found = again
+        if (found.blob >= 0).all():
+            break
+    return found
+
+
+def _layout(reference: Reference) -> Layout:
+    """The reference's arrays, and where its rings end: the outermost ring has as many pins as ``outmost``, each inner one six fewer."""
+    n, rings = len(reference.pins_px), len(reference.outmost) // 6
+    ring = np.arange(rings + 1)
+    ring_ends = n - 3 * (rings * (rings + 1) - ring * (ring + 1))
+    return Layout(reference.pins_px, reference.neighbours, reference.spacing_px, ring_ends)
+
+
+def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
+    """Label blobs by the pins of a reference.
+
+    Parameters
+    ----------
+    reference : Reference
+    px : (K, 2) float
+        Blob centroids, px, in any order.
+    area_px2 : (K,) float
+        Blob areas.
+
+    Returns
+    -------
+    Match
+        The best labelling found; it may be poor: see its score.
+    """
+    n = len(reference.pins_px)
+    nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
+    if len(px) < 3:
+        return nothing
+    px = np.ascontiguousarray(px)
+    layout = _layout(reference)
+    cell = float(np.median(reference.spacing_px))
+    buckets = _buckets(px, cell)
+    grown: list[tuple[float, np.ndarray, Match | None]] = []
+    for pin, blob in _seeds(reference, px):
+        start = np.full(n, -1)
+        start[pin] = blob
+        labels = _grow(*layout[:3], px, start, buckets, cell)
+        unwound = _unwound(layout.rest, px, labels, layout.ring_ends)
+        if (unwound >= 0).any() and not np.array_equal(unwound, labels):
+            labels = _grow(*layout[:3], px, unwound, buckets, cell)
+        count = int((labels >= 0).sum())
+        if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
+            found = _refine(layout, px, area_px2, labels, buckets, cell)
+            if found.score >= SETTLED * count:
+                grown = [(found.score, labels, found)]
+                break
+        grown.append((count, labels, None))
+    grown.sort(key=lambda entry: -entry[0])
+    best = nothing
+    for _, labels, refined in grown[:REFINED]:
+        found = refined or _refine(layout, px, area_px2, labels, buckets, cell)
+        best = max(best, found, key=lambda entry: entry.score)
+    lost = int((best.blob < 0).sum())
+    if 0 < lost < MOST_REGROWN * n and len(px) > n - lost:
+        best = _regrown(layout, px, area_px2, best, buckets, cell)
+    return best
+
+
+def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray) -> Match:
+    """Settle a labelling ``blob`` (N,) of nearly all pins on a slightly different set of blobs, as ``match`` would."""
+    px = np.ascontiguousarray(px)
+    cell = float(np.median(reference.spacing_px))
+    layout = _layout(reference)
+    return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)

@@ -1,0 +1,324 @@
+"""From a frame to an observation, in one way for rendered, recorded and live frames.
+
+Whether the sensor is pressed in a frame that should show no contact: motion of the pins that no camera could make."""
+
+from time import perf_counter
+
+import numpy as np
+
+from scenes.sensor import BlobSpec, SensorSpec
+from twin.errors import FrameError
+from twin.frames.forms import blob_spec, frame_size, gray_levels
+from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, own_threshold
+from twin.pins.graph import GraphKind, make_graph
+from twin.pins.matching import Match, match, predict_all, rematch
+from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
+from twin.pins.split import split_chains, split_merged
+from twin.types import Form, Frame, Observation
+
+# Limits of an observation; they were chosen, not derived.
+# Least share of the pins that must be found.
+MIN_FOUND = 0.8
+# Most blobs among the pins that are no pins, as a share of the pins, where some pins are missing.
+MAX_EXTRA = 0.35
+# Share of the pins from which on none counts as missing; then there may be as many further blobs as pins.
+NEARLY_ALL = 0.97
+# Largest share of the reference's triangles that may be turned over: more is a wrong labelling.
+MAX_FOLDED = 0.02
+# Largest ratio of the rim's radius to that at rest, either way. The rim is clamped: contact changes it by some percent.
+MAX_RIM_SCALE = 1.2
+# Largest displacement of the layout, in its radii: a frame displaced further is not this sensor's view.
+MAX_SHIFT = 0.5
+# Largest area of a blob, in squared mean spacings: larger ones are housing or glare.
+MAX_BLOB_PITCHES2 = 3.0
+# Rounds of splitting caps that touch: each split corrects the predictions for the next.
+SPLIT_ROUNDS = 3
+# Where a smaller share of the pins than this is found, or MAX_EXTRA further blobs, the frame is looked at again.
+ENOUGH = 0.985
+# The thresholds of these looks, in the frame's own threshold half way between caps and skin. The low one finds caps much darker than most.
+OWN_SHARES = (1.0, 0.3)
+# Pins that a further blob costs where looks are compared: noise and clutter make hundreds of blobs.
+EXTRA_COST = 0.05
+# Displacement of a frame, px, above which its mask is displaced, too ...
+REMASK_PX = 2.0
+# ... if a pin is this close to the mask's edge, in spacings.
+MASK_MARGIN = 0.5
+# Share of the pins above which a labelling is taken as a basis for further steps.
+PLAUSIBLE = 0.5
+# Weight of a pin that was itself predicted, where pins in a gap are predicted from the gap's edge inwards.
+PREDICTED_WEIGHT = 0.1
+
+
+class Pipeline:
+    """Finds, labels and connects the pins of one sensor's frames.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    form : Form
+        Form of the frames it will be given.
+    reference : Reference, optional
+        No-contact layout; by default the specification's own.
+    graph : {"voronoi", "delaunay", "knn"}
+    second_look : bool
+        Where an adaptive threshold loses pins, or finds much that is no pin, look again with thresholds from the frame's own contrast.
+    """
+
+    def __init__(
+        self,
+        spec: SensorSpec,
+        form: Form,
+        reference: Reference | None = None,
+        *,
+        graph: GraphKind = "voronoi",
+        second_look: bool = True,
+    ) -> None:
+        self.spec, self.form, self.graph, self.second_look = spec, Form(form), graph, second_look
+        self.size_px = frame_size(spec, self.form)
+        self.blob_spec = blob_spec(spec.pipeline, self.form)
+        self.reference = nominal_reference(spec, self.form) if reference is None else reference
+        self.mask = circular_mask(self.size_px, self.blob_spec.mask_center_px, self.blob_spec.mask_radius_px)
+        pitch = float(np.mean(self.reference.spacing_px))
+        self._max_area_px2 = MAX_BLOB_PITCHES2 * pitch**2
+        self._center_px = np.median(self.reference.pins_px, axis=0)
+        self._radius_px = float(np.linalg.norm(self.reference.pins_px - self._center_px, axis=1).max())
+
+    def __call__(self, frame: Frame) -> Observation:
+        """Observe one frame; a frame without (enough) pins gives ``valid=False`` and why.
+
+        Raises
+        ------
+        FrameError
+            The image isn't one of this sensor's frames: wrong size, type or form.
+        """
+        self.check(frame)
+        started = perf_counter()
+        ms: dict[str, float] = {}
+        blobs, found = self._look(frame, self.blob_spec, ms)
+        now = perf_counter()
+        if self.second_look and self.blob_spec.threshold_block_px and not self._clear(blobs, found):
+            blobs, found = self._with_own_threshold(frame, blobs, found)
+        ms["look again"], now = _since(now)
+        paired = found.blob >= 0
+        pins_px = np.full_like(self.reference.pins_px, np.nan)
+        pins_px[paired] = blobs.px[found.blob[paired]]
+        nodes_px = self._complete(pins_px)
+        predicted_px = np.where(paired[:, None], np.nan, nodes_px)
+        extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
+        ms["complete"], now = _since(now)
+        reason = self._reason(blobs, int(paired.sum()), nodes_px, extra_px)
+        graph = None
+        if not reason:
+            graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost)
+        ms["graph"], now = _since(now)
+        ms["total"], _ = _since(started)
+        return Observation(pins_px, predicted_px, int(paired.sum()), not reason, reason, graph, extra_px, ms)
+
+    def check(self, frame: Frame) -> None:
+        """Raise ``FrameError`` where a frame is not of this sensor and form: size, type, form."""
+        image, (width, height) = frame.image, self.size_px
+        where = frame.name or "frame"
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+            raise FrameError(f"{where}: expected 8-bit levels, got {getattr(image, 'dtype', type(image).__name__)}; convert it to uint8")
+        if image.ndim not in (2, 3) or image.shape[:2] != (height, width) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
+            raise FrameError(
+                f"{where}: expected {width}x{height} gray or RGB ({self.form} form of {self.spec.name}), got shape {image.shape};"
+                " give the right --sensor or --form, or the unresized frame"
+            )
+        if frame.form != self.form:
+            raise FrameError(f"{where}: expected a {self.form} frame, got a {frame.form} one; make a Pipeline of that form for it")
+
+    def _look(self, frame: Frame, blob: BlobSpec, ms: dict[str, float]) -> tuple[Blobs, Match]:
+        """Blobs and their labelling, by one threshold; times of the stages go into ``ms``."""
+        started = perf_counter()
+        blobs = self._detect(frame, self.mask, blob)
+        ms["detect"], now = _since(started)
+        found = match(self.reference, blobs.px, blobs.area_px2)
+        if self._plausible(found):
+            blobs, found = self._with_displaced_mask(frame, blob, blobs, found)
+        if (found.blob < 0).any() and self._plausible(found):
+            blobs, found = self._with_split_caps(blobs, found)
+        ms["match"], _ = _since(now)
+        return blobs, found
+
+    def _with_own_threshold(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
+        """Look again with thresholds from this frame's own contrast until nearly all pins are found; the best labelling of all looks."""
+        own = own_threshold(self._window(frame, self.mask), self.mask.disc, self.blob_spec)
+        best = blobs, found
+        for share in OWN_SHARES:
+            again = self._look(frame, self.blob_spec.model_copy(update={"threshold": share * own}), {})
+            best = max(best, again, key=lambda look: look[1].score - EXTRA_COST * _extra(*look))
+            if self._clear(*best):
+                break
+        return best
+
+    def _clear(self, blobs: Blobs, found: Match) -> bool:
+        """Whether nearly all pins are found, and little else."""
+        n = len(found.blob)
+        return bool((found.blob >= 0).sum() >= ENOUGH * n) and _extra(blobs, found) <= MAX_EXTRA * n
+
+    def _window(self, frame: Frame, mask: Mask) -> np.ndarray:
+        """Gray levels (h, w) of the mask's window, without hot and dead pixels where the threshold is adaptive."""
+        window = gray_levels(np.ascontiguousarray(frame.image[mask.window]))
+        return despeckled(window) if self.blob_spec.threshold_block_px else window
+
+    def _detect(self, frame: Frame, mask: Mask, blob: BlobSpec) -> Blobs:
+        """Blobs in the mask's window, those that are several caps in a row split."""
+        return split_chains(find_blobs(self._window(frame, mask), mask, blob, max_area_px2=self._max_area_px2))
+
+    def _plausible(self, found: Match) -> bool:
+        """Whether a labelling is good enough to be improved."""
+        return bool((found.blob >= 0).sum() > PLAUSIBLE * len(found.blob))
+
+    def _with_displaced_mask(self, frame: Frame, blob: BlobSpec, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
+        """Look again with a displaced mask, if the whole view is displaced so far that the mask cuts pins off, or nearly."""
+        paired = found.blob >= 0
+        rim = self.reference.outmost[paired[self.reference.outmost]]
+        away = np.linalg.norm(found.predicted_px - self.blob_spec.mask_center_px, axis=1)
+        if not len(rim) or not (away > self.blob_spec.mask_radius_px - MASK_MARGIN * self.reference.spacing_px).any():
+            return blobs, found
+        shift = np.median(blobs.px[found.blob[rim]] - self.reference.pins_px[rim], axis=0)
+        if np.linalg.norm(shift) < REMASK_PX:
+            return blobs, found
+        center = np.asarray(self.blob_spec.mask_center_px) + shift
+        displaced = self._detect(frame, circular_mask(self.size_px, tuple(center), self.blob_spec.mask_radius_px), blob)
+        again = match(self.reference, displaced.px, displaced.area_px2)
+        return (displaced, again) if again.score > found.score else (blobs, found)
+
+    def _with_split_caps(self, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
+        """Split caps that touch. Each split corrects the predictions for the next."""
+        for _ in range(SPLIT_ROUNDS):
+            parts = split_merged(self.reference, blobs, found)
+            if parts is blobs:
+                break
+            kept = {tuple(px): k for k, px in enumerate(parts.px)}
+            before = np.array([kept.get(tuple(blobs.px[k]), -1) if k >= 0 else -1 for k in found.blob])
+            again = rematch(self.reference, parts.px, parts.area_px2, before)
+            if again.score <= found.score:
+                break
+            blobs, found = parts, again
+        return blobs, found
+
+    def _complete(self, pins_px: np.ndarray) -> np.ndarray:
+        """Pins (N, 2); a lost pin takes the place that its neighbours' motion predicts."""
+        reference = self.reference
+        found = np.isfinite(pins_px[:, 0])
+        if found.all():
+            return pins_px
+        nodes_px = np.where(found[:, None], pins_px, reference.pins_px)
+        known = found.astype(float)
+        while known.any() and not known.all():  # from the edge of a gap inwards
+            predicted = predict_all(reference.pins_px, reference.neighbours, reference.spacing_px, nodes_px, known)
+            new = (known == 0) & np.isfinite(predicted[:, 0])
+            if not new.any():
+                break
+            nodes_px[new] = predicted[new]
+            known[new] = PREDICTED_WEIGHT
+        return nodes_px
+
+    def _reason(self, blobs: Blobs, found: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
+        """Why a frame is no valid observation; "" if it is one."""
+        n = len(nodes_px)
+        if len(blobs.px) < MIN_FOUND * n / 2:
+            return f"no pins: {len(blobs.px)} blobs seen, {n} pins expected"
+        if found < MIN_FOUND * n:
+            return f"too few pins: {found} of {n} found among {len(blobs.px)} blobs, {MIN_FOUND:.0%} needed"
+        folded = folded_fraction(self.reference, nodes_px)
+        if folded > MAX_FOLDED:
+            return f"inconsistent pins: the labelling turns {folded:.1%} of the layout over"
+        shift = np.linalg.norm(np.median(nodes_px, axis=0) - self._center_px)
+        if shift > MAX_SHIFT * self._radius_px:
+            return f"inconsistent pins: the layout is displaced by {shift:.0f} px"
+        rim = self.reference.outmost
+        scale = _mean_radius(nodes_px[rim]) / _mean_radius(self.reference.pins_px[rim])
+        if not 1 / MAX_RIM_SCALE < scale < MAX_RIM_SCALE:
+            return f"inconsistent pins: the rim is {scale:.2f} times its size at rest; another sensor's frame"
+        center = nodes_px.mean(axis=0)
+        radius = np.linalg.norm(nodes_px - center, axis=1).max()
+        extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
+        if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
+            return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
+        return ""
+
+
+def _extra(blobs: Blobs, found: Match) -> int:
+    """Number of blobs that are no pins."""
+    return len(blobs.px) - int((found.blob >= 0).sum())
+
+
+def _mean_radius(px: np.ndarray) -> float:
+    """Mean distance of points (n, 2) from their mean."""
+    return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
+
+
+def _since(start: float) -> tuple[float, float]:
+    """Milliseconds since a time of ``perf_counter``, and the time now."""
+    now = perf_counter()
+    return 1e3 * (now - start), now
+
+
+def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
+    """The reference that a no-contact frame shows; lost pins are filled in from their neighbours.
+
+    Raises
+    ------
+    FrameError
+        The layout can't be found in the frame.
+    """
+    observation = Pipeline(spec, form, graph="delaunay")(frame)
+    if observation.graph is None:
+        raise FrameError(
+            f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout"
+        )
+    return make_reference(observation.graph.nodes_px, spec.pins.rings)
+
+
+# Largest dent, in the rim's mean radius, of a sensor at rest. Measured: 0.0026 to 0.0041 at rest in three real sensors, 0.005 with a camera
+# tilted by 2 deg; in real contacts at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A touch lighter than about 2 mm is
+# not noticed: it moves the pins less than cameras differ.
+MOST_DENT = 0.008
+
+
+def dent_of(pins_px: np.ndarray, reference: Reference) -> float:
+    """Largest motion of neighbouring pins that another camera cannot explain, in the rim's mean radius.
+
+    Another place, tilt, focal length or radial distortion of the camera moves the reference, to first order, by
+    ``u = t + G x + (h . x) x + k |x|^2 x``. This motion is fitted by least squares and taken away. The rest is averaged over each
+    pin and its neighbours, because the tolerances of a print differ from pin to pin and shall not count.
+
+    Parameters
+    ----------
+    pins_px : (N, 2) float
+        NaN where lost.
+    reference : Reference
+    """
+    rim = reference.pins_px[reference.outmost]
+    middle = rim.mean(axis=0)
+    radius_px = float(np.linalg.norm(rim - middle, axis=1).mean())
+    place, moved = (reference.pins_px - middle) / radius_px, (pins_px - reference.pins_px) / radius_px
+    seen = np.isfinite(moved[:, 0])
+    x, y = place.T
+    one, none, square = np.ones_like(x), np.zeros_like(x), x * x + y * y
+    along_x = np.column_stack([one, none, x, y, none, none, x * x, x * y, square * x])
+    along_y = np.column_stack([none, one, none, none, x, y, x * y, y * y, square * y])
+    camera = np.linalg.lstsq(np.concatenate([along_x[seen], along_y[seen]]), moved[seen].T.ravel(), rcond=None)[0]
+    left = moved - np.column_stack([along_x @ camera, along_y @ camera])
+    around = np.column_stack([np.arange(len(left)), reference.neighbours])[seen]
+    return float(np.linalg.norm(np.nanmean(left[around], axis=1), axis=1).max())
+
+
+def require_untouched(spec: SensorSpec, form: Form, frame: Frame, remedy: str) -> None:
+    """Refuse a frame that is meant to show no contact if its pins show one. A frame in which the pins are not found passes.
+
+    Raises
+    ------
+    FrameError
+        Ends with ``remedy``: what to do.
+    """
+    pipeline = Pipeline(spec, form, graph="delaunay")
+    seen = pipeline(frame)
+    if seen.valid and (dent := dent_of(seen.pins_px, pipeline.reference)) > MOST_DENT:
+        raise FrameError(
+            f"{frame.name or 'frame'}: the sensor seems pressed: its pins are dented by {dent:.1%} of their rim's radius from where "
+            f"{spec.name} has them without contact (allowed {MOST_DENT:.1%}); {remedy}"
+        )

@@ -1,0 +1,74 @@
+"""Where the pins of a sensor are in a frame without contact, and which pins are neighbours there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import Delaunay, cKDTree
+
+from scenes.sensor import SensorSpec
+from twin.camera.projection import project
+from twin.frames.forms import from_raw
+from twin.geometry.pins import rest_pins
+from twin.pins.voronoi import voronoi
+from twin.types import Form
+
+# Neighbours of a pin: two rings of a triangular lattice, enough for a local affine fit without the pin itself.
+NEIGHBOURS = 18
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The no-contact layout in px of one form of frame, in the specification's pin order.
+
+    Attributes
+    ----------
+    pins_px : (N, 2) float
+    neighbours : (N, k) int
+        Other pins by increasing distance.
+    spacing_px : (N,) float
+        Distance to the nearest other pin.
+    triangles : (t, 3) int
+        Delaunay triangles, all of the same orientation, without those of three outmost pins.
+    outmost : (m,) int
+        The outmost pins, in order around the layout.
+    area_px2 : (N,) float
+        Voronoi cell areas.
+    """
+
+    pins_px: np.ndarray
+    neighbours: np.ndarray
+    spacing_px: np.ndarray
+    triangles: np.ndarray
+    outmost: np.ndarray
+    area_px2: np.ndarray
+
+
+def make_reference(pins_px: np.ndarray, rings: int) -> Reference:
+    """Reference from rest positions (N, 2) of a layout whose last 6 ``rings`` pins are the outmost ones, in order."""
+    pins_px = np.ascontiguousarray(pins_px, float)
+    n = len(pins_px)
+    distance, index = cKDTree(pins_px).query(pins_px, k=min(NEIGHBOURS + 1, n))
+    triangles = Delaunay(pins_px).simplices.astype(np.int64)
+    area = _double_areas(pins_px, triangles)
+    triangles[area < 0] = triangles[area < 0][:, ::-1]
+    inner = (triangles < n - 6 * rings).any(axis=1)  # thin triangles of outmost pins alone turn over without meaning
+    triangles = triangles[inner]
+    outmost = np.arange(n - 6 * rings, n)
+    area_px2 = voronoi(pins_px, outmost=outmost).area_px2
+    return Reference(pins_px, np.ascontiguousarray(index[:, 1:]), distance[:, 1], triangles, outmost, area_px2)
+
+
+def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
+    """Reference from the specification alone: rest caps projected by its camera."""
+    return make_reference(from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm)), spec.pins.rings)
+
+
+def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Twice the signed area (t,) of triangles (t, 3) over points (N, 2)."""
+    a, b, c = px[triangles[:, 0]], px[triangles[:, 1]], px[triangles[:, 2]]
+    return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+
+
+def folded_fraction(reference: Reference, nodes_px: np.ndarray) -> float:
+    """Share of the reference's triangles that turn over when the pins move to ``nodes_px`` (N, 2)."""
+    return float(np.mean(_double_areas(nodes_px, reference.triangles) <= 0))

@@ -1,0 +1,190 @@
+"""Caps that touch and have merged into one component: split into one disc each, where the pixels allow it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from twin.pins.blobs import Blobs
+from twin.pins.matching import Match
+from twin.pins.reference import Reference
+
+# All limits were chosen, not derived.
+# A component may be claimed by a pin whose predicted place is this near to it, in spacings.
+REACH = 0.4
+# Least area of a component, as a share of the areas expected of all its claimants: less is one cap, not several.
+MIN_AREA_SHARE = 0.65
+# Least distance of two parts, in cap diameters.
+MIN_SEPARATION = 0.6
+# Least weight of the smallest part, relative to an equal share.
+MIN_PART = 0.4
+# Rounds of k-means.
+ROUNDS = 12
+# Parts from which on a component is a net made by scratches or glare. It is large and each round is slow, so there are fewer rounds.
+MANY, ROUNDS_OF_MANY = 24, 3
+# Shift of the parts' centres, px, below which k-means has settled.
+SETTLED_PX = 1e-3
+# Least elongation of a chain of caps. Two touching discs have 5.
+MIN_ELONGATION = 2.0
+# Least elongation of a chain, relative to the median of the blobs around it: near the rim all caps are long.
+ODD_ELONGATION = 1.5
+# Least and largest area of a chain, in median areas of the blobs around it.
+MIN_CAPS, MAX_CAPS = 1.35, 5.0
+# Largest width of a neck, relative to that of the narrower part beside it.
+NECK = 0.7
+# Least area of a chain with a neck, in median areas of the blobs around it.
+MIN_CAPS_NECKED = 1.0
+# Blobs over which these medians are taken, the chain itself included.
+AROUND = 13
+
+
+def _label_near(blobs: Blobs, px: np.ndarray, reach_px: float) -> int:
+    """Label of the component at a place (2,) in the frame, or of the nearest within reach; 0 for none."""
+    column, row = np.round(px - blobs.corner_px).astype(int)
+    reach = int(np.ceil(reach_px))
+    height, width = blobs.labels.shape
+    if not (0 <= column < width and 0 <= row < height):
+        return 0
+    top, left = max(row - reach, 0), max(column - reach, 0)
+    patch = blobs.labels[top : row + reach + 1, left : column + reach + 1]
+    rows, columns = np.nonzero(patch)
+    if not len(rows):
+        return 0
+    nearest = np.argmin((rows + top - row) ** 2 + (columns + left - column) ** 2)
+    return int(patch[rows[nearest], columns[nearest]])
+
+
+def _weight(level: np.ndarray) -> np.ndarray:
+    """Weights (p,) of pixels: their levels above the darkest one; 1 where all are alike."""
+    return level - float(level.min()) if np.ptp(level) else np.ones(len(level))
+
+
+def _neck(along: np.ndarray, weight: np.ndarray) -> float | None:
+    """Place along a component's axis where it is narrow between two wide parts; None where there is no such neck.
+
+    ``along`` (p,): places of its pixels along the axis, px; ``weight`` (p,).
+    """
+    low = np.floor(along.min())
+    width = np.convolve(np.bincount((along - low).astype(int), weight), [0.25, 0.5, 0.25])[1:-1]  # by px along the axis, smoothed
+    inner = np.arange(2, len(width) - 2)
+    if not len(inner):
+        return None
+    left, right = np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1]
+    ratio = width[inner] / np.minimum(left[inner], right[inner])
+    narrowest = ratio.argmin()
+    return float(low + inner[narrowest] + 0.5) if ratio[narrowest] < NECK else None
+
+
+def _parts(blobs: Blobs, label: int, seeds_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted k-means of a component's pixels from seeds: centres (n, 2) px of the frame, shares of the weight (n,)."""
+    pixels, level = blobs.pixels(label)
+    weight = _weight(level)
+    middle = np.average(pixels, axis=0, weights=weight)
+    pixels = pixels - middle
+    centers = seeds_px - seeds_px.mean(axis=0)
+    share: np.ndarray = np.zeros(len(centers))
+    for _ in range(ROUNDS if len(centers) < MANY else ROUNDS_OF_MANY):
+        owner = ((centers**2).sum(axis=1) - 2 * pixels @ centers.T).argmin(axis=1)  # nearest; a large component has many of both
+        share = np.bincount(owner, weight, len(centers))
+        if (share <= 0).any():
+            break
+        moved = np.stack([np.bincount(owner, weight * pixels[:, axis], len(centers)) / share for axis in (0, 1)], axis=1)
+        if np.abs(moved - centers).max() < SETTLED_PX:
+            break
+        centers = moved
+    return middle + centers, share / weight.sum()
+
+
+def _with_parts(blobs: Blobs, split: list[int], px: list[np.ndarray], area_px2: list[float], label: list[int]) -> Blobs:
+    """The blobs, with those of the labels ``split`` replaced by parts: places (2,), areas and labels."""
+    rest = ~np.isin(blobs.label, split)
+    return replace(
+        blobs,
+        px=np.concatenate([blobs.px[rest], px]),
+        area_px2=np.concatenate([blobs.area_px2[rest], area_px2]),
+        elongation=np.concatenate([blobs.elongation[rest], np.ones(len(px))]),
+        label=np.concatenate([blobs.label[rest], label]),
+    )
+
+
+def _both_sides(pixels: np.ndarray, weight: np.ndarray, beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (2, 2) and shares of the weight (2,) of the pixels (p, 2) before and ``beyond`` (p,) a neck."""
+    share = np.array([weight[~beyond].sum(), weight[beyond].sum()]) / weight.sum()
+    return np.stack([np.average(pixels[part], axis=0, weights=weight[part]) for part in (~beyond, beyond)]), share
+
+
+def split_chains(blobs: Blobs) -> Blobs:
+    """The blobs; each one that is as long and large as two or more of its neighbours is replaced by that many parts."""
+    long = np.flatnonzero(blobs.elongation > MIN_ELONGATION)
+    if not len(long) or len(blobs.px) < AROUND:
+        return blobs
+    distance2 = ((blobs.px - blobs.px[long, None]) ** 2).sum(axis=2)
+    around = np.argpartition(distance2, AROUND - 1, axis=1)[:, :AROUND]
+    odd = blobs.elongation[long] > ODD_ELONGATION * np.median(blobs.elongation[around], axis=1)
+    caps_in = blobs.area_px2[long] / np.median(blobs.area_px2[around], axis=1)
+    split: list[int] = []
+    px: list[np.ndarray] = []
+    part_area: list[float] = []
+    part_label: list[int] = []
+    for k, caps in zip(long[odd], caps_in[odd], strict=True):
+        pixels, level = blobs.pixels(int(blobs.label[k]))
+        weight = _weight(level)
+        middle = np.average(pixels, axis=0, weights=weight)
+        axis = np.linalg.eigh(np.cov(pixels.T, aweights=weight))[1][:, 1]
+        along = (pixels - middle) @ axis
+        neck = _neck(along, weight)
+        if not (MIN_CAPS_NECKED if neck is not None else MIN_CAPS) < caps < MAX_CAPS:
+            continue
+        count = 2 if neck is not None else max(int(np.round(caps)), 2)
+        if neck is not None:
+            centers, share = _both_sides(pixels, weight, along > neck)
+        else:
+            seeds = middle + np.outer(np.quantile(along, (np.arange(count) + 0.5) / count), axis)
+            centers, share = _parts(blobs, int(blobs.label[k]), seeds)
+        if share.min() > MIN_PART / count:
+            split.append(int(blobs.label[k]))
+            px += list(centers)
+            part_area += list(share * blobs.area_px2[k])
+            part_label += [int(blobs.label[k])] * count
+    return _with_parts(blobs, split, px, part_area, part_label) if split else blobs
+
+
+def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
+    """The blobs; each component that several pins claim is replaced by as many parts.
+
+    A pin claims a component if the component, or a part of it, was matched to the pin, or if the pin is lost and predicted there.
+    The component is split if it is large enough for all claimants and falls into as many parts of a cap's size.
+    """
+    labelled = found.blob >= 0
+    claims: dict[int, list[int]] = {}
+    for pin in np.flatnonzero(~labelled & np.isfinite(found.predicted_px).all(axis=1)):
+        label = _label_near(blobs, found.predicted_px[pin], REACH * reference.spacing_px[pin])
+        if label:
+            claims.setdefault(label, []).append(int(pin))
+    if not claims:
+        return blobs
+    owned_label = np.where(labelled, blobs.label[found.blob], 0)
+    area = np.full(len(found.blob), np.nan)
+    area[labelled] = blobs.area_px2[found.blob[labelled]]
+    split: list[int] = []
+    px: list[np.ndarray] = []
+    part_area: list[float] = []
+    part_label: list[int] = []
+    for label, pins in claims.items():
+        pins += np.flatnonzero(owned_label == label).tolist()
+        around = area[reference.neighbours[pins]]
+        if len(pins) < 2 or not np.isfinite(around).any():
+            continue
+        expected = float(np.nanmedian(around))
+        whole = blobs.label_area_px2[label]
+        if whole < MIN_AREA_SHARE * expected * len(pins):
+            continue
+        centers, share = _parts(blobs, label, found.predicted_px[pins])
+        apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(pins), np.inf))
+        if apart.min() > MIN_SEPARATION * 2 * np.sqrt(expected / np.pi) and share.min() > MIN_PART / len(pins):
+            split.append(label)
+            px += list(centers)
+            part_area += list(share * whole)
+            part_label += [label] * len(pins)
+    if not split:
+        return blobs
+    return _with_parts(blobs, split, px, part_area, part_label)

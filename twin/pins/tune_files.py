@@ -1,0 +1,89 @@
+"""Parameters of the pin detection, from a folder of a user's own frames to a file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from scenes import SensorSpec
+from twin.errors import FrameError
+from twin.frames import evenly_read, open_recording
+from twin.pins.detector_spec import Evidence, Method, write_detector
+from twin.pins.tune import Tuned, tune
+from twin.progress import Progress, silent, stage
+from twin.types import Form
+
+LIMIT = 12  # frames that are looked at
+
+
+@dataclass(frozen=True)
+class TunedOnFrames:
+    """What was found.
+
+    Attributes
+    ----------
+    tuned : Tuned
+    evidence : Evidence
+        How sure it is.
+    pins : int
+        Of the sensor.
+    written : list of Path
+        The file, where one was wanted.
+    """
+
+    tuned: Tuned
+    evidence: Evidence
+    pins: int
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """How sure it is, the parameters, and what speaks against them; for people."""
+        detector, evidence = self.tuned.detector, self.evidence
+        blob, exact, low = detector.blob, 100 * evidence.exact_rate, 100 * evidence.low_rate
+        (x, y), radius, slack = blob.mask_center_px, blob.mask_radius_px, evidence.mask_slack_px
+        lines = [
+            f"{evidence.sure}: all {self.pins} pins in {exact:.0f} % of {evidence.frames} frames (90 % sure: at least {low:.0f} %)",
+            f"mask centre ({x:g}, {y:g}) px, radius {radius:g} px, {slack:g} px beyond the outermost pins",
+        ]
+        if recorder := detector.recording:
+            lines.append(f"crop {recorder.crop_px}, adaptive threshold {recorder.threshold_offset:g} over {recorder.threshold_block_px} px")
+        else:
+            over = f" over {blob.threshold_block_px} px, erosion {blob.erosion_px} px" if blob.threshold_block_px else ""
+            lines.append(
+                f"threshold {blob.threshold:g}{over}, slack {evidence.threshold_slack:g} gray levels; least area {blob.min_area_px2:g} px2"
+            )
+        return [*lines, *(f"note: {note}" for note in self.tuned.notes)]
+
+
+def tune_on_frames(
+    path: Path,
+    sensor: SensorSpec,
+    *,
+    out: Path | None = None,
+    method: Method = "twin",
+    form: Form | None = None,
+    limit: int = LIMIT,
+    progress: Progress = silent,
+) -> TunedOnFrames:
+    """Find the parameters from at most ``limit`` frames, evenly spread over what lies at a path.
+
+    Parameters
+    ----------
+    sensor : SensorSpec
+        Only the layout of its pins is used.
+    out : Path, optional
+        The ``.toml`` file to write.
+
+    Raises
+    ------
+    FrameError
+        No frame shows the layout, or ``out`` is no name of a ``.toml`` file.
+    """
+    if out is not None and out.suffix != ".toml":
+        raise FrameError(f"--out {out}: give the name of a .toml file")
+    frames = evenly_read(open_recording(path, sensor, form), limit)
+    with stage(progress, "tuning") as step:
+        found = tune(frames, sensor, method, progress=step)
+    evidence = found.detector.evidence
+    assert evidence is not None  # whoever tunes says how sure it is
+    if out is not None:
+        write_detector(out, found.detector, f"Found by 'twin tune' from {len(frames)} frames of {path.name}; {evidence.sure}.")
+    return TunedOnFrames(found, evidence, sensor.pins.count, [] if out is None else [out])

@@ -101,7 +101,7 @@ def test_a_changed_line_of_the_solver_is_other_code_for_all_that_was_solved(tree
 
 
 HARMLESS = {
-    "a help text": ("twin/cli/dataset.py", 'help="', 'help="Now: '),
+    "a help text": ("twin/cli/learning.py", 'help="', 'help="Now: '),
     "a docstring": (SOLVER, '"""', '"""Otherwise said. '),
     "a comment": (SOLVER, "\nclass SkinSolver", "\n# A remark.\nclass SkinSolver"),
     "formatting": (SOLVER, "import Callable, Iterator", "import (\n    Callable,\n    Iterator,\n)"),

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from scenes.base import NonNegative, Positive, Section
+from scenes.base import Name, NonNegative, Positive, Section
 
 
 class PlaneShape(Section):
@@ -85,7 +85,7 @@ class ObjectSpec(Section):
     point has slid by some ``slip_weakening_mm``. ``shear_strength_mpa`` bounds the friction stress (default: no bound).
     """
 
-    name: str
+    name: Name
     description: str
     source: str = ""
     shape: Shape

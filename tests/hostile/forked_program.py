@@ -44,7 +44,7 @@ LIBRARIES = (  # whose import takes long; Mitsuba is not among them, as it start
 )
 PACKAGES = ("scenes", "twin", "training", "hardware")
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")}
-LOOK_S = 0.05  # between two looks at a running call
+LOOK_S = 0.1  # between two looks at a running call
 GRACE_S = 3.0  # for its helper processes to end after it
 MOST_OUTPUT = 2_000_000  # bytes of stdout and of stderr that are kept
 SET_CHILD_SUBREAPER = 36  # prctl(2): orphans of a call become children of the process that forks
@@ -54,13 +54,18 @@ HERE_ONLY = ("0100007F", "00000000000000000000000001000000", "0000000000000000FF
 
 @dataclass(frozen=True)
 class Limits:
-    """What a call may use: wall time, address space, size of a file it writes; ``end_after_s``: when it is sent ``end_signal``."""
+    """What a call may use: wall time, address space, size of a file it writes.
+
+    ``end_after_s`` seconds after it consists of ``end_processes`` processes it is sent ``end_signal``: SIGINT as a terminal does, to all
+    of them, others to the first alone.
+    """
 
     seconds: float = 60.0
     memory_bytes: int = 8 << 30
     file_bytes: int = 1 << 30
     end_after_s: float = 0.0
     end_signal: int = int(signal.SIGTERM)
+    end_processes: int = 1
 
 
 @dataclass(frozen=True)
@@ -179,6 +184,7 @@ def _watch(pid: int, out: int, err: int, limits: Limits, started: float) -> Ende
     kept = {out: bytearray(), err: bytearray()}
     opened: set[str] = set()
     status, usage, timed_out, told = None, None, False, False
+    complete: float | None = None  # when it consisted of all its processes
     with selectors.DefaultSelector() as looked:
         for descriptor in kept:
             looked.register(descriptor, selectors.EVENT_READ)
@@ -191,11 +197,14 @@ def _watch(pid: int, out: int, err: int, limits: Limits, started: float) -> Ende
                     looked.unregister(key.fd)
             if not looked.get_map():
                 time.sleep(LOOK_S)
-            opened |= _listening(_family(pid))
+            family = _family(pid)
+            opened |= _listening(family)
             passed = time.monotonic() - started
-            if limits.end_after_s and passed > limits.end_after_s and not told:
+            if complete is None and len(family) >= limits.end_processes:
+                complete = passed
+            if limits.end_after_s and complete is not None and passed > complete + limits.end_after_s and not told:
                 told = True
-                os.kill(pid, limits.end_signal)
+                (os.killpg if limits.end_signal == signal.SIGINT else os.kill)(pid, limits.end_signal)
             if passed > limits.seconds and not timed_out:
                 timed_out = True
                 _end(_family(pid))

@@ -8,6 +8,7 @@ nothing foreign touched, an end in time, bounded memory, no process left and no 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -39,6 +40,12 @@ class Entry:
         Words that the call must print, on stdout or stderr.
     leaves : tuple of str
         Files that a call that fails may leave in ``out``.
+    first : str
+        A harmless call that is made before, in the same folder.
+    then : dict of str to function of a path
+        What becomes of its inputs after it.
+    fresh : bool
+        Where it is done, stdout must be that of the same call with an ``out`` of its own.
     same : bool
         Where it is done, stdout must be that of the same call with the harmless inputs.
     seconds : float
@@ -47,8 +54,8 @@ class Entry:
         Of memory, at most.
     file_bytes : int
         No file may become larger: a full disk.
-    end : (float, int)
-        After so many seconds it is sent this signal.
+    end : (float, int, int)
+        After so many seconds it is sent this signal, counted from when it consists of so many processes.
     env : dict of str to str
         Environment of a Python that is started anew for this call.
     sample : bool
@@ -62,11 +69,14 @@ class Entry:
     exit: tuple[int, ...] = (REFUSED,)
     says: tuple[str, ...] = ()
     leaves: tuple[str, ...] = ()
+    first: str = ""
+    then: dict[str, Callable[[Path], object]] = field(default_factory=dict)
+    fresh: bool = False
     same: bool = False
     seconds: float = 20.0
     gibibytes: float = 3.0
     file_bytes: int = 1 << 30
-    end: tuple[float, int] = (0.0, 0)
+    end: tuple[float, int, int] = (0.0, 0, 1)
     env: dict[str, str] = field(default_factory=dict)
     sample: bool = False
 
@@ -101,7 +111,7 @@ READ_LABELS = {
 SLOWLY_READ_LABELS = {  # refused tables only: with others these simulate contacts for minutes
     "validate": f"validate {S} --frames {{data}} --out {{out}} --across 6 --limit 1 --friction-frames 0",
     "calibrate contact": f"calibrate contact {S} --frames {{data}} --out {{out}}/spec.toml --labels 4 --across 6 --workers 1",
-    "study sim-to-real": f"study sim-to-real {S} --frames {{data}} --out {{out}} --labels 4 --count 2 --epochs 1 --across 6 --workers 1",
+    "study sim-to-real": f"study sim-to-real {S} --frames {{data}} --out {{out}} --labels 12 --count 10 --epochs 1 --across 6 --workers 1",
 }
 LABELS, MOVES = "targets.csv", "move_executed.csv"
 
@@ -117,13 +127,13 @@ def _tables() -> list[Entry]:
         for what, edit in given.SAME_TABLE.items():
             found.append(Entry("tables", what, call, _table(edit), ANY, same=True, sample=command == "audit" and what == "semicolons"))
         for what, edit in given.TOLD_TABLE.items():
-            found.append(Entry("tables", what, call, _table(edit), ANY, (LABELS,)))
+            found.append(Entry("tables", what, call, _table(edit), ANY, (f"{LABELS}|pose_",)))
         for what, value in given.TOLD_CELLS.items():
             found.append(Entry("tables", f"a cell: {what}", call, _table(given.cell(3, 1, value)), ANY, ("pose_2",)))
     for command, call in (READ_LABELS | SLOWLY_READ_LABELS).items():
         for what, edit in given.REFUSED_TABLE.items():
             sample = command == "train" and what in ("header alone", "binary")
-            found.append(Entry("tables", what, call, _table(edit), (REFUSED,), (LABELS,), sample=sample))
+            found.append(Entry("tables", what, call, _table(edit), (REFUSED,), (f"{LABELS}|column",), sample=sample))
     for what, edit in given.SAME_TABLE.items():
         found.append(Entry("moves", what, READ_LABELS["evaluate"], _table(edit, MOVES), ANY, same=True))
     for what, edit in {
@@ -196,9 +206,11 @@ def _pictures() -> list[Entry]:
             leaves = ("pins.npz", "summary.json") if command == "preprocess" and what in NOT_TOLD else ()
             found.append(Entry("a picture", what, call, alone, ends, (BAD,) if ends == (REFUSED,) else (), leaves))
         for what, edit in given.VIDEOS.items():
-            ends = (DONE, REFUSED, 2) if what.startswith(("cut at", "damaged")) else (REFUSED,)
-            sample = command == "predict" and what == "text"
-            found.append(Entry("videos", what, call, {"data": edited("video", "", edit)}, ends, ("clip",), sample=sample))
+            partly = what.startswith(("damaged", "a picture"))  # some of it can be read
+            ends = (DONE, REFUSED, 2) if partly or what == "cut at half" else (REFUSED,)
+            make, says = {"data": edited("video", "", edit)}, () if partly else ("clip",)
+            leaves = ("pins.npz", "summary.json") if partly else ()
+            found.append(Entry("videos", what, call, make, ends, says, leaves, sample=command == "predict" and what == "text"))
         for what, make in FOLDERS.items():
             found.append(Entry("folders", what, call, {"data": make}, (REFUSED,), sample=command == "check" and what == "missing"))
     for command, call in READ_RAW.items():
@@ -207,12 +219,15 @@ def _pictures() -> list[Entry]:
         found.append(Entry("pictures", "of another sensor", call, {"data": copied("frames")}, (REFUSED,), ("640x480",)))
     names = {"a line break": "f\n3.png", "an escape sequence": "f\x1b[31m.png", "an umlaut": "f_ä.png", "a leading dash": "-f.png"}
     for what, name in names.items():
-        make = edited("frames", BAD, lambda path, name=name: path.rename(path.with_name(name)))
-        found.append(Entry("names", what, f"preprocess {{data}} {S} --out {{out}} --overlay", {"data": make}, (DONE,)))
+        found.append(Entry("names", what, f"preprocess {{data}} {S} --out {{out}} --overlay", _renamed(name), (DONE,)))
     ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
-    make = edited("frames", BAD, lambda path: path.rename(path.with_name("f_ä.png")))
-    found.append(Entry("names", "an umlaut in an ASCII locale", f"predict {SENSOR} {{data}}", {"data": make}, (DONE,), env=ascii_only))
+    call = f"predict {SENSOR} {{data}}"
+    found.append(Entry("names", "an umlaut in an ASCII locale", call, _renamed("f_ä.png"), (DONE,), env=ascii_only))
     return found
+
+
+def _renamed(name: str) -> dict[str, Maker]:
+    return {"data": edited("frames", BAD, lambda path: path.rename(path.with_name(name)))}
 
 
 def _alone(edit: Callable[[Path], object]) -> Maker:
@@ -283,8 +298,8 @@ def _specifications() -> list[Entry]:
             for what, content in given.SPECIFICATIONS.items():
                 if command not in READ_ALL_SPECIFICATIONS and what not in ("empty", "UTF-16", "nested 100000 deep"):
                     continue
-                if what == "empty" and "--conditions" in call:
-                    continue  # an empty sweep file means: everything as it is
+                if what in ("empty", "5 MB") and "--conditions" in call:
+                    continue  # a sweep file without a key means: everything as it is
                 name = what if len(calls) == 1 else f"{what} ({k + 1})"
                 make = {"spec": written("mine.toml", content)}
                 sample = (command, what) in (("servo", "nested 100000 deep"), ("render", "UTF-16"))
@@ -299,19 +314,12 @@ def _specifications() -> list[Entry]:
         ("nan", "thickness_mm = 1.0", "thickness_mm = nan", (REFUSED,), ("skin.thickness_mm",)),
         ("1e308", "fx_px = ", "fx_px = 1e308 # ", (REFUSED,), ()),
         ("a mask of 1e9 px", "mask_radius_px = ", "mask_radius_px = 1e9 # ", ANY, ()),
-        (
-            "a threshold block of 1000001 px",
-            "threshold_block_px = ",
-            "threshold_block_px = 1000001 # ",
-            (REFUSED,),
-            ("threshold_block_px",),
-        ),
     ):
         make = {"spec": shipped(source, "mine.toml", (old, new))}
         found.append(Entry("specifications", what, sensor, make, exits, says, sample=what.startswith(("a truth", "a name"))))
     found.append(Entry("specifications", "a byte order mark", sensor, {"spec": _with_mark(source)}, (DONE,)))
     press = f"render {S} --object {{spec}} --indent-mm 1 --quality preview --out {{out}}"
-    for what, content in {
+    for what, text in {
         "a name that is a path": 'name = "../../../escaped"\ndescription = ""\nshape = { kind = "plane" }\n',
         "a radius that is a text": 'description = ""\nshape = { kind = "sphere", radius_mm = "4" }\n',
         "a radius of 1e-300 mm": 'description = ""\nshape = { kind = "sphere", radius_mm = 1e-300 }\n',
@@ -319,7 +327,7 @@ def _specifications() -> list[Entry]:
         "a mesh that is no mesh": 'description = ""\nshape = { kind = "mesh", file = "mine.toml" }\n',
         "a mesh that is an endless device": 'description = ""\nshape = { kind = "mesh", file = "/dev/zero" }\n',
     }.items():
-        found.append(Entry("objects", what, press, {"spec": written("mine.toml", content)}, (REFUSED,), sample=what.endswith("a path")))
+        found.append(Entry("objects", what, press, {"spec": written("mine.toml", text)}, (REFUSED,), sample=what.endswith("a path")))
     stl = b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid x\n"
     for what, name, content in (
         ("empty", "part.stl", b""),
@@ -338,7 +346,8 @@ def _specifications() -> list[Entry]:
         found.append(Entry("meshes", what, press, {"spec": written(name, content)}, (REFUSED,), (name,)))
     own = {"TACTIP_SPECS": "{specs}"}
     for command in ("sensors", "objects", "experiments", "randomisations"):
-        for what, content in given.SPECIFICATIONS.items():
+        for what in ("empty", "UTF-16", "nested 100000 deep"):
+            content = given.SPECIFICATIONS[what]
             make = {"specs": _own_specs(command, content)}
             found.append(Entry("own specifications", what, command, make, (DONE,), ("mine", "BROKEN"), env=own, seconds=90))
     return found
@@ -367,11 +376,11 @@ def _own_specs(kind: str, content: bytes) -> Maker:
 NUMBERS = {  # values of an option that are refused, by call; in groups of an option and its values
     READ_LABELS["train"].replace("{data}", "{recording}").removesuffix(" --epochs 1"): {
         "--seed": "-1 1e3 99999999999999999999 x",
-        "--split": "-2 99999999999999999999",
+        "--split": "-2",
         "--epochs": "0 -1 nan",
         "--batch": "0 -1",
         "--members": "0 -1",
-        "--max-minutes": "nan -1 inf",
+        "--max-minutes": "nan -1",
         "--threads": "0 -3 100000",
         "--device": "tpu cuda:99",
         "--target": "nonsense pose_2,nonsense , pose_2,pose_2",
@@ -385,7 +394,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     f"graph {{frames}} {S} --out {{out}}": {"--kind": "star", "--form": "cooked raw"},
     f"tune {S} --frames {{frames}} --out {{out}}/mine.toml": {"--limit": "0 -1", "--method": "magic"},
     f"render {S} --object plane --out {{out}} --quality preview": {
-        "--indent-mm": "nan inf -1 1e9 1e-300 x",
+        "--indent-mm": "nan inf 1e9 x",
         "--indent-mm 1 --twist-deg": "nan inf",
         "--indent-mm 1 --seed": "-1 x",
         "--indent-mm 1 --tilt-deg 0": "nan 1e9",
@@ -396,7 +405,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--count": "0 -1 2000000000 99999999999999999999",
         "--count 1 --seed": "-1",
         "--count 1 --across": "5 7 0 66 -6",
-        "--count 1 --workers": "0 -1 100000",
+        "--count 1 --workers": "0 -1",
         "--count 1 --scheduler": "nowhere tcp://127.0.0.1:1",
     },
     f"validate {S} --frames {{recording}} --out {{out}} --across 6 --friction-frames 0": {
@@ -408,7 +417,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     f"realism {{raw}} {U} --out {{out}}": {"--limit": "0 -1", "--quality": "best"},
     f"calibrate optics {U} --frames {{raw}}": {"--out": "{out} {out}/spec", "--out {out}/spec.toml --limit": "0 -1"},
     f"calibrate contact {S} --frames {{recording}} --out {{out}}/spec.toml --across 6 --workers 1": {
-        "--labels": "0 3 -1 1000000000",
+        "--labels": "0 3 -1",
         "--seed": "-1",
         "--hold": "nonsense",
         "--workers": "0 -1",
@@ -421,7 +430,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     },
     "servo --object can --out {out}": {
         "--steps": "0 -1",
-        "--rate": "0 nan -1 inf",
+        "--rate": "0 -1 x",
         "--stream --rate": "nan inf",
         "--model": "nowhere",
         "--camera": "nowhere http://127.0.0.1:1",
@@ -487,7 +496,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--device": "tpu",
     },
 }
-SAMPLED_NUMBERS = ("--form cooked", "--limit -1", "--labels both", "--time-scale x", "--across 7", "--hold nonsense", "--rate x")
+SAMPLED_NUMBERS = ("--kind star", "--limit -1", "--hold nonsense", "--across 7")
 
 
 def _numbers() -> list[Entry]:
@@ -497,9 +506,9 @@ def _numbers() -> list[Entry]:
             for value in values.split():
                 what = f"{option} {value}"
                 named = option.removesuffix(" 0").split()[-1]
-                found.append(
-                    Entry("numbers", what, f"{call} {what}", {}, (REFUSED, USAGE), (f"{named}|{value}",), sample=what in SAMPLED_NUMBERS)
-                )
+                parts = {named, named.strip("-").partition("-")[0], value, *value.split(","), *value.split(":")[1:2]}
+                says = ("|".join(sorted(parts - {""})),)
+                found.append(Entry("numbers", what, f"{call} {what}", {}, (REFUSED, USAGE), says, sample=what in SAMPLED_NUMBERS))
     for command in EVERY:
         found.append(
             Entry(
@@ -508,7 +517,7 @@ def _numbers() -> list[Entry]:
                 f"{command} --nonsense",
                 exit=(USAGE,),
                 says=("--nonsense",),
-                sample=command in ("doctor", "demo", "objects"),
+                sample=command == "doctor",
             )
         )
         found.append(Entry("usage", "an argument too many", f"{command} a b c d", exit=(USAGE,)))
@@ -545,7 +554,7 @@ WRITE = {
     "demo": "demo --out {there}",
     "study servo": f"study servo --model {SENSOR} --objects can --steps 1 --out {{there}}",
     "study objects": f"study objects {S} --count 2 --tests 1 --across 6 --workers 1 --epochs 1 --out {{there}}",
-    "study sim-to-real": f"study sim-to-real {S} --frames {{recording}} --labels 4 --count 2 --epochs 1 --workers 1 --out {{there}}",
+    "study sim-to-real": f"study sim-to-real {S} --frames {{recording}} --labels 12 --count 10 --epochs 1 --workers 1 --out {{there}}",
     "study tac-vgnn": f"study tac-vgnn --data {{recording}} {S} --out {{there}} --models gnn --epochs 1 --batches 8 --no-contacts",
 }
 QUICK_TO_WRITE = ("audit", "train", "evaluate", "preprocess", "graph", "tune", "dataset", "live", "study tac-vgnn")
@@ -668,13 +677,6 @@ def _damaged() -> list[Entry]:
         if what != "missing":
             again = f"train --model gnn {S} --data {{recording}} --epochs 3 --out {{out}}"
             found.append(Entry("runs", f"checkpoint.pt {what}", again, {"out": edited("begun", "checkpoint.pt", edit)}, ANY, leaves=("*",)))
-    changed = {
-        "other data": edited("recording", "targets.csv", given.text(lambda t: t.replace("-", ""))),
-        "other frames": edited("recording", f"frames_bw/{BAD}", given.PICTURES["noise"]),
-    }
-    for what, make in changed.items():
-        again = f"train --model gnn {S} --data {{data}} --epochs 3 --out {{out}}"
-        found.append(Entry("runs", f"gone on with {what}", again, {"data": make, "out": copied("begun")}, (REFUSED,), leaves=("*",)))
     sorted_table = edited("recording", "targets.csv", given.lines(lambda rows: [rows[0], *reversed(rows[1:])]))
     found.append(Entry("runs", "rows in another order", "evaluate {run} --data {data} --out {out}", {"data": sorted_table}, ANY, same=True))
     pins: dict[str, Callable[[Path], object]] = {
@@ -705,7 +707,31 @@ def _damaged() -> list[Entry]:
                 sample=sample,
             )
         )
-    return found + _sessions() + _collected()
+    return found + _sessions() + _collected() + _gone_on()
+
+
+def _gone_on() -> list[Entry]:
+    """The same command again, after what it works on has changed under the same name."""
+    learn = f"train --model gnn {S} --data {{recording}} --epochs 3 --out {{out}}"
+    study = f"study tac-vgnn --data {{recording}} {S} --out {{out}} --models gnn --epochs 1 --batches 8 --no-contacts"
+    simulate = f"dataset --experiment {{experiment}} {S} --object {{mesh}} --images none --across 6 --workers 1 --out {{out}} --count"
+    changes: dict[str, Callable[[Path], object]] = {
+        "labels": lambda path: given.text(lambda t: t.replace("-", ""))(path / LABELS),
+        "frames": lambda path: shutil.copy(path / "frames_bw" / "f_9.png", path / "frames_bw" / BAD),
+        "moves": lambda path: given.text(lambda t: t.replace(",0", ",1"))(path / MOVES),
+    }
+    found = [
+        Entry("gone on", "with another mesh", f"{simulate} 2", first=f"{simulate} 1", then={"mesh": given.smaller_ball}, leaves=("*",)),
+    ]
+    for what, change in changes.items():
+        then = {"recording": change}
+        begun = f"{learn} --max-minutes 0"
+        found.append(Entry("gone on", f"begun with other {what}", learn, first=begun, then=then, leaves=("*",)))
+        found.append(Entry("gone on", f"finished with other {what}", learn, first=learn, then=then, leaves=("*",)))
+        if what != "moves":
+            again = Entry("gone on", f"finished with other {what}", study, {}, ANY, first=study, then=then, fresh=True, leaves=("*",))
+            found.append(again)
+    return found
 
 
 def _sessions() -> list[Entry]:
@@ -737,7 +763,7 @@ def _sessions() -> list[Entry]:
                 call,
                 {"data": edited("session", name, edit)},
                 exits,
-                ("session",) if exits == (REFUSED,) else (),
+                ("session|frame_",) if exits == (REFUSED,) else (),
                 sample=sample,
             )
         )
@@ -767,7 +793,6 @@ def _collected() -> list[Entry]:
     for what, old, new in (
         ("a truth as a number", "threshold_block_px = ", "threshold_block_px = true # "),
         ("another method", 'method = "twin"', 'method = "magic"'),
-        ("an even block", "threshold_block_px = ", "threshold_block_px = 60 # "),
     ):
         make = {"data": edited("tuned", "", given.text(lambda t, old=old, new=new: t.replace(old, new)))}
         found.append(Entry("tuned files", what, f"check {{frames}} {S} --pipeline {{data}}", make, (REFUSED,), ("tuned.toml",)))
@@ -776,25 +801,26 @@ def _collected() -> list[Entry]:
 
 # --- ends --------------------------------------------------------------------------------------------------------------------------------
 
-LONG = {  # calls that take long, and with several processes where they can
-    "train": (f"train --model vgnn {S} --data {{recording}} --out {{out}} --epochs 2000", 6.0),
-    "dataset": (f"dataset --experiment surface-2d {S} --count 500 --images none --workers 2 --out {{out}}", 15.0),
-    "robustness": (f"robustness {U} --frames {{raw}} --out {{out}} --no-rendered --jobs 2", 12.0),
-    "render": (f"render {U} --object edge --indent-mm 4 --quality high --out {{out}}", 5.0),
-    "emulate mg400": ("emulate mg400 --port-offset 11000", 3.0),
-    "live": (f"live --model {SENSOR} --camera http://127.0.0.1:1 --headless", 1.0),
+LONG = {  # calls that take long: how many processes they become, and how long they are then left alone
+    "train": (f"train --model vgnn {S} --data {{recording}} --out {{out}} --epochs 2000", 1, 6.0),
+    "dataset": (f"dataset --experiment surface-2d {S} --count 500 --images none --workers 2 --out {{out}}", 4, 4.0),
+    "robustness": (f"robustness {U} --frames {{raw}} --out {{out}} --no-rendered --jobs 2", 3, 4.0),
+    "render": (f"render {U} --object edge --indent-mm 4 --quality high --out {{out}}", 1, 5.0),
+    "emulate mg400": ("emulate mg400 --port-offset 11000", 1, 3.0),
+    "collect": (f"collect --camera twin --arm simulated {S} --count 50 --plain-light --out {{out}}", 1, 8.0),
 }
 
 
 def _ends() -> list[Entry]:
     found = []
-    for call, after_s in LONG.values():
+    for call, processes, after_s in LONG.values():
         for what, number, exits in (
             ("Ctrl-C", signal.SIGINT, (130, DONE, REFUSED)),
             ("SIGTERM", signal.SIGTERM, (-int(signal.SIGTERM), 143, 130, DONE, REFUSED)),
             ("SIGKILL", signal.SIGKILL, (-int(signal.SIGKILL), REFUSED)),
         ):
-            found.append(Entry("ends", what, call, exit=exits, leaves=("*",), end=(after_s, int(number)), seconds=60))
+            end = (after_s, int(number), processes)
+            found.append(Entry("ends", what, call, exit=exits, leaves=("*",), end=end, seconds=60))
     workers = f"dataset --experiment {{experiment}} {S} --count 4 --images none --across 6 --workers 2 --out {{out}}"
     found.append(Entry("ends", "with two workers", workers, exit=(DONE,), seconds=120))
     found.append(Entry("ends", "with an unwritable home", f"preprocess {{frames}} {S} --out {{out}}", exit=(DONE,), env=NO_HOME))

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import trimesh
 from forked_program import Program
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
@@ -149,6 +150,13 @@ class Harmless:
         return path
 
     @cached_property
+    def mesh(self) -> Path:
+        """A ball as a mesh."""
+        path = self.folder / "ball.stl"
+        trimesh.creation.icosphere(subdivisions=3, radius=12.0).export(path)
+        return path
+
+    @cached_property
     def dataset(self) -> Path:
         """A small simulated data set."""
         size = ("--images", "none", "--count", 2, "--across", 6, "--workers", 1)
@@ -163,6 +171,11 @@ class Harmless:
 
 
 Maker = Callable[[Path, Harmless], Path]
+
+
+def smaller_ball(path: Path) -> None:
+    """Another mesh under the same name."""
+    trimesh.creation.icosphere(subdivisions=3, radius=8.0).export(path)
 
 
 def moved(rest: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -400,6 +413,7 @@ SAME_TABLE: dict[str, Callable[[Path], object]] = {  # other ways to write the s
     "Windows paths": text(lambda t: t.replace("f_", "C:\\data\\frames_bw\\f_")),
     "paths": text(lambda t: t.replace("f_", "frames_bw/f_")),
     "no newline at the end": text(str.rstrip),
+    "open quote": lines(lambda rows: [*rows[:5], '"' + rows[5], *rows[6:]]),
 }
 TOLD_TABLE: dict[str, Callable[[Path], object]] = {  # read, and told; or refused
     "other case": text(lambda t: t.replace("f_", "F_")),
@@ -411,7 +425,6 @@ TOLD_TABLE: dict[str, Callable[[Path], object]] = {  # read, and told; or refuse
     "rows without a picture": lines(lambda rows: [*rows, rows[1].replace("f_0", "f_999")]),
     "header again": lines(lambda rows: [*rows, rows[0]]),
     "ragged": lines(lambda rows: [*rows[:5], rows[5] + ",1,2", *rows[6:]]),
-    "open quote": lines(lambda rows: [*rows[:5], '"' + rows[5], *rows[6:]]),
     "NUL bytes": text(lambda t: t.replace("f_3.png,", "f_3.png,\0")),
     "a comment": lines(lambda rows: [rows[0], "# made by hand", *rows[1:]]),
 }
@@ -425,7 +438,6 @@ TOLD_CELLS: dict[str, str] = {  # as the value of one label
     "a truth": "True",
     "empty": "",
     "thousands": "1'000",
-    "other digits": "١",
 }
 REFUSED_TABLE: dict[str, Callable[[Path], object]] = {  # no labels to be had
     "empty": text(lambda t: ""),

@@ -1,12 +1,13 @@
 """The program ``twin``, started once: each call is a fork of it, in a session of its own, with limits, and watched until it ends.
 
 Starting Python and importing the libraries costs seconds of one core; a fork of a process that has done so costs milliseconds.
-Apart from that a call is the real thing: the command line is parsed anew, the interpreter exits as it always does, and stdout,
-stderr and the exit code are those of a process. Run as a script this file is the process that forks; ``Program`` talks to it.
+Apart from that a call is the real thing: the command line is parsed anew, threads are waited for and exit functions run at its end,
+and stdout, stderr and the exit code are those of a process. Run as a script this file is the process that forks; ``Program`` talks to it.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import gc
@@ -19,7 +20,9 @@ import selectors
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -290,6 +293,24 @@ def _import_all() -> None:
         raise RuntimeError("an import started a thread, which would not survive a fork")
 
 
+def _run(main: Callable[[], None]) -> None:
+    """Run the program and end as the interpreter does, but for taking down all modules, which costs more than most calls."""
+    code = 0
+    try:
+        main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException as error:
+        sys.excepthook(type(error), error, error.__traceback__)
+        code = 130 if isinstance(error, KeyboardInterrupt) else 1
+    threading._shutdown()  # type: ignore[attr-defined]  # waits for threads that are no daemons
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):
+            stream.flush()
+    os._exit(code)
+
+
 if __name__ == "__main__":
     _import_all()
     from twin.cli import main
@@ -299,4 +320,4 @@ if __name__ == "__main__":
     arguments = _serve()
     if arguments is not None:
         sys.argv = ["twin", *arguments]
-        main()
+        _run(main)

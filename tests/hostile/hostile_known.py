@@ -139,7 +139,7 @@ WRONG: dict[str, tuple[str, ...]] = {
         "study tac-vgnn, outputs: files of the user's own",
         "tune, outputs: its own specification",
     ),
-    "traceback": (
+    "traceback|left ": (
         "robustness, ends: SIGTERM",
         "robustness, ends: SIGKILL",
     ),

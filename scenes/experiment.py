@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from scenes.base import Section
+from scenes.base import Name, Section
 
 LABELS = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7))
 AXES = {"x": 0, "y": 1, "z": 2}
@@ -61,7 +61,7 @@ class ExperimentSpec(Section):
         Name of an experiment whose ranges go a little beyond this one's. Models for this experiment are trained on it in the twin.
     """
 
-    name: str
+    name: Name
     description: str
     source: str = ""
     object: str

@@ -2,7 +2,6 @@
 
 import difflib
 import os
-import tomllib
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,9 +14,11 @@ from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
 from scenes.servo import ServoSpec
 from scenes.tables import fill_in_tables
+from scenes.toml_file import LONGEST_SHOWN, read_toml, shown
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
+MOST_PROBLEMS = 5  # that a message names; the others are counted
 Spec = TypeVar("Spec", bound=BaseModel)
 
 
@@ -74,7 +75,8 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
     if path.suffix.lower() in MESH_SUFFIXES:
         if not path.is_file():
             raise SpecError(f"{path}: no such mesh file; give the path of an existing STL, OBJ or PLY")
-        return ObjectSpec(name=path.stem, description=f"mesh {path.name}", shape=MeshShape(kind="mesh", file=str(path.resolve())))
+        mesh = MeshShape(kind="mesh", file=str(path.resolve()))
+        return _checked({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
     spec_path = _find(name_or_path, "objects")
     spec = _read(spec_path, ObjectSpec)
     if isinstance(spec.shape, MeshShape):
@@ -138,12 +140,10 @@ def _find(name_or_path: str | Path, kind: str) -> Path:
 
 
 def _read(path: Path, model: type[Spec]) -> Spec:
-    try:
-        with path.open("rb") as file:
-            data = tomllib.load(file)
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SpecError(f"{path}: not readable as TOML: {error}") from error
-    data.setdefault("name", path.stem)
+    return _checked({"name": path.stem} | read_toml(path), path, model)
+
+
+def _checked(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
     try:
         data = fill_in_tables(data, path.parent)
     except ValueError as error:
@@ -156,17 +156,20 @@ def _read(path: Path, model: type[Spec]) -> Spec:
 
 def _explain(error: ValidationError, model: type[BaseModel]) -> str:
     problems = []
-    for item in error.errors():
-        key = ".".join(str(part) for part in item["loc"]) or "file"
+    found = error.errors(include_url=False)
+    for item in found[:MOST_PROBLEMS]:
+        key = ".".join(shown(part) for part in item["loc"]) or "file"
         if item["type"] == "extra_forbidden":
             known = _keys_at(model, item["loc"][:-1])
-            near = difflib.get_close_matches(str(item["loc"][-1]), known, n=1)
+            near = difflib.get_close_matches(shown(item["loc"][-1]), known, n=1)
             problems.append(f"unknown key '{key}'; " + (f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"))
         elif item["type"] == "missing":
             problems.append(f"key '{key}' is missing; add it (see the shipped specifications for examples)")
         else:
-            came = "" if isinstance(item["input"], dict) else f", got {item['input']!r}"
-            problems.append(f"{key}: {item['msg'].removeprefix('Value error, ')}{came}")
+            came = "" if isinstance(item["input"], dict) else f", got {shown(repr(item['input']))}"
+            problems.append(f"{key}: {shown(item['msg'].removeprefix('Value error, '), 4 * LONGEST_SHOWN)}{came}")
+    if len(found) > MOST_PROBLEMS:
+        problems.append(f"and {len(found) - MOST_PROBLEMS} more")
     return "; ".join(problems)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from scenes.base import NonNegative, Positive, Section
+from scenes.base import Name, NonNegative, Positive, Section
 
 
 class PlaneShape(Section):
@@ -88,7 +88,7 @@ class ObjectSpec(Section):
     to the rig's.
     """
 
-    name: str
+    name: Name
     description: str
     source: str = ""
     shape: Shape

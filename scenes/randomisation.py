@@ -4,7 +4,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from scenes.base import Fraction, NonNegative, Positive, Section
+from scenes.base import Fraction, Name, NonNegative, Positive, Section
 from scenes.sensor import SensorSpec
 
 Ends = tuple[float, float]
@@ -69,7 +69,7 @@ class RandomisationSpec(Section):
         By the dotted key in the sensor's specification: material, geometry, camera, light, rig.
     """
 
-    name: str
+    name: Name
     description: str
     executed_share: Fraction = 1.0
     pin_noise_px: NonNegative = 0.0

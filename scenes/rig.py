@@ -1,8 +1,8 @@
 """How a robot holds a sensor, and where its object is: what turns a label in robot coordinates into a contact."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from scenes.base import NonNegative, Section
+from scenes.base import NonNegative, NotTruth, Section
 
 
 class RigSpec(Section):
@@ -59,7 +59,7 @@ class RigSpec(Section):
     tcp_lateral_mm: float = 0.0
     tcp_aside_mm: float = 0.0
     turn_offset_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn_sign: Literal[1, -1] = 1
+    turn_sign: Annotated[Literal[1, -1], NotTruth] = 1
     plate_tilt_deg: float = 0.0
     label_depth_per_move: float | None = None
     image_turn_deg: float = 0.0

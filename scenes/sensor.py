@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from scenes.base import Fraction, Index, NearOne, NonNegative, Positive, Rgb, Section
+from scenes.base import Fraction, Index, Name, NearOne, NonNegative, NotTruth, Positive, Rgb, Section
 from scenes.rig import RigSpec
 
 
@@ -407,7 +407,7 @@ class ResponseSpec(Section):
     sharpening: NonNegative = 0.0
     sharpening_sigma_px: Positive = 1.5
     chroma_sigma_px: NonNegative = 0.0
-    chroma_columns: Literal[1, 2] = 1
+    chroma_columns: Annotated[Literal[1, 2], NotTruth] = 1
     noise_sigma_px: NonNegative = 0.0
     stream: Literal["rgb", "bt601", "bt709"] = "rgb"
     jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 0
@@ -500,7 +500,7 @@ class CaptureSpec(Section):
 class SensorSpec(Section):
     """A TacTip, complete. ``name`` is the file's stem; ``rig`` is there where contacts of this sensor on a robot were calibrated."""
 
-    name: str
+    name: Name
     description: str
     source: str
     skin: SkinSpec

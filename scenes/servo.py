@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from scenes.base import NonNegative, Positive, Section
+from scenes.base import Name, NonNegative, Positive, Section
 
 Three = tuple[float, float, float]
 
@@ -51,7 +51,7 @@ class ServoSpec(Section):
         Where the object stands.
     """
 
-    name: str
+    name: Name
     description: str
     source: str = ""
     experiment: str = "surface-2d"

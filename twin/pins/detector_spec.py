@@ -2,10 +2,10 @@
 
 import tomllib
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import tomlkit
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from scenes.base import Fraction, Positive, Section
 from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
@@ -56,7 +56,7 @@ class DetectorSpec(Section):
 
     name: str
     method: Method
-    form: Form = Form.RAW
+    form: Annotated[Form, Field(strict=False)] = Form.RAW  # files hold its text
     blob: BlobSpec
     radius_px: tuple[Positive, Positive] = (2.0, 8.0)
     recording: RecordingSpec | None = None

@@ -1,0 +1,205 @@
+"""Readers of frames, tables, metadata, pins, runs, sessions and records: whatever the bytes, a result or one of our own errors."""
+
+import io
+import json
+import shutil
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from drawn_frames import drawn_frame
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.numpy import save
+
+from hardware.session import SessionSource, SessionWriter, read_steps
+from scenes import SpecError, load_sensor
+from training.packed import unpack
+from twin.errors import TwinError
+from twin.frames import open_recording, read_image
+from twin.frames.tables import order_by_table, read_metadata, read_table
+from twin.pins import nominal_reference
+from twin.pins.graph_files import read_pins
+from twin.store import Item, find_arrays, find_json, keep_arrays, keep_json
+from twin.types import Form
+
+OURS = (TwinError, SpecError)
+MANY = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def damage(data: bytes):
+    """Damaged copies of bytes: a stretch replaced by others, anywhere."""
+    cut = st.tuples(st.integers(0, len(data)), st.integers(0, 2 * len(data)), st.binary(max_size=12))
+    return cut.map(lambda c: data[: c[0]] + c[2] + data[c[0] + c[1] :])
+
+
+@pytest.fixture(scope="module")
+def spec():
+    return load_sensor("mg400-127")
+
+
+@pytest.fixture(scope="module")
+def frame(spec):
+    return drawn_frame(spec, Form.RECORDING, nominal_reference(spec, Form.RECORDING).pins_px)
+
+
+def encoded(frame, suffix: str) -> bytes:
+    return cv2.imencode(suffix, frame.image)[1].tobytes()
+
+
+@MANY
+@given(data=st.data(), suffix=st.sampled_from([".png", ".jpg", ".bmp", ".tiff", ".webp", ".pgm"]))
+def test_a_damaged_picture_is_a_picture_or_our_error(tmp_path, frame, data, suffix):
+    path = tmp_path / f"f{suffix}"
+    path.write_bytes(data.draw(damage(encoded(frame, suffix)[:4000] if suffix == ".bmp" else encoded(frame, suffix))))
+    try:
+        image, note = read_image(path)
+    except OURS as error:
+        assert path.name in str(error)
+    else:
+        assert image.dtype == np.uint8 and image.ndim in (2, 3) and isinstance(note, str)
+
+
+@MANY
+@given(content=st.binary(max_size=300))
+def test_any_bytes_are_a_picture_or_our_error(tmp_path, content):
+    path = tmp_path / "f.png"
+    path.write_bytes(content)
+    with pytest.raises(OURS, match="f.png"):
+        read_image(path)
+
+
+cells = st.text(max_size=8) | st.floats().map(str) | st.sampled_from(["f_0.png", "F_1.PNG", "a\\f_2.png", "", "nan", "1e999", '"', "#"])
+rows = st.lists(st.lists(cells, max_size=5), max_size=6)
+
+
+@MANY
+@given(table=rows, separator=st.sampled_from([",", ";", "\t"]), code=st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "latin-1"]))
+def test_any_table_orders_the_frames_that_are_there(tmp_path, table, separator, code):
+    path, problems = tmp_path / "targets.csv", []
+    text = "\n".join(separator.join(row) for row in [["image_name", "pose_2"], *table])
+    path.write_bytes(text.encode(code, "replace"))
+    files = [tmp_path / f"f_{k}.png" for k in range(3)]
+    ordered, labels = order_by_table([path], files, problems)
+    assert sorted(ordered) == files, "each frame once"
+    assert all(len(column) == len(files) for column in labels.values())
+    assert all(isinstance(problem, str) and "\n" not in problem for problem in problems)
+
+
+@MANY
+@given(content=st.binary(max_size=300))
+def test_any_bytes_are_a_table_or_a_problem(tmp_path, content):
+    path, problems = tmp_path / "targets.csv", []
+    path.write_bytes(content)
+    assert read_table(path, problems) is not None or "targets.csv" in problems[0]
+
+
+@MANY
+@given(content=st.binary(max_size=200) | st.text(max_size=200).map(lambda t: t.encode("utf-8", "replace")))
+def test_any_bytes_are_metadata_or_a_problem(tmp_path, content):
+    path, problems = tmp_path / "meta.json", []
+    path.write_bytes(content)
+    found = read_metadata(path, problems)
+    assert found is not None or problems or json.loads(content.decode("utf-8-sig")) is None
+
+
+@MANY
+@given(names=st.lists(st.sampled_from(["f_0.png", "f_1.png", "f_10.png", "init_0.png", "notes.txt"]), unique=True), data=st.data())
+def test_a_folder_of_damaged_frames_is_read_or_refused(tmp_path, spec, frame, names, data):
+    folder = tmp_path / "frames"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    whole = encoded(frame, ".png")
+    for name in names:
+        (folder / name).write_bytes(data.draw(st.just(whole) | damage(whole)))
+    try:
+        recording = open_recording(folder, spec)
+    except OURS:
+        return
+    seen = [each.name for each in recording]
+    assert sorted([*seen, *(bad["image_name"] for bad in recording.failed)]) == sorted(recording.names), "each frame is read, or told"
+
+
+@pytest.fixture(scope="module")
+def pins_bytes(spec):
+    rest = nominal_reference(spec, Form.RECORDING).pins_px
+    file = io.BytesIO()
+    np.savez(file, image_name=np.array(["f_0.png"]), pins_px=rest[None], predicted_px=rest[None], valid=np.ones(1, bool))
+    return file.getvalue()
+
+
+@MANY
+@given(data=st.data())
+def test_damaged_pins_are_pins_or_our_error(tmp_path, spec, pins_bytes, data):
+    path = tmp_path / "pins.npz"
+    path.write_bytes(data.draw(damage(pins_bytes)))
+    try:
+        names, nodes_px = read_pins(path, spec)
+    except OURS as error:
+        assert path.name in str(error)
+    else:
+        assert nodes_px.shape == (len(names), spec.pins.count, 2) and np.isfinite(nodes_px).all()
+
+
+def written_arrays(tmp_path: Path) -> bytes:
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(save({"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.ones(2)}))
+    return path.read_bytes()
+
+
+@MANY
+@given(data=st.data())
+def test_damaged_weights_are_arrays_or_an_error_that_loading_explains(tmp_path, data):
+    whole = written_arrays(tmp_path)
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(data.draw(damage(whole) | st.binary(max_size=60).map(lambda b: struct.pack("<Q", len(b)) + b)))
+    with pytest.raises((ValueError, KeyError)):  # ``PoseEstimator.load`` explains these; even undamaged, the arrays are no model
+        unpack({"model": "vgnn", "sensor": {}, "size": {}}, path)
+
+
+@MANY
+@given(data=st.data(), kind=st.sampled_from(["npz", "json"]))
+def test_a_damaged_record_is_no_record(tmp_path, data, kind):
+    folder = tmp_path / "records"
+    shutil.rmtree(folder, ignore_errors=True)
+    item = Item("a", (damage,), [1])
+    content = {"x": np.arange(3.0)}
+    path = keep_arrays(folder, item, content) if kind == "npz" else keep_json(folder, item, {"x": content["x"].tolist()})
+    path.write_bytes(data.draw(damage(path.read_bytes())))
+    found = find_arrays(folder, item) if kind == "npz" else find_json(folder, item)
+    assert found is None or set(found) <= {"x"} or isinstance(found, dict)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory, frame):
+    folder = tmp_path_factory.mktemp("live") / "session"
+    with SessionWriter(folder, {"sensor": "mg400-127"}) as writer:
+        for k in range(3):
+            writer.append(frame, {"value": [float(k)]})
+    return folder
+
+
+@pytest.mark.xfail(strict=True, reason="damaged JSON, a step without its frame or another form than ours end in Python's own errors")
+@settings(MANY, derandomize=True)
+@given(data=st.data(), name=st.sampled_from(["session.json", "steps.jsonl"]))
+def test_a_damaged_session_is_replayed_or_refused(tmp_path, session, data, name):
+    folder = tmp_path / "session"
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(session, folder)
+    (folder / name).write_bytes(data.draw(damage((folder / name).read_bytes())))
+    try:
+        source = SessionSource(folder)
+        with source:
+            for _ in range(3):
+                source.read()
+    except (*OURS, EOFError):
+        pass
+
+
+@MANY
+@given(content=st.binary(max_size=300))
+def test_any_bytes_are_steps_up_to_the_first_that_is_none(tmp_path, content):
+    (tmp_path / "steps.jsonl").write_bytes(content)
+    assert isinstance(read_steps(tmp_path), list)

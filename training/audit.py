@@ -16,7 +16,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from training.dataset import PinTable
+from training.pins import PinTable
 
 MODES = 14
 DEGREE = 4
@@ -58,7 +58,7 @@ class Audit:
     drift: dict
 
 
-def audit_labels(pins: PinTable, depth_mm, angle_deg, shear_mm, shear_deg) -> Audit:
+def audit_labels(pins: PinTable, depth_mm: np.ndarray, angle_deg: np.ndarray, shear_mm: np.ndarray, shear_deg: np.ndarray) -> Audit:
     """Ask every frame which story it fits.
 
     Parameters
@@ -131,8 +131,37 @@ def _misfit(residual: np.ndarray, precision: np.ndarray) -> np.ndarray:
     return np.einsum("mi,ij,mj->m", residual, precision, residual, optimize=True)
 
 
-def _depth_per_move(terms, modes, weight, precision, story, shear_mm, rows, depth_scale) -> float:
-    """Slope on the move of the depth that the pins show beyond the label, over frames whose move was not executed."""
+def _depth_per_move(
+    terms: np.ndarray,
+    modes: np.ndarray,
+    weight: np.ndarray,
+    precision: np.ndarray,
+    story: np.ndarray,
+    shear_mm: np.ndarray,
+    rows: np.ndarray,
+    depth_scale: float,
+) -> float:
+    """Slope (mm per mm) on the move of the depth that the pins show beyond the label, over frames whose move was not executed.
+
+    Parameters
+    ----------
+    terms : (M, P) float
+        Polynomials of the story "not executed".
+    modes : (M, D) float
+        Amplitudes of the displacement's modes.
+    weight : (P, D) float
+        The fitted map from polynomials to modes.
+    precision : (D, D) float
+        Inverse covariance of what the map misses.
+    story : (M, 4) float
+        The scaled labels of the story.
+    shear_mm : (M,) float
+        ``move_1`` of the table.
+    rows : (M,) bool
+        Frames whose move was not executed.
+    depth_scale : float
+        mm of depth that 1 stands for in ``story``.
+    """
     if rows.sum() < 20 or np.ptp(shear_mm[rows]) < 1:
         return 0.0
     step = 1e-3

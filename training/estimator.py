@@ -16,10 +16,11 @@ import torch
 
 from scenes.sensor import SensorSpec
 from training.assemble import Ensemble
-from training.dataset import Dataset, PinTable
+from training.dataset import Dataset
 from training.models import model_named
 from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
+from training.pins import PinTable
 from training.recipes import TrainingError
 from twin.errors import FrameError
 from twin.pins import Pipeline, make_reference, measure_reference

@@ -56,11 +56,6 @@ def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndar
     return split_rows(len(data), split, data.group)[1]
 
 
-def predict_rows_of(estimator: PoseEstimator, data: Dataset, rows: np.ndarray) -> Prediction:
-    """The model's labels for some rows of a data set."""
-    return estimator.predict_rows(data, rows)
-
-
 def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
     """Errors against raw and corrected labels, overall and binned, the intervals' coverage and the leak check."""
     targets = data.targets.rows(rows)
@@ -205,10 +200,10 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
 ERASED_MARGIN = 1.25  # of a pin's spacing, the side of the square that is wiped out around it: more than the pin
 
 
-def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, shift_px=(0.0, 0.0)) -> np.ndarray:
+def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, shift_px: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
     height, width = image.shape[:2]
     matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, scale)
-    matrix[:, 2] += shift_px
+    matrix[:, 2] += np.array(shift_px)
     return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR)
 
 

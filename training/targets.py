@@ -6,6 +6,7 @@ depth is ``pose_2 + c move_1``. A tap at ``pose_1`` has the depth ``pose_2 - c p
 c is the rig's ``label_depth_per_move`` for recordings, and the slope of its plate for simulated contacts.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ PRESETS = {
     "edge-2d": ("pose_1", "pose_6"),
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
 }
+TARGET_COLUMNS = ("raw", "corrected", "executed", "move")  # the fields of Targets that hold a row for each frame
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")  # of pose_1..6 and move_1..6
 
 
@@ -43,7 +45,7 @@ class Targets:
         ``move_1`` (mm) and ``move_6`` (deg) as in the table; NaN without them.
     """
 
-    names: tuple
+    names: tuple[str, ...]
     raw: np.ndarray
     corrected: np.ndarray
     executed: np.ndarray
@@ -51,22 +53,22 @@ class Targets:
 
     def rows(self, index: np.ndarray) -> "Targets":
         """The same labels of only some frames."""
-        return replace(self, **{key: getattr(self, key)[index] for key in self.by_frame})
+        return Targets(self.names, **{key: getattr(self, key)[index] for key in TARGET_COLUMNS})
 
-    @property
-    def by_frame(self) -> tuple:
-        """Names of the attributes that hold a row for each frame."""
-        return ("raw", "corrected", "executed", "move")
-
-    def instead(self, known: dict) -> "Targets":
+    def instead(self, known: Mapping[str, np.ndarray]) -> "Targets":
         """The same with other corrected labels: those (M,) of ``known`` whose columns these are."""
         columns = [known.get(name, self.corrected[:, k]) for k, name in enumerate(self.names)]
         return replace(self, corrected=np.column_stack(columns))
 
     @property
-    def units(self) -> tuple:
+    def units(self) -> tuple[str, ...]:
         """Unit of each label: mm, deg, or "" where the column's name doesn't tell."""
         return tuple(unit_of(name) for name in self.names)
+
+
+def joined_targets(parts: Sequence[Targets]) -> Targets:
+    """Labels of several data sets one after the other; all have the same label columns."""
+    return Targets(parts[0].names, **{key: np.concatenate([getattr(part, key) for part in parts]) for key in TARGET_COLUMNS})
 
 
 def unit_of(name: str) -> str:
@@ -82,7 +84,9 @@ def unit_of(name: str) -> str:
     return {"force": "N", "torque": "Nmm"}.get(kind, "")
 
 
-def choose_targets(recording: Recording, columns: str | tuple, rows: np.ndarray, depth_per_move: float, problems: list) -> Targets:
+def choose_targets(
+    recording: Recording, columns: str | tuple[str, ...], rows: np.ndarray, depth_per_move: float, problems: list[str]
+) -> Targets:
     """Labels of the recording's frames ``rows`` (M,); ``depth_per_move`` is c above.
 
     Raises
@@ -113,7 +117,7 @@ def choose_targets(recording: Recording, columns: str | tuple, rows: np.ndarray,
 
 
 def corrected(
-    names: tuple, raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float, x_mm: np.ndarray | float = 0.0
+    names: tuple[str, ...], raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float, x_mm: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """Labels (M, K) with the moves (M, 2) that were not executed taken out; an unknown ``executed`` (M,) counts as executed.
 
@@ -131,7 +135,7 @@ def corrected(
     return out
 
 
-def _numbers(cells: np.ndarray, name: str, problems: list) -> np.ndarray:
+def _numbers(cells: np.ndarray, name: str, problems: list[str]) -> np.ndarray:
     """A column as floats; what is no finite number becomes NaN and is counted."""
     values = cells if cells.dtype.kind == "f" else np.array([_number(cell) for cell in cells])
     bad = ~np.isfinite(values)

@@ -13,6 +13,7 @@ from torch import nn
 from torch.nn import functional
 
 from twin.errors import FrameError
+from twin.progress import Step
 
 PATCH_PX = 64
 PATCHES = 16  # of each frame in each epoch, and in the test
@@ -47,7 +48,9 @@ class TwoSample:
     by_pair: np.ndarray
 
 
-def two_sample(first: list[np.ndarray], second: list[np.ndarray], inside: np.ndarray, *, seed: int = 0, progress=None) -> TwoSample:
+def two_sample(
+    first: list[np.ndarray], second: list[np.ndarray], inside: np.ndarray, *, seed: int = 0, progress: Step | None = None
+) -> TwoSample:
     """Test two sets of as many frames.
 
     Parameters
@@ -152,7 +155,9 @@ def _trained(sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rn
     return network.requires_grad_(False)
 
 
-def _patches(sets, frames, corners, rng, *, turned: bool) -> tuple[torch.Tensor, torch.Tensor]:
+def _patches(
+    sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rng: np.random.Generator, *, turned: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
     """(p, 3, 64, 64) patches of the frames of both sets at random places, and (p,) which set each is from."""
     patches, truth = [], []
     for k in frames:
@@ -160,7 +165,7 @@ def _patches(sets, frames, corners, rng, *, turned: bool) -> tuple[torch.Tensor,
             for row, column in corners[rng.integers(len(corners), size=PATCHES)]:
                 patch = images[k, row : row + PATCH_PX, column : column + PATCH_PX]
                 if turned:
-                    patch = np.rot90(patch, rng.integers(4))
+                    patch = np.rot90(patch, int(rng.integers(4)))
                     patch = patch[:, ::-1] if rng.random() < 0.5 else patch
                 patches.append(patch.transpose(2, 0, 1))
                 truth.append(kind)

@@ -70,10 +70,10 @@ class TruthFile:
         for key, waiting in self._waiting.items():
             block = np.stack(waiting[:rows])
             del waiting[:rows]
-            if key not in self._group:
+            array = self._group.get(key)
+            if not isinstance(array, zarr.Array):
                 shape, chunks = (0, *block.shape[1:]), (CHUNK_ROWS, *block.shape[1:])
                 array = self._group.create_array(key, shape=shape, chunks=chunks, dtype=block.dtype, attributes={"meaning": UNITS[key]})
-            array = self._group[key]
             start = array.shape[0]
             array.resize((start + rows, *block.shape[1:]))
             array[start:] = block

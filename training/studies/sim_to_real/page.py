@@ -31,7 +31,7 @@ def write_page(
     calibrated: bool,
     error_px: float,
     modes: Sequence[Mapping[str, float]],
-    friction: FrictionSpread,
+    friction: FrictionSpread | None,
     simulated: int,
     contacts: int,
     names: Sequence[str],
@@ -54,8 +54,8 @@ def write_page(
         By which the twin's pins miss those of the labelled frames.
     modes : sequence
         First modes of what they miss, with the ``share`` that each holds and what the label has ``told`` of it.
-    friction : FrictionSpread
-        Between which it was drawn for simulated contacts.
+    friction : FrictionSpread or None
+        Range in which friction was drawn for simulated contacts; None where all of them had the rig's friction.
     simulated, contacts : int
         States, and contacts that they are of.
     names : sequence of str
@@ -101,13 +101,14 @@ def write_page(
     )
     page.section("How it was made")
     fitted = "fitted to the labelled frames first" if calibrated else "as shipped, not fitted to the labelled frames"
+    drawn = "that of the rig" if friction is None else f"drawn between {friction.low:.2f} and {friction.high:.2f}"
     bare = ", but for the rows called bare and uncalibrated" if _of(rows, BARE) else ""
     page.items(
         [
             f"The twin: {number(simulated)} states of {number(contacts)} simulated contacts. Its specification is {fitted}"
             f"{'' if calibrated else ' (what its own calibration used is said in it)'}.",
             f"On the labelled frames its pins miss the real ones by {number(error_px, decimals=2)} px, friction found frame by frame; for "
-            f"simulated contacts it is drawn between {friction.low:.2f} and {friction.high:.2f}.",
+            f"simulated contacts it is {drawn}.",
             "What the pins miss was learnt as a Gaussian process of the label and drawn for every simulated contact"
             f"{bare}. Its first modes hold {_percents(mode['share'] for mode in modes)} of it, of which the label tells "
             f"{_percents(mode['told'] for mode in modes)}.",

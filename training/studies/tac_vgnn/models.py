@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from training.dataset import Dataset, PinTable
+from training.dataset import Dataset
 from training.estimator import PoseEstimator
-from training.evaluate import judge, predict_rows_of, rows_to_judge
+from training.evaluate import judge, rows_to_judge
 from training.loop import Loop, Rows, epoch_step
 from training.models import model_named, recipe_of, variant_named
 from training.models.part import Inputs
 from training.networks import parameter_count
+from training.pins import PinTable
 from training.run import RunConfig, is_finished, train_run
 from twin.progress import Progress, silent, stage
 
@@ -184,7 +185,7 @@ def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None)
         return row
     estimator = PoseEstimator.load(folder)
     rows = rows_to_judge(estimator, data, "validation")
-    metrics = judge(predict_rows_of(estimator, data, rows), data, rows)
+    metrics = judge(estimator.predict_rows(data, rows), data, rows)
     curves = read_curves(folder)
     row |= {
         "state": "ended early" if (folder / "checkpoint.pt").exists() else "finished",

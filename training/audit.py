@@ -18,13 +18,13 @@ import numpy as np
 
 from training.pins import PinTable
 
-MODES = 14
-DEGREE = 4
-ROUNDS = 30
-MOST_LEFT_OUT = 0.02  # of the frames: the worst, which the fit does without
-FLAG_CHI2 = 60.0  # by which a sign error must fit better than both other stories
-ODD_CHI2 = 12.0  # times the usual chi^2: a frame that fits no story
-STILL = 0.16  # of the usual displacement: no contact (the shallowest taps of the published recordings have 0.19)
+MODES = 14  # leading modes of the displacement that the labels are fitted to
+DEGREE = 4  # of the polynomials
+ROUNDS = 30  # most turns of fit and choice
+MOST_LEFT_OUT = 0.02  # part of the frames, the worst ones, that the fit leaves out
+FLAG_CHI2 = 60.0  # chi^2 by which a sign error must fit better than both other stories
+ODD_CHI2 = 12.0  # usual chi^2; a frame with more of it fits no story
+STILL = 0.16  # usual displacement; less of it is no contact (the shallowest taps of the published recordings have 0.19)
 STORIES = ("executed", "not executed", "angle's sign", "shear's sign")
 
 
@@ -45,7 +45,7 @@ class Audit:
     depth_per_move : float
         mm of depth that go with each mm of ``move_1`` where it was not executed: the plate's tilt.
     drift : dict
-        Part of the variance (R^2) of the row number that the pins tell beyond the labels, and the drift in px from first to last row.
+        Part of the row number's variance (R^2) that the pins tell beyond the labels, and the drift in px from the first to the last row.
     """
 
     executed: np.ndarray
@@ -99,7 +99,7 @@ def audit_labels(pins: PinTable, depth_mm: np.ndarray, angle_deg: np.ndarray, sh
         done = now
     tilt = _depth_per_move(terms[1], modes, weight, precision, stories[1], shear_mm, used & ~done, scale[0])
     usual = np.median(best[~no_contact])
-    # misfits are of a model that is only nearly right: in the usual misfit's own unit they become odds
+    # The fitted map is only nearly right, so misfits are larger than noise alone makes them: the usual misfit is their unit here.
     odds = np.clip((chi2[:, 1] - chi2[:, 0]) / (2 * max(usual / modes.shape[1], 1.0)), -50, 50)
     chi2[no_contact] = np.nan
     return Audit(
@@ -180,7 +180,7 @@ def _twins(nodes_px: np.ndarray) -> np.ndarray:
 
 
 def _drift(pins: PinTable, terms: np.ndarray, used: np.ndarray) -> dict:
-    """How well the row number is told by what of the outmost pins' middle and spread the labels leave unexplained."""
+    """Drift of the outmost pins' middle and spread along the table, after what the labels explain has been taken out."""
     rim = pins.nodes_px[:, pins.reference.outmost]
     middle = rim.mean(axis=1)
     spread = np.linalg.norm(rim - middle[:, None], axis=2).mean(axis=1)

@@ -1,4 +1,4 @@
-"""What the pipeline sees in every frame of a recording, once, with the labels beside it."""
+"""Labelled recordings, real and simulated, as data sets: the pins of every usable frame, and its labels."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,8 +16,8 @@ from twin.progress import Step
 from twin.rig.labels import label_slope, plate_slope
 from twin.types import Form
 
-HELD_OUT = 5  # one row in five is the validation part
-GROUP_COLUMN = "path_id"  # of a simulated data set's table
+HELD_OUT = 5  # one row in so many is held out for validation
+GROUP_COLUMN = "path_id"  # column of a simulated data set's table that numbers the contacts
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Dataset:
     targets : Targets
         M rows of labels, raw and corrected.
     folders : tuple of Path
-        Where it was read from.
+        Folders that it was read from.
     group : (M,) array or None
         Rows of one value belong together (the states of one simulated contact): they are never split.
     problems : list of str
-        Everything odd about the recording, one line each, and what was left out for it.
+        What is odd about the recording, and what was left out because of it; one line each.
     """
 
     pins: PinTable
@@ -49,12 +49,12 @@ class Dataset:
 
     @property
     def folder(self) -> Path:
-        """Where it was read from, for those who look at its pictures.
+        """The one folder that it was read from, for callers that read its pictures.
 
         Raises
         ------
         FrameError
-            It was put together from several.
+            The data set was joined from several recordings.
         """
         if len(self.folders) > 1:
             raise FrameError(f"pictures are read from one recording at a time, these are {len(self.folders)}; give one --data")
@@ -95,11 +95,11 @@ def load_dataset(
     Raises
     ------
     FrameError
-        If there is no table, a chosen column is missing, or no row is usable.
+        There is no table, a chosen column is missing, or no row is usable.
 
     Notes
     -----
-    Corrected labels of a simulated data set tell depth and angle of the surface that was touched: see ``touched_labels``.
+    The corrected labels of a simulated data set are depth and angle of the surface that was touched: see ``touched_labels``.
     """
     problems: list[str] = []
     simulated = is_simulated(Path(folder))
@@ -129,15 +129,15 @@ def load_dataset(
 
 
 def joined(parts: list[Dataset]) -> Dataset:
-    """Data sets of one sensor as one; what belongs together in one of them does so still, and nothing else does.
+    """Several data sets of one sensor as one; rows that form a group in one of them form the same group in the whole.
 
-    They are put in the order of their folders' names, so that the order in which they are given does not matter. Pins are
-    counted from the first one's no-contact layout.
+    They are put in the order of their folders' names, so that the order in which they are given does not matter. Displacements are
+    counted from the no-contact layout of the first one.
 
     Raises
     ------
     FrameError
-        They are of different sensors, forms or labels, or one is given twice.
+        Their sensors, forms or labels differ, or one is given twice.
     """
     if len(parts) == 1:
         return parts[0]
@@ -169,9 +169,9 @@ def joined(parts: list[Dataset]) -> Dataset:
 
 
 def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Training and validation rows: a random fifth is held out (rows are sorted by label, so never by position).
+    """Training and validation rows: a random fifth is held out. The rows of recordings are sorted by label, so no block of rows would do.
 
-    With ``group`` (count,) it is a fifth of the groups, with all their rows.
+    With ``group`` (count,) a fifth of the groups is held out, with all their rows.
     """
     if group is not None:
         names, of_row = np.unique(group, return_inverse=True)
@@ -190,10 +190,10 @@ def simulated_table(
     *,
     progress: Step | None = None,
 ) -> PinTable:
-    """The table that a pipeline without a fault would make of simulated frames, from their pins; hidden caps count as lost.
+    """The table that a perfect pipeline would make of simulated frames, from their known pins; hidden caps count as lost.
 
-    Each contact may have a sensor of its own (longer pins, a thinner skin): its pins are counted from where they are at rest
-    there, as those of a real sensor are from its own no-contact frame.
+    Each contact may have a sensor of its own (longer pins, a thinner skin). Its displacements are counted from this sensor's pins at rest,
+    as those of a real sensor are counted from its own no-contact frame.
     """
     reference = nominal_reference(spec, recording.form)
     nodes = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])

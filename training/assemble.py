@@ -1,12 +1,12 @@
 """From trained networks to a predictor: the Gaussian process beside them, how they are averaged, and honest intervals.
 
-Intervals are conformal (Vovk et al. 2005; Barber et al. 2021 for ensembles): every training row that some network held out
-gets the prediction it would have without itself, and the 90 % quantile of its error over its expected scale widens or
-narrows the stated intervals. Such a prediction misses the rest of the ensemble, so intervals are rather too wide than too narrow.
+Intervals are conformal (Vovk et al. 2005; Barber et al. 2021 for ensembles). Every training row that a network held out is predicted
+without itself. The 90 % quantile of the errors, each divided by its expected scale, then widens or narrows the stated intervals. Such a
+prediction is made by one network and not by the whole ensemble, so the intervals are too wide rather than too narrow.
 
-The other labels of the same rows (raw where corrected ones were learnt) get intervals of their own. Raw labels err by the
-whole move where it was not executed, so frames that look executed and frames that don't have quantiles of their own
-(Mondrian conformal prediction, Vovk et al. 2005, 4.5): a narrow and a wide interval instead of one that is wrong for both.
+The raw labels of the same rows have intervals of their own, because a raw label errs by the whole move where the move was not executed.
+Frames that look executed and frames that do not have separate quantiles (Mondrian conformal prediction, Vovk et al. 2005, 4.5): one
+narrow and one wide interval, instead of one that is wrong for both.
 """
 
 from collections.abc import Mapping
@@ -20,10 +20,11 @@ from training.models.part import Inputs, Model, Modes, Prediction, Prepared
 from training.networks import predict_rows
 from twin.pins.reference import Reference
 
-COVERAGE = 0.9
-SMALL_GROUP = 30  # rows, below which a quantile of their own says little
-BLENDS = np.linspace(0, 1, 21)
-PROCESS_SHARE = 0.5  # of the process of ``beside`` in the average: the labelled frames have taught both, so they can't weigh the two
+COVERAGE = 0.9  # part of the labels that lie inside their intervals
+SMALL_GROUP = 30  # rows; a smaller group takes the quantile of all rows, because its own says little
+BLENDS = np.linspace(0, 1, 21)  # weights of the Gaussian process in the average, of which the best is taken
+# Weight of the process ``beside`` in its average with the networks. The labelled frames taught both, so they can't tell a better one.
+PROCESS_SHARE = 0.5
 
 
 class Ensemble:
@@ -66,11 +67,11 @@ class Ensemble:
         return mean, *_scale_and_move(outs)
 
     def modes(self, inputs: Inputs, rows: torch.Tensor) -> Modes:
-        """What the Gaussian processes see of some rows (B,): the first network's modes."""
+        """The inputs of the Gaussian processes for some rows (B,): the first network's modes."""
         return self.model.modes(self.networks[0], inputs, rows)
 
     def _kernels_say(self, modes: Modes) -> np.ndarray:
-        """(B, k) standardised; each row's views are weighed by how much of it is seen in them."""
+        """(B, k) standardised labels; the views of a row are weighted by how much of the row is seen in each."""
         share = modes.share[:, None]
         said = np.zeros((len(modes.inputs), len(self.kernel_labels)))
         for kernel, part in zip(self.kernels, (1 - share, share), strict=False):

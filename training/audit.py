@@ -16,15 +16,15 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from training.dataset import PinTable
+from training.pins import PinTable
 
-MODES = 14
-DEGREE = 4
-ROUNDS = 30
-MOST_LEFT_OUT = 0.02  # of the frames: the worst, which the fit does without
-FLAG_CHI2 = 60.0  # by which a sign error must fit better than both other stories
-ODD_CHI2 = 12.0  # times the usual chi^2: a frame that fits no story
-STILL = 0.16  # of the usual displacement: no contact (the shallowest taps of the published recordings have 0.19)
+MODES = 14  # leading modes of the displacement that the labels are fitted to
+DEGREE = 4  # of the polynomials
+ROUNDS = 30  # most turns of fit and choice
+MOST_LEFT_OUT = 0.02  # part of the frames, the worst ones, that the fit leaves out
+FLAG_CHI2 = 60.0  # chi^2 by which a sign error must fit better than both other stories
+ODD_CHI2 = 12.0  # usual chi^2; a frame with more of it fits no story
+STILL = 0.16  # usual displacement; less of it is no contact (the shallowest taps of the published recordings have 0.19)
 STORIES = ("executed", "not executed", "angle's sign", "shear's sign")
 
 
@@ -45,7 +45,7 @@ class Audit:
     depth_per_move : float
         mm of depth that go with each mm of ``move_1`` where it was not executed: the plate's tilt.
     drift : dict
-        Part of the variance (R^2) of the row number that the pins tell beyond the labels, and the drift in px from first to last row.
+        Part of the row number's variance (R^2) that the pins tell beyond the labels, and the drift in px from the first to the last row.
     """
 
     executed: np.ndarray
@@ -58,7 +58,7 @@ class Audit:
     drift: dict
 
 
-def audit_labels(pins: PinTable, depth_mm, angle_deg, shear_mm, shear_deg) -> Audit:
+def audit_labels(pins: PinTable, depth_mm: np.ndarray, angle_deg: np.ndarray, shear_mm: np.ndarray, shear_deg: np.ndarray) -> Audit:
     """Ask every frame which story it fits.
 
     Parameters
@@ -99,7 +99,7 @@ def audit_labels(pins: PinTable, depth_mm, angle_deg, shear_mm, shear_deg) -> Au
         done = now
     tilt = _depth_per_move(terms[1], modes, weight, precision, stories[1], shear_mm, used & ~done, scale[0])
     usual = np.median(best[~no_contact])
-    # misfits are of a model that is only nearly right: in the usual misfit's own unit they become odds
+    # The fitted map is only nearly right, so misfits are larger than noise alone makes them: the usual misfit is their unit here.
     odds = np.clip((chi2[:, 1] - chi2[:, 0]) / (2 * max(usual / modes.shape[1], 1.0)), -50, 50)
     chi2[no_contact] = np.nan
     return Audit(
@@ -131,8 +131,37 @@ def _misfit(residual: np.ndarray, precision: np.ndarray) -> np.ndarray:
     return np.einsum("mi,ij,mj->m", residual, precision, residual, optimize=True)
 
 
-def _depth_per_move(terms, modes, weight, precision, story, shear_mm, rows, depth_scale) -> float:
-    """Slope on the move of the depth that the pins show beyond the label, over frames whose move was not executed."""
+def _depth_per_move(
+    terms: np.ndarray,
+    modes: np.ndarray,
+    weight: np.ndarray,
+    precision: np.ndarray,
+    story: np.ndarray,
+    shear_mm: np.ndarray,
+    rows: np.ndarray,
+    depth_scale: float,
+) -> float:
+    """Slope (mm per mm) on the move of the depth that the pins show beyond the label, over frames whose move was not executed.
+
+    Parameters
+    ----------
+    terms : (M, P) float
+        Polynomials of the story "not executed".
+    modes : (M, D) float
+        Amplitudes of the displacement's modes.
+    weight : (P, D) float
+        The fitted map from polynomials to modes.
+    precision : (D, D) float
+        Inverse covariance of what the map misses.
+    story : (M, 4) float
+        The scaled labels of the story.
+    shear_mm : (M,) float
+        ``move_1`` of the table.
+    rows : (M,) bool
+        Frames whose move was not executed.
+    depth_scale : float
+        mm of depth that 1 stands for in ``story``.
+    """
     if rows.sum() < 20 or np.ptp(shear_mm[rows]) < 1:
         return 0.0
     step = 1e-3
@@ -151,7 +180,7 @@ def _twins(nodes_px: np.ndarray) -> np.ndarray:
 
 
 def _drift(pins: PinTable, terms: np.ndarray, used: np.ndarray) -> dict:
-    """How well the row number is told by what of the outmost pins' middle and spread the labels leave unexplained."""
+    """Drift of the outmost pins' middle and spread along the table, after what the labels explain has been taken out."""
     rim = pins.nodes_px[:, pins.reference.outmost]
     middle = rim.mean(axis=1)
     spread = np.linalg.norm(rim - middle[:, None], axis=2).mean(axis=1)

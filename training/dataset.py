@@ -1,74 +1,23 @@
-"""What the pipeline sees in every frame of a recording, once, with the labels beside it."""
+"""Labelled recordings, real and simulated, as data sets: the pins of every usable frame, and its labels."""
 
-import json
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
+from training.pins import PIN_COLUMNS, PinTable, pin_table, voronoi_areas
 from training.simulated import is_pins_only, is_simulated, open_simulated, touched_labels
-from training.targets import Targets, choose_targets
+from training.targets import Targets, choose_targets, joined_targets
 from twin.errors import FrameError
 from twin.frames import Recording, open_recording
-from twin.pins import Pipeline, make_graph, make_reference, nominal_reference
-from twin.pins.batch import UNMEASURED, recording_reference
-from twin.pins.reference import Reference
+from twin.pins import nominal_reference
+from twin.progress import Step
 from twin.rig.labels import label_slope, plate_slope
-from twin.store import cached_arrays
 from twin.types import Form
 
-HELD_OUT = 5  # one row in five is the validation part
-PIN_COLUMNS = ("image_name", "nodes_px", "area_px2", "lost", "valid")  # what a PinTable holds of each frame
-GROUP_COLUMN = "path_id"  # of a simulated data set's table
-
-
-@dataclass(frozen=True)
-class PinTable:
-    """The pipeline's view of M frames of one sensor with N pins.
-
-    Attributes
-    ----------
-    sensor : SensorSpec
-    form : Form
-    reference : Reference
-        No contact, N pins.
-    image_name : (M,) str
-    nodes_px : (M, N, 2) float
-        Every pin of the valid frames; a lost pin's is its predicted place. NaN where a frame is not valid.
-    area_px2 : (M, N) float
-        Voronoi areas; NaN where a frame is not valid.
-    lost : (M, N) bool
-        Pins without a blob of their own.
-    valid : (M,) bool
-    measured : bool
-        Whether the reference is that of these very frames' own camera, and not only the specification's.
-    """
-
-    sensor: SensorSpec
-    form: Form
-    reference: Reference
-    image_name: np.ndarray
-    nodes_px: np.ndarray
-    area_px2: np.ndarray
-    lost: np.ndarray
-    valid: np.ndarray
-    measured: bool = False
-
-    def __len__(self) -> int:
-        return len(self.image_name)
-
-    def rows(self, index: np.ndarray) -> "PinTable":
-        """The same table with only some rows, or rows in another order."""
-        parts = {key: getattr(self, key)[index] for key in PIN_COLUMNS}
-        return PinTable(self.sensor, self.form, self.reference, **parts, measured=self.measured)
-
-    def seen_from(self, reference: Reference) -> "PinTable":
-        """The same motion of the pins from another no-contact layout: displacements and the areas' growth are kept."""
-        nodes_px = reference.pins_px + (self.nodes_px - self.reference.pins_px)
-        area_px2 = reference.area_px2 * (self.area_px2 / self.reference.area_px2)
-        return replace(self, reference=reference, nodes_px=nodes_px, area_px2=area_px2)
+HELD_OUT = 5  # one row in so many is held out for validation
+GROUP_COLUMN = "path_id"  # column of a simulated data set's table that numbers the contacts
 
 
 @dataclass(frozen=True)
@@ -82,11 +31,11 @@ class Dataset:
     targets : Targets
         M rows of labels, raw and corrected.
     folders : tuple of Path
-        Where it was read from.
+        Folders that it was read from.
     group : (M,) array or None
         Rows of one value belong together (the states of one simulated contact): they are never split.
     problems : list of str
-        Everything odd about the recording, one line each, and what was left out for it.
+        What is odd about the recording, and what was left out because of it; one line each.
     """
 
     pins: PinTable
@@ -100,12 +49,12 @@ class Dataset:
 
     @property
     def folder(self) -> Path:
-        """Where it was read from, for those who look at its pictures.
+        """The one folder that it was read from, for callers that read its pictures.
 
         Raises
         ------
         FrameError
-            It was put together from several.
+            The data set was joined from several recordings.
         """
         if len(self.folders) > 1:
             raise FrameError(f"pictures are read from one recording at a time, these are {len(self.folders)}; give one --data")
@@ -120,8 +69,8 @@ class Dataset:
         """This data set once with its own pins and once more with each of ``pins``; all copies of a row belong together."""
         copies = np.tile(np.arange(len(self)), 1 + len(pins))
         every = self.rows(copies)
-        parts = {key: np.concatenate([getattr(table, key) for table in (self.pins, *pins)]) for key in PIN_COLUMNS}
-        return replace(every, pins=replace(every.pins, **parts), group=copies if self.group is None else every.group)
+        tables = {key: np.concatenate([getattr(table, key) for table in (self.pins, *pins)]) for key in PIN_COLUMNS}
+        return replace(every, pins=every.pins.with_columns(tables), group=copies if self.group is None else every.group)
 
 
 def load_dataset(
@@ -130,7 +79,7 @@ def load_dataset(
     columns: str | tuple = "surface-2d",
     *,
     form: Form | None = None,
-    progress: Callable | None = None,
+    progress: Step | None = None,
 ) -> Dataset:
     """Read a labelled recording, real or simulated.
 
@@ -146,11 +95,11 @@ def load_dataset(
     Raises
     ------
     FrameError
-        If there is no table, a chosen column is missing, or no row is usable.
+        There is no table, a chosen column is missing, or no row is usable.
 
     Notes
     -----
-    Corrected labels of a simulated data set tell depth and angle of the surface that was touched: see ``touched_labels``.
+    The corrected labels of a simulated data set are depth and angle of the surface that was touched: see ``touched_labels``.
     """
     problems: list[str] = []
     simulated = is_simulated(Path(folder))
@@ -180,15 +129,15 @@ def load_dataset(
 
 
 def joined(parts: list[Dataset]) -> Dataset:
-    """Data sets of one sensor as one; what belongs together in one of them does so still, and nothing else does.
+    """Several data sets of one sensor as one; rows that form a group in one of them form the same group in the whole.
 
-    They are put in the order of their folders' names, so that the order in which they are given does not matter. Pins are
-    counted from the first one's no-contact layout.
+    They are put in the order of their folders' names, so that the order in which they are given does not matter. Displacements are
+    counted from the no-contact layout of the first one.
 
     Raises
     ------
     FrameError
-        They are of different sensors, forms or labels, or one is given twice.
+        Their sensors, forms or labels differ, or one is given twice.
     """
     if len(parts) == 1:
         return parts[0]
@@ -207,23 +156,22 @@ def joined(parts: list[Dataset]) -> Dataset:
     tables = [part.pins.seen_from(first.pins.reference) for part in parts]
     columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in PIN_COLUMNS}
     columns["image_name"] = np.concatenate([np.char.add(f"{part.folder.name}/", part.pins.image_name) for part in parts])
-    pins = replace(first.pins, **columns, measured=all(table.measured for table in tables))
-    targets = replace(
-        first.targets, **{key: np.concatenate([getattr(part.targets, key) for part in parts]) for key in first.targets.by_frame}
-    )
-    groups, taken = [], 0
+    pins = replace(first.pins.with_columns(columns), measured=all(table.measured for table in tables))
+    targets = joined_targets([part.targets for part in parts])
+    groups: list[np.ndarray] = []
+    taken = 0  # numbers of groups that the parts before have used
     for part in parts:
         own = np.arange(len(part)) if part.group is None else np.unique(part.group, return_inverse=True)[1]
         groups.append(taken + own)
-        taken += own.max() + 1
+        taken += int(own.max()) + 1
     problems = [f"{part.folder.name}: {problem}" for part in parts for problem in part.problems]
     return Dataset(pins, targets, tuple(part.folder for part in parts), np.concatenate(groups), problems)
 
 
 def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Training and validation rows: a random fifth is held out (rows are sorted by label, so never by position).
+    """Training and validation rows: a random fifth is held out. The rows of recordings are sorted by label, so no block of rows would do.
 
-    With ``group`` (count,) it is a fifth of the groups, with all their rows.
+    With ``group`` (count,) a fifth of the groups is held out, with all their rows.
     """
     if group is not None:
         names, of_row = np.unique(group, return_inverse=True)
@@ -231,8 +179,8 @@ def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[
         out = np.isin(of_row, held)
         return np.flatnonzero(~out), np.flatnonzero(out)
     shuffled = np.random.default_rng(seed).permutation(count)
-    held = -(-count // HELD_OUT)
-    return np.sort(shuffled[held:]), shuffled[:held]
+    out_count = -(-count // HELD_OUT)
+    return np.sort(shuffled[out_count:]), shuffled[:out_count]
 
 
 def simulated_table(
@@ -240,12 +188,12 @@ def simulated_table(
     spec: SensorSpec,
     truth: dict[str, np.ndarray],
     *,
-    progress: Callable | None = None,
+    progress: Step | None = None,
 ) -> PinTable:
-    """The table that a pipeline without a fault would make of simulated frames, from their pins; hidden caps count as lost.
+    """The table that a perfect pipeline would make of simulated frames, from their known pins; hidden caps count as lost.
 
-    Each contact may have a sensor of its own (longer pins, a thinner skin): its pins are counted from where they are at rest
-    there, as those of a real sensor are from its own no-contact frame.
+    Each contact may have a sensor of its own (longer pins, a thinner skin). Its displacements are counted from this sensor's pins at rest,
+    as those of a real sensor are counted from its own no-contact frame.
     """
     reference = nominal_reference(spec, recording.form)
     nodes = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])
@@ -254,80 +202,6 @@ def simulated_table(
     return PinTable(
         spec, recording.form, reference, np.array(recording.names, str), nodes, area_px2, ~truth["visible"], seen, measured=True
     )
-
-
-def voronoi_areas(nodes_px: np.ndarray, reference: Reference, *, progress: Callable | None = None) -> np.ndarray:
-    """Voronoi areas (S, N), px^2, of S times N pins (S, N, 2) with this no-contact layout; computed once, then kept on disk."""
-
-    def compute() -> dict[str, np.ndarray]:
-        areas = np.empty(nodes_px.shape[:2])
-        for k, pins_px in enumerate(nodes_px):
-            areas[k] = make_graph("voronoi", pins_px, outmost=reference.outmost).area_px2
-            if progress:
-                progress(k + 1, len(nodes_px))
-        return {"area_px2": areas}
-
-    key = {"pins": nodes_px.tobytes(), "rest": reference.pins_px.tobytes()}
-    return cached_arrays("simulated-areas", key, compute)["area_px2"]
-
-
-def pin_table(recording: Recording, spec: SensorSpec, *, problems: list, progress: Callable | None = None) -> PinTable:
-    """Run the pipeline over a recording, or take its result from the cache.
-
-    What could not be read is appended to ``problems``.
-    """
-
-    def compute() -> dict[str, np.ndarray]:
-        notes: list[str] = []
-        reference, named = recording_reference(spec, recording, notes)
-        pipeline = Pipeline(spec, recording.form, reference)
-        n = spec.pins.count
-        names, nodes, areas, lost, valid = [], [], [], [], []
-        for frame in recording:
-            try:
-                seen = pipeline(frame)
-            except FrameError as error:
-                notes.append(str(error))
-                continue
-            names.append(frame.name)
-            valid.append(seen.valid)
-            nodes.append(seen.graph.nodes_px if seen.valid else np.full((n, 2), np.nan))
-            areas.append(seen.graph.area_px2 if seen.valid else np.full(n, np.nan))
-            lost.append(np.isnan(seen.pins_px[:, 0]))
-            if progress:
-                progress(frame.sequence + 1, len(recording))
-        notes += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
-        arrays = {
-            "nodes_px": np.reshape(nodes, (-1, n, 2)),
-            "area_px2": np.reshape(areas, (-1, n)),
-            "lost": np.reshape(lost, (-1, n)).astype(bool),
-            "valid": np.array(valid, bool),
-        }
-        about = {"rest_px": reference.pins_px, "measured": np.array(named != UNMEASURED), "notes": np.array(notes, str)}
-        return {"image_name": np.array(names, str)} | about | arrays
-
-    found = cached_arrays("recorded-pins", _key(recording, spec), compute)
-    problems += found.pop("notes").tolist()
-    reference = make_reference(found.pop("rest_px"), spec.pins.rings)
-    return PinTable(spec, recording.form, reference, measured=bool(found.pop("measured")), **found)
-
-
-def _key(recording: Recording, spec: SensorSpec) -> dict:
-    """All that the pins depend on beside the code: files and the specification."""
-    root = recording.path if recording.path.is_dir() else recording.path.parent
-    states = sorted((str(file.relative_to(root)), *_state(file)) for file in root.rglob("*") if file.is_file())
-    return {
-        "path": str(recording.path.resolve()),
-        "names": recording.names,
-        "files": json.dumps(states),
-        "form": str(recording.form),
-        "sensor": spec.model_dump(mode="json"),
-    }
-
-
-def _state(file: Path) -> tuple[int, int]:
-    status = file.stat()
-    return status.st_size, status.st_mtime_ns
 
 
 def _named(names: np.ndarray) -> str:

@@ -1,6 +1,4 @@
-"""A trained model, its sensor and its pipeline in one: frame in, pose out. The one thing a live loop calls.
-
-Several trained models under the names that results give them."""
+"""A trained model with its sensor and its pipeline: a frame goes in, a pose comes out. This is what a live loop calls."""
 
 import hashlib
 import json
@@ -16,10 +14,11 @@ import torch
 
 from scenes.sensor import SensorSpec
 from training.assemble import Ensemble
-from training.dataset import Dataset, PinTable
+from training.dataset import Dataset
 from training.models import model_named
 from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
+from training.pins import PinTable
 from training.recipes import TrainingError
 from twin.errors import FrameError
 from twin.pins import Pipeline, make_reference, measure_reference
@@ -93,12 +92,12 @@ class PoseEstimator:
         Parameters
         ----------
         run : path
-            Where there is no such folder, the name of a sensor whose weights go with the package.
+            A folder, or the name of a sensor whose weights go with the package.
 
         Raises
         ------
         TrainingError
-            If it holds none.
+            The folder holds no trained model, or one that this version can't read.
         """
         run = folder_of(run)
         packed = (run / WEIGHTS).is_file()
@@ -124,12 +123,12 @@ class PoseEstimator:
         return self.part.counts_from_rest
 
     def at_rest(self, frame: Frame) -> "PoseEstimator":
-        """The same model for the sensor in hand, whose frame without contact is given: pins are counted from where it shows them.
+        """The same model for the sensor in hand: displacements are counted from the pins in its frame without contact.
 
         Raises
         ------
         FrameError
-            The layout can't be found in the frame, or the model knows no pins to count.
+            The layout can't be found in the frame, or the model does not count pins from rest.
         """
         if not self.counts_from_rest:
             raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
@@ -153,7 +152,7 @@ class PoseEstimator:
             )
 
     def __call__(self, frame: Frame) -> PoseEstimate:
-        """Estimate the pose in one frame; without (enough) pins the result is not valid and says why.
+        """Estimate the pose in one frame. Where too few pins are found, the result is not valid and says why.
 
         Raises
         ------
@@ -182,8 +181,8 @@ class PoseEstimator:
     def predict_table(self, pins: PinTable) -> Prediction:
         """Labels of many valid frames of one camera at once.
 
-        Where the camera sits otherwise than in training, the table's own no-contact frame tells, or without one the median of
-        the frames.
+        The camera may sit elsewhere than in training. The table's own no-contact frame tells where; without one the median of the
+        frames does.
 
         Raises
         ------
@@ -213,12 +212,12 @@ class PoseEstimator:
 
 
 def folder_of(run: str | Path) -> Path:
-    """The folder of a run, or of the weights that go with the package where there is no such folder and a sensor is named so."""
+    """The folder of a run. Where there is no such folder, the name of a sensor stands for the weights that go with the package."""
     return SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
 
 
 def digest_of(run: str | Path) -> str:
-    """Digest of all that a model's answers depend on: its weights, its configuration, and the code that runs it."""
+    """Digest of everything that a model's answers depend on: its weights, its configuration, and the code that runs it."""
     folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
     for name in ("config.json", WEIGHTS, "weights.pt"):
         if (folder / name).is_file():
@@ -226,12 +225,8 @@ def digest_of(run: str | Path) -> str:
     return digest.hexdigest()
 
 
-def _ms(started: float) -> float:
-    return 1e3 * (perf_counter() - started)
-
-
 def load_by_name(runs: Sequence[Path]) -> dict[str, PoseEstimator]:
-    """Models by the names of their folders, or by their whole paths where two folders are called alike.
+    """Several trained models by the names of their folders, or by their whole paths where two folders have the same name.
 
     Raises
     ------
@@ -242,3 +237,7 @@ def load_by_name(runs: Sequence[Path]) -> dict[str, PoseEstimator]:
     if len(set(names)) < len(names):
         names = [str(run) for run in runs]
     return {name: PoseEstimator.load(run) for name, run in zip(names, runs, strict=True)}
+
+
+def _ms(started: float) -> float:
+    return 1e3 * (perf_counter() - started)

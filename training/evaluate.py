@@ -1,14 +1,15 @@
-"""How good a trained model is on a recording: errors, intervals, leaks, as numbers, a table and pictures.
+"""How good a trained model is on a recording: errors, intervals and leaks as numbers, a table and pictures.
 
-What a model loses when the picture changes in ways that are not the contact's: the camera sits otherwise, pins are gone.
-
-Each change is made to the image itself, frame by frame and in a random direction, before the pipeline sees it."""
+The second part changes the images before the pipeline sees them, as nothing in the contact would: the camera sits elsewhere, or pins
+are gone. Each frame is changed in a random direction. The errors then tell what the model loses.
+"""
 
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,27 +22,35 @@ from training.recipes import TrainingError
 from training.simulated import is_pins_only
 from training.targets import Targets
 from twin.frames import open_recording
+from twin.progress import Step
 from twin.report.charts import new_figure
 from twin.rig.labels import EXECUTED_FILES
 from twin.store import made_by, text_file, write_json
 from twin.types import Form, Frame
 
+# Edges of the bins in which errors are given apart: depth pose_2, size of the angle pose_6, and size of the shear move_1.
 DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)
 ANGLE_EDGES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 SHEAR_EDGES_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-LARGE_MOVE = 1.0  # mm or deg: smaller moves leave the same picture executed or not
-TIMED_FRAMES = 100
-LEAK_LABEL, LEAK_MOVE = "pose_6", "move_6"  # the angle of the recordings in which moves were not executed, and its move
-LEAK_FRAMES = 3  # fewest to lay a line through
+LARGE_MOVE = 1.0  # mm or deg; a frame shows too little of a smaller move to tell whether it was executed
+TIMED_FRAMES = 100  # frames, evenly spread, whose time to a pose is measured
+LEAK_LABEL = "pose_6"  # the label of the leak check: the angle, deg
+LEAK_MOVE = "move_6"  # the move that belongs to this label, deg
+LEAK_FRAMES = 3  # frames; a line through fewer says nothing
+SCALE_CHANGE = 0.01  # by which a changed image is larger or smaller
+SHIFT_CHANGE_PX = 2.0  # by which a changed image is shifted
+TURN_CHANGE_DEG = 1.0  # by which a changed image is turned
+ERASED_PINS = 5  # pins that are wiped out of a changed image
+ERASED_MARGIN = 1.25  # side of the square that is wiped out around a pin, in mean rest spacings: more than the pin
 
 
 def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndarray:
-    """Rows of a data set: ``validation``, those kept out of the run's training, or ``all`` (a recording it never saw).
+    """Rows of a data set: with ``validation`` those that the run kept out of its training, with ``all`` every row.
 
     Raises
     ------
     TrainingError
-        If the run kept none out, or the recording is not the one it was trained on.
+        The run kept no rows out, or it was trained on another recording.
     """
     if rows == "all":
         return np.arange(len(data))
@@ -54,11 +63,6 @@ def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndar
             "give --rows all for a recording it has not seen"
         )
     return split_rows(len(data), split, data.group)[1]
-
-
-def predict_rows_of(estimator: PoseEstimator, data: Dataset, rows: np.ndarray) -> Prediction:
-    """The model's labels for some rows of a data set."""
-    return estimator.predict_rows(data, rows)
 
 
 def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
@@ -89,13 +93,13 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
 
 @dataclass(frozen=True)
 class Leak:
-    """Whether a model reads the time at which a frame was taken, by which a recording's rows are sorted, instead of the contact.
+    """Whether a model reads the time at which a frame was taken instead of the contact; the rows of a recording are sorted by time.
 
     Attributes
     ----------
     slope : float or None
-        Of (angle predicted - corrected) on ``move_6``, over frames whose move was not executed. A model that reads the contact
-        has 0. None where the check can't be made.
+        Slope of (predicted - corrected angle) on ``move_6``, over the frames whose move was not executed. A model that reads the
+        contact has 0. None where the check can't be made.
     reason : str
         Why it can't be made; empty where it is.
     """
@@ -105,7 +109,7 @@ class Leak:
 
 
 def leak_check(mean: np.ndarray, targets: Targets) -> Leak:
-    """The check on predicted labels (M, K) of targets of M frames."""
+    """Make the leak check on predicted labels (M, K) of M frames with known targets."""
     if LEAK_LABEL not in targets.names:
         return Leak(None, f"it needs the angle label {LEAK_LABEL} and its {LEAK_MOVE}; the labels are {', '.join(targets.names)}")
     if not np.isfinite(targets.executed).any():
@@ -144,7 +148,10 @@ def _bins(error: np.ndarray, targets: Targets) -> dict[str, list[dict]]:
 
 
 def time_frames(estimator: PoseEstimator, data: Dataset) -> float | None:
-    """Median ms from frame to pose, one frame at a time on one thread; None where there are no pictures, or of several recordings."""
+    """Median ms from frame to pose, one frame at a time on one thread.
+
+    None where the data set has no pictures, or comes from several recordings.
+    """
     if len(data.folders) > 1 or is_pins_only(data.folder):
         return None
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
@@ -202,58 +209,58 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
     return path
 
 
-ERASED_MARGIN = 1.25  # of a pin's spacing, the side of the square that is wiped out around it: more than the pin
+Change = Callable[[np.ndarray, np.random.Generator, PoseEstimator], np.ndarray]  # an image as it is after the change
 
 
-def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, shift_px=(0.0, 0.0)) -> np.ndarray:
+def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, shift_px: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
     height, width = image.shape[:2]
     matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, scale)
-    matrix[:, 2] += shift_px
+    matrix[:, 2] += np.array(shift_px)
     return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR)
 
 
 def scaled(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """One per cent larger or smaller."""
-    return _similar(image, scale=1 + 0.01 * rng.choice([-1, 1]))
+    """The image one per cent larger or smaller, at random."""
+    return _similar(image, scale=1 + SCALE_CHANGE * rng.choice([-1, 1]))
 
 
 def shifted(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """Two px away, in any direction."""
+    """The image shifted by two px in a random direction."""
     angle = rng.uniform(0, 2 * np.pi)
-    return _similar(image, shift_px=(2 * np.cos(angle), 2 * np.sin(angle)))
+    return _similar(image, shift_px=(SHIFT_CHANGE_PX * np.cos(angle), SHIFT_CHANGE_PX * np.sin(angle)))
 
 
 def turned(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """One degree, either way."""
-    return _similar(image, turn_deg=rng.choice([-1.0, 1.0]))
+    """The image turned by one degree, at random to the left or to the right."""
+    return _similar(image, turn_deg=TURN_CHANGE_DEG * rng.choice([-1.0, 1.0]))
 
 
 def erased(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """Five of the pins that were found are wiped out."""
+    """The image with five of its pins wiped out, drawn from those that the pipeline finds."""
     seen = estimator.pipeline(Frame(image, estimator.form))
     found = np.flatnonzero(np.isfinite(seen.pins_px[:, 0]))
     half = ERASED_MARGIN * float(estimator.pipeline.reference.spacing_px.mean()) / 2
     image = image.copy()
     background = int(np.median(image)) if estimator.form == Form.RAW else 0
-    for pin in rng.choice(found, min(5, len(found)), replace=False):
+    for pin in rng.choice(found, min(ERASED_PINS, len(found)), replace=False):
         low, high = np.maximum(np.round(seen.pins_px[pin] - half), 0).astype(int), np.round(seen.pins_px[pin] + half).astype(int)
         image[low[1] : high[1] + 1, low[0] : high[0] + 1] = background
     return image
 
 
-CHANGES: dict[str, Callable] = {"1 % scale": scaled, "2 px shift": shifted, "1 deg turn": turned, "5 pins erased": erased}
+CHANGES: dict[str, Change] = {"1 % scale": scaled, "2 px shift": shifted, "1 deg turn": turned, "5 pins erased": erased}
 
 
 def judge_changes(
-    estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Callable | None = None
-) -> list[dict]:
+    estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Step | None = None
+) -> list[dict[str, Any]]:
     """Errors against corrected labels of single frames as they are and under every change.
 
     Returns
     -------
     list of dict
-        ``change``, ``frames``, ``not_valid``, and for every label ``<label>_mae`` and ``<label>_more``, the part by which the
-        mean absolute error is larger than that of the same frames as they are.
+        ``change``, ``frames``, ``not_valid``, and for every label ``<label>_mae`` and ``<label>_more``: by which part the mean absolute
+        error is larger than on the unchanged frames.
 
     Raises
     ------
@@ -264,7 +271,7 @@ def judge_changes(
         raise TrainingError(f"{data.folder}: a data set of pins has no pictures to change; render it, or judge without --robustness")
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
     place = {name: k for k, name in enumerate(recording.names)}
-    changes: dict = {"none": lambda image, rng, estimator: image} | CHANGES
+    changes: dict[str, Change] = {"none": lambda image, rng, estimator: image} | CHANGES
     rngs = {name: np.random.default_rng([seed, k]) for k, name in enumerate(changes)}
     value = {name: np.full((len(rows), len(estimator.names)), np.nan) for name in changes}
     for m, row in enumerate(rows):

@@ -1,6 +1,4 @@
-"""One network's training, epoch by epoch, in a state that can be kept and taken up again.
-
-How trainings tell how far they are, in the terms of ``twin.progress``."""
+"""One network's training, epoch by epoch, with a state that can be kept on disk and continued."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -15,9 +13,10 @@ from training.networks import device_of, predict_rows
 from training.recipes import Recipe
 from twin.progress import Step
 
-RISE_STEPS = 100  # over which the cosine schedule's rate rises to its full size
-PLATEAU_PATIENCE = 3
-SCALE_LOSS, EXECUTED_LOSS = 0.05, 0.05  # beside the labels' own
+RISE_STEPS = 100  # steps in which the cosine schedule's rate rises to its full size
+PLATEAU_PATIENCE = 3  # epochs without a smaller loss after which the plateau schedule halves the rate, as the published code does
+SCALE_LOSS = 0.05  # weight of the error scales' loss, beside 1 of the labels' loss
+EXECUTED_LOSS = 0.05  # weight of the executed move's loss, beside 1 of the labels' loss
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Rows:
 
 
 def no_penalty(network: nn.Module) -> None:
-    """Nothing is added to the loss."""
+    """The penalty of networks that have none: nothing is added to the loss."""
 
 
 @dataclass
@@ -61,7 +60,7 @@ class Loop:
     seed : int
         Of the rows' order.
     penalty : callable, optional
-        A number that is added to the loss of every batch, of the network.
+        Gives for the network a number that is added to the loss of every batch.
     """
 
     network: nn.Module
@@ -92,11 +91,11 @@ class Loop:
 
     @property
     def finished(self) -> bool:
-        """Whether all epochs are done, or patience is at an end."""
+        """Whether all epochs are done, or the held-out error has not fallen for as many epochs as the recipe's patience."""
         return self.epochs_done >= self.recipe.epochs or bool(self.recipe.patience and self.since_best >= self.recipe.patience)
 
     def epoch(self) -> dict:
-        """Go once through the training rows; returns the row of the learning curve."""
+        """Go once through the training rows; returns the new point of the learning curve."""
         started = perf_counter()
         self.network.train()
         total, loss = 0.0, math.nan
@@ -120,7 +119,7 @@ class Loop:
         return point
 
     def result(self) -> nn.Module:
-        """The network with the weights to keep: averaged, or those that were best on the held-out rows."""
+        """The network with the weights to keep: the best on the held-out rows where the recipe has patience, else the averaged ones."""
         if self.recipe.patience:
             self.network.load_state_dict(self.best_weights)
         elif self.recipe.average:
@@ -181,9 +180,9 @@ class Loop:
 
 
 def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: torch.Tensor, kind: str) -> torch.Tensor:
-    """Mean over rows of the labels' weighted error; with the error's scale and the executed move where the network gives them.
+    """Mean over rows of the labels' weighted error, plus the losses of error scale and executed move where the network gives them.
 
-    The scale is that of a Laplace distribution around the mean; it does not pull at the mean.
+    The error scale is that of a Laplace distribution around the mean. Its loss has no gradient with respect to the mean.
     """
     error = out["mean"] - labels
     loss = ((error.abs() if kind == "l1" else error.square()) * weight).mean()
@@ -197,7 +196,7 @@ def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: to
 
 
 def epoch_step(step: Step) -> Callable[[int, int, Mapping[str, float]], None]:
-    """What ``train_run`` calls with (epochs done, epochs in all, the curve's last row): the error on held-out rows becomes the note."""
+    """The callback of ``train_run`` that reports epochs as a ``twin.progress`` step, with the error on held-out rows as the note."""
 
     def told(done: int, total: int, point: Mapping[str, float]) -> None:
         step(done, total, f"{point['held_out_error']:.4f}")

@@ -1,8 +1,8 @@
 """Small copies of runs, small enough to go with the package: ``config.json`` and ``weights.safetensors``.
 
-The arrays are in the safetensors format (https://github.com/huggingface/safetensors), nothing of which can be run. Large ones
-are kept in half precision; those of a Gaussian process are not, as its terms cancel. What a network's weights can do without is
-the model's own matter: see ``Model.pack``.
+The arrays are in the safetensors format (https://github.com/huggingface/safetensors), which holds no code. Large arrays are kept in half
+precision. Those of a Gaussian process are not, because its terms nearly cancel. Each model decides itself which weights a small copy can
+do without: see ``Model.pack``.
 """
 
 import json
@@ -22,9 +22,10 @@ from twin.store import write_bytes, write_text
 
 WEIGHTS = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "weights"
-LARGE = 1000  # numbers, from which an array is kept in half precision
-NETWORKS, BESIDE = "networks", "beside"  # groups of arrays in ``weights.pt``
-NOT_PACKED = ("kernels", "kernel_labels", "parameters")  # no arrays, or none that are packed
+LARGE = 1000  # numbers; a larger array is kept in half precision
+NETWORKS = "networks"  # the networks' weights, in ``weights.pt``
+BESIDE = "beside"  # the arrays of the Gaussian process beside the networks, in ``weights.pt``
+NOT_PACKED = ("kernels", "kernel_labels", "parameters")  # entries of ``weights.pt`` that a small copy leaves out
 
 
 def shipped_names() -> list[str]:

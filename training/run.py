@@ -1,9 +1,12 @@
-"""The files of a training run, each written whole or not at all.
+"""Training runs: a folder with the configuration, the learning curves, the weights, and what continuing after a kill needs.
 
-Training runs: a folder with configuration, learning curves, weights, and what continuing after a kill needs.
+- ``config.json``: the resolved configuration (model, recipe, sensor, pipeline, labels, rows).
+- ``curves.csv``: the learning curves.
+- ``checkpoint.pt``: the state of training, while the run goes on.
+- ``weights.pt``: the trained model, when the run is done.
 
-``config.json`` (resolved: model, recipe, sensor, pipeline, labels, rows), ``curves.csv``, ``checkpoint.pt`` while the run
-goes on, ``weights.pt`` when it is done. Every file is written whole or not at all."""
+Every file is written whole or not at all.
+"""
 
 import csv
 import io
@@ -26,34 +29,9 @@ from training.recipes import Recipe, TrainingError, as_dict
 from twin.frames.forms import blob_spec
 from twin.store import fingerprint, write_text, write_with
 
-
-def write_tensors(path: Path, content: dict) -> None:
-    """A dict of numbers, text, lists, arrays and tensors, as ``torch.load`` reads it with ``weights_only``."""
-    write_with(path, lambda file: torch.save(_as_tensors(content), file))
-
-
-def _as_tensors(value: object) -> object:
-    """The same with arrays as tensors, which are read back without running anything that a file may hold."""
-    if isinstance(value, np.ndarray):
-        return torch.from_numpy(value)
-    if isinstance(value, dict):
-        return {key: _as_tensors(part) for key, part in value.items()}
-    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
-
-
-def write_curves(out: Path, curves: list) -> None:
-    """``curves.csv`` of networks one after the other."""
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
-    for k, points in enumerate(curves):
-        writer.writerows([k, *point.values()] for point in points)
-    write_text(out / "curves.csv", text.getvalue())
-
-
-FOLDS = 10  # each network of an ensemble watches another tenth of the training rows
-KEEP_EVERY_S = 20.0
-EXTRA_WEIGHT = 0.3  # of labels that only help the others
+FOLDS = 10  # parts of the training rows; each network of an ensemble watches another part
+KEEP_EVERY_S = 20.0  # s between two checkpoints
+EXTRA_WEIGHT = 0.3  # of a helper label in the loss, beside 1 of a label that is asked for
 
 
 @dataclass(frozen=True)
@@ -70,11 +48,11 @@ class RunConfig:
     split : int or None
         Seed of the validation fifth that is kept out of training; None trains on all rows.
     helpers : tuple of str
-        Further label columns that are learnt beside the data set's own, with less weight.
+        Label columns that are learnt only because they help the others; they have less weight.
     size : dict
         Sizes of the network that differ from the model's own.
     labelled : tuple of str
-        Names of the real frames that what simulated pins miss was learnt from.
+        Names of the real frames from which was learnt what simulated pins miss; empty for other runs.
     """
 
     model: str
@@ -103,7 +81,7 @@ def train_run(
     progress : callable, optional
         Called with (epochs done, epochs in all, the curve's last row) over all networks.
     max_minutes : float, optional
-        Stop at the end of an epoch after that long; what is there by then is assembled all the same.
+        Stop after the epoch in which this time has passed. The weights so far are written all the same.
     device : {"cpu", "cuda"}
         Where the networks learn; what is kept runs anywhere.
 
@@ -115,11 +93,11 @@ def train_run(
     Raises
     ------
     TrainingError
-        If ``out`` holds another run.
+        ``out`` holds another run.
     """
     started = monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
+    train = training_rows(config, data)
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     prepared = model_named(config.model).prepare(data, train)
@@ -153,16 +131,16 @@ def train_run(
 
 
 def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
-    """Whether a folder holds this very run, done.
+    """Whether a folder holds this very run, and it is finished.
 
     Raises
     ------
     TrainingError
-        If it holds another one.
+        The folder holds another finished run.
     """
     if not (out / "weights.pt").is_file() or (out / "checkpoint.pt").is_file():
         return False
-    train = np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
+    train = training_rows(config, data)
     wanted = json.loads(json.dumps(resolve(config, data, train)))
     found = json.loads((out / "config.json").read_text())
     if _identity(wanted) != _identity({key: found.get(key) for key in wanted}):
@@ -170,6 +148,11 @@ def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
             f"{out}: holds a finished run with other settings or data, or of another version of the program; give another --out"
         )
     return True
+
+
+def training_rows(config: RunConfig, data: Dataset) -> np.ndarray:
+    """Rows (m,) of a data set that a run learns from."""
+    return np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
 
 
 def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
@@ -229,7 +212,7 @@ def _member(
 
 
 def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The tenth of the training rows that a network watches, and those it learns from; ``group`` as in ``Dataset``."""
+    """The tenth of the training rows that a network watches, and the rows that it learns from; ``group`` as in ``Dataset``."""
     parts = train if group is None else np.unique(group[train])
     held = np.random.default_rng([seed, 1]).permutation(parts)[member % FOLDS :: FOLDS]
     if group is not None:
@@ -283,7 +266,7 @@ def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:
 
 
 def _opened(out: Path, resolved: dict) -> dict | None:
-    """What an interrupted run of the same configuration left; None where there is nothing to continue."""
+    """The checkpoint of an interrupted run of the same configuration; None where there is nothing to continue."""
     path = out / "checkpoint.pt"
     if not path.is_file():
         if (out / "weights.pt").is_file():
@@ -297,6 +280,30 @@ def _opened(out: Path, resolved: dict) -> dict | None:
             "give another --out, or the same settings"
         )
     return state
+
+
+def write_tensors(path: Path, content: dict) -> None:
+    """Write a dict of numbers, text, lists, arrays and tensors so that ``torch.load`` reads it with ``weights_only``."""
+    write_with(path, lambda file: torch.save(_as_tensors(content), file))
+
+
+def _as_tensors(value: object) -> object:
+    """The same content with arrays as tensors: PyTorch reads tensors back without running code that a file may hold."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value)
+    if isinstance(value, dict):
+        return {key: _as_tensors(part) for key, part in value.items()}
+    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
+
+
+def write_curves(out: Path, curves: list[list[dict]]) -> None:
+    """Write ``curves.csv``: the curves of all networks, one network after the other."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(["network", "epoch", "loss", "held_out_error", "rate", "seconds"])
+    for k, points in enumerate(curves):
+        writer.writerows([k, *point.values()] for point in points)
+    write_text(out / "curves.csv", text.getvalue())
 
 
 def _identity(resolved: dict) -> str:

@@ -1,6 +1,7 @@
 """Simulated data sets: read like recordings where they have no pictures, and what is known of their contacts beyond the table."""
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -49,10 +50,10 @@ def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str,
         raise FrameError(f"{folder}: no {TABLE} of a finished data set; give the command that made it once more")
     _, labels = order_by_table([folder / TABLE], [folder / name for name in table.name_lists[0]], problems)
     names = table.name_lists[0]
-    arrays = {key: truth[key][:] for key in ("pins_px", "rest_px", "visible")}
+    arrays = _arrays(truth, ("pins_px", "rest_px", "visible"))
     if len(names) != len(arrays["pins_px"]) or arrays["pins_px"].shape[1] != spec.pins.count:
         raise FrameError(f"{folder}: {len(names)} rows in the table, pins {arrays['pins_px'].shape} in {TRUTH}; make the data set again")
-    form = Form(truth.attrs["form"])
+    form = Form(str(truth.attrs["form"]))
     return Recording(folder, form, names, frame_size(spec, form), labels, problems=problems), arrays
 
 
@@ -87,8 +88,9 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     with (folder / DRAWS).open(newline="") as file:
         draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
     rows = np.array([row_of.get(name, -1) for name in names.tolist()], int)
-    pose = truth["pose"][:] - truth["move"][:] * ~truth["executed"][:][:, None]
-    pose, force_n, contact = pose[rows], truth["force_n"][:][rows], np.where(rows < 0, -1, truth["path_id"][:][rows])
+    arrays = _arrays(truth, ("pose", "move", "executed", "force_n", "path_id"))
+    pose = (arrays["pose"] - arrays["move"] * ~arrays["executed"][:, None])[rows]
+    force_n, contact = arrays["force_n"][rows], np.where(rows < 0, -1, arrays["path_id"][rows])
     surface = Surface(config.object)
     found: dict[str, np.ndarray] = {}
     for path_id in np.unique(contact[rows >= 0]):
@@ -98,6 +100,17 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         sent[:, 2, 3] += config.object.compliance_mm_per_n * force_n[mine, 2]
         for label, values in surface_labels(config.experiment, Mounting.of(sensor, config.experiment), surface, sent).items():
             found.setdefault(label, np.full(len(rows), np.nan))[mine] = values
+    return found
+
+
+def _arrays(truth: zarr.Group, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Arrays of ``truth.zarr`` by name."""
+    found = {}
+    for name in names:
+        array = truth.get(name)
+        if not isinstance(array, zarr.Array):
+            raise FrameError(f"{truth.store_path}: no array '{name}'; the data set is damaged or of another version: make it again")
+        found[name] = np.asarray(array[:])
     return found
 
 

@@ -1,11 +1,12 @@
 """Which labels a model learns: columns of a recording's table, as published and corrected.
 
-Corrected: in the published Tac-VGNN recordings the shear move had not been executed in about a third of the frames when
-the frame was taken. In those frames both shears are zero and the angle is ``pose_6 - move_6``. The plate is slightly tilted, so the
-depth is ``pose_2 + c move_1``. A tap at ``pose_1`` has the depth ``pose_2 - c pose_1``, which it would have before the plate's middle.
-c is the rig's ``label_depth_per_move`` for recordings, and the slope of its plate for simulated contacts.
+Why labels are corrected: in the published Tac-VGNN recordings the shear move had not been executed in about a third of the frames when
+the frame was taken. In those frames both shears are zero, and the angle is ``pose_6 - move_6``. The plate is slightly tilted, so their
+depth is ``pose_2 + c move_1``. For the same reason a tap at ``pose_1`` has the depth ``pose_2 - c pose_1``. For recordings c is the rig's
+``label_depth_per_move``; for simulated contacts it is the slope of the plate.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,8 @@ PRESETS = {
     "edge-2d": ("pose_1", "pose_6"),
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
 }
-UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")  # of pose_1..6 and move_1..6
+TARGET_COLUMNS = ("raw", "corrected", "executed", "move")  # the fields of Targets that hold a row for each frame
+UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")  # units of pose_1 to pose_6, and of move_1 to move_6
 
 
 @dataclass(frozen=True)
@@ -35,15 +37,15 @@ class Targets:
     raw : (M, K) float
         As in the table: mm and deg; NaN where a cell holds no number.
     corrected : (M, K) float
-        The same with moves that were not executed taken out; equal to ``raw`` where nothing is known. Of simulated contacts
-        depth and angle of the surface that was touched, whatever its shape.
+        ``raw`` without the moves that were not executed; equal to ``raw`` where nothing is known. For simulated contacts the depth
+        and the angle of the surface that was touched, whatever its shape.
     executed : (M,) float
         Whether each move had been executed: 1, 0, or NaN where that isn't known.
     move : (M, 2) float
         ``move_1`` (mm) and ``move_6`` (deg) as in the table; NaN without them.
     """
 
-    names: tuple
+    names: tuple[str, ...]
     raw: np.ndarray
     corrected: np.ndarray
     executed: np.ndarray
@@ -51,22 +53,22 @@ class Targets:
 
     def rows(self, index: np.ndarray) -> "Targets":
         """The same labels of only some frames."""
-        return replace(self, **{key: getattr(self, key)[index] for key in self.by_frame})
+        return Targets(self.names, **{key: getattr(self, key)[index] for key in TARGET_COLUMNS})
 
-    @property
-    def by_frame(self) -> tuple:
-        """Names of the attributes that hold a row for each frame."""
-        return ("raw", "corrected", "executed", "move")
-
-    def instead(self, known: dict) -> "Targets":
-        """The same with other corrected labels: those (M,) of ``known`` whose columns these are."""
+    def instead(self, known: Mapping[str, np.ndarray]) -> "Targets":
+        """The same with other corrected labels: ``known`` holds values (M,) by the names of label columns."""
         columns = [known.get(name, self.corrected[:, k]) for k, name in enumerate(self.names)]
         return replace(self, corrected=np.column_stack(columns))
 
     @property
-    def units(self) -> tuple:
+    def units(self) -> tuple[str, ...]:
         """Unit of each label: mm, deg, or "" where the column's name doesn't tell."""
         return tuple(unit_of(name) for name in self.names)
+
+
+def joined_targets(parts: Sequence[Targets]) -> Targets:
+    """Labels of several data sets one after the other; all have the same label columns."""
+    return Targets(parts[0].names, **{key: np.concatenate([getattr(part, key) for part in parts]) for key in TARGET_COLUMNS})
 
 
 def unit_of(name: str) -> str:
@@ -82,13 +84,15 @@ def unit_of(name: str) -> str:
     return {"force": "N", "torque": "Nmm"}.get(kind, "")
 
 
-def choose_targets(recording: Recording, columns: str | tuple, rows: np.ndarray, depth_per_move: float, problems: list) -> Targets:
+def choose_targets(
+    recording: Recording, columns: str | tuple[str, ...], rows: np.ndarray, depth_per_move: float, problems: list[str]
+) -> Targets:
     """Labels of the recording's frames ``rows`` (M,); ``depth_per_move`` is c above.
 
     Raises
     ------
     FrameError
-        If the recording has no table, or a column is missing.
+        The recording has no table, or a column is missing.
     """
     names = PRESETS.get(columns, (columns,)) if isinstance(columns, str) else tuple(columns)
     if not recording.labels:
@@ -113,7 +117,7 @@ def choose_targets(recording: Recording, columns: str | tuple, rows: np.ndarray,
 
 
 def corrected(
-    names: tuple, raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float, x_mm: np.ndarray | float = 0.0
+    names: tuple[str, ...], raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float, x_mm: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """Labels (M, K) with the moves (M, 2) that were not executed taken out; an unknown ``executed`` (M,) counts as executed.
 
@@ -131,8 +135,8 @@ def corrected(
     return out
 
 
-def _numbers(cells: np.ndarray, name: str, problems: list) -> np.ndarray:
-    """A column as floats; what is no finite number becomes NaN and is counted."""
+def _numbers(cells: np.ndarray, name: str, problems: list[str]) -> np.ndarray:
+    """A column as floats; a cell without a finite number becomes NaN, and such cells are counted in ``problems``."""
     values = cells if cells.dtype.kind == "f" else np.array([_number(cell) for cell in cells])
     bad = ~np.isfinite(values)
     if bad.any():

@@ -17,24 +17,25 @@ from training.targets import PRESETS
 from twin.progress import Progress, silent, stage
 from twin.types import Form
 
-SHEAR_PRESET, SHEAR_HELPERS = "surface-2d-shear", ("move_1", "move_6")  # this preset's moves also help its other labels
-FILES = ("config.json", "curves.csv", "weights.pt")
+SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helpers of its other labels
+SHEAR_HELPERS = ("move_1", "move_6")  # these moves
+FILES = ("config.json", "curves.csv", "weights.pt")  # of a finished run
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What came of it.
+    """A training run and its recordings.
 
     Attributes
     ----------
     out : Path
         The run's folder.
     finished : bool
-        Whether training came to its end; if not, the same call goes on.
+        Whether training came to its end; if not, the same call continues it.
     frames : int
-        That were usable.
+        Number of usable frames.
     names : tuple of str
-        Of the labels.
+        The label columns.
     labels : str
         Whether they are corrected or raw.
     problems : list of str
@@ -54,7 +55,7 @@ class Trained:
         return [self.out / name for name in FILES]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Lines for people."""
         lines = [f"note: {problem}" for problem in self.problems]
         lines.append(f"{self.frames} usable frames; labels {', '.join(self.names)} ({self.labels})")
         if not self.finished:
@@ -82,7 +83,7 @@ def train_model(
     form: Form | None = None,
     progress: Progress = silent,
 ) -> Trained:
-    """Train a model on labelled recordings, or go on with the run in ``out``.
+    """Train a model on labelled recordings, or continue the run in ``out``.
 
     Parameters
     ----------
@@ -91,21 +92,21 @@ def train_model(
     recordings : sequence of Path
         Several are joined.
     target : str
-        A preset's name, or label columns with commas between.
+        A preset's name, or label columns separated by commas.
     labels : {"corrected", "raw"}
     seed : int
         Of weights and order.
     split : int or None
         Seed of the fifth that is kept out of training; None: train on all.
     epochs, batch, members, kernel : optional
-        Instead of the recipe's own.
+        Values that replace the recipe's own.
     max_minutes : float, optional
-        Stop after the epoch that passes this time.
+        Stop after the epoch in which this time has passed.
     threads : int, optional
         Of the CPU.
     device : {"auto", "cpu", "cuda"}
     form : Form, optional
-        Of the frames; told by size and content by default.
+        Form of the frames; recognised by size and content by default.
 
     Raises
     ------
@@ -131,5 +132,5 @@ def train_model(
 
 
 def columns_of(target: str) -> str | tuple[str, ...]:
-    """What ``load_dataset`` takes: the name of a preset, or the columns that are named with commas between."""
+    """The ``columns`` of ``load_dataset``: the name of a preset, or a tuple of column names that are separated by commas."""
     return target if target in PRESETS else tuple(name.strip() for name in target.split(","))

@@ -1,8 +1,8 @@
 """Can a small network tell two sets of frames apart? A classifier two-sample test (Lopez-Paz & Oquab 2017).
 
-A fixed network of four convolutions sees colour patches of the lens disc. It is trained on some frames and asked about
-others it has never seen: frame k of one set is always held out together with frame k of the other, so a pair that
-shows the same contact can't give the answer away. 50 %: not to be told apart; 100 %: always.
+A fixed network of four convolutions sees colour patches of the lens disc. It is trained on some frames and judged on others that it has
+never seen. Frame k of one set is always held out together with frame k of the other, so that a pair which shows the same contact can't
+give the answer away. An accuracy of 50 % means that the sets can't be told apart, 100 % that every patch can.
 """
 
 from dataclasses import dataclass
@@ -13,18 +13,19 @@ from torch import nn
 from torch.nn import functional
 
 from twin.errors import FrameError
+from twin.progress import Step
 
-PATCH_PX = 64
-PATCHES = 16  # of each frame in each epoch, and in the test
-CHANNELS = (16, 32, 64, 64)
+PATCH_PX = 64  # side of a patch
+PATCHES = 16  # patches of each frame, in each epoch and in the test
+CHANNELS = (16, 32, 64, 64)  # of the convolutions, one after the other
 EPOCHS = 12
-BATCH = 64
-FOLDS = 5
-RATE = 2e-3
-WEIGHT_DECAY = 1e-2
-INSIDE = 0.9  # of a patch lies in the disc at least
-RESAMPLES = 2000  # of the frames, for the interval
-LEVEL_SCALE = 64.0  # gray levels
+BATCH = 64  # patches
+FOLDS = 5  # parts of the frames; each is held out once
+RATE = 2e-3  # largest learning rate of AdamW
+WEIGHT_DECAY = 1e-2  # of AdamW
+INSIDE = 0.9  # least part of a patch that lies in the lens disc
+RESAMPLES = 2000  # drawings of the frame pairs, for the interval
+LEVEL_SCALE = 64.0  # gray levels that are 1 in the network's input
 
 
 @dataclass(frozen=True)
@@ -47,27 +48,29 @@ class TwoSample:
     by_pair: np.ndarray
 
 
-def two_sample(first: list[np.ndarray], second: list[np.ndarray], inside: np.ndarray, *, seed: int = 0, progress=None) -> TwoSample:
+def two_sample(
+    first: list[np.ndarray], second: list[np.ndarray], inside: np.ndarray, *, seed: int = 0, progress: Step | None = None
+) -> TwoSample:
     """Test two sets of as many frames.
 
     Parameters
     ----------
     first, second : list of (H, W, 3) or (H, W) uint8
-        M frames each, at least one per fold; pairs (k-th and k-th) are held out together.
+        M frames each; the k-th frames of both sets are held out together.
     inside : (H, W) bool
         The lens disc.
     seed : int
-        Of patches, network and folds: the same seed gives the same outcome.
+        Of patches, network and folds. The same seed gives the same outcome.
     progress : callable, optional
         ``progress(done, total)`` after each fold.
 
     Raises
     ------
     FrameError
-        Sets of different length, or fewer than two pairs.
+        The sets differ in length, or have fewer than two frames each.
     """
     if len(first) != len(second) or len(first) < 2:
-        raise FrameError(f"the two-sample test needs as many frames of both kinds, at least 2; got {len(first)} and {len(second)}")
+        raise FrameError(f"the two-sample test needs equally many frames of both kinds, at least 2; got {len(first)} and {len(second)}")
     rng = np.random.default_rng(seed)
     corners = patch_corners(inside)
     sets = [np.stack([as_color(image) for image in images]) for images in (first, second)]
@@ -87,27 +90,13 @@ def two_sample(first: list[np.ndarray], second: list[np.ndarray], inside: np.nda
     return TwoSample(float(correct.mean()), float(low), float(high), correct)
 
 
-def random_halves(images: list[np.ndarray], inside: np.ndarray, *, splits: int = 4, seed: int = 0) -> TwoSample:
-    """The same test on one set of frames, divided at random again and again: what no difference looks like."""
-    rng, outcomes = np.random.default_rng(seed), []
-    half = len(images) // 2
-    for split in range(splits):
-        order = rng.permutation(len(images))
-        first, second = ([images[k] for k in part] for part in (order[:half], order[half : 2 * half]))
-        outcomes.append(two_sample(first, second, inside, seed=seed + split).by_pair)
-    every = np.concatenate(outcomes)
-    means = every[rng.integers(len(every), size=(RESAMPLES, len(every)))].mean(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
-    return TwoSample(float(every.mean()), float(low), float(high), every)
-
-
 def as_color(image: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8 of a colour or gray frame."""
     return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
 
 
 def patch_corners(inside: np.ndarray) -> np.ndarray:
-    """(k, 2) row and column of all patches that lie in the disc for nine tenths.
+    """(k, 2) row and column of the first pixel of every patch that lies in the disc with at least nine tenths of its area.
 
     Raises
     ------
@@ -152,7 +141,9 @@ def _trained(sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rn
     return network.requires_grad_(False)
 
 
-def _patches(sets, frames, corners, rng, *, turned: bool) -> tuple[torch.Tensor, torch.Tensor]:
+def _patches(
+    sets: list[np.ndarray], frames: np.ndarray, corners: np.ndarray, rng: np.random.Generator, *, turned: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
     """(p, 3, 64, 64) patches of the frames of both sets at random places, and (p,) which set each is from."""
     patches, truth = [], []
     for k in frames:
@@ -160,7 +151,7 @@ def _patches(sets, frames, corners, rng, *, turned: bool) -> tuple[torch.Tensor,
             for row, column in corners[rng.integers(len(corners), size=PATCHES)]:
                 patch = images[k, row : row + PATCH_PX, column : column + PATCH_PX]
                 if turned:
-                    patch = np.rot90(patch, rng.integers(4))
+                    patch = np.rot90(patch, int(rng.integers(4)))
                     patch = patch[:, ::-1] if rng.random() < 0.5 else patch
                 patches.append(patch.transpose(2, 0, 1))
                 truth.append(kind)

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from scenes import load_sensor
-from training.dataset import Dataset, PinTable
+from training.dataset import Dataset
 from training.models import recipe_of
+from training.pins import PinTable
 from training.run import RunConfig
 from training.targets import Targets
 from twin.pins import make_graph, nominal_reference

@@ -12,7 +12,7 @@ import pytest
 from fresh_contacts import read_for, simulate_contacts
 
 from training.estimator import PoseEstimator
-from training.evaluate import judge, predict_rows_of
+from training.evaluate import judge
 from training.packed import shipped_names
 
 SEED = 5  # of contacts that no training drew
@@ -51,7 +51,7 @@ def test_shipped_weights_predict_within_their_stated_error(name, size, tmp_path)
     estimator = PoseEstimator.load(name)
     data = read_for(estimator, simulate_contacts(tmp_path, name, EXPERIMENTS[name], contacts, seed=SEED, across=across))
     rows = np.arange(len(data))
-    found = judge(predict_rows_of(estimator, data, rows), data, rows)["corrected"]
+    found = judge(estimator.predict_rows(data, rows), data, rows)["corrected"]
     error, inside = ([found[label][key] for label in estimator.names] for key in ("mae", "coverage_90"))
     print(f"{name}, {contacts} contacts, {across} across, {len(rows)} states: errors {np.round(error, 4)}, inside {np.round(inside, 3)}")
     assert error == pytest.approx(STATED[name, size].error, rel=RELATIVE)

@@ -9,7 +9,7 @@ import numpy as np
 from scenes import load_experiment, load_object, load_randomisation, load_sensor
 from scenes.randomisation import FrictionSpread
 from training.audit import STORIES, Audit
-from training.dataset import PinTable
+from training.pins import PinTable
 from training.studies.label_audit import summary_of, write_audit
 from training.studies.objects import Plan, verdicts
 from training.studies.tac_vgnn import page as study_report

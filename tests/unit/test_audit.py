@@ -6,7 +6,7 @@ from drawn_recording import drawn_pins
 
 from scenes import load_sensor
 from training.audit import audit_labels
-from training.dataset import PinTable
+from training.pins import PinTable
 from twin.pins import nominal_reference
 from twin.types import Form
 

@@ -9,10 +9,12 @@ from drawn_frames import drawn_frame, smooth_warp
 
 from scenes import load_sensor
 from training.dataset import load_dataset, split_rows
+from training.pins import pin_table
 from training.targets import corrected, unit_of
 from twin.errors import FrameError
 from twin.pins import make_reference, nominal_reference
 from twin.rig.labels import label_slope, plate_slope
+from twin.store import code_of
 from twin.types import Form
 
 SENSOR = "mg400-127"
@@ -74,12 +76,19 @@ def test_a_missing_column_names_those_that_are_there(tmp_path):
 def test_pins_come_from_the_cache_until_a_frame_changes(tmp_path, monkeypatch):
     spec = write_recording(tmp_path / "r", ["f_0.png,-1,5,1,2"], ["f_0.png"])
     first = load_dataset(tmp_path / "r", spec)
-    monkeypatch.setattr("training.dataset.Pipeline", None)  # not callable: a second look would fail
+    monkeypatch.setattr("training.pins.Pipeline", None)  # not callable: a second look would fail
     again = load_dataset(tmp_path / "r", spec)
     assert np.array_equal(first.pins.nodes_px, again.pins.nodes_px)
     (tmp_path / "r" / "meta.json").write_text(json.dumps({"new": 1}))
     with pytest.raises(TypeError):
         load_dataset(tmp_path / "r", spec)
+
+
+def test_kept_pins_of_recordings_do_not_depend_on_the_simulations_code():
+    """Otherwise every change of the mechanics or the renderer would have all recordings read again."""
+    parts = {name.rpartition(".")[0] for name in code_of(pin_table).modules}
+    assert "twin.pins" in parts
+    assert not parts & {"twin.mechanics", "twin.optics", "twin.rig", "training.generation"}
 
 
 def test_moves_that_were_not_executed_are_taken_out():

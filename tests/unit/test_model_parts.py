@@ -13,14 +13,14 @@ from drawn_frames import drawn_frame
 from drawn_recording import config_of, drawn_pins
 from torch import nn
 
-from training.dataset import PinTable
 from training.estimator import PoseEstimator
-from training.evaluate import judge, predict_rows_of, rows_to_judge
+from training.evaluate import judge, rows_to_judge
 from training.models import MODELS, model_named, recipe_of, register, variant_named
 from training.models.part import PinModel
 from training.models.vgnn.network import mode_components
 from training.models.vgnn.registration import fit_registration, spanned
 from training.packed import SHIPPED, WEIGHTS, pack, shipped_names
+from training.pins import PinTable
 from training.recipes import Recipe, TrainingError
 from training.run import RunConfig, train_run
 from twin.errors import FrameError
@@ -81,7 +81,7 @@ def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change
     assert json.loads((tmp_path / "config.json").read_text())["model"] == toy and (tmp_path / "weights.pt").is_file()
     estimator = PoseEstimator.load(tmp_path)
     rows = rows_to_judge(estimator, data, "validation")
-    made = predict_rows_of(estimator, data, rows)
+    made = estimator.predict_rows(data, rows)
     errors = judge(made, data, rows)["corrected"]
     for k, name in enumerate(data.targets.names):
         truth = data.targets.corrected[:, k]
@@ -92,7 +92,7 @@ def test_a_new_model_trains_is_judged_estimates_and_is_kept_with_no_other_change
     blank = estimator(Frame(np.zeros((256, 256), np.uint8), Form.RECORDING))
     assert not blank.valid and "no pins" in blank.reason
     again = PoseEstimator.load(tmp_path)
-    assert np.array_equal(predict_rows_of(again, data, rows).mean, made.mean)
+    assert np.array_equal(again.predict_rows(data, rows).mean, made.mean)
 
 
 def test_what_a_new_model_does_not_provide_it_says(data, toy, tmp_path):

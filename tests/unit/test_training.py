@@ -11,11 +11,12 @@ from drawn_frames import drawn_frame
 from drawn_recording import FRAMES, config_of
 
 from scenes import load_sensor
-from training.dataset import Dataset, PinTable
+from training.dataset import Dataset
 from training.estimator import PoseEstimator, digest_of, folder_of
-from training.evaluate import judge, leak_check, predict_rows_of, rows_to_judge, write_evaluation
+from training.evaluate import judge, leak_check, rows_to_judge, write_evaluation
 from training.models import recipe_of
 from training.models.part import Prediction
+from training.pins import PinTable
 from training.recipes import TrainingError
 from training.run import fold_rows, train_run
 from twin.errors import FrameError
@@ -63,7 +64,7 @@ def test_a_run_keeps_all_that_made_it(trained):
 def test_a_trained_model_tells_the_pose(data, trained, tmp_path):
     estimator = PoseEstimator.load(trained)
     rows = rows_to_judge(estimator, data, "validation")
-    made = predict_rows_of(estimator, data, rows)
+    made = estimator.predict_rows(data, rows)
     metrics = judge(made, data, rows)
     assert metrics["corrected"]["pose_2"]["mae"] < 0.3 and metrics["corrected"]["pose_6"]["mae"] < 5
     assert metrics["without_prediction"] == 0 and metrics["frames"] == 18

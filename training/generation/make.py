@@ -6,6 +6,7 @@ from functools import cache, lru_cache
 import cv2
 import numpy as np
 
+from scenes.sensor import SensorSpec
 from training.generation.config import DatasetError, Draw, GenerationConfig, draw_contact
 from twin.camera.truth import cap_truth
 from twin.errors import ContactError, MeshError
@@ -129,5 +130,5 @@ def _nominal(text: str) -> Simulator:
     return _simulator(config, config.sensor, keep=True)
 
 
-def _simulator(config: GenerationConfig, sensor, *, keep: bool) -> Simulator:
+def _simulator(config: GenerationConfig, sensor: SensorSpec, *, keep: bool) -> Simulator:
     return Simulator(sensor, quality=config.quality, solver=SkinSolver(sensor, resolution=Resolution(config.across), keep=keep))

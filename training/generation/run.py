@@ -1,8 +1,5 @@
-"""Making a data set: here, in processes of this machine, or on a cluster.
+"""Making a simulated data set, from what a user asks for to its folder: in this process, in several, or on a cluster."""
 
-A simulated data set, from what a user asks for to its folder."""
-
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +8,7 @@ from training.generation.config import GenerationConfig, Images, Quality, States
 from training.generation.make import REST, make_contact
 from training.generation.store import Store, refuse_foreign
 from twin.frames.forms import frame_size
-from twin.progress import Progress, silent, stage
+from twin.progress import Progress, Step, silent, stage
 from twin.rig.contact import friction_between
 from twin.store import locked
 from twin.types import FINE
@@ -20,7 +17,17 @@ from twin.workers import outcomes
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run made: contacts in the data set, frames, contacts that were there before, draws that failed in this run."""
+    """What a run made.
+
+    Attributes
+    ----------
+    contacts, frames : int
+        In the whole data set.
+    before : int
+        Contacts that were there before this run.
+    failed : int
+        Draws that failed in this run.
+    """
 
     contacts: int
     frames: int
@@ -29,18 +36,18 @@ class Summary:
 
 
 def generate(
-    folder: Path, config: GenerationConfig, count: int, *, workers: int = 1, scheduler: str = "", progress: Callable | None = None
+    folder: Path, config: GenerationConfig, count: int, *, workers: int = 1, scheduler: str = "", progress: Step | None = None
 ) -> Summary:
-    """Make a data set of ``count`` contacts, or go on with the one in the folder.
+    """Make a data set of ``count`` contacts, or continue the one in the folder.
 
-    What is made does not depend on ``workers``, ``scheduler``, or how often the work was broken off.
+    The result does not depend on ``workers``, on ``scheduler``, or on how often the work was interrupted.
 
     Parameters
     ----------
     workers : int
-        Processes on this machine; 1: in this very process.
+        Processes on this machine; with 1 the work is done in this process.
     scheduler : str
-        Address of a Dask scheduler whose workers do it instead.
+        Address of a Dask scheduler whose workers do the work instead.
     progress : callable, optional
         Called with (contacts done, contacts wanted).
 
@@ -75,18 +82,18 @@ def generate(
 
 @dataclass(frozen=True)
 class Simulated:
-    """What was made, and where."""
+    """A data set that was made, and its folder."""
 
     folder: Path
     made: Summary
 
     @property
     def written(self) -> list[Path]:
-        """The folder."""
+        """The data set's folder."""
         return [self.folder]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Lines for people."""
         lines = [f"{self.made.before} contacts were there before"] if self.made.before else []
         if self.made.failed:
             lines.append(f"{self.made.failed} draws failed and were drawn anew: see {self.folder / 'failures.csv'}")
@@ -110,16 +117,16 @@ def config_for(
     Parameters
     ----------
     touched : ObjectSpec, optional
-        The object. By default the experiment's own, with the friction that the sensor's rig was calibrated with, where it has a rig.
+        The object; the experiment's own by default. ``friction_between`` tells which friction it has on this sensor.
     seed : int, optional
-        Of all that is drawn; the experiment's own by default.
+        Seed of everything that is drawn; the experiment's own by default.
     quality : {"preview", "standard", "high"}, optional
         By default ``preview`` for images in the recordings' form, which are thresholded, else ``standard``.
 
     Raises
     ------
     FrameError
-        The sensor has not the form that is asked for.
+        The sensor has no frames of the form that is asked for.
     """
     thing = touched or load_object(experiment.object)
     config = GenerationConfig(
@@ -141,6 +148,6 @@ def config_for(
 def simulate_dataset(
     config: GenerationConfig, out: Path, count: int, *, workers: int = 1, scheduler: str = "", progress: Progress = silent
 ) -> Simulated:
-    """Make a data set of ``count`` contacts, or go on with the one in the folder; parameters and errors as of ``generate``."""
+    """Make a data set of ``count`` contacts, or continue the one in the folder; parameters and errors as of ``generate``."""
     with stage(progress, f"{config.experiment.name}, {config.sensor.name}") as step:
         return Simulated(out, generate(out, config, count, workers=workers, scheduler=scheduler, progress=step))

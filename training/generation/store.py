@@ -1,10 +1,11 @@
-"""``truth.zarr``: everything that is known about the frames of a simulated data set, row by row as in its table.
+"""The folder of a simulated data set, written so that the work can be stopped at any moment and continued.
 
-The folder of a simulated data set, written so that it can be ended at any moment and gone on with.
+A contact is done once its record lies in ``records/``. The record is written after the contact's pictures, whole or not at all. When
+all records are there, the tables and ``truth.zarr`` are put together from them in the contacts' order. So a data set does not depend on
+the order in which its contacts were made, on the number of workers, or on interruptions.
 
-A contact counts as done once its record lies in ``records/``: it is written last, whole or not at all, after the
-contact's pictures. When all are there, the tables and ``truth.zarr`` are put together from the records in the contacts'
-order, so that a data set does not show in which order, by how many workers and in how many sittings it was made."""
+``truth.zarr`` holds everything that is known about the frames, row by row as in the table ``targets.csv``.
+"""
 
 import csv
 import io
@@ -23,9 +24,13 @@ from twin.store import remove_parts, replace_folder, require_same_code, unwritte
 from twin.store.atomic import LOCK, PART
 from twin.store.resume import MADE_BY
 
-TRUTH = "truth.zarr"
-CHUNK_ROWS = 256
-UNITS = {
+CONFIG = "generation.json"  # the data set's configuration
+RECORDS = "records"  # folder of a record for each contact that is done
+DRAWS = "draws.csv"  # table of what was drawn for each contact
+FAILURE_COLUMNS = ("path_id", "attempt", "reason")  # of the table of draws that failed
+TRUTH = "truth.zarr"  # all that is known about the frames
+CHUNK_ROWS = 256  # rows of a chunk of its arrays
+UNITS = {  # unit and meaning of each of its arrays
     "caps_mm": "mm, sensor frame",
     "caps_px": "px of the frame: exact projection of each cap's centre",
     "rest_px": "px of the frame: the same sensor without contact",
@@ -44,52 +49,13 @@ UNITS = {
 }
 
 
-class TruthFile:
-    """A Zarr group that grows by rows, ``CHUNK_ROWS`` at a time: a chunk is written once, when it is full."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        shutil.rmtree(path, ignore_errors=True)
-        self._group = zarr.create_group(path, zarr_format=3)
-        self._waiting: dict[str, list] = {}
-
-    def append(self, arrays: dict) -> None:
-        """Add rows: for each key an array (S, ...)."""
-        for key, rows in arrays.items():
-            self._waiting.setdefault(key, []).extend(rows)
-        while len(self._waiting["path_id"]) >= CHUNK_ROWS:
-            self._flush(CHUNK_ROWS)
-
-    def close(self, attributes: dict) -> None:
-        """Write what is left."""
-        if self._waiting["path_id"]:
-            self._flush(len(self._waiting["path_id"]))
-        self._group.attrs.update(attributes)
-
-    def _flush(self, rows: int) -> None:
-        for key, waiting in self._waiting.items():
-            block = np.stack(waiting[:rows])
-            del waiting[:rows]
-            if key not in self._group:
-                shape, chunks = (0, *block.shape[1:]), (CHUNK_ROWS, *block.shape[1:])
-                array = self._group.create_array(key, shape=shape, chunks=chunks, dtype=block.dtype, attributes={"meaning": UNITS[key]})
-            array = self._group[key]
-            start = array.shape[0]
-            array.resize((start + rows, *block.shape[1:]))
-            array[start:] = block
-
-
-CONFIG, RECORDS, DRAWS = "generation.json", "records", "draws.csv"
-FAILURE_COLUMNS = ("path_id", "attempt", "reason")
-
-
 class Store:
-    """A data set's folder, of which the run that opens it holds the lock.
+    """A data set's folder. The caller holds its lock (``twin.store.locked``).
 
     Parameters
     ----------
     folder : Path
-        That is there, and holds a data set or nothing: see ``refuse_foreign``.
+        An existing folder that is empty or holds a data set; ``refuse_foreign`` checks this.
     config : GenerationConfig
 
     Raises
@@ -97,7 +63,7 @@ class Store:
     DatasetError
         The folder holds another data set, or can't be written to.
     StoreError
-        Another version of the program made it: its contacts would not be of one kind with the new ones.
+        Another version of the program made the contacts in the folder, so new ones would differ from them.
     """
 
     def __init__(self, folder: Path, config: GenerationConfig) -> None:
@@ -114,7 +80,7 @@ class Store:
             raise DatasetError(f"{folder}: can't be written to ({error.strerror}); give another folder with --out") from error
 
     def finished(self) -> set[int]:
-        """Numbers of the contacts that are done; ``REST`` among them where its frame is there, or none is wanted."""
+        """Numbers of the contacts that are done; ``REST`` is among them where the no-contact frame is there, or no pictures are wanted."""
         done = {int(path.stem) for path in (self.folder / RECORDS).glob("*.npz")}
         if self.config.images != "none":
             done = {index for index in done if (self.pictures / image_name(index, 0)).is_file()}
@@ -123,18 +89,18 @@ class Store:
         return done
 
     def check_count(self, count: int) -> None:
-        """DatasetError if the folder holds contacts beyond the ``count`` wanted ones."""
+        """Raise DatasetError where the folder holds more contacts than the ``count`` that are wanted."""
         highest = max(self.finished(), default=REST)
         if highest >= count:
             raise DatasetError(f"{self.folder}: holds contacts up to {highest}; give --count {highest + 1} or more, or another --out")
 
     def add(self, outcome: Outcome) -> None:
-        """Keep what became of a contact.
+        """Write the pictures and the record of a contact.
 
         Raises
         ------
         DatasetError
-            It can't be written: disk full, folder gone.
+            They can't be written: the disk is full, or the folder is gone.
         """
         try:
             self._keep(outcome)
@@ -151,7 +117,7 @@ class Store:
         write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", {"notes": np.array(notes), **outcome.arrays})
 
     def finish(self, count: int) -> int:
-        """Write tables and truth of the contacts 0 to ``count`` - 1; how many frames there are."""
+        """Write tables and truth of the contacts 0 to ``count`` - 1; returns the number of frames."""
         tables: dict[str, list[dict]] = {"targets.csv": [], "move_executed.csv": [], DRAWS: [], "failures.csv": []}
         truth = TruthFile(self.folder / f".{TRUTH}.part")
         try:
@@ -225,7 +191,7 @@ class Store:
 
 
 def refuse_foreign(folder: Path) -> None:
-    """DatasetError where a folder holds files, and none of them is a data set's configuration."""
+    """Raise DatasetError where a folder holds files but no data set's configuration."""
     if not folder.exists() or (folder / CONFIG).is_file():
         return
     try:
@@ -239,6 +205,41 @@ def refuse_foreign(folder: Path) -> None:
 def image_name(index: int, state: int) -> str:
     """Name of a contact's picture, as recordings number them."""
     return f"frame_{index}_{state}.png"
+
+
+class TruthFile:
+    """A Zarr group to which rows are added. A chunk of ``CHUNK_ROWS`` rows is written once, when it is full."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        shutil.rmtree(path, ignore_errors=True)
+        self._group = zarr.create_group(path, zarr_format=3)
+        self._waiting: dict[str, list] = {}
+
+    def append(self, arrays: dict) -> None:
+        """Add S rows; ``arrays`` holds an array (S, ...) for each key."""
+        for key, rows in arrays.items():
+            self._waiting.setdefault(key, []).extend(rows)
+        while len(self._waiting["path_id"]) >= CHUNK_ROWS:
+            self._flush(CHUNK_ROWS)
+
+    def close(self, attributes: dict) -> None:
+        """Write the rows that are left, and the attributes."""
+        if self._waiting["path_id"]:
+            self._flush(len(self._waiting["path_id"]))
+        self._group.attrs.update(attributes)
+
+    def _flush(self, rows: int) -> None:
+        for key, waiting in self._waiting.items():
+            block = np.stack(waiting[:rows])
+            del waiting[:rows]
+            array = self._group.get(key)
+            if not isinstance(array, zarr.Array):
+                shape, chunks = (0, *block.shape[1:]), (CHUNK_ROWS, *block.shape[1:])
+                array = self._group.create_array(key, shape=shape, chunks=chunks, dtype=block.dtype, attributes={"meaning": UNITS[key]})
+            start = array.shape[0]
+            array.resize((start + rows, *block.shape[1:]))
+            array[start:] = block
 
 
 def _csv(rows: list[dict], columns: tuple | None = None) -> str:

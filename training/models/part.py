@@ -17,7 +17,8 @@ import torch
 from torch import nn
 
 from scenes.sensor import SensorSpec
-from training.dataset import Dataset, PinTable
+from training.dataset import Dataset
+from training.pins import PinTable
 from training.recipes import Recipe, TrainingError
 from twin.pins import Pipeline
 from twin.pins.reference import Reference

@@ -1,6 +1,4 @@
-"""The pose in every frame of a recording, as a trained model tells it.
-
-How good a trained model is on labelled recordings, from the run's folder to tables and figures."""
+"""Use of trained models on recordings: the pose in every frame, and how good a model is on labelled frames."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -9,16 +7,19 @@ from typing import Any
 
 from training.dataset import joined, load_dataset
 from training.estimator import PoseEstimate, PoseEstimator
-from training.evaluate import judge, judge_changes, predict_rows_of, rows_to_judge, time_frames, write_evaluation
+from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.recipes import TrainingError
 from twin.frames import Recording, open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 
+ROWS = ("validation", "all")  # which rows can be judged
+LABELS = ("corrected", "raw")  # which labels can be the truth
+
 
 @dataclass(frozen=True)
 class Predictions:
-    """Estimates of a recording's frames, made as they are asked for: iterate over it.
+    """Estimates of a recording's frames. Iterate over it: each estimate is made when it is asked for.
 
     Attributes
     ----------
@@ -30,12 +31,12 @@ class Predictions:
     recording: Recording = field(repr=False)
 
     def __iter__(self) -> Iterator[tuple[str, PoseEstimate]]:
-        """The name of each frame, and what the model makes of it."""
+        """The name of each frame and its estimate."""
         for frame in self.recording:
             yield frame.name, self.estimator(frame)
 
     def lines(self) -> Iterator[str]:
-        """For people: each frame's pose as soon as it is told, and at the end the frames that can't be read."""
+        """Lines for people: each frame's pose as soon as it is estimated, and at the end the frames that can't be read."""
         for name, made in self:
             yield f"{name}: {_said(made)}"
         for bad in self.recording.failed:
@@ -43,9 +44,9 @@ class Predictions:
 
 
 def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
-    """What a trained model tells of the frames at a path.
+    """Poses in the frames at a path, by a trained model.
 
-    A recording's frame without contact tells where its pins are at rest, where the model can count from it.
+    Where the model counts pins from rest and the recording has a frame without contact, they are counted from that frame.
 
     Parameters
     ----------
@@ -77,23 +78,20 @@ def _said(made: PoseEstimate) -> str:
     return f"{pose}{moved} ({made.ms:.1f} ms)"
 
 
-ROWS, LABELS = ("validation", "all"), ("corrected", "raw")
-
-
 @dataclass(frozen=True)
 class Evaluation:
-    """What was found.
+    """How good a model is.
 
     Attributes
     ----------
     metrics : dict
         As ``metrics.json`` holds them.
     changes : list of dict
-        Errors on changed images; none where they were not asked for.
+        Errors on changed images; empty where they were not asked for.
     units : dict of str to str
         Of each label.
     frames : int
-        That were judged.
+        Number of judged frames.
     problems : list of str
         What is odd about the recordings.
     written : list of Path
@@ -107,7 +105,7 @@ class Evaluation:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Lines for people."""
         lines = [f"note: {problem}" for problem in self.problems]
         for name, unit in self.units.items():
             raw, corrected = self.metrics["raw"][name], self.metrics["corrected"][name]
@@ -142,18 +140,18 @@ def evaluate_run(
     run : path
         As ``PoseEstimator.load`` takes it.
     recordings : sequence of Path
-        Labelled; for ``validation`` all that the run was trained on.
+        Labelled recordings; for ``validation`` exactly those that the run was trained on.
     rows : {"validation", "all"}
-        Those that were kept out of the run's training, or every one.
+        The rows that were kept out of the run's training, or every row.
     labels : {"corrected", "raw"}
-        The truth in ``predictions.csv`` and ``errors.png``.
+        Which labels are the truth in ``predictions.csv`` and ``errors.png``.
     robustness : bool
         Also judge changed images.
 
     Raises
     ------
     TrainingError
-        There is no such run, or an option has another value.
+        There is no such run, or ``rows`` or ``labels`` has another value.
     FrameError
         The recordings are not of the run's sensor, or have no labels.
     """
@@ -166,7 +164,7 @@ def evaluate_run(
             parts.append(load_dataset(folder, estimator.sensor, estimator.names, form=estimator.form, progress=step))
     found = joined(parts)
     chosen = rows_to_judge(estimator, found, rows)
-    made = predict_rows_of(estimator, found, chosen)
+    made = estimator.predict_rows(found, chosen)
     metrics = {"model": estimator.model, "rows": rows, **judge(made, found, chosen), "ms_per_frame": time_frames(estimator, found)}
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []
     if robustness:

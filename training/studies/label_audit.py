@@ -1,6 +1,4 @@
-"""An audit's findings as files: a table of corrected labels, numbers, pictures and one page.
-
-Whether a recording's labels agree with its pins, from the recording to tables and a page."""
+"""Whether a recording's labels agree with its pins: the audit of a recording, written as tables, numbers, a picture and a page."""
 
 import csv
 import io
@@ -14,7 +12,7 @@ from matplotlib.figure import Figure
 from scenes import SensorSpec
 from training.audit import STORIES, Audit, audit_labels
 from training.dataset import Dataset, load_dataset
-from training.targets import corrected
+from training.targets import PRESETS, corrected
 from twin.progress import Progress, silent, stage
 from twin.report.charts import muted, new_figure, write_chart
 from twin.report.numbers import number
@@ -23,14 +21,65 @@ from twin.report.table import Column
 from twin.store import made_by, write_json, write_text
 from twin.types import Form
 
-NAMES = ("pose_2", "pose_6", "move_1", "move_6")
-LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")
-NAMED = 8  # frames of a list that the page names; audit.json holds all
-LARGE_MOVE = 1.0  # mm or deg: what smaller moves leave undecided changes nothing
+TARGET = "surface-2d-shear"  # the preset of labels that an audit needs
+NAMES = PRESETS[TARGET]  # depth (mm), angle (deg), shear (mm) and shear (deg), as columns of the table
+LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")  # findings that are lists of frames
+SAID = 3  # frames of each list that are named on the terminal
+NAMED = 8  # frames of each list that are named on the page; audit.json names all
+LARGE_MOVE = 1.0  # mm or deg; whether a smaller move was executed changes the labels too little to count
+
+
+@dataclass(frozen=True)
+class LabelAudit:
+    """What an audit found, and its files.
+
+    Attributes
+    ----------
+    audit : Audit
+    summary : dict
+        As ``audit.json`` holds it.
+    frames : int
+    written : list of Path
+    """
+
+    audit: Audit
+    summary: dict[str, Any]
+    frames: int
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """Lines for people."""
+        undone, undecided = self.summary["moves_not_executed"], self.summary["undecided"]
+        lines = [f"{self.frames} frames; in {undone['frames']} the move was not executed; {undecided} undecided"]
+        for key in (*LISTS, "reader"):
+            if names := self.summary[key]:
+                more = ", ..." if len(names) > SAID else ""
+                lines.append(f"{key.replace('_', ' ')}: {len(names)} ({', '.join(names[:SAID])}{more})")
+        drift = self.audit.drift["r2_of_row_number_beyond_labels"]
+        return [
+            *lines,
+            f"depth beyond the label where not executed: {self.audit.depth_per_move:+.4f} mm for each mm of move_1",
+            f"row number told by the outmost pins beyond the labels: R^2 {drift:.2f}",
+        ]
+
+
+def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
+    """Audit the labels of a flat-surface recording, and write what was found to an existing folder.
+
+    Raises
+    ------
+    FrameError
+        The recording lacks one of the labels pose_2, pose_6, move_1 and move_6.
+    """
+    with stage(progress, "frames") as step:
+        found = load_dataset(data, sensor, TARGET, form=form, progress=step)
+    made = audit_labels(found.pins, *found.targets.raw.T)
+    summary = summary_of(made, found)
+    return LabelAudit(made, summary, len(found), write_audit(out, made, found, summary))
 
 
 def summary_of(audit: Audit, data: Dataset) -> dict:
-    """The findings as numbers and lists of names."""
+    """The findings as numbers and lists of frame names."""
     names = data.pins.image_name
     large = np.abs(data.targets.raw[:, 2:]).max(axis=1) > LARGE_MOVE
     undone = audit.executed < 0.5
@@ -56,7 +105,7 @@ def summary_of(audit: Audit, data: Dataset) -> dict:
 
 
 def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[Path]:
-    """``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``."""
+    """Write ``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``; their paths."""
     labels = corrected(NAMES, data.targets.raw, audit.executed.round(), data.targets.raw[:, 2:], audit.depth_per_move)
     table = write_text(out / "labels_corrected.csv", _labels_csv(audit, data, labels))
     numbers = write_json(out / "audit.json", summary | {"made_by": made_by("training.audit")})
@@ -86,7 +135,7 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
 
 
 def _findings(summary: dict) -> list[dict]:
-    """The findings that are numbers, one a row; those of a group are named after it."""
+    """The findings that are numbers, one in each row; the names in a group begin with the group's name."""
     rows = []
     for key, value in summary.items():
         if key in LISTS or key == "reader":
@@ -144,56 +193,3 @@ def _evidence_figure(audit: Audit, data: Dataset, labels: np.ndarray) -> Figure:
     axes[3].set(title="middle of the outmost pins, along the table", xlabel="row", ylabel="px")
     axes[3].legend(markerscale=5)
     return figure
-
-
-TARGET = "surface-2d-shear"  # the labels that an audit needs
-SHOWN = 3  # names of each list
-
-
-@dataclass(frozen=True)
-class LabelAudit:
-    """What was found.
-
-    Attributes
-    ----------
-    audit : Audit
-    summary : dict
-        As ``audit.json`` holds it.
-    frames : int
-    written : list of Path
-    """
-
-    audit: Audit
-    summary: dict[str, Any]
-    frames: int
-    written: list[Path]
-
-    def lines(self) -> list[str]:
-        """For people."""
-        undone, undecided = self.summary["moves_not_executed"], self.summary["undecided"]
-        lines = [f"{self.frames} frames; in {undone['frames']} the move was not executed; {undecided} undecided"]
-        for key in (*LISTS, "reader"):
-            if names := self.summary[key]:
-                more = ", ..." if len(names) > SHOWN else ""
-                lines.append(f"{key.replace('_', ' ')}: {len(names)} ({', '.join(names[:SHOWN])}{more})")
-        drift = self.audit.drift["r2_of_row_number_beyond_labels"]
-        return [
-            *lines,
-            f"depth beyond the label where not executed: {self.audit.depth_per_move:+.4f} mm for each mm of move_1",
-            f"row number told by the outmost pins beyond the labels: R^2 {drift:.2f}",
-        ]
-
-
-def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
-    """Audit the labels of a flat-surface recording, and write what was found to an existing folder.
-
-    Raises
-    ------
-    FrameError
-        The recording has not the labels pose_2, pose_6, move_1 and move_6.
-    """
-    with stage(progress, "frames") as step:
-        found = load_dataset(data, sensor, TARGET, form=form, progress=step)
-    made = audit_labels(found.pins, *found.targets.raw.T)
-    summary = summary_of(made, found)
-    return LabelAudit(made, summary, len(found), write_audit(out, made, found, summary))

@@ -9,6 +9,7 @@ import numpy as np
 from scenes import SensorSpec
 from training.two_sample import TwoSample, two_sample
 from twin.judge.pictures.realism import run_realism
+from twin.optics.render import Quality
 from twin.progress import Progress, Step, silent
 
 IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip")
@@ -54,7 +55,7 @@ def compare_with_renders(
     *,
     pose_aligned: bool = False,
     limit: int | None = None,
-    quality: str = "standard",
+    quality: Quality = "standard",
     test: bool = True,
     progress: Progress = silent,
 ) -> Realism:

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from training.dataset import PinTable
 from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Variant, Weights, refuse_sizes
 from training.models.vgnn.inputs import PinInputs, filled, pin_features, seated_inputs
 from training.models.vgnn.network import Vgnn, VgnnSize
 from training.models.vgnn.registration import Registration, fit_registration
-from training.recipes import Recipe
+from training.pins import PinTable
+from training.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 from twin.pins.voronoi import directed_edges, triangulate
 
@@ -32,7 +32,10 @@ class VgnnModel(PinModel):
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Vgnn:
         """See ``Model``; sizes are the fields of ``VgnnSize``."""
         refuse_sizes(self, size, tuple(field.name for field in fields(VgnnSize)))
-        edges = directed_edges(triangulate(reference.pins_px), len(reference.pins_px))
+        triangles = triangulate(reference.pins_px)
+        if triangles is None:
+            raise TrainingError(f"{self.name} needs pins that span an area; the {len(reference.pins_px)} pins at rest lie on one line")
+        edges = directed_edges(triangles, len(reference.pins_px))
         return Vgnn(np.asarray(edges), len(reference.pins_px), outputs, VgnnSize(**size))
 
     def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:

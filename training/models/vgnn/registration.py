@@ -1,36 +1,28 @@
-"""How many of some rows' principal components are directions, and not rounding.
+"""Whether the camera sits where it sat in training: a frame that is displaced, turned or scaled as a whole, told from contact.
 
-Whether the camera sits where it sat: a frame displaced, turned or scaled as a whole, told from one changed by contact.
+Contact moves the pins too, but not freely. The best similarity (shift, turn, scale) is taken out of the pins; what is left of their
+displacement tells how large that similarity has to be. Where the observed similarity differs from the expected one by far more than it
+ever does in training, the difference comes from the camera, and it is taken out of the frame. All frames of one recording share a camera:
+there the median over many frames tells its displacement far better than one frame can.
 
-Contact moves the pins too, but not freely: what is left of the pins after the best similarity (shift, turn, scale) has
-been taken out tells how large that similarity has to be. Where the one observed differs from the one expected by far more
-than it ever does in training, the difference is the camera's, and it is taken out of the frame. Frames of one recording
-share a camera: there the median over many frames tells its displacement far better than one frame can.
-
-What is taken out takes a little of the contact with it. A model that also learns from training frames with all of the
-difference taken out knows such frames, and loses little on them."""
+Taking the difference out also removes a little of the contact. A model that also learns from training frames with the whole difference
+taken out knows such frames, and loses little on them.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-LEAST_SIZE = 1e-5  # of a mode, relative to the largest: features are in single precision, whose rounding is 1e-7 of each of their numbers
-
-
-def spanned(sizes: np.ndarray, most: int) -> int:
-    """How many modes to keep, at most ``most``, of centred rows with these singular values, largest first.
-
-    M rows span M - 1 directions at most. The modes after those are made of rounding errors: scaled to unit deviation, they would
-    turn the rounding errors of other rows into amplitudes of thousands.
-    """
-    return int((sizes[:most] > LEAST_SIZE * sizes[0]).sum())
-
-
-MODES, SQUARED = 40, 20  # modes taken linearly, and those of them whose products are taken too
-RIDGE = 0.1
-FILL_RIDGE, FILL_ROUNDS = 1e-3, 3
-MANY, COMMON = 30, 1.5  # frames whose median difference, if larger than that usual size, is their one camera's
-FREE, FULL = 6.0, 9.0  # differences, in their usual size, up to which nothing and from which everything is taken out
+MODES = 40  # modes of what the similarity leaves, that the expected similarity depends on
+SQUARED = 20  # the first modes, whose products it depends on too
+RIDGE = 0.1  # penalty of the least-squares fit, in modes of unit deviation
+LEAST_SIZE = 1e-5  # of a kept mode, relative to the largest; features are in single precision, rounded to 1e-7 of their size
+FILL_RIDGE = 1e-3  # penalty of the modes that lost pins are filled in by
+FILL_ROUNDS = 3  # rounds of filling in: the similarity changes with the pins that were filled in
+MANY = 30  # frames, from which on their median difference tells where their common camera sits
+COMMON = 1.5  # median difference, in usual differences, above which it is taken for the camera's
+FREE = 6.0  # difference of a frame, in usual differences, up to which nothing is taken out
+FULL = 9.0  # difference of a frame, in usual differences, from which on all of it is taken out
 
 
 @dataclass(frozen=True)
@@ -45,7 +37,7 @@ class Registration:
     weight : (q, 4) float
         To log scale, turn (rad), shift x and y (px).
     usual : (4,) float
-        Root mean square difference between observed and expected, each training frame left out.
+        Root mean square difference between observed and expected similarity, each training frame left out of the fit in turn.
     """
 
     rest_px: np.ndarray
@@ -91,7 +83,7 @@ class Registration:
         return np.stack([z.real, z.imag], axis=-1) + middle, area_px2 * np.exp(-2 * taken[:, :1])
 
     def fill(self, nodes_px: np.ndarray, lost: np.ndarray) -> np.ndarray:
-        """One frame's pins (N, 2) with the lost ones (N,) where the modes that the others show put them."""
+        """One frame's pins (N, 2); each lost pin (N,) is put where the modes of the others' displacements place it."""
         directions = self.components / np.maximum(np.linalg.norm(self.components, axis=0), 1e-12)
         known = np.repeat(~lost, 2)
         normal = directions[known].T @ directions[known] + FILL_RIDGE * np.eye(directions.shape[1])
@@ -106,7 +98,7 @@ class Registration:
         return nodes_px
 
     def difference(self, nodes_px: np.ndarray) -> np.ndarray:
-        """By how much the similarities (M, 4) of frames differ from those that their contact lets expect."""
+        """Differences (M, 4) between the frames' similarities and those that are expected from their contact."""
         aligned, observed = align(nodes_px, self.rest_px)
         return observed - _terms(self._modes(aligned)) @ self.weight
 
@@ -114,18 +106,18 @@ class Registration:
         return (aligned.reshape(len(aligned), -1) - self.mean) @ self.components
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that makes the same again."""
+        """The arrays that make the same registration again."""
         return {key: getattr(self, key) for key in ("rest_px", "mean", "components", "weight", "usual")}
 
 
 def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registration, np.ndarray]:
-    """Learn what similarity contact brings, from frames (M, N, 2) of one camera position.
+    """Learn which similarity comes with a contact, from frames (M, N, 2) of one camera position.
 
     Returns
     -------
     Registration
     left : (M, 4) float
-        Each frame's difference as if it had not been fitted to.
+        Each frame's difference when it is left out of the fit.
     """
     aligned, observed = align(nodes_px, rest_px)
     flat = aligned.reshape(len(aligned), -1)
@@ -164,6 +156,15 @@ def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.nda
     factor = (frame @ rest.conj()) / (np.abs(rest) ** 2).sum()
     left = frame / factor[:, None] - rest
     return np.stack([left.real, left.imag], axis=-1), np.column_stack([np.log(np.abs(factor)), np.angle(factor), shift])
+
+
+def spanned(sizes: np.ndarray, most: int) -> int:
+    """How many modes of centred rows to keep, at most ``most``; ``sizes`` are the rows' singular values, the largest first.
+
+    M centred rows span M - 1 directions at most. The modes after these are made of rounding errors. Scaled to unit deviation, they would
+    turn the rounding errors of other rows into amplitudes of thousands.
+    """
+    return int((sizes[:most] > LEAST_SIZE * sizes[0]).sum())
 
 
 def _terms(modes: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ import numpy as np
 from scenes import ExperimentSpec
 from training.dataset import Dataset, load_dataset
 from training.estimator import PoseEstimator
-from training.evaluate import predict_rows_of
 from training.generation import GenerationConfig, generate
 from training.recipes import TrainingError
 from training.studies.objects.page import write_page
@@ -106,7 +105,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
                 raise TrainingError(
                     f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more --tests"
                 )
-            off = predict_rows_of(estimator, data, chosen).mean - data.targets.corrected[chosen]
+            off = estimator.predict_rows(data, chosen).mean - data.targets.corrected[chosen]
             error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)
             flat = error if flat is None else flat
             row: dict[str, Any] = {"model": model, "object": thing.name, "seen": thing.name in learnt}

@@ -26,17 +26,18 @@ from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 
 FRICTION = next(parameter for parameter in PARAMETERS if parameter.name == "rig.friction")
-FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)  # of a frame, between which it is sought; the last is stick
-PLAIN_PX = 0.5  # of the pins' change with the logarithm of friction, from which on a frame shows it
-USUAL, WIDER = (0.05, 0.95), 1.25  # quantiles of the frames' frictions that are drawn between, and how far beyond
-FEWEST = 8  # frames that both stories could be simulated of
-LEAST_PX = 0.5  # of the rms displacement that residuals are divided by
-VARIES = 1e-6  # mm or deg: sd of a label's axis from which on it counts
-MODES_SHARE = 0.97  # of the residuals' variance that the modes hold
-LENGTHS = (1.0, 30.0)  # bounds of w, in sd of the label
+FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)  # tried on every labelled frame; with the last one the object sticks
+PLAIN_PX = 0.5  # change of the pins with the logarithm of friction, from which on a frame shows its friction
+USUAL = (0.05, 0.95)  # quantiles of the frames' frictions between which friction is drawn
+WIDER = 1.25  # factor by which the range of drawn frictions is wider at both ends
+FEWEST = 8  # frames that the twin must be able to simulate and explain
+LEAST_PX = 0.5  # least rms displacement that a frame's residuals are divided by
+VARIES = 1e-6  # mm or deg; an axis of the label with a smaller standard deviation is left out
+MODES_SHARE = 0.97  # part of the residuals' variance that the modes hold
+LENGTHS = (1.0, 30.0)  # bounds of w, in standard deviations of the label
 SIZES = (1e-3, 10.0)  # bounds of c and s, in rms of the amplitude
-NOISES = (0.05, 1.0)  # bounds of n^2: some tens of frames would be explained to the last by so many lengths
-TRUSTED = 0.5
+NOISES = (0.05, 1.0)  # bounds of n^2; with less noise so many lengths would explain some tens of frames exactly
+TRUSTED = 0.5  # least ``Weights.trust`` of a frame whose residuals are used
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,9 @@ class Residuals:
     missing_px : (K, N, 2) float
         Real less simulated; 0 for lost pins.
     friction : (K,) float
-        The likeliest of each frame; NaN where no move was executed, which would show it.
+        The likeliest friction of each frame; NaN where no move was executed, because only a move shows it.
     friction_px : (K,) float
-        How plainly each frame shows it: rms change of the pins' places with its logarithm.
+        How plainly each frame shows its friction: rms change of the pins' places with its logarithm.
     """
 
     axes: np.ndarray
@@ -71,8 +72,7 @@ class Residuals:
     def friction_spread(self) -> FrictionSpread | None:
         """What friction to draw for simulated contacts; None where too few moves were executed to tell.
 
-        Frames that slide or stick whatever it is say nothing. One that slides for want of friction says so, be it not as plainly
-        as others: all that show it count alike.
+        A frame that slides or sticks with every friction shows nothing and is left out. All frames that show their friction count alike.
         """
         shown = self.friction[np.isfinite(self.friction) & (self.friction_px >= PLAIN_PX)]
         if len(shown) < FEWEST:
@@ -89,16 +89,15 @@ def label_axes(labels: list[ArmLabel]) -> np.ndarray:
 def measure_residuals(
     setup: Setup, measured: MeasuredFrames, progress: Callable | None = None, *, frictions: tuple = FRICTIONS
 ) -> Residuals:
-    """Simulate labelled frames after the tap and after the move, with several frictions; the likeliest story of each is compared.
+    """Simulate labelled frames after the tap and after the move, with several frictions, and compare the likeliest story of each frame.
 
-    Between two frictions pins are taken to move evenly with its logarithm.
-
-    Friction differs from frame to frame, and simulated data sets draw it: what is left must not hold it once more.
+    Between two frictions pins are assumed to move evenly with the logarithm of friction. Friction differs from frame to frame, and
+    simulated data sets draw it. So the best friction of each frame is taken: else the residuals would hold the friction a second time.
 
     Raises
     ------
     TrainingError
-        Too few frames that the twin can simulate and half explain.
+        The twin can simulate and explain too few frames.
     """
     labels, real_px = measured.labels, measured.pins_px - measured.no_contact_px
     setup = replace(setup, parameters=(FRICTION,))
@@ -107,7 +106,9 @@ def measure_residuals(
     weights = expect(mean_squared(moved, real_px))
     good = np.flatnonzero(np.isfinite(moved).all(axis=(1, 2, 3)) & (weights.trust > TRUSTED))
     if len(good) < FEWEST:
-        raise TrainingError(f"{len(good)} of {len(labels)} labelled frames fit the twin, {FEWEST} must; give more --labels, or --calibrate")
+        raise TrainingError(
+            f"{len(good)} of {len(labels)} labelled frames fit the twin, at least {FEWEST} are needed; give more --labels, or --calibrate"
+        )
     executed = weights.executed[good] > 0.5
     told = [replace(labels[k], executed=bool(done)) for k, done in zip(good, executed, strict=True)]
     simulated = moved[good, executed.astype(int)]
@@ -116,9 +117,10 @@ def measure_residuals(
 
 
 def _likeliest(moved: np.ndarray, real_px: np.ndarray, frictions: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of displacements (F, M, 2, N, 2) with F frictions those (M, 2, N, 2) nearest to real ones (M, N, 2).
+    """The displacements (M, 2, N, 2) nearest to the real ones (M, N, 2), from those with F frictions (F, M, 2, N, 2).
 
-    Beside them their frictions (M, 2), and their rms change with its logarithm (M, 2), px. NaN where the contact failed with all frictions.
+    Also returned are their frictions (M, 2), and the rms change of the pins with the logarithm of friction (M, 2), px. All are NaN where
+    the contact failed with every friction.
     """
     seen, target = np.isfinite(real_px)[:, None], np.nan_to_num(real_px)[:, None]
     best, least = np.full(moved.shape[1:], np.nan), np.full(moved.shape[1:3], np.inf)

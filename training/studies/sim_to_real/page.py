@@ -15,8 +15,8 @@ from twin.report.page import Page, Picture
 from twin.report.table import Column
 from twin.report.themes import BLUE, OLIVE, PURPLE, RED
 
-SIMULATED = "simulated"  # trained in the twin alone; the names of the other rows that did without frames begin so
-BARE = "simulated, bare"
+SIMULATED = "simulated"  # the row trained in the twin alone; rows without one ingredient begin with this word and a comma
+BARE = "simulated, bare"  # the row trained on simulated pins as they are
 STYLES = ((RED, "o-"), (OLIVE, "s--"))  # of the models that were trained on real frames, in the order of the rows
 
 
@@ -31,7 +31,7 @@ def write_page(
     calibrated: bool,
     error_px: float,
     modes: Sequence[Mapping[str, float]],
-    friction: FrictionSpread,
+    friction: FrictionSpread | None,
     simulated: int,
     contacts: int,
     names: Sequence[str],
@@ -46,27 +46,29 @@ def write_page(
     ----------
     folder : Path
     sensor : str
-    tested, frames, labelled, seed : int
-        Frames that were judged on, of the recording, and labelled for the twin; the seed they were drawn by.
+    tested, frames, labelled : int
+        Number of frames that are judged, in the whole recording, and labelled for the twin.
+    seed : int
+        By which the frames were drawn.
     calibrated : bool
-        The specification was fitted to the labelled frames.
+        Whether the specification was fitted to the labelled frames.
     error_px : float
-        By which the twin's pins miss those of the labelled frames.
+        Mean distance of the twin's pins from those of the labelled frames.
     modes : sequence
-        First modes of what they miss, with the ``share`` that each holds and what the label has ``told`` of it.
-    friction : FrictionSpread
-        Between which it was drawn for simulated contacts.
+        The first modes of what the pins miss: the ``share`` of each, and the part of it that the label tells (``told``).
+    friction : FrictionSpread or None
+        Range in which friction was drawn for simulated contacts; None where all of them had the rig's friction.
     simulated, contacts : int
-        States, and contacts that they are of.
+        Number of simulated states, and of the contacts that they belong to.
     names : sequence of str
         Labels.
     left_out : (K,) float
-        Errors of the process alone on labelled frames that it did not know.
+        Errors of the process alone on labelled frames that were left out of it.
     columns : sequence of str
         Keys of the table, in their order.
     rows : sequence of mappings
     problems : sequence of str
-        Of the reader of the recording.
+        What the reader of the recording found odd.
     """
     page = Page(f"From the twin to real frames: {sensor}", "twin study sim-to-real", topic="TacTip twin: study")
     page.lead = (
@@ -74,6 +76,30 @@ def write_page(
         f"choice was made by. The {number(labelled)} labelled frames were drawn at random from the others (seed {seed})."
     )
     page.notice("The reader says", problems)
+    page.figures(*_charts(folder, rows, names, labelled))
+    page.section("Errors")
+    page.table(rows, [_column(key, names) for key in columns], caption="The least error of each column is marked.")
+    page.text(
+        "Corrected labels have the shear moves that were never executed taken out; all models learnt these. The leak slope is that of the "
+        "angle's error on such moves: a model that reads the contact has 0. Inside 90 %: share of the frames whose label lies within the "
+        "model's 90 % interval."
+    )
+    page.section("How it was made")
+    page.items(
+        [
+            _twin_said(simulated, contacts, calibrated=calibrated),
+            _pins_said(error_px, friction),
+            _missing_said(modes, bare=bool(_of(rows, BARE))),
+            _beside_said(names, left_out),
+            "Pins are counted from the no-contact frame of the recording, or of each simulated sensor.",
+        ]
+    )
+    page.download(folder / "study.csv", "the table, with all digits")
+    return page.write(folder / "index.html")
+
+
+def _charts(folder: Path, rows: Sequence[Mapping], names: Sequence[str], labelled: int) -> list[Picture]:
+    """Errors by the number of labelled frames, and without one ingredient at a time where such rows are there."""
     charts = [
         Picture(
             write_chart(folder / "errors.png", lambda: errors_figure(rows, names)),
@@ -91,36 +117,40 @@ def write_page(
                 "Training in the twin alone, with one ingredient left out or changed at a time; the line is the full recipe.",
             )
         )
-    page.figures(*charts)
-    page.section("Errors")
-    page.table(rows, [_column(key, names) for key in columns], caption="The least error of each column is marked.")
-    page.text(
-        "Corrected labels have the shear moves that were never executed taken out; all models learnt these. The leak slope is that of the "
-        "angle's error on such moves: a model that reads the contact has 0. Inside 90 %: share of the frames whose label lies within the "
-        "model's 90 % interval."
-    )
-    page.section("How it was made")
+    return charts
+
+
+def _twin_said(simulated: int, contacts: int, *, calibrated: bool) -> str:
     fitted = "fitted to the labelled frames first" if calibrated else "as shipped, not fitted to the labelled frames"
-    bare = ", but for the rows called bare and uncalibrated" if _of(rows, BARE) else ""
-    page.items(
-        [
-            f"The twin: {number(simulated)} states of {number(contacts)} simulated contacts. Its specification is {fitted}"
-            f"{'' if calibrated else ' (what its own calibration used is said in it)'}.",
-            f"On the labelled frames its pins miss the real ones by {number(error_px, decimals=2)} px, friction found frame by frame; for "
-            f"simulated contacts it is drawn between {friction.low:.2f} and {friction.high:.2f}.",
-            "What the pins miss was learnt as a Gaussian process of the label and drawn for every simulated contact"
-            f"{bare}. Its first modes hold {_percents(mode['share'] for mode in modes)} of it, of which the label tells "
-            f"{_percents(mode['told'] for mode in modes)}.",
-            "Simulated and real: the model from the twin, averaged with a Gaussian process that takes the labelled frames for the "
-            "simulated contacts' labels plus a smooth difference. Left out of it one after another, the labelled frames are missed by that "
-            f"process alone by "
-            f"{', '.join(f'{number(float(error))} {unit_of(name)} ({name})' for name, error in zip(names, left_out, strict=True))}. These "
-            "errors also widen the 90 % intervals of the model from the twin, but not those of the other rows.",
-            "Pins are counted from the no-contact frame of the recording, or of each simulated sensor.",
-        ]
+    return (
+        f"The twin: {number(simulated)} states of {number(contacts)} simulated contacts. Its specification is {fitted}"
+        f"{'' if calibrated else ' (what its own calibration used is said in it)'}."
     )
-    page.download(folder / "study.csv", "the table, with all digits")
-    return page.write(folder / "index.html")
+
+
+def _pins_said(error_px: float, friction: FrictionSpread | None) -> str:
+    drawn = "that of the rig" if friction is None else f"drawn between {friction.low:.2f} and {friction.high:.2f}"
+    return (
+        f"On the labelled frames its pins miss the real ones by {number(error_px, decimals=2)} px, friction found frame by frame; for "
+        f"simulated contacts it is {drawn}."
+    )
+
+
+def _missing_said(modes: Sequence[Mapping[str, float]], *, bare: bool) -> str:
+    return (
+        "What the pins miss was learnt as a Gaussian process of the label and drawn for every simulated contact"
+        f"{', but for the rows called bare and uncalibrated' if bare else ''}. Its first modes hold "
+        f"{_percents(mode['share'] for mode in modes)} of it, of which the label tells {_percents(mode['told'] for mode in modes)}."
+    )
+
+
+def _beside_said(names: Sequence[str], left_out: np.ndarray) -> str:
+    missed = ", ".join(f"{number(float(error))} {unit_of(name)} ({name})" for name, error in zip(names, left_out, strict=True))
+    return (
+        "Simulated and real: the model from the twin, averaged with a Gaussian process that takes the labelled frames for the simulated "
+        "contacts' labels plus a smooth difference. Left out of it one after another, the labelled frames are missed by that process alone "
+        f"by {missed}. These errors also widen the 90 % intervals of the model from the twin, but not those of the other rows."
+    )
 
 
 def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:

@@ -10,12 +10,13 @@ import torch
 
 from scenes.object import ObjectSpec
 from training.assemble import intervals
-from training.dataset import Dataset, joined, split_rows, voronoi_areas
+from training.dataset import Dataset, joined, split_rows
 from training.estimator import PoseEstimator
-from training.evaluate import judge, leak_check, predict_rows_of
+from training.evaluate import judge, leak_check
 from training.gaussian_process import fit_two_fidelities
 from training.loop import epoch_step
 from training.models import recipe_of
+from training.pins import voronoi_areas
 from training.recipes import TrainingError
 from training.run import RunConfig, is_finished, train_run, write_tensors
 from training.simulated import config_of, is_pins_only, open_simulated
@@ -232,7 +233,7 @@ def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
 def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict[str, Any]:
     """A row of the study's table: mean errors of a run on the frames that are judged on."""
     estimator = PoseEstimator.load(run)
-    found = judge(predict_rows_of(estimator, real, test), real, test)
+    found = judge(estimator.predict_rows(real, test), real, test)
     row = {"trained_on": name, "labelled_frames": labelled, "model": estimator.model}
     for kind in ("corrected", "raw"):
         row |= {f"{label}_{kind}": found[kind][label]["mae"] for label in real.targets.names}

@@ -1,9 +1,9 @@
-"""The paper's first table: size of each kind of graph, and the time to make it from found pins.
+"""What the graphs are: the paper's table of graph sizes and times, and its figure of Voronoi areas in contact.
 
-The paper's interpretability figure: where and how deep the sensor is touched, read off the Voronoi areas by eye.
-
-Rendered in the twin: a flat surface and an edge under the middle, and a surface that reaches only the top or only the
-bottom of the sensor, each 2 and 4 mm beyond first touch. Beside them recorded frames of about these depths."""
+The figure shows by eye where and how deep the sensor is touched. Four contacts are rendered in the twin, each 2 and 4 mm beyond first
+touch: a flat surface and an edge under the middle of the sensor, and a surface that reaches only its top or only its bottom. Recorded
+frames of about these depths stand beside them.
+"""
 
 from dataclasses import dataclass
 from time import perf_counter
@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 
 from scenes import load_object
 from scenes.sensor import SensorSpec
-from training.dataset import Dataset, PinTable
+from training.dataset import Dataset
+from training.pins import PinTable
 from twin.errors import TwinError
 from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.objects import build_field
@@ -27,16 +28,29 @@ from twin.simulator import Simulator
 from twin.types import Form, PinGraph
 
 KINDS: tuple[GraphKind, ...] = ("knn", "delaunay", "voronoi")
-TIMED = 200  # graphs
-# directed edges and seconds of Table I, by pins and kind
+TIMED = 200  # graphs of each kind, evenly spread over the frames, whose making is timed
+# Table I of the paper: directed edges and seconds, by number of pins and kind of graph.
 PAPER = {
     (127, "knn"): (762, 0.004), (127, "delaunay"): (744, 0.007), (127, "voronoi"): (744, 0.019),
     (331, "knn"): (1986, 0.010), (331, "delaunay"): (1860, 0.008), (331, "voronoi"): (1860, 0.045),
 }  # fmt: skip
+DEPTHS_MM = (2.0, 4.0)  # beyond first touch
+TAP_MM = 5.0  # depth of the tap in the published recordings (tap_move in their meta.json)
+ASIDE_MM = 6.0  # from the middle of the sensor to the border of a surface that touches one side only
+# The contacts: object, turn of the whole contact about the sensor's axis (deg, from x towards y), and offset before the turn (mm).
+# The y axis of the image points down.
+CONTACTS = {
+    "centre, surface": ("plane", 0.0, 0.0),
+    "centre, edge": ("edge", 0.0, 0.0),
+    "top, surface": ("edge", -90.0, ASIDE_MM),
+    "bottom, surface": ("edge", 90.0, ASIDE_MM),
+}
+# Differences from the wanted contact that weigh the same when a recorded frame is chosen.
+USUAL = {"depth_mm": 0.25, "angle_deg": 1.5, "shear_mm": 0.5, "shear_deg": 0.7}
 
 
 def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
-    """One row for each kind of graph: nodes, features, directed edges without contact and over frames, ms (median, this machine)."""
+    """One row for each kind of graph: nodes, features, directed edges without contact and in the frames, and the median time, ms."""
     outmost, rest = pins.reference.outmost, pins.reference.pins_px
     chosen = np.linspace(0, len(pins) - 1, min(TIMED, len(pins))).astype(int)
     rows = []
@@ -65,19 +79,6 @@ def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
     return rows
 
 
-DEPTHS_MM = (2.0, 4.0)
-TAP_MM = 5.0  # of the published recordings (their meta.json: tap_move)
-ASIDE_MM = 6.0  # from the middle to the border of the surface that touches one side only
-# object, turn of the whole contact about the sensor's axis (x towards y, deg), offset before turning (mm); image y is down
-CONTACTS = {
-    "centre, surface": ("plane", 0.0, 0.0),
-    "centre, edge": ("edge", 0.0, 0.0),
-    "top, surface": ("edge", -90.0, ASIDE_MM),
-    "bottom, surface": ("edge", 90.0, ASIDE_MM),
-}
-USUAL = {"depth_mm": 0.25, "angle_deg": 1.5, "shear_mm": 0.5, "shear_deg": 0.7}  # distances that weigh the same in the choice of a frame
-
-
 @dataclass(frozen=True)
 class AreaChange:
     """The areas of one contact.
@@ -101,7 +102,7 @@ class AreaChange:
     source: str = "twin"
 
     def figures(self) -> dict[str, Any]:
-        """Percent by which areas grew, where (px from the middle, weighted by growth), and of how many pins."""
+        """Row of the table: by how many percent areas changed, and the mean place of growth (px from the middle, weighted by growth)."""
         change = 100 * (self.graph.area_px2 / self.rest_area_px2 - 1)
         grown = np.maximum(change, 0)
         place = self.graph.nodes_px - self.graph.nodes_px.mean(axis=0)
@@ -125,12 +126,12 @@ def twin_contacts(
     names: tuple[str, ...] = tuple(CONTACTS),
     progress: Step | None = None,
 ) -> list[AreaChange]:
-    """Press, render, find pins, tessellate: every contact at every depth.
+    """Every contact at every depth: pressed, rendered, its pins found and their Voronoi cells made.
 
     Raises
     ------
     TwinError
-        If the pins of a rendered frame are not found.
+        The pins of a rendered frame are not found.
     """
     simulator, pipeline = Simulator(spec), Pipeline(spec, form)
     rest = pipeline(simulator.shoot_rest(form).frame)
@@ -153,9 +154,9 @@ def twin_contacts(
 
 
 def recorded_contacts(data: Dataset) -> list[AreaChange]:
-    """Recorded frames nearest to a straight press of these depths; none where the labels don't tell depth, angle and moves.
+    """The recorded frame nearest to a straight press of each depth; none where the labels lack depth, angle or moves.
 
-    Depth beyond first touch is ``pose_2`` + tap + the rig's contact offset (0 where it was never calibrated).
+    The depth beyond first touch is ``pose_2`` + tap + the rig's contact offset, which is 0 for a rig that was never calibrated.
     """
     targets = data.targets
     if not {"pose_2", "pose_6"} <= set(targets.names) or not np.isfinite(targets.move).all():
@@ -183,7 +184,7 @@ def _turned(turn_deg: float) -> np.ndarray:
 
 
 def contacts_figure(contacts: list[AreaChange]) -> Figure:
-    """One column for each contact, shallow above deep, all in the same colours."""
+    """One column for each contact, the shallow one above the deep one, all on the same colour scale."""
     limit = max(contact.figures()["largest_growth_percent"] for contact in contacts)
     names = list(dict.fromkeys(contact.name for contact in contacts))
     figure, axes = new_figure(len(names), len(DEPTHS_MM), panel_inch=3.8)

@@ -1,6 +1,4 @@
-"""The paper's figure of training efficiency: time and memory of training against batch size.
-
-The paper's second table: every model trained on the same rows, and judged on the same others."""
+"""The models of the paper's comparison: trained on the same rows, judged on the same others, and timed at several batch sizes."""
 
 import csv
 import ctypes
@@ -16,93 +14,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from training.dataset import Dataset, PinTable
+from training.dataset import Dataset
 from training.estimator import PoseEstimator
-from training.evaluate import judge, predict_rows_of, rows_to_judge
+from training.evaluate import judge, rows_to_judge
 from training.loop import Loop, Rows, epoch_step
 from training.models import model_named, recipe_of, variant_named
 from training.models.part import Inputs
 from training.networks import parameter_count
+from training.pins import PinTable
 from training.run import RunConfig, is_finished, train_run
 from twin.progress import Progress, silent, stage
 
-INITIAL_ROWS = 500  # from which a network takes what it needs before its first step: speed does not depend on it
-MIB = 2.0**20
-
-
-class PeakMemory:
-    """The largest memory while it is watched, MiB above the start: of the GPU, or the process's resident set."""
-
-    def __init__(self, device: str = "cpu") -> None:
-        self.device, self.peak = device, 0.0
-
-    def __enter__(self) -> "PeakMemory":
-        gc.collect()
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # else what was freed before and not given back would hide what is taken
-        if trim:
-            trim(0)
-        if self.device == "cuda":
-            torch.cuda.reset_peak_memory_stats()
-        self.start, self.watching = self._now(), True
-        self.thread = threading.Thread(target=self._watch, daemon=True)
-        self.thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.watching = False
-        self.thread.join()
-        if self.device == "cuda":
-            self.peak = torch.cuda.max_memory_allocated() / MIB - self.start
-
-    def _watch(self) -> None:
-        while self.watching and self.device != "cuda":
-            self.peak = max(self.peak, self._now() - self.start)
-            time.sleep(0.01)
-
-    def _now(self) -> float:
-        if self.device == "cuda":
-            return torch.cuda.memory_allocated() / MIB
-        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / MIB
-
-
-def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, device: str = "cpu") -> dict:
-    """Train on a frame's inputs for a while and see what it costs.
-
-    Parameters
-    ----------
-    pins : PinTable
-        M frames.
-    inputs : Inputs
-        Rows of an epoch: of the same frames, once or more often.
-
-    Returns
-    -------
-    dict
-        ``model``, ``parameters``, ``batch``, ``rows_timed``, ``ms_per_frame`` (in an epoch, all its rows together),
-        ``s_per_epoch`` (None where only some batches were timed) and ``memory_mib``. A first pass, not timed, warms up.
-    """
-    torch.manual_seed(0)
-    part, count = model_named(model), len(inputs)
-    network = part.build(pins.reference, 2, {})
-    part.initialise(network, inputs, torch.arange(min(INITIAL_ROWS, count)))
-    timed = count if part.timed_batches is None else min(part.timed_batches * batch, count)
-    labels, executed, none = torch.randn(count, 2), torch.full((count,), torch.nan), torch.zeros(0, dtype=torch.long)
-    rows = Rows(inputs, labels, torch.ones(2), executed, torch.arange(timed), none)
-    loop = Loop(network.to(device), recipe_of(model, batch=batch), rows, 0, part.penalty)
-    with PeakMemory(device) as memory:
-        loop.epoch()
-        seconds = loop.epoch()["seconds"]
-    return {
-        "model": model,
-        "parameters": parameter_count(network),
-        "batch": batch,
-        "rows_timed": timed,
-        "ms_per_frame": 1e3 * seconds / timed * count / len(pins),
-        "s_per_epoch": seconds if timed == count else None,
-        "memory_mib": memory.peak,
-    }
-
-
+INITIAL_ROWS = 500  # rows from which a timed network takes its scales and modes; its speed does not depend on their number
+MIB = 2.0**20  # bytes
+WATCH_S = 0.01  # s between two looks at the process's memory
+# Columns of the page's table of models that hold no errors, in their order.
 SHOWN = (
     *("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters"),
     *("frames", "without_prediction", "leak_slope", "paper_mm", "paper_deg"),
@@ -130,12 +56,12 @@ class PlannedRun:
 
 
 def plan_run(name: str, *, labels: str, seed: int, split: int, epochs: int | None = None) -> PlannedRun:
-    """What a model's name stands for.
+    """The run that a model's name stands for.
 
     Raises
     ------
     TrainingError
-        For a name that stands for nothing.
+        There is no model of this name.
     """
     model, variant = variant_named(name)
     recipe = recipe_of(model.name, epochs=epochs, **variant.recipe)
@@ -150,7 +76,7 @@ def train_all(
     Returns
     -------
     dict
-        Minutes spent here on each run's folder; runs for which no time was left are missing.
+        Minutes that this call spent on each run, by its folder; runs for which no time was left are missing.
     """
     started, spent = monotonic(), {}
     for k, plan in enumerate(plans):
@@ -171,7 +97,7 @@ def train_all(
 
 
 def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None) -> dict[str, Any]:
-    """What became of one run: errors on the rows kept out of training, or only that there was no time for it."""
+    """One run's row of the table: its errors on the rows kept out of training, or only that it was not begun."""
     folder = out / plan.folder
     row: dict[str, Any] = {
         "model": plan.name,
@@ -184,7 +110,7 @@ def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None)
         return row
     estimator = PoseEstimator.load(folder)
     rows = rows_to_judge(estimator, data, "validation")
-    metrics = judge(predict_rows_of(estimator, data, rows), data, rows)
+    metrics = judge(estimator.predict_rows(data, rows), data, rows)
     curves = read_curves(folder)
     row |= {
         "state": "ended early" if (folder / "checkpoint.pt").exists() else "finished",
@@ -212,15 +138,89 @@ def error_columns(data: Dataset) -> list[str]:
 
 
 def read_curves(folder: Path) -> list[dict[str, float]]:
-    """The learning curve of a run: one dict of numbers an epoch, networks one after the other."""
+    """The learning curve of a run: a dict of numbers for each epoch, one network after the other."""
     with (folder / "curves.csv").open(newline="") as file:
         return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
 
 def ordering(rows: list[dict[str, Any]], key: str) -> list[tuple[str, float, float]]:
-    """Models by their mean over seeds of a column, best first: name, mean, spread between seeds (largest less least)."""
+    """Models in the order of a column's mean over seeds, the least first: name, mean, and largest less least of the seeds."""
     values: dict[str, list[float]] = {}
     for row in rows:
         if row.get(key) is not None:
             values.setdefault(row["model"], []).append(row[key])
     return sorted(((name, float(np.mean(v)), float(np.ptp(v))) for name, v in values.items()), key=lambda item: item[1])
+
+
+class PeakMemory:
+    """The largest memory while it is watched, in MiB above the start: of the GPU, or of the process's resident set on a CPU."""
+
+    def __init__(self, device: str = "cpu") -> None:
+        self.device, self.peak = device, 0.0
+
+    def __enter__(self) -> "PeakMemory":
+        gc.collect()
+        # Memory that was freed before and not given back to the system would hide what is taken now.
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim:
+            trim(0)
+        if self.device == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+        self.start, self.watching = self._now(), True
+        self.thread = threading.Thread(target=self._watch, daemon=True)
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.watching = False
+        self.thread.join()
+        if self.device == "cuda":
+            self.peak = torch.cuda.max_memory_allocated() / MIB - self.start
+
+    def _watch(self) -> None:
+        while self.watching and self.device != "cuda":
+            self.peak = max(self.peak, self._now() - self.start)
+            time.sleep(WATCH_S)
+
+    def _now(self) -> float:
+        if self.device == "cuda":
+            return torch.cuda.memory_allocated() / MIB
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / MIB
+
+
+def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, device: str = "cpu") -> dict[str, Any]:
+    """Time and memory of training a model for an epoch, or for some batches where an epoch takes many minutes.
+
+    Parameters
+    ----------
+    pins : PinTable
+        M frames.
+    inputs : Inputs
+        Rows of an epoch: each frame once or several times.
+
+    Returns
+    -------
+    dict
+        ``model``, ``parameters``, ``batch``, ``rows_timed``, ``ms_per_frame`` (in an epoch, all its rows together),
+        ``s_per_epoch`` (None where only some batches were timed) and ``memory_mib``. A first pass, not timed, warms up.
+    """
+    torch.manual_seed(0)
+    part, count = model_named(model), len(inputs)
+    network = part.build(pins.reference, 2, {})
+    part.initialise(network, inputs, torch.arange(min(INITIAL_ROWS, count)))
+    timed = count if part.timed_batches is None else min(part.timed_batches * batch, count)
+    labels, executed, none = torch.randn(count, 2), torch.full((count,), torch.nan), torch.zeros(0, dtype=torch.long)
+    rows = Rows(inputs, labels, torch.ones(2), executed, torch.arange(timed), none)
+    loop = Loop(network.to(device), recipe_of(model, batch=batch), rows, 0, part.penalty)
+    with PeakMemory(device) as memory:
+        loop.epoch()
+        seconds = loop.epoch()["seconds"]
+    return {
+        "model": model,
+        "parameters": parameter_count(network),
+        "batch": batch,
+        "rows_timed": timed,
+        "ms_per_frame": 1e3 * seconds / timed * count / len(pins),
+        "s_per_epoch": seconds if timed == count else None,
+        "memory_mib": memory.peak,
+    }

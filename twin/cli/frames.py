@@ -174,7 +174,7 @@ def check(
     sensor: Sensor,
     form: FormOrAuto = None,
     pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="what 'twin tune' wrote")] = None,
-    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="look at most at N frames, evenly spread")] = 20,
+    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="look at no more than N frames, evenly spread")] = 20,
 ) -> None:
     from hardware.examining import examine_sensor
     from scenes import load_sensor

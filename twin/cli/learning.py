@@ -152,8 +152,8 @@ def train(
     labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
     seed: Annotated[int, typer.Option("--seed", help="seed of weights and order")] = 0,
     split: Annotated[int, typer.Option("--split", help="seed of the fifth kept out of training; -1: none")] = 0,
-    epochs: Annotated[int | None, typer.Option("--epochs", help="instead of the model's own number")] = None,
-    batch: Annotated[int | None, typer.Option("--batch", help="instead of the model's own size")] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
+    batch: Annotated[int | None, typer.Option("--batch", help="batch size, instead of the model's own")] = None,
     members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
     kernel: Annotated[
         bool | None,

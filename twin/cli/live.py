@@ -184,7 +184,7 @@ def servo(
     camera: Camera = "twin",
     arm: ArmOption = "simulated",
     parameters: ServoName = "surface",
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="instead of once around the object")] = None,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")] = None,
     stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
     rate: Annotated[float, typer.Option("--rate", min=0.1, help="decisions a second with --stream")] = 10.0,
     limits: Limits = None,

@@ -53,8 +53,8 @@ def servo_command(
     out: Out,
     objects: Annotated[str, typer.Option("--objects", help="names with commas between")] = OBJECTS,
     parameters: ServoName = "surface",
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="for each object, instead of once around it")] = None,
-    seed: Annotated[int, typer.Option("--seed", help="of the twin's noise")] = 0,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="steps on each object, instead of once around it")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
     plain_light: PlainLight = False,
 ) -> None:
     from hardware.servo_study import ServoStudyPlan, study_servo
@@ -112,7 +112,7 @@ def study_objects(
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="contacts to judge on ('twin experiments')")] = "objects-2d",
     randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="randomisation ('twin randomisations')")] = "moves",
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the contacts and the weights")] = 0,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="of both trainings, instead of the study's own number")] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
 ) -> None:
@@ -190,7 +190,7 @@ def study_sim_to_real(
     sim: Annotated[list[Path] | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead; several are joined")] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
     ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time")] = False,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="of every training, instead of the model's own number")] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of every training, instead of the model's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
 ) -> None:
@@ -249,8 +249,8 @@ def study_tac_vgnn(
     labels: Annotated[str, typer.Option("--labels", help="labels to learn: raw (as in the paper) or corrected")] = "raw",
     target: Target = "surface-2d",
     split: Annotated[int, typer.Option("--split", min=0, help="seed of the fifth kept out of training")] = 0,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="instead of each model's own number")] = None,
-    max_minutes: Annotated[float | None, typer.Option("--max-minutes", min=0, help="for all training together")] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of training, instead of each model's own number")] = None,
+    max_minutes: Annotated[float | None, typer.Option("--max-minutes", min=0, help="time for all training together")] = None,
     batches: Annotated[
         str, typer.Option("--batches", help="batch sizes of the efficiency figure, with commas between; empty: no figure")
     ] = "64,256,512",

@@ -6,20 +6,22 @@ from hardware.errors import DeviceError
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 from hardware.safety import distance_to_axis
 
-MARGIN_MM = 10.0  # between the dome and the circle about the object
-STEP_DEG = 30.0  # along that circle
-SAMPLE_MM = 1.0  # along a straight way
+# Distance between the dome and the circle around the object, in mm.
+MARGIN_MM = 10.0
+# Largest angle between two poses along this circle, in deg.
+STEP_DEG = 30.0
+# Distance between the places of a straight way at which the gap is checked, in mm.
+SAMPLE_MM = 1.0
 
 
 def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> list[np.ndarray]:
     """Poses (6,) to pass from ``start`` on, the last of them ``clear``.
 
-    Straight, where the dome keeps out of a circle about the object's section. Else out of the circle if need be, and along
-    it the shorter way, the sensor turned towards the object. The object counts as endlessly high: the way is level, whatever
-    the heights of its ends, and neither the arm's own links nor what holds the object are known.
+    The way is straight if the dome stays outside a circle around the object's section. Otherwise the arm first leaves the circle if it is
+    inside, and then goes the shorter way along it, with the sensor turned towards the object. The object is treated as infinitely
+    high, so the way is level whatever the heights of its ends are. The arm's links and the object's holder are not known.
 
-    An object without an end (a plane, an edge) is not gone around: nothing but its surface is assumed to be there, and the way
-    is straight.
+    There is no way around an object without an end (a plane, an edge). Only its surface is taken into account, and the way is straight.
 
     Raises
     ------
@@ -57,13 +59,13 @@ def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> li
 
 
 def _require_in_front(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> None:
-    """That the dome's centre, on its straight way to a pose, stays in front of the surface; it may begin in contact."""
+    """Raise ``DeviceError`` unless the dome's centre stays in front of the surface on its straight way. It may begin in contact."""
     ends = [matrix_of(pose)[:3, :3] @ placed.mounting.centre_mm + pose[:3] for pose in (start, clear)]
     samples = max(2, int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / SAMPLE_MM)))
     gap_mm = min(placed.distance_mm(ends[0] + share * (ends[1] - ends[0])) for share in np.linspace(0.0, 1.0, samples))
     if gap_mm < 0.0:
         raise DeviceError(
-            f"the straight way to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, whose end is not known; jog the arm "
+            f"the straight way to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, which has no known end; jog the arm "
             "to the side from which the sensor is to touch it, or correct the object's place ('placement' in the file for --servo)"
         )
 

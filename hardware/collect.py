@@ -1,11 +1,10 @@
-"""Collecting labelled frames: pose, tap, shear, frame; in the recordings' own format, resumable.
+"""Collecting labelled frames in the recordings' own format: for each contact a pose, a tap, a shear and one frame.
 
-The arm comes from ``CLEAR_MM`` away, and between contacts lifts off by ``LIFT_MM``; to there, and from lift to lift, it goes
-around the object as ``hardware.approach`` has it, straight before one without an end. A frame is taken only after the arm has
-said that it stands at the commanded pose, and only one exposed after that; what the table holds is the pose that it said.
-
-
-A whole collection: from a plan to labelled frames in a folder."""
+``collect_frames`` goes from a plan to labelled frames in a folder, and goes on with a collection that was interrupted. The arm starts
+``CLEAR_MM`` from the object and lifts off by ``LIFT_MM`` between two contacts. From lift to lift it goes around the object as
+``hardware.approach`` plans it; in front of an object without an end it goes straight. A frame counts only if it was exposed after the arm
+reported that it stands at the commanded pose. The table holds the reported pose.
+"""
 
 import csv
 import json
@@ -34,19 +33,26 @@ from twin.progress import Progress, Step, silent, stage
 from twin.store import locked, made_by, write_json, write_text
 from twin.types import Form, Frame
 
-CLEAR_MM = 50.0  # from the object at the start and at the end
-LIFT_MM = 10.0  # off the object between two contacts
-NEAR_MM = 0.5  # a move that is shortened by more than this is refused
-MOVE_TIMEOUT_S = 30.0  # for a move, beside the time that its way takes
-FRAME_TIMEOUT_S = 5.0  # for a frame of the arm where it stands
-SPARE = 2.0  # times the duration that a move's way and speed give: arms round their speed to whole percents
+# Distance from the object at the start and at the end, in mm.
+CLEAR_MM = 50.0
+# Distance from the object between two contacts, in mm.
+LIFT_MM = 10.0
+# A move that guards or arm shorten by more than this (mm) is an error.
+NEAR_MM = 0.5
+# Time in s that a move may take beyond what its way and speed give.
+MOVE_TIMEOUT_S = 30.0
+# Factor on the time that a move's way and speed give: arms round their speed to whole percents.
+SPARE = 2.0
+# Longest wait in s for a frame of the arm where it stands.
+FRAME_TIMEOUT_S = 5.0
+# Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
 
 @dataclass(frozen=True)
 class Contact:
-    """One contact as asked for: label of the pose after the move, and the move, (6,) each in mm and deg."""
+    """One contact to make: the label of the pose after the move (6,), and the move (6,), in mm and deg."""
 
     pose: np.ndarray
     move: np.ndarray
@@ -59,10 +65,11 @@ class Collection:
     Parameters
     ----------
     folder : Path
-        New, empty, or of a collection with the same ``about``, which is gone on with.
+        A new or empty folder, or the folder of a collection with the same ``about``, which is continued.
     about : dict
-        What the frames depend on (JSON).
+        What the frames depend on, in types that JSON can hold.
     form : Form
+        Form of the frames.
     """
 
     folder: Path
@@ -70,6 +77,13 @@ class Collection:
     form: Form
 
     def __post_init__(self) -> None:
+        """Open the folder: check what it holds, and drop a line that was not finished.
+
+        Raises
+        ------
+        DeviceError
+            The folder holds something else, or a collection that was made otherwise.
+        """
         self.pictures = self.folder / ("frames_bw" if self.form is Form.RECORDING else "images")
         self.folder.mkdir(parents=True, exist_ok=True)
         meta, about = self.folder / META, json.loads(json.dumps(self.about))
@@ -77,7 +91,7 @@ class Collection:
             try:
                 before = json.loads(meta.read_text())
             except ValueError as error:
-                raise DeviceError(f"{meta}: not whole ({error}); remove it if the folder holds no contacts yet") from error
+                raise DeviceError(f"{meta}: is damaged ({error}); remove it if the folder holds no contacts yet") from error
             if other := [key for key in about if before.get(key) != about[key]]:
                 raise DeviceError(
                     f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
@@ -115,7 +129,7 @@ class Collection:
         write_image(self.rest, frame.image)
 
     def keep(self, index: int, frame: Frame, label: np.ndarray, move: np.ndarray, log: dict[str, Any]) -> None:
-        """Write a contact: its picture, a line of the log, its row; a row's picture is always there."""
+        """Write a contact in this order: its picture, its line of the log, its row of the table. So the picture of every row exists."""
         name = f"frame_{index}_0.png"
         write_image(self.pictures / name, frame.image)
         with (self.folder / LOG).open("a") as file:
@@ -134,17 +148,22 @@ class Collection:
 
 
 def draw_contact(experiment: ExperimentSpec, seed: int, index: int) -> Contact:
-    """Pose and move of contact ``index``, each number even over its range; depends on nothing else."""
+    """Pose and move of contact ``index``, uniformly random within the experiment's ranges. It depends on these arguments alone."""
     low, high = np.array(list(experiment.ranges().values())).T
     numbers = np.random.default_rng([seed, index]).uniform(low, high)
     return Contact(numbers[:6], numbers[6:])
 
 
 class WorkFrame:
-    """The robot's coordinates of an experiment in front of an object.
+    """The robot's coordinates of an experiment in front of an object (the work frame).
 
-    A label means there what the mounting says: at its origin, after ``clear`` and ``tap``, the tool is as deep and as far from
-    the normal as labels of 0 stand for.
+    Labels mean what the mounting says: after ``clear`` and ``tap``, the pose with labels of 0 has the depth and the angle from the
+    surface's normal that labels of 0 stand for.
+
+    Parameters
+    ----------
+    experiment : ExperimentSpec
+    placed : PlacedObject
     """
 
     def __init__(self, experiment: ExperimentSpec, placed: PlacedObject) -> None:
@@ -157,14 +176,14 @@ class WorkFrame:
         self._toward = mounting.axis
 
     def base_pose(self, label: np.ndarray, near: np.ndarray, *, away_mm: float = 0.0) -> np.ndarray:
-        """The arm's pose (6,) at work coordinates (6,), ``away_mm`` back along the approach."""
+        """The arm's pose (6,) at work coordinates (6,), ``away_mm`` back along the approach. ``near`` (6,) selects the turn about z."""
         T = np.eye(4)
         T[:3, :3] = Rotation.from_euler("xyz", label[3:], degrees=True).as_matrix()
         T[:3, 3] = label[:3] - away_mm * self._toward
         return pose_of(self._T @ T, near)
 
     def label(self, base_pose: np.ndarray) -> np.ndarray:
-        """The pose's label (6,) with the arm at a pose (6,), after the tap."""
+        """The label (6,) of the arm's pose (6,) after the tap."""
         return pose_of(np.linalg.inv(self._T) @ matrix_of(base_pose), np.zeros(6)) - self._offset
 
 
@@ -183,20 +202,25 @@ def collect(
     on_rest: Callable[[Frame], None] | None = None,
     progress: Step | None = None,
 ) -> int:
-    """Collect up to ``count`` contacts; those that the collection holds already are not made again.
+    """Collect contacts until the collection holds ``count``. Contacts that it holds already are not made again.
 
-    Whatever happens the arm is stopped, withdrawn (once it has come to the object) and disabled.
+    After any end, Ctrl-C included, the arm is stopped, withdrawn (if it has come to the object) and disabled.
 
     Parameters
     ----------
+    count : int
+        Contacts in the collection at the end.
     seed : int
-        Of the draws.
+        Seed of the drawn contacts.
     speed : (float, float)
-        In mm/s and deg/s.
+        Speed of the arm in mm/s and deg/s.
+    guards : tuple of Guard
+        Called before every move, in this order. Each may change the target or refuse it.
     frame_timeout_s : float
-        For so long a frame of the arm where it stands is waited for.
+        Longest wait in s for a frame of the arm where it stands.
     on_rest : callable, optional
-        Called with the frame without contact when it has been kept.
+        Called with the frame without contact after it was kept.
+    progress : Step, optional
 
     Returns
     -------
@@ -206,10 +230,10 @@ def collect(
     Raises
     ------
     DeviceError
-        The source is not live, no way leads to the object, the arm did not come to stand where it was sent or could not be let go
-        of, or no frame came.
+        The source is not live, no way leads to the object, the arm did not reach its target, letting go of the arm failed, or no frame
+        came.
     StoreError
-        Another run collects into the folder, or it can't be written to.
+        Another run collects into the folder, or the folder can't be written to.
     """
     if not source.is_live:
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
@@ -254,9 +278,9 @@ def _collect_all(
 
 
 def _collect_one(rig: "_Stops", experiment: ExperimentSpec, collection: Collection, index: int, asked: Contact) -> None:
-    """Make one contact and keep its frame: above it, onto it, into it, along it, off it.
+    """Make one contact and keep its frame: go above the place, tap, move along the surface, take the frame, lift off.
 
-    At every stop a frame is awaited: what the skin remembers depends on where the arm has been.
+    A frame is awaited at every stop, because the skin's state depends on where the arm has been.
     """
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
     before = asked.pose - asked.move + clear
@@ -287,9 +311,9 @@ class _Stops:
     Attributes
     ----------
     label : (6,) float
-        Work coordinates of the contact that the arm is at or on its way to: from there it is withdrawn.
+        Work coordinates of the contact at which the arm is, or to which it goes. The arm is withdrawn from there.
     at_object : bool
-        Whether the arm has come around the object, so that withdrawing from ``label`` is a straight way.
+        Whether the arm has come around the object. From then on a straight way leads from ``label`` back.
     """
 
     source: FrameSource
@@ -303,11 +327,11 @@ class _Stops:
     at_object: bool = False
 
     def go(self, label: np.ndarray, away_mm: float = 0.0) -> ArmState:
-        """Go straight to work coordinates (6,), or to ``away_mm`` back from them along the approach; the state there."""
+        """Go straight to work coordinates (6,), ``away_mm`` back along the approach. Returns the state there."""
         return self._go_to(self.work.base_pose(label, self.arm.state().pose, away_mm=away_mm))
 
     def go_around(self, label: np.ndarray, away_mm: float) -> ArmState:
-        """The same, around the object and not through it."""
+        """As ``go``, but around the object and not through it."""
         start = self.arm.state().pose
         for pose in way_around(self.placed, start, self.work.base_pose(label, start, away_mm=away_mm)):
             state = self._go_to(pose)
@@ -325,6 +349,7 @@ class _Stops:
             raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
 
     def _go_to(self, target: np.ndarray) -> ArmState:
+        """Go straight to a pose (6,). Returns the state that confirms it."""
         state = self.arm.state()
         for guard in self.guards:
             target = guard(state, target)
@@ -339,7 +364,7 @@ class _Stops:
 
 @dataclass(frozen=True)
 class CollectPlan:
-    """What to collect, with what.
+    """What to collect, and with which devices.
 
     Attributes
     ----------
@@ -351,15 +376,15 @@ class CollectPlan:
     servo : ServoSpec
         The arm's speeds, and where the object stands.
     camera, arm : str
-        As ``build_rig`` takes them.
+        As for ``build_rig``.
     count : int
         Contacts in the folder at the end.
     seed : int or None
-        Of the draws; None: the experiment's own.
+        Seed of the drawn contacts. None: the experiment's own seed.
     form : Form or None
-        Of the frames; None: that of the sensor's recordings where it has one.
+        Form of the frames. None: the form of the sensor's recordings if it has one.
     limits : str or None
-        Safety limits, by name or file; those of the arm's kind by default.
+        Safety limits, by name or file. None: those of the arm's kind.
     plain_light : bool
         The twin's frames without path tracing; see ``build_rig``.
     """
@@ -378,13 +403,13 @@ class CollectPlan:
 
     @property
     def drawn_with(self) -> int:
-        """The seed that counts."""
+        """The seed of the drawn contacts: the plan's, else the experiment's."""
         return self.experiment.seed if self.seed is None else self.seed
 
 
 @dataclass(frozen=True)
 class Collected:
-    """Contacts in the folder, and those that were there before."""
+    """Number of contacts in the folder, and the number that was there before."""
 
     folder: Path
     count: int
@@ -396,14 +421,14 @@ class Collected:
 
 
 def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent) -> Collected:
-    """Collect labelled frames into a folder, or go on with a collection that was made with the same plan.
+    """Collect labelled frames into a folder, or continue a collection that was made with the same plan.
 
     Raises
     ------
     DeviceError
-        The folder holds something else, or see ``hardware.collect.collect``.
+        The folder holds something else, or one of the reasons of ``collect``.
     FrameError
-        The sensor seems pressed in the frame without contact.
+        The sensor seems to be pressed in the frame without contact.
     """
     rig = build_rig(
         plan.sensor,
@@ -423,8 +448,8 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
 
     def require_rest(frame: Frame) -> None:
         remedy = (
-            f"look what touches it, remove {collection.rest} and give the same command again to have it taken anew; "
-            "or the same command alone, to go on with it"
+            f"look for what touches it, remove {collection.rest} and give the same command again, which takes it anew; "
+            "or give the same command without removing it, to use it as it is"
         )
         require_untouched(plan.sensor, rig.source.form, frame, remedy)
 
@@ -448,7 +473,7 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
 
 
 def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:
-    """What the frames depend on: a collection is gone on with only where all of it is the same."""
+    """What the frames depend on. A collection is continued only if all of this is the same."""
     low, high = zip(*plan.experiment.ranges().values(), strict=True)
     return {
         "comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.stimulus.name}",

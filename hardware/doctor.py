@@ -1,6 +1,4 @@
-"""What devices are attached to this machine: cameras and serial ports. Opens none of them.
-
-What is there on this machine, what is missing, and the remedy."""
+"""What this machine has, what is missing, and the remedy: packages, renderer, 3D pictures, cameras, serial ports. Opens no device."""
 
 import importlib.metadata
 import platform
@@ -14,7 +12,15 @@ from twin.errors import RenderError
 from twin.optics.variant import report
 from twin.report.skin3d import probe_offscreen
 
+# Folder in which the Linux kernel lists its cameras.
 SYSFS_CAMERAS = Path("/sys/class/video4linux")
+# Packages whose versions are listed.
+PACKAGES = ("mitsuba", "drjit", "pyvista", "vtk", "trimesh", "torch", "scikit-image", "pyserial", "opencv-python-headless", "numba")
+# Kinds of devices, each with the remedy if none is found.
+DEVICES = {
+    "camera": "plug in the sensor's USB camera; in a container pass --device /dev/video0",
+    "serial": "plug in the arm's USB cable; the user must be in the group 'dialout'",
+}
 
 
 @dataclass(frozen=True)
@@ -39,13 +45,6 @@ def serial_ports() -> list[Device]:
     return [Device(port.device, port.description or "serial port") for port in sorted(list_ports.comports())]
 
 
-PACKAGES = ("mitsuba", "drjit", "pyvista", "vtk", "trimesh", "torch", "scikit-image", "pyserial", "opencv-python-headless", "numba")
-DEVICES = {
-    "camera": "plug in the sensor's USB camera; in a container pass --device /dev/video0",
-    "serial": "plug in the arm's USB cable; the user must be in the group 'dialout'",
-}
-
-
 @dataclass(frozen=True)
 class Machine:
     """What was found.
@@ -59,7 +58,7 @@ class Machine:
     can_render : bool
         Whether anything can be rendered here.
     plain_pictures : str
-        Why VTK draws no 3D pictures, which are drawn plainly then; "" if it does.
+        Why VTK draws no 3D pictures ("" if it does). Without VTK the pictures are drawn plainly.
     devices : dict of str to list of Device
         By kind: ``camera`` and ``serial``.
     """
@@ -71,7 +70,7 @@ class Machine:
     devices: dict[str, list[Device]]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result in words."""
         lines = [f"Python      {platform.python_version()} ({sys.executable}) on {platform.system()} {platform.machine()}"]
         lines += [f"{name:11} {version or 'MISSING; run ' + repr('make setup')}" for name, version in self.packages.items()]
         lines += ["", "Rendering (Mitsuba)", *(f"  {line}" for line in self.rendering)]

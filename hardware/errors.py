@@ -1,6 +1,8 @@
-"""Errors of attached devices. Their shape is what users of LeRobot expect.
+"""Errors of attached devices, and devices as context managers.
 
-Devices as context managers: connected when entered, disconnected when left."""
+The classes of errors are those that users of LeRobot expect. A ``Connection`` is connected when it is entered, and disconnected when it
+is left.
+"""
 
 from abc import ABC, abstractmethod
 from typing import Self
@@ -9,7 +11,7 @@ from twin.errors import TwinError
 
 
 class DeviceError(TwinError):
-    """A device does not do what it was told; the message names the device and the remedy."""
+    """A device does not do what it was told. The message names the device and the remedy."""
 
 
 class DeviceNotConnectedError(DeviceError, ConnectionError):
@@ -25,7 +27,7 @@ class StaleDataError(DeviceError):
 
 
 class Connection(ABC):
-    """Base of whatever has ``connect()`` and ``disconnect()``."""
+    """Base of all devices with ``connect()`` and ``disconnect()``."""
 
     @abstractmethod
     def connect(self) -> None: ...

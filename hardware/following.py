@@ -1,4 +1,4 @@
-"""One run of surface following: from a plan to its results, which are also written to disk."""
+"""One run of surface following: from a plan to results, which are also written to disk."""
 
 import json
 from contextlib import ExitStack
@@ -22,13 +22,16 @@ from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import save_figure
 from twin.types import Frame
 
-GIVE_UP_S = 5.0  # without a usable frame for so long, following ends
-STREAM_HZ = 10.0  # decisions a second that the loop's settings name where each waits for the move before, and none is timed
+# Following ends after this time in s without a usable frame.
+GIVE_UP_S = 5.0
+# Rate in Hz from which the loop's period is set if no rate is given. Then each decision waits for the move before it, and the period is
+# only the pause after a frame that could not be used.
+STREAM_HZ = 10.0
 
 
 @dataclass(frozen=True)
 class FollowPlan:
-    """What to follow, with what. The sensor and the form of its frames are the model's.
+    """What to follow, and with which devices. The sensor and the form of its frames are the model's.
 
     Attributes
     ----------
@@ -37,23 +40,25 @@ class FollowPlan:
     servo : ServoSpec
         Gains, speeds and where the object stands.
     camera, arm : str
-        As ``build_rig`` takes them.
+        As for ``build_rig``.
     steps : int or None
-        None: once around the object.
+        Number of steps. None: once around the object.
     stream_hz : float or None
-        Decisions a second; None: each waits for the move before.
+        Decisions a second. None: each decision waits for the move before it.
     limits : str or None
-        Safety limits, by name or file; those of the arm's kind by default.
+        Safety limits, by name or file. None: those of the arm's kind.
     record : bool
         Keep every frame and step in a session.
     seed : int
-        Of the twin's noise.
+        Seed of the twin's noise.
     plain_light : bool
         The twin's frames without path tracing; see ``build_rig``.
     known_place : bool
-        The object stands where the servo's placement has it, so that there is a truth to measure against (always so in the twin).
+        Whether the object really stands at the servo's placement, so that the results can be compared with the truth. In the twin it
+        always does.
     at_rest : str
-        What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none``, or a file.
+        What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none`` (the specification's layout), or
+        a file.
     """
 
     stimulus: ObjectSpec
@@ -72,7 +77,7 @@ class FollowPlan:
 
 @dataclass(frozen=True)
 class Followed:
-    """What came of it; ``failure`` says why it ended early ("" if it did not)."""
+    """The result of ``follow``. ``failure`` says why it ended early ("" if it did not); ``outline_mm`` (N, 2) is in the base frame."""
 
     measures: Measures
     timing: Timing
@@ -83,7 +88,7 @@ class Followed:
     written: list[Path] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """For people; what is not known is left out."""
+        """The result in words, without what is not known."""
         m = self.measures
         smooth = {"smoothness S": m.smoothness, "local": m.local_smoothness, "jerk in mm per step^3": m.jerk}
         out = [
@@ -106,7 +111,7 @@ class Followed:
 def follow(
     plan: FollowPlan, model: SensorModel, out: Path, *, about: dict[str, Any] | None = None, progress: Progress = silent
 ) -> Followed:
-    """Follow an object and write what came of it to ``out``; an end before the last step is a result, too.
+    """Follow an object and write the results to ``out``. A run that ends before its last step has results, too.
 
     Parameters
     ----------
@@ -118,7 +123,7 @@ def follow(
     Raises
     ------
     TwinError
-        It could not be begun, or ended before its first step.
+        The run could not begin, or it ended before its first step.
     """
     rest = given_frame(plan.at_rest, model)
     if rest is not None:
@@ -146,7 +151,7 @@ def follow(
             if not loop.records:
                 raise
             failure = str(error)
-        finally:  # after Ctrl-C, too: what was followed so far is kept
+        finally:  # after Ctrl-C, too, so that the steps so far are kept
             if loop.records:
                 followed = _results(plan, rig, loop, wanted_mm, failure)
                 followed.written.extend(_write(out, plan, model, followed, told))

@@ -1,6 +1,4 @@
-"""An arm with the interface of a LeRobot robot. LeRobot itself is not needed.
-
-A frame source in the shape that users of LeRobot expect of a camera: images in, no import of LeRobot."""
+"""An arm and a camera with the interfaces that LeRobot expects of a robot and a camera. LeRobot itself is not imported."""
 
 from functools import cached_property
 
@@ -45,7 +43,7 @@ class LeRobotArm:
 
     @property
     def is_calibrated(self) -> bool:
-        """Always: these arms know their joints' zeros (a Magician once it was homed)."""
+        """Always true: these arms know their joints' zeros (a Magician after it was homed)."""
         return True
 
     def connect(self, calibrate: bool = True) -> None:
@@ -76,7 +74,7 @@ class LeRobotArm:
 
 
 class LeRobotCamera:
-    """``connect``, ``read``, ``async_read``, ``read_latest`` and ``disconnect`` as LeRobot's cameras have them.
+    """A frame source with ``connect``, ``read``, ``async_read``, ``read_latest`` and ``disconnect`` of LeRobot's cameras.
 
     Parameters
     ----------
@@ -91,12 +89,12 @@ class LeRobotCamera:
         return self._source.is_connected
 
     @staticmethod
-    def find_cameras() -> list[dict]:
+    def find_cameras() -> list[dict[str, str]]:
         """USB cameras of this machine."""
         return [{"type": "OpenCV", "id": device.node, "name": device.description} for device in cameras()]
 
     def connect(self, warmup: bool = True) -> None:
-        """Open it; with ``warmup`` return when the first frame has come."""
+        """Open the camera. With ``warmup`` wait for the first frame."""
         self._source.connect()
         if warmup:
             self._source.read(timeout_s=self._source.first_frame_s)
@@ -117,5 +115,5 @@ class LeRobotCamera:
             raise TimeoutError(str(error)) from error
 
     def disconnect(self) -> None:
-        """Let go of it."""
+        """Close the camera."""
         self._source.disconnect()

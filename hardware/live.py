@@ -1,6 +1,7 @@
-"""Watching a camera: every frame through the model, kept if wanted, the newest shown.
+"""Watching a camera, or replaying a session: from a plan to estimates, figures and, if wanted, a recorded session.
 
-Watching a camera, or replaying a session: from a plan to estimates, figures and a recorded session."""
+``watch`` runs the model on every frame. ``LiveSession`` is its loop; ``Shower`` draws the newest frame in a thread of its own.
+"""
 
 import threading
 import time
@@ -25,16 +26,27 @@ from hardware.view.server import BrowserView
 from twin.pins import Pipeline
 from twin.types import Frame
 
+# Newest times of each kind that the figures are computed from.
 KEPT_TIMES = 10_000
-RATE_SPAN = 30  # frames over which the rate is told
-SHOW_S = 0.1  # between pictures of the view
-CLOSE_S = 20.0  # a view may take to bring out what it was shown
+# Number of newest frames from which the present frame rate is computed.
+RATE_SPAN = 30
+# Interval in s between two pictures of the view.
+SHOW_S = 0.1
+# Time in s that a view may take at the end to write or send what it was shown.
+CLOSE_S = 20.0
+# Longest wait for a frame, in s.
 FRAME_TIMEOUT_S = 5.0
+# Port of the page that shows the frames.
+PORT = 8080
+
+View = RerunView | WindowView | BrowserView
+Draw = Callable[[Frame, Estimate, list[str]], np.ndarray]
+"""From a frame, its estimate and lines of text to a picture (H, W, 3) uint8 RGB."""
 
 
 @dataclass
 class LiveSession:
-    """Estimates the pose in every frame of a source that can be had.
+    """Estimates the pose in every frame that a source delivers.
 
     Parameters
     ----------
@@ -52,19 +64,19 @@ class LiveSession:
     on_estimate: Callable[[Frame, Estimate], None] | None = None
     newest: tuple[Frame, Estimate] | None = None
     count: int = 0
-    _ages: deque = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _late: deque = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _spent: deque = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _done: deque = field(default_factory=lambda: deque(maxlen=RATE_SPAN))
+    _ages: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _late: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _spent: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
+    _done: deque[float] = field(default_factory=lambda: deque(maxlen=RATE_SPAN))
     _begun_s: float = field(default_factory=time.monotonic)
 
     def run(self, *, most: int | None = None, seconds: float | None = None, going: Callable[[], bool] = lambda: True) -> Timing:
-        """Go on until the recording ends, ``most`` frames or ``seconds`` are over, or ``going()`` is false.
+        """Run until the recording ends, ``most`` frames were read, ``seconds`` have passed, or ``going()`` is false.
 
         Raises
         ------
         DeviceError
-            The camera ended, or gives nothing.
+            The camera has ended, or delivers no frame.
         """
         self._begun_s = time.monotonic()
         while going() and (most is None or self.count < most) and (seconds is None or time.monotonic() - self._begun_s < seconds):
@@ -131,22 +143,22 @@ def same_estimates(steps: list[dict], estimates: list[Estimate]) -> int:
 
 
 class Shower:
-    """Draws the newest frame at its own pace, so that drawing holds up nothing. A context manager.
+    """Draws the newest frame in a thread of its own, so that drawing does not delay the session. A context manager.
 
     Parameters
     ----------
     session : LiveSession
     draw : callable
-        From frame, estimate and lines to a picture (H, W, 3).
-    view : BrowserView, WindowView or RerunView
+        See ``Draw``.
+    view : View
 
     Raises
     ------
     DeviceError
-        On entering, where the view can't be opened; on leaving, where it broke.
+        On entering if the view can't be opened, on leaving if it broke.
     """
 
-    def __init__(self, session: LiveSession, draw: Callable[[Frame, Estimate, list], np.ndarray], view) -> None:
+    def __init__(self, session: LiveSession, draw: Draw, view: View) -> None:
         self._session, self._draw, self._view = session, draw, view
         self._opened, self._end = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
@@ -170,7 +182,7 @@ class Shower:
             self._tell()
 
     def _tell(self) -> None:
-        """Raise what the view ended with, if it did."""
+        """Raise the error with which the view ended, if there is one."""
         if isinstance(self._error, DeviceError):
             raise self._error
         if self._error is not None:
@@ -195,20 +207,16 @@ class Shower:
                     continue
                 try:
                     lines = self._session.lines(newest[1])
-                except RuntimeError:  # the figures' queues grew while they were read
+                except RuntimeError:  # the session added a time while it was read
                     continue
                 shown = newest
                 if not view.show(self._draw(*newest, lines), {str(k): line for k, line in enumerate(lines)}):
                     self._end.set()
 
 
-PORT = 8080  # of the page that shows the frames
-View = RerunView | WindowView | BrowserView
-
-
 @dataclass(frozen=True)
 class WatchPlan:
-    """What to watch, and what becomes of it.
+    """What to watch, how to show it, and whether to keep it.
 
     Attributes
     ----------
@@ -221,13 +229,13 @@ class WatchPlan:
     shown : bool
         Show the frames: in a window where there is a display, else on a page.
     rerun : str or None
-        Show them in Rerun instead, as ``RerunView`` takes it, whatever ``shown`` says.
+        A target of ``RerunView``: show the frames there instead, whatever ``shown`` says.
     seconds, count : float or None, int or None
-        Stop after so long, or after so many frames.
+        Stop after this time in s, or after this number of frames.
     at_rest : str
         What pins are counted from: ``first`` (the first frame), ``none`` (the specification's layout), or a file.
     port : int
-        Of the page; 0: a free one.
+        Port of the page; 0: a free one.
     """
 
     camera: str = ""
@@ -245,13 +253,13 @@ class WatchPlan:
             raise DeviceError("give either --camera or --replay")
         if self.replay is not None and self.at_rest != NONE:
             raise DeviceError(
-                "--at-rest goes with --camera: a replay counts pins from the frame that was kept with its session; leave it out"
+                "--at-rest goes with --camera: a replay counts pins from the frame that was kept with its session; leave --at-rest out"
             )
 
 
 @dataclass(frozen=True)
 class Watched:
-    """What came of it.
+    """The result of ``watch``.
 
     Attributes
     ----------
@@ -259,10 +267,11 @@ class Watched:
     interrupted : bool
         Whether Ctrl-C ended it.
     same : (int, int) or None
-        Of a replay: how many estimates are those that were recorded, and how many there are.
+        For a replay: the number of estimates that equal the recorded ones, and the number of all estimates.
     record : Path or None
-        The session's folder.
+        Folder of the recorded session.
     frames : int
+        Number of frames.
     """
 
     timing: Timing
@@ -272,7 +281,7 @@ class Watched:
     frames: int
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result in words."""
         lines = ["ended"] if self.interrupted else []
         lines += self.timing.lines()
         if self.same is not None:
@@ -290,14 +299,14 @@ def watch(
     on_shown: Callable[[str], None] | None = None,
     on_estimate: Callable[[Frame, Estimate], None] | None = None,
 ) -> Watched:
-    """Estimate the pose in every frame that can be had, until it is told to stop.
+    """Estimate the pose in every frame that the camera or the session delivers, until the plan's end or Ctrl-C.
 
     Parameters
     ----------
     plan : WatchPlan
     model : SensorModel
     name : str
-        Of the model, to be kept with the session.
+        The model's name, which is kept with the session.
     on_shown : callable, optional
         Called with the address of the view once it is open.
     on_estimate : callable, optional
@@ -306,7 +315,7 @@ def watch(
     Raises
     ------
     TwinError
-        There is no such camera or session, it is not the model's sensor, or the view can't be opened or broke.
+        There is no such camera or session, its sensor is not the model's, or the view can't be opened or broke.
     """
     source = SessionSource(plan.replay) if plan.replay is not None else open_camera(plan.camera, model.sensor, model.form)
     model.check(model.sensor, source.form)
@@ -328,7 +337,7 @@ def watch(
             shower = stack.enter_context(Shower(session, _drawing(view, model), view))
             if on_shown is not None:
                 on_shown(view.url)
-        if plan.record is not None:  # last: a folder is begun only where there is something to keep
+        if plan.record is not None:  # the last step: no folder is made if one of the steps before fails
             about = {"sensor": model.sensor.name, "form": str(source.form), "camera": source.name, "model": name}
             session.record = stack.enter_context(SessionWriter(plan.record, about))
             if rest is not None:
@@ -347,12 +356,14 @@ def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Fra
     if plan.at_rest == FIRST:
         rest = await_frame(source)
         return counting_from_first(model, rest), rest
-    if rest is not None and (model.counts_from_rest or plan.replay is None):  # a session may be replayed with another model than its own
+    # A session may be replayed with another model than its own, which may not count pins from a frame without contact.
+    if rest is not None and (model.counts_from_rest or plan.replay is None):
         return model.at_rest(rest), rest
     return model, rest
 
 
 def _view(plan: WatchPlan, title: str) -> View | None:
+    """The view of the plan, not yet open; None if nothing is shown."""
     if plan.rerun is not None:
         return RerunView(title, plan.rerun)
     if not plan.shown:
@@ -360,8 +371,8 @@ def _view(plan: WatchPlan, title: str) -> View | None:
     return WindowView(title) if has_window() else BrowserView(title, port=plan.port)
 
 
-def _drawing(view: View, model: SensorModel) -> Callable[[Frame, Estimate, list[str]], np.ndarray]:
-    """What draws a frame with its pins and its estimate, in the thread of the view."""
+def _drawing(view: View, model: SensorModel) -> Draw:
+    """The function that draws a frame with its pins and its estimate, in the thread of the view."""
     pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)
     rest_px2 = pipeline.reference.area_px2
 

@@ -1,11 +1,13 @@
-"""Where an arm was at a given time, from the states that it reported.
+"""The servo loop: frame, estimate, law, move. It knows a frame source, an estimator and an arm, and not what stands behind them.
 
-The servo loop: frame, pose, law, arm. Knows a frame source, an estimator and an arm, and not what stands behind them."""
+A frame is exposed while the arm moves. So the loop keeps the newest states of the arm (``ArmTrack``) and takes the pose at the time of the
+frame's exposure from them.
+"""
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -26,8 +28,20 @@ from twin.errors import TwinError
 from twin.rig.mounting import Mounting
 from twin.types import Frame
 
+# States of the arm that are kept: 256 states of 20 ms are 5 s, ten times the oldest frame that a servo accepts.
 KEPT_STATES = 256
+# Interval in s at which a thread asks the arm for its state.
 WATCH_S = 0.02
+# Largest number of pieces into which guards and arm may divide a move that is waited for.
+MOST_PIECES = 200
+# A move that ends nearer than this to its target (mm) needs no further piece.
+NEAR_MM = 0.5
+# Time in s that a move may take beyond what its way and speed give.
+MOVE_TIMEOUT_S = 10.0
+# Factor on the time that a move's way and speed give: arms round their speed to whole percents.
+SPARE = 2.0
+# The arm may lag behind its target by this number of the servo's largest moves. When it lags farther, it gets no new target.
+BEHIND_MOVES = 2.0
 
 
 class ArmTrack:
@@ -55,8 +69,8 @@ class ArmTrack:
         return np.array([np.interp(time_s, times, column) for column in poses.T])
 
     @contextmanager
-    def watched(self):
-        """Context in which a thread asks the arm for its state many times a step: frames are exposed while the arm moves."""
+    def watched(self) -> Iterator[None]:
+        """Context in which a thread asks the arm for its state many times a step, because frames are exposed while the arm moves."""
         end = threading.Event()
 
         def watch() -> None:
@@ -73,24 +87,18 @@ class ArmTrack:
             thread.join()
 
 
-MOST_PIECES, NEAR_MM = 200, 0.5
-MOVE_TIMEOUT_S = 10.0  # beside what the way takes
-SPARE = 2.0  # of that: arms take whole percents of their speed
-BEHIND_MOVES = 2.0  # largest moves that an arm may lag behind before it is told more
-
-
 class Decided(StrEnum):
     """What each round of the loop ends with."""
 
     MOVE = "moved"
     AWAIT_ARM = "let the arm catch up"
-    AWAIT_FRAME = "awaited a newer frame"  # too far from what was seen last
+    AWAIT_FRAME = "awaited a newer frame"  # the arm is too far from the place that the last frame showed
     HOLD = "held still"
 
 
 @dataclass
 class _View:
-    """What the newest frame that was taken in showed.
+    """What the newest used frame showed.
 
     Attributes
     ----------
@@ -98,9 +106,9 @@ class _View:
         None before the first one.
     reading : Reading
     doubt : str
-        Why the estimate is not to be believed ("" if it is).
+        Why the estimate can't be trusted ("" if it can).
     exposed_pose : (6,) float
-        The arm's pose when the last frame without doubt was exposed.
+        The arm's pose when the last trusted frame was exposed.
     tangent : (4, 4) float
         The surface that this frame showed; None before the first one.
     """
@@ -128,18 +136,19 @@ class ServoLoop:
     mounting : Mounting
     settings : LoopSettings
     guards : list of Guard
-        Asked before every move, in order; each may clamp or refuse.
+        Called before every move, in this order. Each may change the target or refuse it.
     sense : callable, optional
-        Told the depth (mm) and the exposure (``time.monotonic()``) of each fresh estimate, before the move.
+        Called before the move with the depth (mm) and the exposure (``time.monotonic()``) of each fresh estimate.
     retreat : callable, optional
-        Withdraws the arm, given the direction (3,) away from the object in the base frame; by default a straight move of the
+        Withdraws the arm. It gets the direction (3,) away from the object in the base frame. By default the arm moves straight by the
         servo's ``clear_mm``.
     way : callable, optional
-        From where the arm stands to the pose clear of the object: the poses to pass, the last of them that one. By default straight.
+        Gives the poses to pass from the arm's pose to the pose clear of the object, which is the last of them. By default the arm goes
+        straight.
     take_rest : callable, optional
-        Given a frame without contact, taken clear of the object, the estimator to go on with.
+        Gets a frame without contact, taken clear of the object, and returns the estimator to use from then on.
     on_step : callable, optional
-        Called with each record, its frame and its estimate, after the command was given.
+        Called with each record, its frame and its estimate after the move was commanded.
     """
 
     source: FrameSource
@@ -158,10 +167,10 @@ class ServoLoop:
     def __post_init__(self) -> None:
         self.records: list[StepRecord] = []
         self.notes: list[str] = []  # what went wrong
-        self.decided: list[tuple[Decided, float]] = []  # every decision, and the age (s) of the frame behind it (NaN without one)
-        self._held_since: float | None = None
-        self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has one
-        self._behind_since: float | None = None  # since when the arm lags too far behind to be told more
+        self.decided: list[tuple[Decided, float]] = []  # every decision, with the age (s) of its frame (NaN without a frame)
+        self._held_since: float | None = None  # when the arm began to hold still
+        self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has a queue
+        self._behind_since: float | None = None  # when the arm began to lag too far behind for a new target
         self._view, self._memory = _View(), Memory()
         self._track = ArmTrack(self.arm)
         self._started_s = self._ended_s = 0.0
@@ -169,7 +178,7 @@ class ServoLoop:
     def run(self, start_pose: np.ndarray) -> Timing:
         """Approach the start pose (6,), follow the surface for the given steps, retreat.
 
-        Whatever happens, Ctrl-C too, the arm is stopped, retreats along the sensor's axis and is disabled.
+        After any end, Ctrl-C included, the arm is stopped, retreats along the sensor's axis and is disabled.
 
         Raises
         ------
@@ -196,10 +205,10 @@ class ServoLoop:
         return self.timing()
 
     def require_labels(self, names: tuple[str, ...]) -> None:
-        """``DeviceError`` if a model that tells these has not what following needs; to be asked before anything moves."""
+        """Raise ``DeviceError`` if the model's labels are not those that following needs. Call it before anything moves."""
         depth, angle = self.mounting.depth_label, self.mounting.angle_label
         if not {depth, angle} <= set(names):
-            raise DeviceError(f"the model tells {', '.join(names)}; following a surface needs {depth} and {angle} (the experiment's)")
+            raise DeviceError(f"the model tells {', '.join(names)}; following a surface needs the experiment's {depth} and {angle}")
 
     def timing(self) -> Timing:
         """Figures of the steps so far."""
@@ -218,7 +227,7 @@ class ServoLoop:
         )
 
     def _follow(self) -> None:
-        """Take frames and decide on each, until the steps are made or a recording ends."""
+        """Take frames and decide on each one, until all steps are made or the recording ends."""
         self._view, self._memory, self._sent, self._behind_since = _View(), Memory(), None, None
         self._started_s = arrived_s = due_s = time.monotonic()
         while len(self.records) < self.settings.steps:
@@ -236,7 +245,7 @@ class ServoLoop:
             self._decide(state, frame)
 
     def _decide(self, state: ArmState, frame: Frame) -> None:
-        """One decision on one frame: to move, to wait for the arm or for a newer frame, or to hold still."""
+        """Decide on one frame: move, wait for the arm, wait for a newer frame, or hold still."""
         taken_s = time.monotonic()
         age_s = taken_s - frame.time_s
         fresh = self._look(frame, state)
@@ -268,7 +277,7 @@ class ServoLoop:
             self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
 
     def _look(self, frame: Frame, state: ArmState) -> bool:
-        """Take in a frame, if it was not used before; whether it is fresh."""
+        """Estimate the pose in a frame if it was not used before. Returns whether the frame is fresh."""
         used = self._view.frame
         if used is not None and frame.sequence == used.sequence:
             return False
@@ -283,22 +292,23 @@ class ServoLoop:
         return True
 
     def _lags(self, state: ArmState, from_pose: np.ndarray, now_s: float) -> bool:
-        """Whether the arm is too far from where it was sent to be told more; since when is kept."""
+        """Whether the arm is too far behind its target to get a new one. The time when this began is kept."""
         if _apart_mm(from_pose, state.pose) <= BEHIND_MOVES * self.servo.largest_move_mm:
             return False
         self._behind_since = now_s if self._behind_since is None else self._behind_since
         return True
 
     def _require_catching_up(self, now_s: float) -> None:
+        """Raise ``DeviceError`` if the arm has lagged behind for too long."""
         behind_s = now_s - (now_s if self._behind_since is None else self._behind_since)
         if behind_s > MOVE_TIMEOUT_S:
             raise DeviceError(
-                f"{self.arm.name}: says that it moves, and has not come near to where it was sent for {behind_s:.1f} s; "
+                f"{self.arm.name}: says that it moves, but has not come near its target for {behind_s:.1f} s; "
                 "look for what holds it, call clear_error(), then begin again"
             )
 
     def _record(self, state: ArmState, from_pose: np.ndarray, sent: np.ndarray, *, fresh: bool, taken_s: float) -> None:
-        """Keep what was decided, and tell it."""
+        """Keep the record of a move, and pass it to ``on_step``."""
         view, now_s = self._view, time.monotonic()
         assert view.frame is not None and view.estimate is not None  # nothing is decided before the first frame
         record = StepRecord(
@@ -326,16 +336,17 @@ class ServoLoop:
             self.on_step(record, view.frame, view.estimate)
 
     def _frame(self, state: ArmState, arrived_s: float) -> Frame:
+        """The frame to decide on: a recording's next one, one exposed at the present stop, or the newest one."""
         if not self.source.is_live:
             return self.source.read()
         if self.settings.blocking:
             return self.source.read_after(state.time_s, timeout_s=self.settings.frame_timeout_s)
-        if not self.records:  # not one of the approach
+        if not self.records:  # the first decision must not use a frame of the approach
             return self.source.read_after(arrived_s, timeout_s=self.settings.frame_timeout_s)
         return self.source.read_latest(max_age_s=self.servo.max_frame_age_s)
 
     def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
-        """What an estimate means, and why it isn't to be believed ("" if it is)."""
+        """The depth and angle of an estimate, and why they can't be trusted ("" if they can)."""
         if not estimate.valid:
             return Reading(np.nan, np.nan), estimate.reason
         self.require_labels(estimate.names)
@@ -351,11 +362,11 @@ class ServoLoop:
         return reading, ""
 
     def _hold(self, reason: str, problem: Exception | None, age_s: float = float("nan")) -> None:
-        """Stop where the arm is; give up after a while."""
+        """Stop the arm where it is. ``DeviceError`` after ``give_up_s`` without a usable frame."""
         self.decided.append((Decided.HOLD, age_s))
         if self._held_since is None:
             self._held_since = time.monotonic()
-            self._sent = None  # stopping empties the queue, however long feedback goes on saying that it moves
+            self._sent = None  # a stop empties the queue, even if feedback reports a motion for some time
             self.arm.stop()
             self.notes.append(f"held still before step {len(self.records)}: {reason}")
         held_s = time.monotonic() - self._held_since
@@ -364,6 +375,7 @@ class ServoLoop:
         time.sleep(min(0.05, self.settings.period_s))
 
     def _state(self) -> ArmState:
+        """The arm's newest state, which is also kept in the track; ``DeviceError`` if the arm reports an error."""
         state = self.arm.state()
         if state.error:
             raise DeviceError(f"{self.arm.name}: {state.error}")
@@ -371,7 +383,10 @@ class ServoLoop:
         return state
 
     def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:
-        """Move, in as many pieces as guards and arm make of it if the end is waited for; what was sent last."""
+        """Move to a pose (6,) and return the pose that was sent last.
+
+        With ``wait``, the move is repeated until it ends at the target, because guards and arm may shorten it.
+        """
         for _ in range(MOST_PIECES if wait else 1):
             state, allowed = self._state(), target
             for guard in self.guards:
@@ -383,10 +398,11 @@ class ServoLoop:
         return sent
 
     def _away_from(self, pose: np.ndarray) -> np.ndarray:
+        """The pose (6,) withdrawn by the servo's ``clear_mm`` along the sensor's axis."""
         return moved(pose, -self.servo.clear_mm * self.mounting.axis)
 
     def _let_go(self, *, retreat: bool) -> None:
-        """Stop, retreat, disable."""
+        """Stop the arm, withdraw it if it may touch the object, and disable it. Every step is tried."""
 
         def back() -> None:
             pose = self.arm.state().pose
@@ -400,4 +416,5 @@ class ServoLoop:
 
 
 def _apart_mm(one: np.ndarray, other: np.ndarray) -> float:
+    """Distance between the tools of two poses (6,)."""
     return float(np.linalg.norm(one[:3] - other[:3]))

@@ -1,8 +1,8 @@
-"""How work that moves an arm may be ended from outside.
+"""The composition root of live work: the one place that decides what is simulated, recorded or real.
 
-Which frame without contact a model counts pins from: a given one, the first that is taken, or none.
-
-The composition root of live work: the one place that decides what is simulated, recorded or real."""
+``build_rig`` makes a camera and an arm before an object from what a user writes. Also here: which frame without contact a model counts
+pins from (``given_frame``, ``counting_from_first``), and how a signal ends work that moves an arm (``signals_as_ctrl_c``).
+"""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -37,12 +37,23 @@ from twin.rig.mounting import Mounting
 from twin.store import cached_arrays
 from twin.types import Form, Frame
 
+# What a user may write after --at-rest besides a file.
+FIRST, NONE = "first", "none"
+# What a user writes after --camera for the twin.
+TWIN = "twin"
+# Samples per pixel of the path-traced frame that sets the shading of the twin's frames.
+SHADING_QUALITY: Literal["standard"] = "standard"
+# Longest wait in s for a frame of an arm that stands still.
+FRAME_S = 5.0
+# The same for the twin, which may take longer to draw a frame.
+TWIN_FRAME_S = 60.0
+
 
 @contextmanager
 def signals_as_ctrl_c() -> Iterator[None]:
-    """SIGTERM and a closed terminal (SIGHUP) raise ``KeyboardInterrupt``, as Ctrl-C does, so that the arm is let go of.
+    """Context in which SIGTERM and a closed terminal (SIGHUP) raise ``KeyboardInterrupt``, as Ctrl-C does, so that the arm is let go of.
 
-    For the main thread only. A signal that is ignored outside (``nohup``) stays ignored. The handlers of before are put back at the end.
+    Only for the main thread. A signal that was ignored before (``nohup``) stays ignored. The former handlers are restored at the end.
     """
 
     def interrupt(*_: object) -> None:
@@ -59,11 +70,8 @@ def signals_as_ctrl_c() -> Iterator[None]:
             signal.signal(ended, handler)
 
 
-FIRST, NONE = "first", "none"
-
-
 def given_frame(at_rest: str, model: SensorModel) -> Frame | None:
-    """The no-contact frame of a file, or of a recording's folder; None for ``first`` and ``none``.
+    """The frame without contact from a file or from a recording's folder; None for ``first`` and ``none``.
 
     Raises
     ------
@@ -84,17 +92,12 @@ def counting_from_first(model: SensorModel, frame: Frame) -> SensorModel:
     Raises
     ------
     FrameError
-        The sensor seems pressed in it, or the model can't count from it.
+        The sensor seems to be pressed in this frame, or the model can't count from it.
     """
     found = model.at_rest(frame)
     remedy = "move it clear of everything and begin again, or give a frame that was taken without contact: --at-rest FRAME"
     require_untouched(model.sensor, model.form, frame, remedy)
     return found
-
-
-TWIN = "twin"
-SHADING_QUALITY: Literal["standard"] = "standard"
-FRAME_S, TWIN_FRAME_S = 5.0, 60.0  # the twin may take its time over a frame while a simulated arm stands
 
 
 @dataclass
@@ -105,10 +108,10 @@ class Rig:
     ----------
     source : FrameSource
     arm : Arm
-        A real or emulated one is a ``SafeArm``.
+        A real or emulated arm is wrapped in a ``SafeArm``.
     placed : PlacedObject
     knows_truth : bool
-        Whether the object is where ``placed`` has it for certain: in the twin.
+        Whether the object certainly stands where ``placed`` says. This is so in the twin.
     """
 
     source: FrameSource
@@ -122,16 +125,16 @@ class Rig:
 
     @property
     def frame_timeout_s(self) -> float:
-        """For so long a frame of an arm that stands is waited for."""
+        """Longest wait in s for a frame of an arm that stands still."""
         return TWIN_FRAME_S if self.knows_truth else FRAME_S
 
     def await_frame(self) -> Frame:
-        """The first frame, for which the camera is given the time that one of its kind may need.
+        """Wait for the first frame, as long as a camera of this kind may need for it.
 
         Raises
         ------
         DeviceError
-            None comes; it names the camera.
+            No frame comes. The message names the camera.
         """
         return await_frame(self.source)
 
@@ -178,10 +181,10 @@ def build_rig(
     limits : str, optional
         Name or file; that of the arm's kind by default.
     plain_light : bool
-        Draw the twin's frames with the lamps' direct light alone, without the path-traced frame that sets what comes on top.
+        Draw the twin's frames with the direct light of the lamps alone. No frame is path-traced at the start to add the indirect light.
     at_once : bool
-        A simulated arm before the twin's camera takes no time, and frames are drawn when they are waited for: for whoever waits for
-        frames at each stop.
+        For callers that wait for a frame at each stop: a simulated arm in front of the twin's camera moves in no time, and a frame is drawn
+        only while a reader waits for it.
     """
     form = form or (Form.RECORDING if sensor.recording else Form.RAW)
     placed = PlacedObject(stimulus, placement, Mounting.of(sensor, experiment))
@@ -206,7 +209,7 @@ def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form
 
 
 def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
-    """The preview of a form's window, its shading from a path-traced frame at rest, which is kept between runs."""
+    """The preview of a form's window. Its shading comes from a path-traced frame at rest, which is kept between runs."""
     preview = preview_of(sensor, form)
     if plain_light:
         return preview
@@ -230,41 +233,46 @@ def servo_loop(
     settings: LoopSettings,
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None,
 ) -> ServoLoop:
-    """The loop on a connected rig; a safe arm is told what the sensor feels, and retreats in its own way."""
+    """The loop on a connected rig. A ``SafeArm`` is told what the sensor feels, and retreats as its limits allow."""
     loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[no_full_turn(rig.arm)], on_step=on_step)
     loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
-        loop.sense = lambda depth_mm, time_s: rig.arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
-
-        def retreat(away: np.ndarray) -> None:
-            rig.arm.normal = away
-            if rig.arm.retreat() is None:
-                raise DeviceError(f"the limits allow no way back: {rig.arm.decisions[-1].decision.reason}; free the sensor by hand")
-
-        loop.retreat = retreat
+        arm = rig.arm
+        loop.sense = lambda depth_mm, time_s: arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
+        loop.retreat = lambda away: _retreat(arm, away)
     return loop
 
 
+def _retreat(arm: SafeArm, away: np.ndarray) -> None:
+    """Withdraw an arm in a direction (3,) of the base frame; ``DeviceError`` if its limits allow no way back."""
+    arm.normal = away
+    if arm.retreat() is None:
+        raise DeviceError(f"the limits allow no way back: {arm.decisions[-1].decision.reason}; free the sensor by hand")
+
+
 def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[int, float]:
-    """Steps that ``rounds`` around the object take, and the outline's length in mm; a tool off the surface goes farther than that."""
+    """The steps that ``rounds`` around the object take, and the way along its outline in mm.
+
+    A tool that stands off the surface of a closed outline goes farther than the outline is long; the steps count this.
+    """
     outline = placed.outline()
     length_mm = float(np.linalg.norm(np.diff(outline, axis=0), axis=1).sum())
-    tool_mm = placed.mounting.apex_mm @ placed.mounting.axis - servo.indent_mm  # of the tool from the surface
+    tool_mm = placed.mounting.apex_mm @ placed.mounting.axis - servo.indent_mm  # distance of the tool from the surface
     closed = bool(np.allclose(outline[0], outline[-1]))
     way_mm = rounds * (length_mm + closed * 2 * np.pi * max(tool_mm, 0.0))
     return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
 
 
 def no_full_turn(arm: Arm) -> Guard:
-    """A guard: where an arm of four axes would have to turn back by a full turn at the object, it ends."""
+    """A guard that ends the loop before an arm of four axes would turn back by a full turn at the object."""
     kinematics = getattr(arm, "kinematics", None)
 
     def guard(state: ArmState, target: np.ndarray) -> np.ndarray:
         if kinematics is not None and abs(kinematics.nearest_pose(target)[5] - state.pose[5]) > 180.0:
             raise DeviceError(
-                f"{arm.name}: its last axis turns no farther than here (R {state.pose[5]:.0f} deg, J4 {state.joints_deg[3]:.0f} deg), and "
-                "to go on it would have to turn the sensor back by a full turn at the object; give no more --steps than were made, or "
-                "turn the object ('placement.turn_deg' in a file for --servo) so that the way begins near the axis' other end"
+                f"{arm.name}: its last axis turns no farther than here (R {state.pose[5]:.0f} deg, J4 {state.joints_deg[3]:.0f} deg). "
+                "To go on, it would have to turn the sensor back by a full turn at the object; give no more --steps than were made, or "
+                "turn the object ('placement.turn_deg' in a file for --servo) so that the way begins near the other end of the axis"
             )
         return target
 

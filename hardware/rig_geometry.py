@@ -11,7 +11,9 @@ from scenes.servo import PlacementSpec
 from twin.rig.mounting import Mounting
 from twin.rig.touch import Surface, Touch
 
+# Distance between two points of an outline, in mm.
 OUTLINE_STEP_MM = 0.5
+# An outline that is not closed after this length (mm) ends there: the object has no end.
 LONGEST_OUTLINE_MM = 2000.0
 
 
@@ -80,7 +82,7 @@ class PlacedObject:
         return np.linalg.inv(matrix_of(pose) @ self._T_tool_sensor) @ self.T_base_object
 
     def start_pose(self, indent_mm: float) -> np.ndarray:
-        """The arm's pose (6,) with the sensor normal to the object at its origin, that deep."""
+        """The arm's pose (6,) with the sensor normal to the object at the object's origin, ``indent_mm`` deep."""
         x, y, z = self.mounting.across, self.mounting.axis, self.mounting.out_of_plane
         T = np.eye(4)  # the tool's across, axis and plane's normal lie along the object's x, z and -y
         T[:3, :3] = self.T_base_object[:3, [0, 2, 1]] * [1, 1, -1] @ np.stack([x, y, z])
@@ -90,12 +92,12 @@ class PlacedObject:
         return pose_of(T, np.zeros(6))
 
     def touch(self, pose: np.ndarray) -> Touch:
-        """What the sensor truly touches with the arm at a pose (6,): a ``Touch`` of one row, without that axis."""
+        """What the sensor truly touches with the arm at a pose (6,): a ``Touch`` of this one pose, without the axis of poses."""
         found = self._surface.touched(self.mounting, self.seen_from(pose)[None])
         return Touch(*(getattr(found, field.name)[0] for field in fields(Touch)))
 
     def distance_mm(self, place_mm: np.ndarray) -> float:
-        """Of a place (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""
+        """Distance of a place (3,) of the base frame from the surface, in the section through the object's origin; negative inside."""
         local = (place_mm - self.T_base_object[:3, 3]) @ self.T_base_object[:3, :3] * [1, 0, 1]
         return float(self._surface.field.distance(local[None])[0]) - self._surface.raised_mm
 

@@ -1,12 +1,14 @@
-"""Letting go of a device: every step is tried, whatever became of the others.
+"""An arm whose every move is checked by ``hardware.safety``, and which lets go of the object after any exception.
 
-An arm whose every move is checked by ``hardware.safety``."""
+Letting go has several steps: stop, retreat, disable. ``try_each`` tries every one of them, even if one before it failed.
+"""
 
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -15,14 +17,24 @@ from hardware.arms.kinematics import Kinematics
 from hardware.errors import DeviceError, StaleDataError
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
 
+# Newest decisions that are kept in memory.
+KEPT_DECISIONS = 10_000
+# Shares of the retreat's length. They are tried in this order until the limits allow one.
+RETREAT_SHARES = (1.0, 0.75, 0.5, 0.25)
+
 
 def try_each(**steps: Callable[[], object]) -> list[str]:
-    """Call each step; a second Ctrl-C ends the step that it meets, not those after it.
+    """Call every step, even if one before it failed. A second Ctrl-C ends only the step that runs at that moment.
 
     Returns
     -------
     list of str
-        What failed. It is also noted on the exception that is on its way, if there is one, and printed with it.
+        What failed. If an exception is being handled, each failure is also added to it as a note.
+
+    Raises
+    ------
+    BaseException
+        What interrupted a step (``KeyboardInterrupt``), after all steps were tried.
     """
     on_its_way, failed, interrupt = sys.exc_info()[1], [], None
     for name, act in steps.items():
@@ -38,10 +50,6 @@ def try_each(**steps: Callable[[], object]) -> list[str]:
     if interrupt is not None:
         raise interrupt
     return failed
-
-
-KEPT_DECISIONS = 10_000
-RETREAT_SHARES = (1.0, 0.75, 0.5, 0.25)  # shares of the retreat, tried in turn until the limits allow one
 
 
 class RefusedMoveError(DeviceError):
@@ -96,7 +104,7 @@ class SafeArm:
         self._sensed: Sensed | None = None
 
     def sense(self, *, depth_mm: float, frame_time_s: float) -> None:
-        """Report what the sensor shows. After the first call a move needs a frame that is new enough. A depth of NaN is not known."""
+        """Report what the sensor shows. After the first call a move needs a frame that is new enough. A depth of NaN means not known."""
         self._sensed = Sensed(depth_mm, frame_time_s)
 
     @property
@@ -110,7 +118,7 @@ class SafeArm:
         self._note("disconnect", Decision(Action.MOVE, Code.UNGATED, ""))
         self.arm.disconnect()
 
-    def __enter__(self) -> "SafeArm":
+    def __enter__(self) -> Self:
         self.connect()
         return self
 

@@ -1,14 +1,15 @@
-"""A live session on disk: every frame as it was, and a line of JSON for each step; whole up to its last complete line at any time.
+"""A live session on disk: every frame as it was, and a line of JSON for each step.
 
-``session.json`` says what it is, ``steps.jsonl`` has a line a step, ``frames/`` the pictures (PNG, lossless). A picture
-is written before its line, so what a line names is there. ``rest.png`` is the frame without contact that pins were counted
-from, where one was taken.
+``session.json`` says what the session is. ``steps.jsonl`` has one line a step, ``frames/`` the pictures (PNG, lossless). A picture is
+written before its line, so every picture that a line names exists, and the session can be read up to its last complete line at any
+time. ``rest.png`` is the frame without contact that pins were counted from, if one was taken.
 """
 
 import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -34,9 +35,9 @@ class SessionWriter:
     Parameters
     ----------
     folder : path
-        New or empty, or of a session that ended before its first step: that one is begun anew.
+        A new or empty folder, or the folder of a session that ended before its first step. Such a session is begun anew.
     about : dict
-        What JSON can hold: sensor, camera, model, arm.
+        Sensor, camera, model and arm, in types that JSON can hold.
     """
 
     def __init__(self, folder: str | Path, about: dict) -> None:
@@ -59,7 +60,8 @@ class SessionWriter:
             write_image(self.folder / FRAMES / name, frame.image)
             self._written = {frame.sequence: name}
         about_frame = {"file": name, "name": frame.name, "form": str(frame.form), "time_s": frame.time_s, "sequence": frame.sequence}
-        self._lines.write(json.dumps({"step": self.count, "frame": about_frame, **plain(step)}) + "\n")
+        line = {"step": self.count, "frame": about_frame, **{key: plain(value) for key, value in step.items()}}
+        self._lines.write(json.dumps(line) + "\n")
         self._lines.flush()
         self.count += 1
 
@@ -71,7 +73,7 @@ class SessionWriter:
         """End the session; its lines are on disk already."""
         self._lines.close()
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -90,7 +92,7 @@ def read_steps(folder: str | Path) -> list[dict]:
 
 
 class SessionSource(SequentialSource):
-    """A session's frames in their order; one that served several steps comes as often.
+    """A session's frames in the order of its steps. A frame that served several steps is given once for each.
 
     Parameters
     ----------
@@ -121,8 +123,8 @@ class SessionSource(SequentialSource):
             yield Frame(image, Form(about["form"]), about["name"], about["time_s"], about["sequence"])
 
 
-def plain(value):
-    """What JSON can hold: arrays as lists, what is no finite number as null."""
+def plain(value: object) -> object:
+    """The value as JSON can hold it: an array becomes a list, a number that is not finite becomes null."""
     if isinstance(value, dict):
         return {key: plain(part) for key, part in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

@@ -1,4 +1,4 @@
-"""What a servo loop is told, and what it tells of each of its decisions."""
+"""What a servo loop takes (estimators, guards, settings), and the record of each of its decisions."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -13,7 +13,7 @@ from twin.types import Form, Frame
 
 
 class Estimate(Protocol):
-    """What an estimator makes of a frame (``training.estimator.PoseEstimate``)."""
+    """An estimator's result on a frame (``training.estimator.PoseEstimate``)."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -46,7 +46,7 @@ class SensorModel(Protocol):
 
     @property
     def counts_from_rest(self) -> bool:
-        """Whether it counts pins from a frame without contact, where it is given one."""
+        """Whether the model can count pins from a frame without contact."""
 
     def __call__(self, frame: Frame) -> Estimate: ...
 
@@ -54,10 +54,11 @@ class SensorModel(Protocol):
         """The same model, counting pins from a frame without contact."""
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
-        """Raise an error where frames of that sensor and form are not what the model was trained on."""
+        """Raise an error if the model was not trained on frames of this sensor and form."""
 
 
-Guard = Callable[[ArmState, np.ndarray], np.ndarray]  # state and target (6,) to what may be sent; raises to refuse
+Guard = Callable[[ArmState, np.ndarray], np.ndarray]
+"""From the arm's state and a target (6,) to the pose (6,) that may be sent. It raises an error to refuse the move."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,18 +71,30 @@ class StepRecord:
     time_s : float
         ``time.monotonic()`` when the command was given.
     sequence : int
-        Of the frame behind it, ``frame_s`` its exposure, ``age_s`` its age then, ``fresh`` whether it was not used before.
+        Sequence number of the frame behind the decision.
+    frame_s : float
+        Time of its exposure.
+    age_s : float
+        Its age when the loop received it.
+    fresh : bool
+        Whether the frame was not used before.
     latency_s : float
-        From exposure to command, and ``compute_s`` from having the frame to the command.
+        Time from the exposure to the command.
+    compute_s : float
+        Time from receiving the frame to the command.
     names : tuple of str
+        Names of the estimated labels.
     value, low, high : (K,) float
-        The estimate and its interval; NaN where not valid.
+        The estimate and its interval; NaN if it is not valid.
     depth_mm, angle_deg : float
-        What they mean for the law.
-    pose, joints_deg : (6,), (J,) float
-        From where it decided (the arm's place, or the end of the move it is on), ``exposed_pose``: at the frame's exposure.
+        Depth of the tool and its angle from the surface's normal, by the estimate.
+    pose : (6,) float
+        The pose from which the step was decided: where the arm is, or the end of its present move.
+    exposed_pose : (6,) float
+        The arm's pose at the frame's exposure.
+    joints_deg : (J,) float
     sent : (6,) float
-        What the arm was told.
+        The pose that was commanded.
     """
 
     index: int
@@ -104,7 +117,7 @@ class StepRecord:
     sent: np.ndarray
 
     def plain(self) -> dict[str, Any]:
-        """For a session's line."""
+        """The record as a session keeps it."""
         return asdict(self)
 
 
@@ -116,12 +129,12 @@ class LoopSettings:
     ----------
     steps : int
     blocking : bool
-        Wait for each move and take a frame exposed after it; else a decision every ``period_s`` on the newest frame.
+        Wait for each move and take a frame that was exposed after it. Else decide every ``period_s`` on the newest frame.
     period_s : float
     frame_timeout_s : float
-        For so long a frame is waited for where one is (blocking, and at the start).
+        Longest wait for a frame, with ``blocking`` and at the start.
     give_up_s : float
-        After holding for so long the loop ends with an error.
+        The loop ends with an error after it has held still for this time.
     """
 
     steps: int

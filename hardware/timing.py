@@ -4,12 +4,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+# Percentiles that are given, in %.
 LEVELS = (50, 95, 99)
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Percentiles of times in seconds; NaN without any."""
+    """Percentiles of times, in s; NaN without any time."""
 
     p50: float
     p95: float
@@ -17,7 +18,7 @@ class Spread:
 
     @classmethod
     def of(cls, times_s: list[float]) -> "Spread":
-        """The spread of what was measured."""
+        """The spread of measured times."""
         return cls(*np.percentile(times_s, LEVELS).tolist()) if times_s else cls(*[float("nan")] * 3)
 
     def __str__(self) -> str:
@@ -32,19 +33,21 @@ class Timing:
     ----------
     steps : int
     rate_hz : float
-        Steps a second, and ``fresh_hz``: those on a frame not used before.
+        Steps a second.
+    fresh_hz : float
+        Steps a second on a frame that was not used before.
     latency_s : Spread
-        From a fresh frame's exposure to the command it led to.
+        Time from a fresh frame's exposure to the command that it led to.
     age_s : Spread
-        Of the frame behind every decision, when it was made.
+        Age of the frame behind each decision at the time of the decision.
     compute_s : Spread
-        From having the frame to the command.
+        Time from receiving the frame to the command.
     dropped : int
         Frames that nobody read.
     decided_hz : float
-        Decisions a second: to move (a step), to let the arm or the camera catch up, or to hold. NaN for who decides nothing.
+        Decisions a second: to move (a step), to wait for the arm or the camera, or to hold still. NaN if the loop decides nothing.
     decided : dict of str to int
-        How often each of them.
+        Number of decisions of each kind.
     """
 
     steps: int
@@ -55,10 +58,13 @@ class Timing:
     compute_s: Spread
     dropped: int
     decided_hz: float = float("nan")
-    decided: dict = field(default_factory=dict)
+    decided: dict[str, int] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
-        """For people; who decides nothing gives no commands but poses, and a recording's frames have no age."""
+        """The figures in words.
+
+        A loop that decides nothing gives poses instead of commands. Frames of a recording have no age, so theirs is left out.
+        """
         total = sum(self.decided.values())
         decided = [f"decisions at {self.decided_hz:.1f} Hz: " + ", ".join(f"{n / total:.0%} {what}" for what, n in self.decided.items())]
         made = "command" if total else "pose"

@@ -1,6 +1,8 @@
-"""How well a surface was followed: the paper's smoothness, and measures that do not depend on the axes.
+"""How well a surface was followed: the trajectory, its measures, and its pictures.
 
-Pictures of a followed surface, as in the paper's figure: trajectory, a zoom with its local smoothness, depth and angle."""
+Measures are the Tac-VGNN paper's smoothness S, and others that do not depend on the axes. The pictures are those of the paper's figure:
+the trajectory, a zoom with its local smoothness, depth and angle.
+"""
 
 import csv
 from dataclasses import asdict, dataclass
@@ -17,27 +19,33 @@ from twin.report.themes import BLUE, RED
 from twin.rig.mounting import Mounting
 from twin.store import text_file
 
-LOCAL_N = 9  # points in a window of the local smoothness
-SETTLING_N = 5  # steps after the start that the errors leave out
+# Points in a window of the local smoothness.
+LOCAL_N = 9
+# Steps after the start that the errors leave out.
+SETTLING_N = 5
+# Half the side of the zoom, in mm.
+ZOOM_MM = 12.0
+# Colours of the tool's path and of the felt surface.
+TOOL, FELT = BLUE, RED
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A followed surface, step by step (M steps); the truth is NaN where there is none.
+    """A followed surface in M steps. The true values are NaN if the truth is not known.
 
     Attributes
     ----------
     tool_mm : (M, 2) float
-        Where the tool was, base frame x and y.
+        Place of the tool, base frame x and y.
     felt_mm : (M, 2) float
         The surface as the estimates place it.
     depth_mm, angle_deg : (M,) float
-        Estimated.
+        Estimated depth and angle.
     true_depth_mm, true_angle_deg, true_indent_mm : (M,) float
     off_mm : (M,) float
         Distance of ``felt_mm`` from the true surface.
     along_mm : (M,) float
-        Way along the object's outline to the place that is touched.
+        Way along the object's outline to the touched place.
     """
 
     tool_mm: np.ndarray
@@ -53,15 +61,15 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Measures:
-    """Of one trajectory; NaN without the truth.
+    """Measures of one trajectory. Those that need the truth are NaN without it.
 
     Attributes
     ----------
     steps : int
     smoothness : float
-        The paper's S: mean of |dy / dx| over neighbouring points (pairs of equal x left out). Depends on the axes.
+        The paper's S: mean of |dy / dx| over neighbouring points, without pairs of equal x. It depends on the axes.
     local_smoothness : float
-        The same within windows, each turned so that its ends lie along x: mean over the windows.
+        Mean of S over windows of points, each turned so that its ends lie along x.
     path_error_mm : float
         Root mean square distance of the felt surface from the true one.
     depth_error_mm, angle_error_deg : float
@@ -97,7 +105,7 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
     records : list of StepRecord
     mounting : Mounting
     placed : PlacedObject, optional
-        Tells the truth where it is known.
+        The object, if its place is known; it gives the true values.
     """
     used = [record for record in records if record.fresh]
     poses = np.array([record.exposed_pose for record in used]).reshape(-1, 6)
@@ -123,7 +131,7 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
 
 
 def felt_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
-    """Where (3,) an estimate puts the surface: the foot of the dome's centre on the tangent."""
+    """The place (3,) of the surface by an estimate: the foot of the dome's centre on the tangent."""
     tangent = tangent_of(mounting, record.exposed_pose, Reading(record.depth_mm, record.angle_deg))
     tool = matrix_of(record.exposed_pose)
     centre, inward = tool[:3, :3] @ mounting.centre_mm + tool[:3, 3], tangent[:3, :3] @ mounting.axis
@@ -183,7 +191,7 @@ def jerk(points_mm: np.ndarray) -> float:
 
 
 def lost_contacts(indent_mm: np.ndarray) -> float:
-    """How often the indentation (M,) falls to zero or less; the start counts as touching. NaN where it isn't known."""
+    """How often the indentation (M,) falls to zero or less. The start counts as touching. NaN if the indentation is not known."""
     if np.isnan(indent_mm).any():
         return float("nan")
     off = np.concatenate([[False], indent_mm <= 0])
@@ -217,12 +225,8 @@ def write_csv(path: Path, trajectory: Trajectory) -> Path:
     return path
 
 
-ZOOM_MM = 12.0  # half the side of the zoom
-TOOL, FELT = BLUE, RED
-
-
 def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outline_mm: np.ndarray | None = None) -> Figure:
-    """Four panels; with an outline (N, 2) in the base frame the true surface too."""
+    """Four panels. With an outline (N, 2) in the base frame they also show the true surface."""
     figure, (whole, zoom, depth, angle) = new_figure(2, 2, panel_inch=4.6)
     figure.suptitle(
         f"{title}: S = {measures.smoothness:.3f}, path error {measures.path_error_mm:.2f} mm, "

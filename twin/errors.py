@@ -2,7 +2,7 @@
 
 
 class TwinError(Exception):
-    """Base of every error raised on purpose: says what came, what was expected, what to do."""
+    """Base of the errors that are raised on purpose. The message says what was expected, what came, and what to do."""
 
 
 class FrameError(TwinError):
@@ -10,20 +10,20 @@ class FrameError(TwinError):
 
 
 class ContactError(TwinError):
-    """A contact can't be computed: start inside the object, out of reach, not converged."""
+    """A contact can't be computed: it starts inside the object, is out of reach, or does not converge."""
 
 
 class MeshError(TwinError):
-    """An object's mesh can't be used: not closed, wrong unit, empty."""
+    """An object's mesh can't be used: it is not closed, empty, or in a wrong unit."""
 
 
 class RenderError(TwinError):
-    """Nothing can be rendered on this machine as asked."""
+    """This machine can't render what is asked for."""
 
 
 class StoreError(TwinError):
-    """A result can't be written, or what lies in a folder was made otherwise, or another run is at work there."""
+    """A result can't be written, a folder holds results that were made otherwise, or another run works in it."""
 
 
 class DatasetError(TwinError):
-    """A data set can't be made, or not gone on with."""
+    """A data set can't be made or continued."""

@@ -1,6 +1,4 @@
-"""The files of one rendered contact: frame, truth, skin, panel.
-
-One contact, from specifications to a folder: pressed, rendered, and written with its exact ground truth."""
+"""One contact, from specifications to a folder: pressed, rendered, and written with its exact ground truth."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +8,7 @@ from scenes.object import ObjectSpec
 from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
 from twin.objects import build_field
-from twin.optics.render import write_exr
+from twin.optics.render import Quality, write_exr
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.plots import Look, contact_panel
@@ -18,6 +16,68 @@ from twin.report.skin3d import displaced_skin, draw_contact_skin
 from twin.simulator import Shot, Simulator
 from twin.store import made_by, write_json, write_npz
 from twin.types import ContactState, FloatArray, Form
+
+
+@dataclass(frozen=True)
+class RenderedContact:
+    """A contact that was pressed and rendered, and the files that were written of it."""
+
+    state: ContactState
+    shot: Shot
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """Force, contact area and caps in sight, for people."""
+        force = self.state.force_n.round(2) + 0.0  # no negative zeros
+        visible = self.shot.truth.visible
+        return [
+            f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {self.state.area_mm2:.1f} mm2, "
+            f"{int(visible.sum())} of {len(visible)} caps in sight"
+        ]
+
+
+def render_contact(
+    sensor: SensorSpec,
+    stimulus: ObjectSpec,
+    pose: ContactPose,
+    out: Path,
+    *,
+    form: Form = Form.RAW,
+    quality: Quality = "standard",
+    seed: int = 0,
+    progress: Progress = silent,
+) -> RenderedContact:
+    """Press an object against a sensor, render what the camera sees, and write both with their ground truth.
+
+    Parameters
+    ----------
+    out : Path
+        An existing folder.
+    form : Form
+        The camera's frame, or the form of the sensor's recordings.
+    quality : {"preview", "standard", "high"}
+        Samples per pixel.
+    seed : int
+        Seed of the renderer and of the camera's noise.
+
+    Raises
+    ------
+    FrameError
+        The sensor has no recordings' form.
+    ContactError
+        The pose is out of reach, or the solver does not converge.
+    RenderError
+        Nothing can be rendered here.
+    """
+    simulator = Simulator(sensor, quality=quality)
+    simulator.check_form(form)
+    with stage(progress, f"press {stimulus.name}") as step:
+        state = simulator.press(stimulus, pose, progress=step)
+    with stage(progress, "render"):
+        shot = simulator.shoot(state, form=form, seed=seed)
+    with stage(progress, "pictures"):
+        written = write_contact(out, simulator, stimulus, pose, state, shot)
+    return RenderedContact(state, shot, written)
 
 
 def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> list[Path]:
@@ -46,7 +106,7 @@ def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Co
 
 
 def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
-    """The contact, place by place (see ``ContactState``)."""
+    """The state's arrays on each place in contact, by their names in ``truth.npz`` (see ``ContactState``)."""
     names = ("contact_mm", "point_area_mm2", "normal", "normal_n", "tangential_n", "slipping")
     return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}
 
@@ -55,12 +115,12 @@ def look_at(simulator: Simulator, shot: Shot) -> Look:
     """Run the pipeline on a shot and on the same sensor's no-contact frame."""
     form = shot.frame.form
     pipeline = Pipeline(simulator.spec, form)
-    rest = pipeline(simulator.shoot_rest(form).frame)  # first: it loads the compiled code, so that the shot's times are a frame's
+    rest = pipeline(simulator.shoot_rest(form).frame)  # first, because this loads compiled code, which must not count in the shot's times
     return Look(shot.frame, pipeline(shot.frame), rest)
 
 
 def contact_record(simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> dict[str, object]:
-    """What ``truth.json`` holds: forces on the object in the sensor frame, pose, everything resolved."""
+    """The content of ``truth.json``: forces on the object in the sensor frame, the pose, and all resolved specifications."""
     return {
         "force_n": state.force_n.tolist(),
         "torque_nmm": state.torque_nmm.tolist(),
@@ -75,65 +135,3 @@ def contact_record(simulator: Simulator, touched: ObjectSpec, pose: ContactPose,
         "sensor": simulator.spec.model_dump(mode="json"),
         "object": touched.model_dump(mode="json"),
     }
-
-
-@dataclass(frozen=True)
-class RenderedContact:
-    """What was made of it."""
-
-    state: ContactState
-    shot: Shot
-    written: list[Path]
-
-    def lines(self) -> list[str]:
-        """Force, contact area and caps in sight, for people."""
-        force = self.state.force_n.round(2) + 0.0  # no negative zeros
-        visible = self.shot.truth.visible
-        return [
-            f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {self.state.area_mm2:.1f} mm2, "
-            f"{int(visible.sum())} of {len(visible)} caps in sight"
-        ]
-
-
-def render_contact(
-    sensor: SensorSpec,
-    stimulus: ObjectSpec,
-    pose: ContactPose,
-    out: Path,
-    *,
-    form: Form = Form.RAW,
-    quality: str = "standard",
-    seed: int = 0,
-    progress: Progress = silent,
-) -> RenderedContact:
-    """Press an object against a sensor, render what the camera sees, and write both with their ground truth.
-
-    Parameters
-    ----------
-    out : Path
-        An existing folder.
-    form : Form
-        The camera's frame, or the form of the sensor's recordings.
-    quality : {"preview", "standard", "high"}
-        Samples per pixel.
-    seed : int
-        Of the renderer and of the camera's noise.
-
-    Raises
-    ------
-    FrameError
-        The sensor has no recordings' form.
-    ContactError
-        The pose is out of reach, or the solver does not converge.
-    RenderError
-        Nothing can be rendered here.
-    """
-    simulator = Simulator(sensor, quality=quality)
-    simulator.check_form(form)
-    with stage(progress, f"press {stimulus.name}") as step:
-        state = simulator.press(stimulus, pose, progress=step)
-    with stage(progress, "render"):
-        shot = simulator.shoot(state, form=form, seed=seed)
-    with stage(progress, "pictures"):
-        written = write_contact(out, simulator, stimulus, pose, state, shot)
-    return RenderedContact(state, shot, written)

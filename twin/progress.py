@@ -1,11 +1,11 @@
-"""How long work tells how far it is: one protocol for all of it.
+"""How a function that takes long reports its progress: one protocol for all of them.
 
-A function that takes long has a keyword option ``progress``, a ``Progress``. Its work has stages, each with a title, and it calls
-``progress(stage, done, total, note)`` as each of them goes on. The command line draws bars from these calls; a program gives a function
-of its own, or nothing (``silent``).
+Such a function has a keyword option ``progress``, a ``Progress``. Its work has stages, each with a title, and it calls
+``progress(stage, done, total, note)`` during each stage. The command line draws bars from these calls. A program may give a function of
+its own; by default nothing is reported (``silent``).
 
-A function that is one stage of something larger does not know its title. It takes a ``Step`` instead: ``step(done, total)``. The caller
-makes one from its own ``progress`` with ``stage``.
+A function that is one stage of a larger work does not know its title. It takes a ``Step`` instead: ``step(done, total)``. The caller
+makes the ``Step`` from its own ``progress`` with ``stage``.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,26 +14,26 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Called as work goes on."""
+    """Called during long work."""
 
     def __call__(self, stage: str, done: float, total: float, note: str = "") -> None:
-        """Take notice of how far a stage is.
+        """Receive the progress of a stage.
 
         Parameters
         ----------
         stage : str
             The stage's title. The first call with a title begins the stage.
         done : float
-            What is done, in the stage's own unit: contacts, frames, epochs. The first value counts what was there before.
+            Finished work, in the stage's own unit: contacts, frames, epochs. The first value counts what was finished before.
         total : float
-            What there is to do, in the same unit. 0 means that it is not known yet; 1 means that ``done`` is a fraction.
+            All work, in the same unit. 0 means that it is not known yet; 1 means that ``done`` is a fraction.
         note : str
-            What can be said of the work at this point, such as the present error of a training; "" for nothing.
+            A remark on the work at this point, such as the present error of a training; "" for none.
         """
 
 
 class Step(Protocol):
-    """Called as one stage goes on; arguments as those of ``Progress``."""
+    """Called during one stage. The arguments are those of ``Progress`` without the title."""
 
     def __call__(self, done: float, total: float = 1.0, note: str = "") -> None: ...
 
@@ -43,14 +43,14 @@ Bar = Callable[[str], AbstractContextManager[Step]]
 
 
 def silent(stage: str, done: float, total: float, note: str = "") -> None:
-    """The ``Progress`` of who does not want to know."""
+    """The ``Progress`` that reports nothing."""
 
 
 @contextmanager
 def stage(progress: Progress, title: str) -> Iterator[Step]:
-    """One stage of some work: yields the ``Step`` that tells how far it is.
+    """Context of one stage: yields the ``Step`` that reports its progress.
 
-    It begins with a total of 0. If nothing was told of it when it ends without an error, it counts as one thing that is done.
+    The stage begins with a total of 0. If it ends without an error and nothing was reported, it counts as one finished item.
     """
     told = False
 

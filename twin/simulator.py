@@ -21,7 +21,7 @@ from twin.types import ContactState, FloatArray, Form, Frame
 
 @dataclass(frozen=True)
 class Shot:
-    """A rendered frame and everything that is known about it.
+    """A rendered frame with its ground truth.
 
     Attributes
     ----------
@@ -29,9 +29,9 @@ class Shot:
     linear : (H, W) or (H, W, 3) float32
         Radiance before the camera's response, of the whole raw frame.
     truth : CapTruth
-        In px of ``frame``.
+        Where the caps are, in px of ``frame``.
     seconds : float
-        Time to render.
+        Time that rendering took, in s.
     """
 
     frame: Frame
@@ -49,7 +49,7 @@ class Simulator:
     quality : {"preview", "standard", "high"}
         Samples per pixel of the renderer.
     solver : SkinSolver, optional
-        Of the same sensor; by default one of the usual resolution.
+        A solver of the same sensor. By default one with the usual resolution is made.
     """
 
     def __init__(self, spec: SensorSpec, *, quality: Quality = "standard", solver: SkinSolver | None = None) -> None:

@@ -1,18 +1,25 @@
-"""What a loop knows of an arm. Units at this edge are mm and degrees; times are ``time.monotonic()`` seconds.
+"""What a loop knows of an arm (``Arm``, ``ArmState``), and what all drivers share (``BaseArm``).
 
-What all drivers share: errors when the arm is not connected, and waiting until the arm is at rest."""
+Units are mm and degrees; times are ``time.monotonic()`` seconds.
+"""
 
 import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Protocol
+from types import TracebackType
+from typing import Protocol, Self
 
 import numpy as np
 
 from hardware.arms.motion import turn_between_deg
 from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
+
+# Interval in s at which feedback is read. It is shorter than the 8 ms period of the fastest feedback.
+POLL_S = 0.005
+# A commanded move shows in feedback sooner than this (s). An arm that rests elsewhere for longer does not execute the move.
+BELIEVE_REST_S = 0.15
 
 
 @dataclass(frozen=True)
@@ -58,9 +65,9 @@ class Arm(Protocol):
     def disconnect(self) -> None:
         """Stop the arm and close the connection. It has no effect when the arm is not connected."""
 
-    def __enter__(self) -> "Arm": ...
+    def __enter__(self) -> Self: ...
 
-    def __exit__(self, *_: object) -> None: ...
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None: ...
 
     def enable(self) -> None: ...
 
@@ -96,10 +103,6 @@ class Arm(Protocol):
         DeviceError
             It did not get there in time, or reports an error.
         """
-
-
-POLL_S = 0.005  # shorter than the 8 ms period of the fastest feedback
-BELIEVE_REST_S = 0.15  # a move shows in feedback sooner than this; an arm that rests elsewhere for longer does not execute it
 
 
 class BaseArm(Connection):

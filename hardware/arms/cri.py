@@ -1,12 +1,13 @@
-"""Poses as matrices and back.
+"""The interface of ``cri``, so that scripts written for it drive our arms. Only their imports change:
 
-Scripts written for the sensor group's ``cri`` drive our arms: change the imports, keep the rest.
+    from hardware.arms.cri import SyncRobot, MG400Controller as Controller
 
-from hardware.arms.cri import SyncRobot, MG400Controller as Controller
+    with SyncRobot(Controller()) as robot:
+        robot.coord_frame = (300, 0, 0, -180, 0, 0)
+        robot.move_linear((0, 0, 0, 0, 0, 0))
 
-with SyncRobot(Controller()) as robot:
-    robot.coord_frame = (300, 0, 0, -180, 0, 0)
-    robot.move_linear((0, 0, 0, 0, 0, 0))"""
+``cri`` is the robot interface of the group that made the sensor.
+"""
 
 from collections.abc import Sequence
 
@@ -18,6 +19,11 @@ from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS
 from hardware.arms.open_arm import open_arm
 from hardware.errors import DeviceError
+
+# Euler axes that cri knows: s for static, r for rotating axes, then their order.
+EULER_AXES = tuple(
+    frame + order for frame in "sr" for order in ("xyz", "xyx", "xzy", "xzx", "yzx", "yzy", "yxz", "yxy", "zxy", "zxz", "zyx", "zyz")
+)
 
 
 def pose_matrix(pose: np.ndarray, axes: str = "sxyz") -> np.ndarray:
@@ -37,11 +43,6 @@ def _scipy_axes(axes: str) -> str:
     return axes[1:] if axes[0] == "s" else axes[1:].upper()
 
 
-EULER_AXES = tuple(
-    frame + order for frame in "sr" for order in ("xyz", "xyx", "xzy", "xzx", "yzx", "yzy", "yxz", "yxy", "zxy", "zxz", "zyx", "zyz")
-)
-
-
 class Controller:
     """An arm with the interface of ``cri``. It is connected and enabled when it is made.
 
@@ -57,7 +58,7 @@ class Controller:
         self.arm = open_arm(arm) if isinstance(arm, str) else arm
         self._linear, self._angular = 20.0, 20.0
         self._overall: float | None = None
-        self._tilt_deg = np.zeros(2)  # the tilt last commanded: an arm of four axes does not report it, so reading a pose returns this one
+        self._tilt_deg = np.zeros(2)  # last commanded tilt; poses are returned with it, as an arm of four axes does not report it
         self.commanded_pose: np.ndarray | None = None
         self.commanded_joint_angles: np.ndarray | None = None
         self.arm.connect()

@@ -1,12 +1,10 @@
-"""Kinematics of arms. Poses are (6,): ``x, y, z, rx, ry, rz`` in mm and deg, static xyz Euler angles.
+"""Kinematics of arms, and targets that are checked before anything is sent.
 
-Both Dobots carry their wrist on a parallel linkage: J2 and J3 are absolute angles of the two links, so with
-J2 from the vertical and J3 downwards from the horizontal
+Poses are (6,): ``x, y, z, rx, ry, rz`` in mm and deg, static xyz Euler angles. Both Dobots carry their wrist on a parallel linkage: J2
+and J3 are absolute angles of the two links, J2 from the vertical and J3 downwards from the horizontal. So
 
     rho = R0 + L1 sin J2 + L2 cos J3        z = Z0 + L1 cos J2 - L2 sin J3        R = J1 + J4 (not wrapped)
-
-
-Targets of an arm of four axes with a parallel linkage, checked before anything is sent."""
+"""
 
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -14,6 +12,14 @@ from typing import Protocol
 import numpy as np
 
 from hardware.errors import DeviceError
+
+# Numbers of the Dobots' alarms that planning raises (see ``hardware.arms.dobot_alarms``).
+NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23
+# Alarm of J1 above its range. The next are J1 below, J2 above, ... up to 71.
+FIRST_JOINT_ALARM = 64
+LINKAGE_ABOVE, LINKAGE_BELOW = 72, 73
+# Rounding errors of the inverse kinematics at a limit, in deg, do not violate it.
+LIMIT_TOLERANCE_DEG = 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,12 +54,6 @@ class Kinematics(Protocol):
         """The pose (6,) without the turns that the arm does not have."""
 
 
-NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23  # numbers of the alarms that planning raises
-FIRST_JOINT_ALARM = 64  # J1 above, J1 below, J2 above, ... up to 71
-LINKAGE_ABOVE, LINKAGE_BELOW = 72, 73
-LIMIT_TOLERANCE_DEG = 1e-6  # rounding errors of the inverse kinematics at a limit do not violate it
-
-
 @dataclass(frozen=True)
 class LinkageKinematics:
     """An arm of four axes on a parallel linkage.
@@ -63,7 +63,7 @@ class LinkageKinematics:
     l1_mm, l2_mm : float
         Upper arm and forearm.
     r0_mm, z0_mm : float
-        Reach and height of the tool with both links of no length.
+        The part of the tool's reach and height that does not come from the two links.
     limits_deg : (4, 2) tuple
         Smallest and largest angle of each joint.
     linkage_deg : float or None
@@ -74,7 +74,7 @@ class LinkageKinematics:
     l2_mm: float
     r0_mm: float
     z0_mm: float
-    limits_deg: tuple
+    limits_deg: tuple[tuple[float, float], ...]
     linkage_deg: float | None = None
     axes: int = 4
 

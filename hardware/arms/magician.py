@@ -17,11 +17,16 @@ from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, requ
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
-REPLY_TIMEOUT_S = 0.3  # a reply usually takes about 10 ms
-TRIES = 4  # a command may be sent again: moves are absolute, so a repeated move does not move the arm
+# Longest wait for a reply, in s. A reply usually takes about 10 ms.
+REPLY_TIMEOUT_S = 0.3
+# Times that a command is sent until a reply comes. Moves are absolute, so a repeated move does not move the arm.
+TRIES = 4
+# Longest time of homing, in s.
 HOME_TIMEOUT_S = 60.0
-PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)  # what pyserial raises when a port vanishes
-ACCELERATION = 4.0  # mm/s2 and deg/s2 for each mm/s and deg/s: full speed within a quarter of a second
+# What pyserial raises when a port vanishes.
+PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)
+# Acceleration in mm/s2 (deg/s2) for each mm/s (deg/s) of speed, in 1/s: full speed is reached within a quarter of a second.
+ACCELERATION = 4.0
 
 
 class Magician(BaseArm):

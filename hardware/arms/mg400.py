@@ -27,11 +27,15 @@ from hardware.arms.mg400_wire import (
 )
 from hardware.errors import DeviceError, DeviceNotConnectedError
 
+# Longest wait in s until feedback shows that the arm is enabled, or that an alarm is cleared.
 ENABLE_TIMEOUT_S = 5.0
-SETTLE_S = 0.5  # feedback gets at least this long to confirm a move: two periods of the slowest port
-PAUSED = "paused by another client; stop() drops what is queued, its Continue() would go on"
-SHORT_MM = 5.0  # in a move shorter than this the turn may determine the speed
-RESTED_S = 0.05  # old firmware sends no replies: a move counts as done after the arm rested for so long
+# Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
+SETTLE_S = 0.5
+PAUSED = "paused by another client; stop() drops the queue, Continue() of that client would execute it"
+# In a move shorter than this (mm) the turn may determine the speed.
+SHORT_MM = 5.0
+# Old firmware does not reply to moves. There a move counts as done after the arm has rested for this time (s).
+RESTED_S = 0.05
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,16 @@ import numpy as np
 from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
+# Longest wait for a connection, in s.
 CONNECT_TIMEOUT_S = 2.0
+# Longest wait for a reply, in s.
 REPLY_TIMEOUT_S = 2.0
-SILENCE_S = 1.0  # older feedback is not used, and its connection is closed
-RECONNECT_S = 0.5  # public clients wait 5 s; a servo that stands still needs feedback sooner
-BACKLOG_BYTES = 64 * PACKET_BYTES  # bytes in one read: more than half a second of feedback
+# Feedback older than this (s) is not used. A connection that is silent for this time is closed.
+SILENCE_S = 1.0
+# Pause before feedback is connected again, in s. Public clients wait 5 s, but a servo that stands still needs feedback sooner.
+RECONNECT_S = 0.5
+# Largest number of bytes in one read: more than half a second of feedback.
+BACKLOG_BYTES = 64 * PACKET_BYTES
 
 
 class CommandPort:

@@ -1,6 +1,4 @@
-"""JPEG pictures over HTTP as multipart/x-mixed-replace: what a server of such a stream writes.
-
-A camera behind a URL: JPEG pictures over HTTP, multipart/x-mixed-replace."""
+"""JPEG pictures over HTTP (multipart/x-mixed-replace): what a server of such a stream writes, and a camera that reads it."""
 
 import http.client
 import time
@@ -18,7 +16,18 @@ from twin.types import Form
 
 BOUNDARY = "frame"
 CONTENT_TYPE = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+# Quality (0 to 100) of the JPEGs that are written.
 JPEG_QUALITY = 95
+# A read has failed after this time in s without a byte.
+SILENT_S = 2.0
+# Largest accepted picture, in bytes.
+LARGEST_PART = 32_000_000
+# Header of a part with the exposure in Unix seconds, in lower case, as mjpg-streamer sends it.
+TIME_HEADER = "x-timestamp"
+# A time stamp that differs from now by more than this (s) comes from another clock and is not used.
+CLOCK_SLACK_S = 60.0
+# First and last bytes of a JPEG.
+START, END = b"\xff\xd8", b"\xff\xd9"
 
 
 def jpeg_of(image: np.ndarray) -> bytes:
@@ -38,13 +47,6 @@ def write_part(out: Writable, jpeg: bytes, headers: dict[str, object] | None = N
     more = "".join(f"{name}: {value}\r\n" for name, value in (headers or {}).items())
     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n{more}\r\n"
     out.write(head.encode("ascii") + jpeg + b"\r\n")
-
-
-SILENT_S = 2.0  # without a byte for so long the read has failed
-LARGEST_PART = 32_000_000  # bytes
-TIME_HEADERS = ("x-timestamp",)  # Unix seconds of the exposure, as mjpg-streamer sends it
-CLOCK_SLACK_S = 60.0  # a time stamp farther from now comes from another clock and is not used
-START, END = b"\xff\xd8", b"\xff\xd9"
 
 
 class Readable(Protocol):
@@ -137,7 +139,7 @@ class MjpegCamera(LiveSource):
         return capture(image, self._spec, self.form, self.name)
 
 
-def next_part(stream: Readable) -> tuple[dict, bytes]:
+def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:
     """Headers (lower case) and body of the next part of a multipart stream; ``EOFError`` at its end."""
     headers: dict[str, str] = {}
     while True:  # up to the next part's headers, past its boundary
@@ -169,14 +171,11 @@ def decode_jpeg(data: bytes) -> np.ndarray:
     return image if image.ndim == 2 else image[..., ::-1].copy()
 
 
-def stamped_s(headers: dict) -> float:
+def stamped_s(headers: dict[str, str]) -> float:
     """Time of exposure on the monotonic clock, from a part's headers; the present time if they do not hold it."""
     now_s, unix_s = time.monotonic(), time.time()
-    for name in TIME_HEADERS:
-        try:
-            age_s = unix_s - float(headers[name])
-        except (KeyError, ValueError):
-            continue
-        if abs(age_s) < CLOCK_SLACK_S:
-            return now_s - max(age_s, 0.0)
-    return now_s
+    try:
+        age_s = unix_s - float(headers[TIME_HEADER])
+    except (KeyError, ValueError):
+        return now_s
+    return now_s - max(age_s, 0.0) if abs(age_s) < CLOCK_SLACK_S else now_s

@@ -1,6 +1,8 @@
 """What all live sources share: a background reader that keeps the newest frame and reports faults.
 
-From a camera's picture to a sensor's frame: check the size, make it gray for a mono camera, threshold it for the recordings' form."""
+``capture`` makes a sensor's frame of a camera's picture: it checks the size, makes the picture gray for a mono camera, and thresholds it
+for the recordings' form.
+"""
 
 import threading
 import time
@@ -16,12 +18,15 @@ from twin.camera.capture import record
 from twin.frames.forms import frame_size, gray_levels
 from twin.types import Form, Frame
 
-MOST_FAILED_READS = 10  # the reader ends after more failed reads in a row
-FAILED_PAUSE_S = 0.2  # pause before the next attempt
-# An identical picture for this time, and this number of times, means a frozen stream: a live sensor has noise.
+# The reader ends after more than this number of failed reads in a row.
+MOST_FAILED_READS = 10
+# Pause in s before the next attempt.
+FAILED_PAUSE_S = 0.2
+# The stream is frozen if a picture stays the same for this time (s) and this number of times. A live sensor's pictures differ by noise.
 FROZEN_S, FROZEN_N = 0.5, 5
-BLACK_LEVEL = 16  # gray level; a picture without a brighter pixel is black: the lamps are off
-# The first picture of a real camera may take START_S after opening, plus FIRST_PERIODS periods of its frames.
+# Gray level (0 to 255). A picture without a pixel of this level is black: the lamps are off.
+BLACK_LEVEL = 16
+# The first picture of a real camera may take this time (s) after opening, and in addition FIRST_PERIODS periods of its frames.
 START_S = 4.0
 FIRST_PERIODS = 5
 

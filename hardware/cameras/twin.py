@@ -8,9 +8,9 @@ import numpy as np
 
 from hardware.arms.arm import ArmState
 from hardware.cameras.reader import LiveSource, Picture, ReadFailed
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.rig_geometry import PlacedObject
-from scenes.sensor import SensorSpec
+from scenes.sensor import ResponseSpec, SensorSpec
 from twin.camera.capture import expose, record
 from twin.errors import ContactError
 from twin.frames.forms import frame_size
@@ -21,9 +21,14 @@ from twin.rig.contact import contact_law
 from twin.types import ContactState, Form, Frame
 
 PoseSource = Callable[[], ArmState]
-RETRY_S, ASKED_S = 0.05, 0.1
-FIRST_FRAME_S = 120.0  # kernels may have to be compiled
-STEADY_SD = 1.0  # gray levels of noise where the specification has none: a real sensor's measured temporal noise
+# Pause after a pose that could not be drawn, in s.
+RETRY_S = 0.05
+# Interval in s at which a camera that waits for a reader looks whether it was closed.
+ASKED_S = 0.1
+# Longest time from connecting to the first frame, in s: kernels may have to be compiled.
+FIRST_FRAME_S = 120.0
+# Standard deviation of the noise in gray levels, for a sensor whose specification has no noise. Measured over time on a real sensor.
+STEADY_SD = 1.0
 
 
 class TwinCamera(LiveSource):
@@ -40,13 +45,13 @@ class TwinCamera(LiveSource):
         The arm's newest state.
     form : Form
     fps : float
-        No more frames a second than this.
+        The largest number of frames a second.
     seed : int
         Of the noise.
     preview : Preview, optional
-        Of the window that the form needs; the direct light's by default.
+        A preview of the window that the form needs. By default it draws the direct light alone.
     on_demand : bool
-        Draw only while a frame is waited for: for loops that stop for each frame, and have no use for those in between.
+        Draw only while a reader waits for a frame. This is for loops that stop for each frame: they do not use the frames in between.
     """
 
     notices_still = False  # the twin has a memory, not a cable
@@ -68,7 +73,8 @@ class TwinCamera(LiveSource):
         frame_size(spec, self.form)
         self._spec, self._placed, self._arm, self._period_s = spec, placed, arm, 1.0 / fps
         self._seed, self._preview = seed, preview
-        self._asked = threading.Event() if on_demand else None
+        self._recording = spec.recording if self.form is Form.RECORDING else None
+        self._on_demand, self._asked = on_demand, threading.Event()
         self._follower: Follower | None = None
         self._drawn, self._due_s = 0, 0.0
         self.state: ContactState | None = None  # of the newest frame
@@ -84,48 +90,54 @@ class TwinCamera(LiveSource):
     def _close(self) -> None:
         pass
 
-    def _take(self, wanted, timeout_s: float, missing: str) -> Frame:
-        if self._asked is not None:
-            self._asked.set()
+    def _take(self, wanted: Callable[[Frame], bool], timeout_s: float, missing: str) -> Frame:
+        self._asked.set()
         return super()._take(wanted, timeout_s, missing)
 
     def _grab(self) -> Picture:
-        if self._asked is not None:
+        follower, preview = self._opened()
+        if self._on_demand:
             self._await_reader()
         self._end.wait(max(0.0, self._due_s - time.monotonic()))
         self._due_s = time.monotonic() + self._period_s
         try:
             told = self._arm()
-            self.state = self._follower.move(self._placed.seen_from(told.pose), told.time_s)
+            self.state = follower.move(self._placed.seen_from(told.pose), told.time_s)
         except (ContactError, DeviceError) as error:
             self._end.wait(RETRY_S)
-            if self._asked is not None:
-                self._asked.set()
+            self._asked.set()
             raise ReadFailed(str(error)) from error
-        light = self._preview.render(self.state)
+        light = preview.render(self.state)
         self._drawn += 1
         rng = np.random.default_rng((self._seed, self._drawn))
-        return Picture(steady(expose(light, self._spec.capture, rng, origin_px=self._preview.window_px[:2]), self._spec, rng), told.time_s)
+        image = expose(light, self._spec.capture, rng, origin_px=preview.window_px[:2])
+        return Picture(steady(image, self._spec.response, rng), told.time_s)
+
+    def _opened(self) -> tuple[Follower, Preview]:
+        """What ``_open`` made; ``DeviceNotConnectedError`` before it."""
+        if self._follower is None or self._preview is None:
+            raise DeviceNotConnectedError(f"{self.name}: not connected; call connect() first")
+        return self._follower, self._preview
 
     def _await_reader(self) -> None:
-        """Until a frame is asked for; who asks from now on gets one that is drawn later."""
+        """Wait until a reader asks for a frame. A reader that asks after that gets a frame that is drawn later."""
         while not (self._asked.wait(ASKED_S) or self._end.is_set()):
             pass
         self._asked.clear()
 
     def _finish(self, image: np.ndarray) -> np.ndarray:
-        if self.form is Form.RECORDING:
-            return record(image, self._spec.recording, origin_px=self._preview.window_px[:2])
-        return image
+        if self._recording is None:
+            return image
+        return record(image, self._recording, origin_px=self._opened()[1].window_px[:2])
 
 
 def preview_of(spec: SensorSpec, form: Form) -> Preview:
     """The preview of the part of the raw frame that a form needs."""
-    return Preview(spec, window_px=spec.recording.crop_px if form is Form.RECORDING else None)
+    return Preview(spec, window_px=spec.recording.crop_px if form is Form.RECORDING and spec.recording is not None else None)
 
 
-def steady(image: np.ndarray, spec: SensorSpec, rng: np.random.Generator) -> np.ndarray:
-    """A frame with the least noise that a real sensor has, where the specification has none."""
-    if spec.response.read_noise or spec.response.shot_noise:
+def steady(image: np.ndarray, response: ResponseSpec, rng: np.random.Generator) -> np.ndarray:
+    """A frame with the least noise that a real sensor has, if the specified response has none."""
+    if response.read_noise or response.shot_noise:
         return image
     return np.clip(np.rint(image + STEADY_SD * rng.standard_normal(image.shape, np.float32)), 0, 255).astype(np.uint8)

@@ -12,8 +12,11 @@ from scenes.sensor import SensorSpec
 from twin.frames.images import quiet
 from twin.types import Form
 
-MANUAL_EXPOSURE = 1  # V4L2; 3 is automatic
-CLOCK_SLACK_S = 5.0  # a buffer time farther from now is not on the monotonic clock and is not used
+# Value of Video4Linux's setting for the exposure mode: 1 is manual, 3 is automatic.
+MANUAL_EXPOSURE = 1
+# A buffer time that differs from now by more than this (s) is not on the monotonic clock and is not used.
+CLOCK_SLACK_S = 5.0
+# Pictures that the driver may queue. With 1, the next picture is the newest.
 BUFFERS = 1
 
 

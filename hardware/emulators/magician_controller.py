@@ -13,11 +13,15 @@ from hardware.arms.magician_wire import Id, Message, Ptp
 from hardware.arms.motion import MotionTrack, Speeds
 from hardware.emulators.faults import Faults
 
+# Commands that the queue holds.
 QUEUE_N = 32
+# Numbers of alarms (see ``hardware.arms.dobot_alarms``).
 NOT_UNDERSTOOD, LOST_STEPS = 1, 80
 START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
+# Speed of the joints while homing, in deg/s. Chosen for the emulator.
 HOME_SPEED_DEG_S = 30.0
-JOG_MM, JOG_DEG = 400.0, 300.0  # a jog's target, beyond any limit: mm, deg
+# Length of a jog, in mm and in deg, which is beyond every limit.
+JOG_MM, JOG_DEG = 400.0, 300.0
 # Parameters that are stored as received, with their initial bytes. The number of bytes must agree.
 PARAMETERS: dict[int, bytes] = {
     Id.HOME_PARAMS: struct.pack("<4f", 200.0, 0.0, 0.0, 0.0),

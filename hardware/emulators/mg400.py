@@ -1,6 +1,4 @@
-"""The emulated MG400's feedback packet.
-
-A Dobot MG400 emulated on this machine, over real TCP sockets on all five ports."""
+"""A Dobot MG400 emulated on this machine, over real TCP sockets on all five ports."""
 
 import contextlib
 import select
@@ -30,59 +28,17 @@ from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controlle
 from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
 from twin.errors import TwinError
 
-DIFFERENCE_S = 0.008  # interval of the finite differences that give speeds
-
-
-def feedback_packet(arm: Mg400Controller) -> np.ndarray:
-    """The present state as a record of ``PACKET``. The arm follows its targets exactly. Currents and forces are not emulated."""
-    mode, now_s = arm.mode(), arm.update()
-    user, tool = arm.users[arm.user], arm.tools[arm.tool]
-    joints, before = arm.track.joints_deg(now_s), arm.track.joints_deg(now_s - DIFFERENCE_S)
-    seen = _seen(arm, joints, user, tool)
-    speed = (seen - _seen(arm, before, user, tool)) / DIFFERENCE_S
-    half_turn = np.radians(seen[3]) / 2
-    packet = np.zeros((), PACKET)
-    for names, value in (
-        (("length",), PACKET_BYTES),
-        (("test_value",), TEST_VALUE),
-        (("digital_out",), arm.digital_out),
-        (("mode",), int(mode)),
-        (("unix_ms",), int(time.time() * 1000)),
-        (("speed_scaling",), arm.percent["speedfactor"]),
-        (("q_target", "q_actual"), [*joints, 0, 0]),
-        (("qd_target", "qd_actual"), [*((joints - before) / DIFFERENCE_S), 0, 0]),
-        (("tool_target", "tool_actual"), [*seen, 0, 0]),
-        (("tcp_speed_target", "tcp_speed_actual"), [*speed, 0, 0]),
-        (("user_index",), arm.user),
-        (("tool_index",), arm.tool),
-        (("queue_runs",), arm.queue_runs),
-        (("paused",), arm.paused),
-        (("enabled",), arm.enabled),
-        (("running",), mode == Mode.RUNNING),
-        (("error",), bool(arm.alarms)),
-        (("jog",), mode == Mode.JOG),
-        (("robot_type",), ROBOT_TYPE_MG400),
-        (("load",), arm.load),
-        (("user",), [user.x, user.y, user.z, user.r, 0, 0]),
-        (("tool",), [tool.x, tool.y, tool.z, tool.r, 0, 0]),
-        (("target_quaternion", "actual_quaternion"), [np.cos(half_turn), 0, 0, np.sin(half_turn)]),
-    ):
-        for name in names:
-            packet[name] = value
-    return packet
-
-
-def _seen(arm: Mg400Controller, joints: np.ndarray, user: PlanarFrame, tool: PlanarFrame) -> np.ndarray:
-    """X, Y, Z, R of the tool in the user frame."""
-    flange = PlanarFrame.of_pose(arm.kinematics.forward(joints))
-    return (user.inverse() @ flange @ tool).pose[[0, 1, 2, 5]]
-
-
 PORTS = (DASHBOARD_PORT, MOTION_PORT, *FEEDBACK_PERIOD_S)
 OLD_FIRMWARE, NEW_FIRMWARE = "1.5.5", "1.7.0"
-FIRST_NUMBERED_REPLIES = (1, 5, 6)  # older firmware answers bare echoes
+# First firmware whose replies have numbers; older firmware answers bare echoes.
+FIRST_NUMBERED_REPLIES = (1, 5, 6)
+# Length of a feedback packet that was cut short, in bytes.
 SHORT_BYTES = 1000
+# Interval in s at which a waiting thread looks again.
 POLL_S = 0.002
+# Interval in s of the finite differences that give speeds: the period of the fastest feedback.
+DIFFERENCE_S = 0.008
+# Faults by name: the default value (None: a switch without a value) and what the fault does.
 FAULTS = {
     "no-tcp-mode": (None, "not in TCP mode: every command is refused with -1"),
     "split-refusals": (None, "a refusal arrives as two fragments: -1,{},;EnableRobot();"),
@@ -153,7 +109,7 @@ class Mg400Emulator:
         self._bare = version < FIRST_NUMBERED_REPLIES
         self.ports: dict[int, int] = {}
         self._sockets: list[socket.socket] = []  # bound
-        self._listeners: dict[socket.socket, int] = {}  # of them, those that listen
+        self._listeners: dict[socket.socket, int] = {}  # the bound sockets that listen, with the arm's own port
         self._clients: dict[socket.socket, int] = {}
         self._lock, self._ended = Lock(), Event()
         self._threads: list[Thread] = []
@@ -331,3 +287,48 @@ class Mg400Emulator:
             if readable:
                 time.sleep(POLL_S)
         return True
+
+
+def feedback_packet(arm: Mg400Controller) -> np.ndarray:
+    """The present state as a record of ``PACKET``. The arm follows its targets exactly. Currents and forces are not emulated."""
+    mode, now_s = arm.mode(), arm.update()
+    user, tool = arm.users[arm.user], arm.tools[arm.tool]
+    joints, before = arm.track.joints_deg(now_s), arm.track.joints_deg(now_s - DIFFERENCE_S)
+    seen = _seen(arm, joints, user, tool)
+    speed = (seen - _seen(arm, before, user, tool)) / DIFFERENCE_S
+    half_turn = np.radians(seen[3]) / 2
+    packet = np.zeros((), PACKET)
+    for names, value in (
+        (("length",), PACKET_BYTES),
+        (("test_value",), TEST_VALUE),
+        (("digital_out",), arm.digital_out),
+        (("mode",), int(mode)),
+        (("unix_ms",), int(time.time() * 1000)),
+        (("speed_scaling",), arm.percent["speedfactor"]),
+        (("q_target", "q_actual"), [*joints, 0, 0]),
+        (("qd_target", "qd_actual"), [*((joints - before) / DIFFERENCE_S), 0, 0]),
+        (("tool_target", "tool_actual"), [*seen, 0, 0]),
+        (("tcp_speed_target", "tcp_speed_actual"), [*speed, 0, 0]),
+        (("user_index",), arm.user),
+        (("tool_index",), arm.tool),
+        (("queue_runs",), arm.queue_runs),
+        (("paused",), arm.paused),
+        (("enabled",), arm.enabled),
+        (("running",), mode == Mode.RUNNING),
+        (("error",), bool(arm.alarms)),
+        (("jog",), mode == Mode.JOG),
+        (("robot_type",), ROBOT_TYPE_MG400),
+        (("load",), arm.load),
+        (("user",), [user.x, user.y, user.z, user.r, 0, 0]),
+        (("tool",), [tool.x, tool.y, tool.z, tool.r, 0, 0]),
+        (("target_quaternion", "actual_quaternion"), [np.cos(half_turn), 0, 0, np.sin(half_turn)]),
+    ):
+        for name in names:
+            packet[name] = value
+    return packet
+
+
+def _seen(arm: Mg400Controller, joints: np.ndarray, user: PlanarFrame, tool: PlanarFrame) -> np.ndarray:
+    """X, Y, Z, R of the tool in the user frame."""
+    flange = PlanarFrame.of_pose(arm.kinematics.forward(joints))
+    return (user.inverse() @ flange @ tool).pose[[0, 1, 2, 5]]

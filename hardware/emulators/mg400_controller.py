@@ -13,10 +13,15 @@ from hardware.arms.motion import MotionTrack, Speeds, check_line
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400_grammar import RefusedError
 
-MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0  # chosen for the emulator; those of a real arm are not known
+# Largest accelerations. They are chosen for the emulator, because those of a real arm are not known.
+MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0
+# Numbers of alarms (see ``hardware.arms.dobot_alarms``).
 EMERGENCY_STOP, COLLISIONS = 85, (112, -2)
-START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)  # far from all limits
-JOG_STEP = 1.0  # mm or deg; step of the search for the end of a jog
+# Joints at the start, far from all limits.
+START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)
+# Step of the search for the end of a jog, in mm or deg.
+JOG_STEP = 1.0
+# Longest jog, in mm or deg, which is beyond every limit.
 JOG_REACH = 1000.0
 
 

@@ -1,6 +1,7 @@
-"""The pose of an MG400 from its feedback port alone. An emulated camera needs it when the arm runs in another process.
+"""The twin as a camera on the network: it shows the contact at the pose of an arm that runs in another process.
 
-The twin as a camera on the network: it shows what the pose of an arm in another process makes of the contact."""
+``FeedbackPose`` reads this pose from the feedback ports of an MG400.
+"""
 
 from collections.abc import Callable
 
@@ -18,6 +19,7 @@ from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
 from twin.rig.mounting import Mounting
 from twin.types import Form
 
+# Feedback older than this (s) is not used.
 MAX_AGE_S = 1.0
 
 

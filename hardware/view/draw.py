@@ -1,6 +1,8 @@
-"""A view in a window, where there is a display and an OpenCV that can open one.
+"""A picture of one frame, and a window that shows such pictures.
 
-One picture of one frame: pins and graph over it, the Voronoi map beside it, pose and rates below."""
+The picture has pins and graph over the frame, the Voronoi map beside it, and pose and rates below. The window needs a display, and an
+OpenCV that can open windows.
+"""
 
 import os
 import re
@@ -11,7 +13,13 @@ import numpy as np
 from twin.pins.batch import draw_overlay
 from twin.types import Frame, Observation
 
+# Keys that close the window: q and Esc.
 QUIT = {ord("q"), 27}
+# Height of a line of text, and the margin around the text, in px.
+TEXT_PX, MARGIN_PX = 18, 8
+# Relative change of a cell's area at both ends of the colour scale.
+FULL_CHANGE = 0.3
+WHITE, GRAY = (255, 255, 255), (28, 32, 38)
 
 
 def has_window() -> bool:
@@ -26,7 +34,7 @@ class WindowView:
     def __init__(self, title: str) -> None:
         self._title, self.url = title, "a window"
 
-    def show(self, picture: np.ndarray, stats: dict) -> bool:
+    def show(self, picture: np.ndarray, stats: dict[str, object]) -> bool:
         """Show a picture (H, W, 3) RGB; False once the user closed it."""
         cv2.imshow(self._title, picture[..., ::-1])
         return cv2.waitKey(1) & 0xFF not in QUIT
@@ -37,11 +45,6 @@ class WindowView:
 
     def __exit__(self, *_: object) -> None:
         cv2.destroyWindow(self._title)
-
-
-TEXT_PX, MARGIN_PX = 18, 8
-FULL_CHANGE = 0.3  # relative change of a cell's area at both ends of the colour scale
-WHITE, GRAY = (255, 255, 255), (28, 32, 38)
 
 
 def draw_view(frame: Frame, seen: Observation, rest_area_px2: np.ndarray | None, lines: list[str]) -> np.ndarray:
@@ -66,7 +69,7 @@ def draw_view(frame: Frame, seen: Observation, rest_area_px2: np.ndarray | None,
     return np.vstack([picture, text])
 
 
-def voronoi_map(shape: tuple, seen: Observation, rest_area_px2: np.ndarray | None) -> np.ndarray:
+def voronoi_map(shape: tuple[int, int], seen: Observation, rest_area_px2: np.ndarray | None) -> np.ndarray:
     """Cells (H, W, 3) coloured by their relative change of area: blue smaller, red larger than without contact."""
     canvas = np.full((*shape, 3), GRAY, np.uint8)
     if seen.graph is None or rest_area_px2 is None or not seen.graph.cells:

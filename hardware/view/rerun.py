@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     import rerun
 
 VIEWER, SUFFIX = "viewer", ".rrd"
-ANSWER_S = 8.0  # longest wait for a viewer, at the start and at the end; a new viewer takes a second or two
+# Longest wait for a viewer, at the start and at the end, in s. A new viewer takes a second or two.
+ANSWER_S = 8.0
 
 
 class RerunView:
@@ -78,7 +79,7 @@ class RerunView:
         try:
             stream.flush(timeout_sec=ANSWER_S)
         except RuntimeError as error:
-            raise DeviceError(f"--rerun {self._target}: gone before the end ({error}); the last that was shown is missing there") from error
+            raise DeviceError(f"--rerun {self._target}: gone before the end ({error}); the last pictures are missing there") from error
         finally:
             stream.disconnect()
 

@@ -10,6 +10,7 @@ from hardware.cameras.mjpeg import CONTENT_TYPE, jpeg_of, write_part
 from hardware.errors import DeviceError
 from twin.report.page import render_page
 
+# Interval in s at which a stream looks whether the view was closed.
 WAIT_S = 0.5
 
 

@@ -142,7 +142,7 @@ def test_a_lost_scheduler_ends_the_run_in_one_line(tmp_path, undisturbed):
         worker.kill()
         job.check_records()
         said = finish(job.start("--scheduler", address), 1)
-        assert "none answers there" in said
+        assert "no scheduler answers there" in said
     finally:
         for process in running:
             process.kill()

@@ -1,11 +1,18 @@
-"""The command line ``twin``: the outermost composition root, so it may import every package."""
+"""The command line ``twin``: the outermost composition root, so it may import every package.
+
+Each module of this package holds the commands of one kind of work. A command imports what it runs inside its function, so that
+``--help`` does not wait for libraries that it does not need.
+"""
 
 import sys
+from importlib import import_module
 
 import typer
 
-from scenes.base import SpecError
 from twin.errors import TwinError
+
+# Modules of commands, in the order in which 'twin --help' lists them.
+COMMANDS = ("start", "frames", "calibration", "learning", "studies", "live")
 
 app = typer.Typer(
     name="twin",
@@ -21,26 +28,35 @@ app = typer.Typer(
 
 
 def command_line() -> typer.Typer:
-    """The program with all its commands; each module registers its own when it is imported."""
-    from twin.cli import calibration, frames, learning, live, start, studies  # noqa: F401
-
+    """The program with all its commands. Each module adds its own commands when it is imported."""
+    for name in COMMANDS:
+        import_module(f"twin.cli.{name}")
     return app
 
 
 def main() -> None:
-    """Run the command line; an error meant for the user is one line on stderr and exit code 1."""
+    """Run the command line. An error that a user can act on is printed as one line on stderr, and the exit code is 1."""
     try:
         command_line()()
-    except (TwinError, SpecError) as error:
-        print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
-        print_notes(error)
-        sys.exit(1)
     except KeyboardInterrupt:
         print("twin: interrupted", file=sys.stderr)
         sys.exit(130)
+    except Exception as error:
+        if not _for_user(error):
+            raise
+        print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print_notes(error)
+        sys.exit(1)
+
+
+def _for_user(error: Exception) -> bool:
+    """Whether an error tells the user what to do. The specifications' error is imported only now, because their models load slowly."""
+    from scenes.base import SpecError
+
+    return isinstance(error, TwinError | SpecError)
 
 
 def print_notes(error: BaseException) -> None:
-    """A line on stderr for each note on an error: what went wrong on top of it, as an arm that could not be stopped."""
+    """Print each note of an error on stderr. Notes tell what failed after the error, for example that an arm could not be stopped."""
     for note in getattr(error, "__notes__", ()):
         print(f"twin: note: {' '.join(note.split())}", file=sys.stderr)

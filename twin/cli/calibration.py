@@ -1,12 +1,11 @@
-"""``twin calibrate``: a specification fitted to frames of a real sensor.
+"""Commands that compare the twin with a real sensor, and fit it to one.
 
-``twin validate``: the twin's pins against those of labelled real frames.
-
-``twin realism``: how close the renders of a sensor come to its real frames.
-
-``twin robustness``: how far a sensor may degrade before its pins are lost.
-
-``twin audit``: whether a recording's labels agree with its pins."""
+- ``twin calibrate``: a specification fitted to frames of a real sensor.
+- ``twin validate``: the twin's pins compared with those of labelled real frames.
+- ``twin realism``: how close the renders of a sensor come to its real frames.
+- ``twin robustness``: how far a sensor may degrade before its pins are lost.
+- ``twin audit``: whether a recording's labels agree with its pins.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,13 +13,13 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, FormOrAuto, Out, Quality, Sensor, Workers, if_given, writable_folder
+from twin.cli.options import CORES, Across, FormOrAuto, Out, Quality, Sensor, Workers, if_given, say, tell, writable_folder
 from twin.types import FINE
 
 calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(calibrate_app, name="calibrate")
 
-HELP_CALIBRATE = """Fit light, colours, sharpness and noise of a specification to raw frames of the real sensor.
+HELP_CALIBRATE_OPTICS = """Fit light, colours, sharpness and noise to raw frames.
 
 Start from the shipped specification that is most like your sensor. The frames may show any contact: their pins are found,
 the skin is fitted to them, the twin renders the same state, and its parameters are moved until both agree, by
@@ -30,12 +29,11 @@ contact fits the camera first.
 
 \b
 Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-calibration/ with
-index.html (before, after, what is left, what changed) and the stages' results: an interrupted
-run goes on where it was.
+index.html (before, after, what is left, what changed) and the stages' results. An
+interrupted run continues where it ended.
 
-\b
-What frames cannot tell is held at the starting values, and named: the response curve (gamma) and the
-product of LED power and exposure always, distance and focal length with no-contact frames only.
+What frames cannot tell is kept at the starting values, and named: the response curve (gamma) and the product of LED power and
+exposure in any case; distance and focal length if all frames are without contact.
 
 \b
 Example:
@@ -43,7 +41,7 @@ Example:
 """
 
 
-@calibrate_app.command("optics", help=HELP_CALIBRATE)
+@calibrate_app.command("optics", help=HELP_CALIBRATE_OPTICS)
 def optics(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="folder of raw frames, in contact or not")],
@@ -54,7 +52,6 @@ def optics(
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
 ) -> None:
     from scenes import load_sensor
-    from twin.cli.options import tell
     from twin.cli.progress import shown
     from twin.fit.optics import calibrate_optics
 
@@ -63,21 +60,21 @@ def optics(
     tell(found)
 
 
-CONTACT_HELP = """Fit the contact of a specification to labelled frames of the real sensor on its robot.
+HELP_CALIBRATE_CONTACT = """Fit the contact to labelled frames of the real sensor.
 
 From the no-contact frame (init_0.png) and N labelled frames: contact offset, tool point, angle offset and sign, tilt of the
 surface, direction of the robot's axes in the image, friction, how far the arm gives way and turns, stiffness of the gel relative to
 the skin and how much its volume yields, thickness of the skin, length of the pins. Whether each frame's move had been executed
-when it was taken is found along with them, and frames that fit no story lose their weight. As many frames again, at most 20, are
-kept out of the fit to state the error.
+when it was taken is found along with them. A frame that fits neither case gets a small weight. As many other frames, at most 20,
+are kept out of the fit, and the error is stated on them.
 
 \b
 Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/ with index.html (parameters with their
 uncertainty and what the frames tell of them, frames with their probabilities, before and after), calibration.json and
-contacts/: an interrupted run goes on where it was.
+contacts/. An interrupted run continues where it ended.
 
 \b
-It simulates about 50 + 60 N contacts, of 1 to 3 s each on one core; --workers divides that.
+It simulates about 50 + 60 N contacts. Each takes 1 to 3 s on one core; --workers shares them among processes.
 
 \b
 Example:
@@ -85,13 +82,13 @@ Example:
 """
 
 
-@calibrate_app.command("contact", help=CONTACT_HELP)
+@calibrate_app.command("contact", help=HELP_CALIBRATE_CONTACT)
 def contact(
     sensor: Sensor,
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled recording with its no-contact frame")],
     out: Annotated[Path, typer.Option("--out", metavar="SPEC.toml", help="the specification to write")],
     labels: Annotated[int, typer.Option("--labels", min=4, metavar="N", help="frames to fit to, chosen at random")] = 20,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="of the choice of frames")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
     experiment: Annotated[
         str, typer.Option("--experiment", metavar="E", help="how they were recorded ('twin experiments')")
     ] = "surface-2d",
@@ -104,7 +101,6 @@ def contact(
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor
-    from twin.cli.options import tell
     from twin.cli.progress import shown
     from twin.fit.contact.calibrate import calibrate_to_file
 
@@ -126,12 +122,13 @@ def contact(
     tell(found)
 
 
-HELP_VALIDATE = """Compare the twin's pins with those of labelled real frames.
+HELP_VALIDATE = """Compare the twin's pins with those of real frames.
 
-Each frame's contact is simulated along the arm's own way, from its label and the sensor's [rig] alone ('twin calibrate
-contact' fits one), and the simulated displacement is added to the recorded no-contact pins (init_0.png). Moves that
-move_executed.csv or labels_corrected.csv ('twin audit') calls not executed are left out. Errors are stated apart for executed and
-not executed moves, by depth, angle and shear. For some frames with an executed move they are also stated with one friction a frame.
+The contact of each labelled frame is simulated along the arm's way, from the frame's label and the sensor's [rig] alone ('twin
+calibrate contact' fits a [rig]). The simulated displacement is added to the recorded pins without contact (init_0.png). If
+move_executed.csv or labels_corrected.csv ('twin audit') says that a move was not executed, this move is not simulated. Errors are
+stated separately for executed and not executed moves, by depth, angle and shear. For some frames with an executed move the errors
+are also stated with the friction that fits the frame best.
 
 \b
 Writes index.html, frames.csv (a row a frame), validation.json.
@@ -149,19 +146,18 @@ def validate(
     out: Out,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how it was recorded ('twin experiments')")] = "surface-2d",
     object_: Annotated[
-        str | None, typer.Option("--object", metavar="O", help="what was touched; the experiment's own if not given")
+        str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")
     ] = None,
     limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="N frames, chosen at random")] = None,
     friction_frames: Annotated[
-        int, typer.Option("--friction-frames", min=0, metavar="N", help="frames for which their own friction is sought, 9 contacts each")
+        int, typer.Option("--friction-frames", min=0, metavar="N", help="frames for which the best friction is searched, 9 contacts each")
     ] = 5,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="of the choice of frames")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
     across: Across = FINE,
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor
     from training.studies.validation import validate_contacts
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     with shown() as progress:
@@ -181,17 +177,16 @@ def validate(
     tell(found)
 
 
-HELP_REALISM = """Compare a folder of real raw frames with their renders, pair by pair and as two sets.
+HELP_REALISM = """Compare real raw frames with their renders.
 
-Each real frame's pins are found, the skin is fitted to them, and the sensor in that state is rendered and captured. Every
-cap stands where it stood in the real frame, so what differs is camera and light. With --pose-aligned the whole twin is
-judged as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5 turns in deg, a tap on a flat plate) become
-contacts. The arm's kinematics is fitted to the pins of one half of the frames, and the error is stated on the other half.
+They are compared pair by pair, and as two sets. Each real frame's pins are found, the skin is fitted to them, and the sensor in
+that state is rendered and captured. Every cap stands where it stood in the real frame, so the differences come from camera and
+light. With --pose-aligned the whole twin is judged as well: the labels in targets.csv (pose_3 depth in mm, pose_4 and pose_5
+turns in deg, a tap on a flat plate) become contacts. The arm's kinematics is fitted to the pins of one half of the frames, and
+the error is stated on the other half.
 
-\b
-Reads: a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder).
-Frames that are black, saturated, of another size or without all their pins are
-refused by name; exit code 0 if at least one frame was good.
+It reads a folder of raw colour or gray frames of one size (images/ with targets.csv, or any folder). Frames that are black,
+saturated, of another size or without all their pins are refused by name. The exit code is 0 if at least one frame was good.
 
 \b
 Writes:
@@ -205,9 +200,9 @@ Writes:
   pictures/       real, rendered and difference of each frame
 
 \b
-How to read it: PSNR and SSIM of two real frames with the same contact are the best that can
-be reached. Two-sample accuracy is the share of patches of unseen frames that a small network
-puts into the right set: at 100 % they are always told apart, at 50 % never.
+How to read it: no render can do better than PSNR and SSIM of two real frames with the
+same contact. Two-sample accuracy is the share of patches of unseen frames that a small
+network puts into the right set: at 100 % it always tells real from rendered, at 50 % never.
 
 \b
 Example:
@@ -222,12 +217,11 @@ def realism(
     out: Out,
     pose_aligned: Annotated[bool, typer.Option("--pose-aligned", help="also render from the labels alone")] = False,
     limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = None,
-    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = Quality.STANDARD,
+    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
 ) -> None:
     from scenes import load_sensor
     from training.studies.realism import compare_with_renders
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     with shown() as progress:
@@ -237,7 +231,7 @@ def realism(
             writable_folder(out),
             pose_aligned=pose_aligned,
             limit=limit,
-            quality=quality.value,
+            quality=quality,
             test=two_sample,
             progress=progress,
         )
@@ -257,19 +251,20 @@ Writes:
   curves.csv      every measure against severity, with its 90 % interval
   frames.csv      every frame
   real-on-rendered.csv  with --frames: where real and rendered frames fail, and their ratio
-  cells/          finished work: an interrupted run goes on where it was; work from another sensor, other weights or another
-                  version is not used
+  cells/          finished work: an interrupted run continues where it ended; work of
+                  another sensor, other weights or another version is not used
 
 \b
-With --frames DIR real frames take the place of rendered ones. Only conditions that act on a
-frame are swept, and the truth is the pins on which several detectors agree. Raw frames are shown
-on the envelope of rendered ones: how much of a sound sensor's margin has this one left? For that
-rendered frames are swept too; --no-rendered leaves it out.
+With --frames DIR real frames take the place of rendered ones. Then only conditions that
+act on a frame are swept, and the truth is the pins on which several detectors agree.
+Raw frames are compared with the envelope of rendered ones, which tells how much of a
+sound sensor's margin this sensor has left. Rendered frames are swept for that, too;
+--no-rendered leaves this out.
 
 \b
 A file for --conditions:
   steps = [0.1, 0.3, 1.0]               # severities
-  pairs = [["leds-dim", "noise"]]       # grow together
+  pairs = [["leds-dim", "noise"]]       # conditions that grow together
   [[condition]]
   name = "noise"
   severe = 0.2                          # the parameter at severity 1
@@ -301,7 +296,6 @@ def robustness(
 ) -> None:
     from scenes import load_sensor
     from training.studies import degradation
-    from twin.cli.options import say, tell
     from twin.cli.progress import shown
     from twin.judge.degradation.conditions import condition_lines
     from twin.judge.degradation.plan import SweepPlan, load_plan
@@ -324,14 +318,19 @@ def robustness(
     tell(found)
 
 
-HELP_AUDIT = """Find what is wrong with the labels of a flat-surface recording, from its pins and targets.csv alone.
+HELP_AUDIT = """Find what is wrong with the labels of a recording.
 
-It looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames that fit no label,
-frames that occur twice, drift along the table, and anything odd about the files. It needs pose_2, pose_6, move_1, move_6.
+It needs a recording of a flat surface with the labels pose_2, pose_6, move_1 and move_6, and uses its pins and targets.csv alone. It
+looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames that fit no label,
+frames that occur twice, drift along the table, and faults of the files.
 
 \b
-Writes labels_corrected.csv (image_name, executed, the four labels corrected, misfit to each story, findings),
-audit.json, audit.png, audit.html. Copy labels_corrected.csv beside targets.csv, and 'twin train' corrects the labels by it.
+Writes:
+  labels_corrected.csv  image_name, executed, the four corrected labels, the misfit to
+                        each explanation, findings
+  audit.json, audit.png, audit.html
+
+Copy labels_corrected.csv beside targets.csv, and 'twin train' corrects the labels with it.
 """
 
 
@@ -344,7 +343,6 @@ def audit(
 ) -> None:
     from scenes import load_sensor
     from training.studies.label_audit import audit_recording
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     spec = load_sensor(sensor)

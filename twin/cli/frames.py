@@ -1,10 +1,10 @@
-"""``twin preprocess``: the real pipeline over frames, wherever they come from.
+"""Commands on frames, rendered or real.
 
-``twin graph``: graphs of frames or of found pins, as arrays and pictures.
-
-``twin tune``: parameters of the pin detection, found from a user's own frames.
-
-``twin check``: is the sensor well?"""
+- ``twin preprocess``: find the pins in frames.
+- ``twin graph``: graphs of frames or of found pins, as arrays and pictures.
+- ``twin tune``: parameters of the pin detection, found from a user's own frames.
+- ``twin check``: whether the sensor is well.
+"""
 
 from collections.abc import Iterator
 from enum import StrEnum
@@ -14,20 +14,21 @@ from typing import Annotated, Any, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, Out, Sensor, if_given, writable_folder
+from twin.cli.options import FormOrAuto, Out, Sensor, if_given, say, tell, writable_folder
 
-HELP_PREPROCESS = """Find the pins in every frame of a folder, a video, an image or a recording.
+HELP_PREPROCESS = """Find the pins in every frame.
 
-Understands any folder of images, videos, and the recordings' own folders (frames_bw/ or images/ or sensor_images/ or
-processed_images/ with targets.csv and metadata). init_* is the no-contact reference, not a frame. Broken frames are
-listed and skipped; exit code 0 if at least one frame was good.
+The frames are an image, a folder of images, a video, or a folder of the recordings (frames_bw/, images/, sensor_images/ or
+processed_images/ with targets.csv and metadata). A file init_* is the reference without contact, not a frame. Broken frames are
+listed and skipped. The exit code is 0 if at least one frame was good.
 
 \b
 Writes pins.npz:
   image_name (M,)    base names, in the order of targets.csv where there is one
   pins_px (M, N, 2)  (x, y) in px of the input frame, pixel centres at integers, the
                      specification's pin order; NaN where a pin has no blob of its own
-  predicted_px       same shape: the motion model's guess for those pins only
+  predicted_px       same shape: the motion model's guess for the pins that are NaN in
+                     pins_px, NaN for all others
   area_px2 (M, N)    Voronoi cell areas
   found (M,), valid (M,)
 and summary.json (frames, exact_fraction, ms.<stage>.p50|p95|p99, parameters, failed).
@@ -43,7 +44,6 @@ def preprocess(
     overlay: Annotated[bool, typer.Option("--overlay", help="also write a picture of every frame with its pins and graph")] = False,
 ) -> None:
     from scenes import load_sensor
-    from twin.cli.options import say
     from twin.cli.progress import shown
     from twin.pins.batch import preprocess_recording
     from twin.progress import stage
@@ -56,7 +56,7 @@ def preprocess(
 
 
 def _lines(summary: dict[str, Any], pins: int) -> Iterator[str]:
-    """What ``summary.json`` says, for people."""
+    """What ``summary.json`` says, in words."""
     yield (
         f"{summary['frames']} frames, all {pins} pins found in {100 * summary['exact_fraction']:.2f} %, "
         f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
@@ -66,7 +66,9 @@ def _lines(summary: dict[str, Any], pins: int) -> Iterator[str]:
     yield from (f"skipped {failed['image_name']}: {failed['reason']}" for failed in summary["failed"])
 
 
-HELP_GRAPH = """Build the graph of a frame, a folder of frames, or of a pins.npz.
+HELP_GRAPH = """Build the graphs of frames or of found pins.
+
+The input is a frame, a folder of frames, or the pins.npz of 'twin preprocess'.
 
 \b
 knn       edges from each pin to its 6 nearest (directed)
@@ -75,12 +77,16 @@ voronoi   the same edges, and the area of each pin's Voronoi cell inside the enl
           boundary around the outermost pins
 
 \b
-Writes graph.npz: image_name (M,), nodes_px (M, N, 2), area_px2 (M, N), edges (E, 2) of all
-graphs one after the other (graph k has edges[edge_start[k]:edge_start[k+1]]), and pictures of
-the first: graph.png, and surface.png (cell area as a surface: no contact, contact, difference).
+Writes:
+  graph.npz     image_name (M,), nodes_px (M, N, 2), area_px2 (M, N), and edges (E, 2) of
+                all graphs one after the other: graph k has the edges
+                edges[edge_start[k]:edge_start[k+1]]
+  graph.png     the first graph
+  surface.png   its cell areas as a surface: no contact, contact, difference
 
-With --legacy (frames in the recordings' form only) pins, edges and areas are those of the published release: nodes in its
-detector's order, px of its resized image about its scalar median; a frame without exactly all pins is left out.
+With --legacy (for frames in the recordings' form) pins, edges and areas are computed as by the published release: the nodes are in
+its detector's order, in px of its resized image, relative to its scalar median. A frame in which not exactly all pins are found is
+left out.
 """
 
 
@@ -102,23 +108,21 @@ def graph(
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
 ) -> None:
     from scenes import load_sensor
-    from twin.cli.options import tell
     from twin.pins.graph_files import write_graphs_of
 
     made = write_graphs_of(path, load_sensor(sensor), writable_folder(out), kind=kind.value, form=form, legacy=legacy)
     tell(made)
 
 
-HELP_TUNE = """Find mask, crop, threshold and blob parameters for your own frames.
+HELP_TUNE = """Find parameters of the pin detection for your own frames.
 
-It uses nothing of the sensor but the layout of its pins (count, rings, round or hexagon). Give some frames, in contact or not, as
-they come from the camera, or as a recorder thresholded them (then there is no crop, and the threshold hardly matters).
+These are mask, crop, threshold and blob parameters. Of the sensor's specification only the layout of the pins is used (count, rings,
+round or hexagon). Give some frames, with or without contact, as they come from the camera or as a recorder thresholded them
+(then there is no crop, and the threshold hardly matters).
 
-\b
-Prints how sure it is: in how many frames all pins are found, by how many gray levels the
-threshold may move, and what speaks against it.
-Writes a file for 'twin robustness --pipeline' and 'twin check --pipeline'; its [blob] section is what
-[pipeline.raw] (or [pipeline.recording]) of a sensor's specification takes.
+It prints how reliable the result is: in how many frames all pins are found, by how many gray levels the threshold may change, and
+what speaks against the result. It writes a file for 'twin robustness --pipeline' and 'twin check --pipeline'. The section [blob] of
+this file can be copied to [pipeline.raw] or [pipeline.recording] of a sensor's specification.
 
 \b
 Example:
@@ -138,7 +142,6 @@ def tune_command(
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 12,
 ) -> None:
     from scenes import load_sensor
-    from twin.cli.options import tell
     from twin.cli.progress import shown
     from twin.pins.tune_files import tune_on_frames
 
@@ -147,14 +150,14 @@ def tune_command(
     tell(found)
 
 
-HELP_CHECK = """Is the sensor well? Brightness, focus, missing pins, specks, glare, and drift from its calibration; and what to do.
+HELP_CHECK = """Check whether the sensor is well, and say what to do.
 
-Looks at a frame, a folder of frames, a video or a camera, in contact or not, and compares with what the sensor's specification
-promises (the twin draws that sensor's frame). Thresholded recordings tell of pins, specks and place only. A lost pin, or a spot,
-counts as a fault of the sensor if it is so in half of the frames: give frames of several contacts.
+It checks brightness, focus, missing pins, specks, glare, and drift from the calibration. It looks at a frame, a folder of frames, a
+video or a camera, with or without contact, and compares the frames with the one that the twin draws from the sensor's specification.
+Thresholded recordings show pins, specks and place only. A lost pin or a spot counts as a fault of the sensor if it is
+there in half of the frames, so give frames of several contacts.
 
-\b
-Exit code: 0 if everything is good or to be watched, 2 if something is bad.
+The exit code is 2 if something is bad, else 0.
 
 \b
 Example:
@@ -171,11 +174,10 @@ def check(
     sensor: Sensor,
     form: FormOrAuto = None,
     pipeline: Annotated[Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="what 'twin tune' wrote")] = None,
-    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="look at most at N frames, evenly spread")] = 20,
+    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="look at no more than N frames, evenly spread")] = 20,
 ) -> None:
     from hardware.examining import examine_sensor
     from scenes import load_sensor
-    from twin.cli.options import say
     from twin.cli.progress import shown
     from twin.pins import load_detector
 

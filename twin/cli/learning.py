@@ -1,12 +1,11 @@
-"""``twin dataset``: simulated recordings with ground truth.
+"""Commands that make data sets and models.
 
-``twin train``: a model from a labelled recording.
-
-``twin evaluate``: how good a trained model is.
-
-``twin predict``: the pose in one frame.
-
-``twin pack``: a small copy of a run."""
+- ``twin dataset``: a simulated recording with ground truth.
+- ``twin train``: a model from labelled recordings.
+- ``twin evaluate``: how good a trained model is.
+- ``twin predict``: the pose in each frame.
+- ``twin pack``: a small copy of a trained model.
+"""
 
 from enum import StrEnum
 from pathlib import Path
@@ -15,14 +14,14 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, Device, FormOrAuto, Out, Quality, Sensor, Target, Workers, if_given, writable_folder
+from twin.cli.options import CORES, Across, Device, FormOrAuto, Out, Quality, Sensor, Target, Workers, if_given, say, tell, writable_folder
 from twin.types import FINE
 
-HELP_DATASET = """Simulate a labelled data set: the contacts of an experiment, in the recordings' own format, with ground truth.
+HELP_DATASET = """Simulate a labelled data set with ground truth.
 
-For each contact a pose and a move are drawn from the experiment's ranges ('twin experiments' lists them; robot coordinates).
-The arm's way is followed by finite elements, and the last state, or every converged one, becomes a frame. A contact that
-does not converge is listed, and drawn anew.
+It simulates the contacts of an experiment and writes them in the recordings' own format. For each contact a pose and a move are drawn
+from the experiment's ranges, in robot coordinates ('twin experiments' lists them). Finite elements follow the arm's way, and the last
+state, or every converged state, becomes a frame. A contact that does not converge is listed, and drawn again.
 
 \b
 --images raw        the camera's frames
@@ -31,8 +30,8 @@ does not converge is listed, and drawn anew.
          none       pins alone, without rendering (vgnn and the other graph
                     networks train on them; 'twin train' reads them like frames)
 --states all        also the states on the way, labelled by how far tap and move have
-                    gone; all states of a contact share a path_id, and training and
-                    validation parts are split by it
+                    gone. All states of a contact share a path_id, and they all go
+                    either into the training or into the validation part
 --randomise R       what differs from contact to contact ('twin randomisations')
 
 \b
@@ -42,13 +41,13 @@ Writes:
   truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in contact
                       and sliding, the object's pose: one row a frame
   draws.csv           what was drawn for each contact; failures.csv: draws that failed
-  generation.json     everything resolved
-  made_by.json        the code that makes it; a version whose code for contacts differs
-                      does not go on with it, as its frames would differ
-  records/            one for each finished contact; with them the same command goes on
+  generation.json     all resolved specifications and options
+  made_by.json        the code that made it; a version whose code for contacts differs
+                      does not continue the data set, because its frames would differ
+  records/            one for each finished contact; with them the same command continues
                       after any end, or to a larger --count
 
-The result depends on the options alone. It is the same, byte by byte, with any number of workers and after any interruption.
+The result depends on the options alone. Every byte is the same with any number of workers and after any interruption.
 
 \b
 Examples:
@@ -89,9 +88,9 @@ def dataset(
     randomise: Annotated[
         str | None, typer.Option("--randomise", metavar="R", help="randomisation name or file; nothing if not given")
     ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="of all that is drawn; the experiment's own if not given")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of all draws; the experiment's own if not given")] = None,
     workers: Workers = CORES,
-    scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="of a running Dask scheduler, whose workers do it")] = "",
+    scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
     quality: Annotated[
         Quality | None, typer.Option(help="samples per pixel", show_default="preview for --images recording, else standard")
     ] = None,
@@ -99,7 +98,6 @@ def dataset(
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation.run import config_for, simulate_dataset
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     config = config_for(
@@ -110,7 +108,7 @@ def dataset(
         states=states.value,
         randomisation=if_given(load_randomisation, randomise),
         seed=seed,
-        quality=quality.value if quality else None,
+        quality=quality,
         across=across,
     )
     with shown() as progress:
@@ -127,19 +125,20 @@ tac-vgnn-release  the same with the dense layers of the published code: 128, 96
 gnn               the paper's graph network on 6 nearest neighbours, without areas
 cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters on 128 x 128 px
 
-Labels are columns of the recording's table: a preset (surface-2d: pose_2 pose_6; surface-2d-shear: also move_1 move_6;
-surface-3d: pose_3 pose_4 pose_5; edge-2d, edge-3d) or names with commas between. With --labels corrected, moves that
-were not executed are taken out, where move_executed.csv or labels_corrected.csv beside the table tells which.
+--target selects the labels, which are columns of the recording's table. It is a preset (surface-2d: pose_2 pose_6; surface-2d-shear:
+also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d) or names with commas between. With --labels corrected, a
+move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the table says so.
 
-Depth and angle of simulated contacts are those of the surface that was touched, whatever its shape: indentation along its normal
-at the nearest place, and the angle from that normal. So data sets of several objects can be joined: give --data once for each.
+Depth and angle of simulated contacts are relative to the touched surface, whatever its shape: the indentation along the normal at
+the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
 
-A random fifth of the rows is kept out of training for 'twin evaluate'; of simulated data a fifth of the contacts, with all their
-states. --split gives its seed; --split -1 trains on all.
+A random fifth of the rows is kept out of training for 'twin evaluate'. Of simulated data it is a fifth of the contacts, with all
+their states. --split gives the seed of this choice; with --split -1 all rows are trained on.
 
 \b
-Writes to --out: config.json (resolved, with the sensor and the pipeline's parameters), curves.csv, weights.pt, and
-while it runs checkpoint.pt. A run that was ended goes on where it was when it is started again with the same options.
+Writes to --out: config.json (resolved, with the sensor and the parameters of the
+pipeline), curves.csv, weights.pt, and checkpoint.pt while it runs. The same command
+continues a run that was interrupted.
 """
 
 
@@ -151,10 +150,10 @@ def train(
     out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
     target: Target = "surface-2d",
     labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
-    seed: Annotated[int, typer.Option("--seed", help="of weights and order")] = 0,
+    seed: Annotated[int, typer.Option("--seed", help="seed of weights and order")] = 0,
     split: Annotated[int, typer.Option("--split", help="seed of the fifth kept out of training; -1: none")] = 0,
-    epochs: Annotated[int | None, typer.Option("--epochs", help="instead of the model's own number")] = None,
-    batch: Annotated[int | None, typer.Option("--batch", help="instead of the model's own size")] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
+    batch: Annotated[int | None, typer.Option("--batch", help="batch size, instead of the model's own")] = None,
     members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
     kernel: Annotated[
         bool | None,
@@ -167,7 +166,6 @@ def train(
 ) -> None:
     from scenes import load_sensor
     from training.train import train_model
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     with shown() as progress:
@@ -197,29 +195,33 @@ HELP_EVALUATE = """Judge a trained model on a labelled recording.
 
 \b
 --rows validation  the fifth of the run's own recording that was kept out of its training
---rows all         every row: for a recording that the model has not seen
+--rows all         every row, for a recording that the model has not seen
 
 \b
-Writes predictions.csv (image_name, and for every label <label>_true, _pred, _lo90, _hi90; executed_probability, valid),
-metrics.json (mean absolute errors against raw and corrected labels, overall and by depth, angle and shear; coverage of the
-90 % intervals; slope of the angle's error on move_6 over frames whose move was not executed; ms per frame), errors.png.
+Writes:
+  predictions.csv  image_name; <label>_true, _pred, _lo90, _hi90 of every label;
+                   executed_probability, valid
+  metrics.json     mean absolute errors against raw and corrected labels, overall and by
+                   depth, angle and shear; coverage of the 90 % intervals; slope of the
+                   angle's error on move_6 over frames whose move was not executed; ms
+                   per frame
+  errors.png
 
-With --robustness it also writes robustness.csv: errors of single frames whose image is changed (1 % scale, 2 px shift, 1 deg
-turn, 5 pins erased, each in a random direction), and how much larger they are than those of the same frames unchanged.
+With --robustness it also writes robustness.csv: errors on frames whose image is changed (1 % scale, 2 px shift, 1 deg turn, 5 pins
+erased, each in a random direction), and how much larger they are than the errors on the unchanged frames.
 """
 
 
 @app.command("evaluate", help=HELP_EVALUATE)
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights go with the package")],
-    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; all that the run was trained on")],
+    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
+    data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give all that the run was trained on")],
     out: Out,
     rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
     labels: Annotated[str, typer.Option("--labels", help="truth in predictions.csv and errors.png: corrected or raw")] = "corrected",
     robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
 ) -> None:
     from training.studies.evaluation import evaluate_run
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     with shown() as progress:
@@ -227,27 +229,27 @@ def evaluate(
     tell(found)
 
 
-HELP_PREDICT = """Tell the pose in a frame, or in every frame of a folder or video, with its 90 % interval.
+HELP_PREDICT = """Tell the pose in every frame, with its 90 % interval.
 
-The model carries its sensor and pipeline; a frame of another sensor is refused. A recording with a
-frame without contact (init_0.png) tells where its pins are at rest.
+The model contains its sensor and pipeline, and a frame of another sensor is refused. If a recording has a frame without contact
+(init_0.png), the pins are counted from that frame.
 """
 
 
 @app.command("predict", help=HELP_PREDICT)
 def predict(
-    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights go with the package")],
+    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
 ) -> None:
     from training.studies.evaluation import predict_frames
-    from twin.cli.options import say
 
     say(predict_frames(run, frame).lines())
 
 
-HELP_PACK = """Write a small copy of a finished training run, half as precise and less than a tenth as large.
+HELP_PACK = """Write a small copy of a finished training run.
 
-It serves wherever a RUN does. Those that go with the package, below training/weights, were made so:
+Its numbers have half the precision, and its size is less than a tenth. It can be given wherever a RUN is asked for. The shipped
+weights below training/weights were made with these commands:
 
 \b
   twin study sim-to-real --sensor mg400-331 --frames DIR --contacts surface-2d-wide --draws 2 --epochs 60 --out study
@@ -259,7 +261,6 @@ It serves wherever a RUN does. Those that go with the package, below training/we
 def pack(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, trained with --no-kernel")], out: Out) -> None:
     from training.estimator import PoseEstimator
     from training.packed import WEIGHTS, pack
-    from twin.cli.options import say
 
     PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
     size = pack(run, writable_folder(out))

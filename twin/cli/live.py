@@ -1,12 +1,10 @@
-"""``twin live``: a camera through a model, shown as it comes.
+"""Commands that work with a camera and an arm, real or emulated.
 
-``twin collect``: labelled frames from a camera and an arm.
-
-``twin servo``: follow an object's outline.
-
-``twin emulate``: devices emulated on this machine, for any client.
-
-``twin emulate camera``: the twin as a camera on the network."""
+- ``twin live``: a model's estimates on a camera's frames, shown as they come.
+- ``twin collect``: labelled frames from a camera and an arm.
+- ``twin servo``: follow an object's outline.
+- ``twin emulate``: arms, and the sensor's camera, emulated on this machine for any client.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -29,16 +27,21 @@ from twin.cli.options import (
     PlainLight,
     Sensor,
     ServoName,
+    arm_let_go,
+    say,
+    tell,
     writable_folder,
 )
 
-HELP_LIVE = """Show what a model makes of a camera's frames: pins, graph, Voronoi map, pose with its 90 % interval, rates.
+HELP_LIVE = """Show a model's estimates on a camera's frames.
 
-A window opens if there is a display, and an OpenCV that can open one. Otherwise a page is served for the browser; its address is
-printed. With --rerun (package rerun-sdk) it is Rerun's viewer, or its file: frame, pins, graph and pose on a time line.
-With --record DIR every frame is kept, lossless, with its estimate; the folder is readable even if the program is killed.
---replay DIR gives the same frames again, and says whether the estimates are the same. With --at-rest first the camera must see
-no contact at the start; that frame is kept with the session.
+It shows pins, graph, Voronoi map, the pose with its 90 % interval, and rates. They are shown in a window if there is a display and an
+OpenCV that can open a window. Otherwise a page is served for the browser, and its address is printed. With --rerun (package
+rerun-sdk) they go to Rerun's viewer or to a file: frame, pins, graph and pose on a time line.
+
+With --record DIR every frame is kept, lossless, with its estimate. The folder can be read even if the program was killed. --replay
+DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
+contact at the start; the first frame is then kept with the session.
 
 \b
   twin live --camera /dev/video0 --model RUN
@@ -52,19 +55,18 @@ def live(
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
     record: Annotated[Path | None, typer.Option("--record", metavar="DIR", help="new folder for the session")] = None,
-    replay: Annotated[Path | None, typer.Option("--replay", metavar="DIR", help="a recorded session instead of a camera")] = None,
+    replay: Annotated[Path | None, typer.Option("--replay", metavar="DIR", help="recorded session, instead of a camera")] = None,
     headless: Annotated[bool, typer.Option("--headless", help="show nothing, print the figures at the end")] = False,
     rerun: Annotated[
         str | None, typer.Option("--rerun", metavar="T", help="viewer, a new file *.rrd, or a viewer's address rerun+http://...")
     ] = None,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="stop after this time")] = None,
-    count: Annotated[int | None, typer.Option("--count", min=1, help="stop after so many frames")] = None,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="stop after this number of frames")] = None,
     at_rest: AtRest = NONE,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="of the page; 0: a free one")] = 8080,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; 0: a free one")] = 8080,
 ) -> None:
     from hardware.live import WatchPlan, watch
     from training.estimator import PoseEstimator
-    from twin.cli.options import arm_let_go, say
 
     plan = WatchPlan(
         camera=camera,
@@ -87,14 +89,17 @@ def tell_view(url: str) -> None:
     print(f"showing in {url}; Ctrl-C ends it", flush=True)
 
 
-HELP_COLLECT = """Collect labelled frames: for each contact a random pose and shear, a tap, and one frame.
+HELP_COLLECT = """Collect labelled frames with a camera and an arm.
 
-A frame is taken only after the arm has said that it stands at the commanded pose, and it is exposed after that. The pose that
-the arm said is the label. The arm goes around the object to 50 mm before it. Where the object has no end (a plane, an edge), it goes
-straight, and stays in front of it. It lifts between contacts, and ends 50 mm clear, disabled. The arm's links and the object's holder
-are not known: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
-The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json);
-contacts.jsonl has the times. The same command goes on where it was ended.
+Each contact has a random pose and shear, a tap, and one frame. This frame was exposed after the arm reported that it stands at the
+commanded pose. The label is the reported pose.
+
+The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
+stays in front of it. It lifts off between contacts; at the end it stands 50 mm away, disabled. The program does not know the arm's
+links and the object's holder: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
+
+The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json). The times are in
+contacts.jsonl. The same command continues an interrupted collection.
 
 \b
   twin collect --camera twin --arm simulated --sensor mg400-331 --experiment surface-2d --count 200 --out data/first
@@ -116,12 +121,11 @@ def collect_command(
     parameters: ServoName = "surface",
     form: FormOrAuto = None,
     limits: Limits = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="of the draws; the experiment's own if not given")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of the drawn contacts; the experiment's own if not given")] = None,
     plain_light: PlainLight = False,
 ) -> None:
     from hardware.collect import CollectPlan, collect_frames
     from scenes import load_experiment, load_object, load_sensor, load_servo
-    from twin.cli.options import arm_let_go, say
     from twin.cli.progress import shown
 
     asked = load_experiment(experiment)
@@ -143,13 +147,17 @@ def collect_command(
     say(collected.lines())
 
 
-HELP_SERVO = """Follow an object's outline with the sensor, frame by frame: pose-based tactile servoing.
+HELP_SERVO = """Follow an object's outline with the sensor.
 
-It runs in the twin unless told otherwise: the arm is simulated, and the frames are drawn for the contact that its pose makes. With
---camera and --arm the same loop runs on devices, real or emulated. The arm goes around the object to 50 mm before it. Where the object
-has no end (a plane, an edge), it goes straight, and stays in front of it. The arm's links and the object's holder are not known.
-Whatever happens (Ctrl-C too), the arm stops, retreats along the surface's normal and is disabled. Before it touches anything, a frame
-is taken that the model counts pins from. With --at-rest none it counts from the specification's layout; models on graphs always do.
+This is pose-based tactile servoing, frame by frame. By default it runs in the twin: the arm is simulated, and the frames are drawn
+for the contact at its pose. With --camera and --arm the same loop runs on devices, real or emulated.
+
+The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
+stays in front of it. The program does not know the arm's links and the object's holder: make sure that both have room. After any
+end, Ctrl-C included, the arm stops, retreats along the surface's normal and is disabled.
+
+Before the arm touches anything, a frame is taken from which the model counts pins. With --at-rest none it counts them from the
+specification's layout, as models on graphs always do.
 
 \b
   twin servo --object can --model RUN --out out/servo
@@ -157,9 +165,14 @@ is taken that the model counts pins from. With --at-rest none it counts from the
   twin servo --object can --model RUN --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1 --stream --steps 60 --out out/live
 
 \b
-Writes to --out: trajectory.csv, trajectory.png, measures.json (smoothness S as the Tac-VGNN paper defines it, path, depth
-and angle errors, jerk, share of the way, lost contacts; rate, latency and age of the frames), session/ with --record.
-Exit code 1 if it ended early.
+Writes to --out:
+  trajectory.csv, trajectory.png
+  measures.json   smoothness S as the Tac-VGNN paper defines it, path, depth and angle
+                  errors, jerk, share of the way, lost contacts; rate, latency and age
+                  of the frames
+  session/        with --record
+
+The exit code is 1 if it ended early.
 """
 
 
@@ -171,20 +184,19 @@ def servo(
     camera: Camera = "twin",
     arm: ArmOption = "simulated",
     parameters: ServoName = "surface",
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="instead of once around the object")] = None,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")] = None,
     stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
     rate: Annotated[float, typer.Option("--rate", min=0.1, help="decisions a second with --stream")] = 10.0,
     limits: Limits = None,
     record: Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="of the twin's noise")] = 0,
-    known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo has it: measure against it")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
+    known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")] = False,
     plain_light: PlainLight = False,
     at_rest: AtRest = FIRST,
 ) -> None:
     from hardware.following import FollowPlan, follow
     from scenes import load_object, load_servo
     from training.estimator import PoseEstimator
-    from twin.cli.options import arm_let_go, tell
     from twin.cli.progress import shown
 
     plan = FollowPlan(
@@ -209,7 +221,8 @@ def servo(
 
 
 emulate = typer.Typer(
-    help="Emulate a device on this machine until SIGTERM or Ctrl-C; 'ready ...' is printed when it listens.", no_args_is_help=True
+    help="Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.",
+    no_args_is_help=True,
 )
 app.add_typer(emulate, name="emulate")
 
@@ -220,9 +233,8 @@ TimeScale = Annotated[float, typer.Option("--time-scale", help="how much faster 
 
 
 def faults_of(asked: list[str] | None, known: dict[str, tuple[float | None, str]]) -> tuple[str, ...]:
-    """The faults that are asked for; lists those that are known, and leaves, where that is asked for."""
+    """The faults that the user asks for. If the user asks for help, the known faults are printed and the command ends."""
     from hardware.emulators.running import fault_lines
-    from twin.cli.options import say
 
     if asked and "help" in asked:
         say(fault_lines(known))
@@ -235,11 +247,13 @@ def mg400(
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
     port_offset: Annotated[int, typer.Option("--port-offset", help="added to 29999 and 30003 to 30006")] = 0,
     fault: FaultOption = None,
-    firmware: Annotated[str, typer.Option("--firmware", help="version whose manners to have; below 1.5.6 bare echoes")] = "1.7.0",
+    firmware: Annotated[str, typer.Option("--firmware", help="version to behave like; below 1.5.6 it answers bare echoes")] = "1.7.0",
     lenient: Annotated[bool, typer.Option("--lenient", help="as firmware 1.5.5: bare echoes, no reply to moves")] = False,
     time_scale: TimeScale = 1.0,
 ) -> None:
-    """Emulate a Dobot MG400: dashboard 29999, motion 30003, feedback 30004 (8 ms), 30005 (200 ms) and 30006 (50 ms).
+    """Emulate a Dobot MG400 on its network ports.
+
+    The ports are 29999 (dashboard), 30003 (motion), and 30004 (every 8 ms), 30005 (200 ms) and 30006 (50 ms) for feedback.
 
     Try it: twin emulate mg400 &  then in Python: open_arm("mg400:127.0.0.1").
     """
@@ -256,7 +270,9 @@ def magician(
     fault: FaultOption = None,
     time_scale: TimeScale = 1.0,
 ) -> None:
-    """Emulate a Dobot Magician on a pseudo-terminal; its device is printed.
+    """Emulate a Dobot Magician on a pseudo-terminal.
+
+    The name of its device is printed.
 
     Try it: twin emulate magician --link /tmp/magician &  then in Python: open_arm("magician:/tmp/magician").
     """
@@ -267,9 +283,10 @@ def magician(
     emulate_magician(link=link, faults=faults, time_scale=time_scale)
 
 
-HELP_EMULATE_CAMERA = """Emulate the sensor's camera: a stream of JPEGs over HTTP that shows the contact at an emulated arm's pose.
+HELP_EMULATE_CAMERA = """Emulate the sensor's camera as a stream over HTTP.
 
-The pose comes from the arm's feedback ports, so that camera and arm are processes of their own.
+The stream of JPEGs shows the contact at the pose of an emulated arm. The pose comes from the arm's feedback ports, so camera and arm
+may run in different processes.
 
 \b
   twin emulate mg400 &
@@ -284,7 +301,7 @@ def camera(
     object_name: Object,
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: a free one")] = 8081,
-    fps: Annotated[float, typer.Option("--fps", min=0.1, help="no more pictures a second")] = 30.0,
+    fps: Annotated[float, typer.Option("--fps", min=0.1, help="largest number of pictures a second")] = 30.0,
     parameters: ServoName = "surface",
     fault: FaultOption = None,
     plain_light: PlainLight = False,

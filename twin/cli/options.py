@@ -1,15 +1,10 @@
-"""What a command prints of a result, on stdout.
-
-How a command that moves an arm may be ended.
-
-Options that several commands share."""
+"""What several commands share: their options, what they print of a result, and how a command that moves an arm may be ended."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Protocol, TypeVar
+from typing import Annotated, Literal, Protocol, TypeVar
 
 import typer
 
@@ -17,41 +12,8 @@ from twin.cli import print_notes
 from twin.errors import TwinError
 from twin.types import Form
 
-
-class Result(Protocol):
-    """What a function that does a command's work returns."""
-
-    @property
-    def written(self) -> Sequence[Path]:
-        """The files that it wrote."""
-
-    def lines(self) -> Iterable[str]:
-        """What it found, for people."""
-
-
-def say(lines: Iterable[str]) -> None:
-    """Print lines, each as soon as it is there."""
-    for line in lines:
-        print(line, flush=True)
-
-
-def tell(result: Result) -> None:
-    """Print what was found and where it was written."""
-    say(result.lines())
-    say(f"wrote {path}" for path in result.written)
-
-
-@contextmanager
-def arm_let_go() -> Iterator[None]:
-    """SIGTERM and a closed terminal end the command as Ctrl-C does. What could not be let go of is printed."""
-    from hardware.rig import signals_as_ctrl_c
-
-    with signals_as_ctrl_c():
-        try:
-            yield
-        except KeyboardInterrupt as interrupt:
-            print_notes(interrupt)  # here, because typer ends without a word
-            raise
+Given = TypeVar("Given", str, Path)
+Spec = TypeVar("Spec")
 
 
 def usable_cores() -> int:
@@ -61,19 +23,23 @@ def usable_cores() -> int:
 
 CORES = usable_cores()
 
+Quality = Literal["preview", "standard", "high"]
+"""Presets of the renderer (``twin.optics.render.Quality``, which would load the renderer)."""
+
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
 Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
-FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; told by size and content if not given")]
+FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; found from size and content if not given")]
 Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
 Target = Annotated[str, typer.Option("--target", help="preset, or label columns with commas between")]
 Workers = Annotated[int, typer.Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
-Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights go with the package")]
-SHIPPED_MODEL = Path("mg400-331")  # its weights go with the package
+Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
+# Sensor whose trained weights are shipped with the package.
+SHIPPED_MODEL = Path("mg400-331")
 Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
 ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400:ADDRESS, magician:PORT")]
-PlainLight = Annotated[bool, typer.Option("--plain-light", help="twin: lamps' direct light alone, no path tracing at the start")]
+PlainLight = Annotated[bool, typer.Option("--plain-light", help="draw the twin's frames with direct light alone, without path tracing")]
 ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
 Limits = Annotated[str | None, typer.Option("--limits", help="safety limits: mg400, magician, or a TOML file")]
 AtRest = Annotated[
@@ -81,24 +47,16 @@ AtRest = Annotated[
     typer.Option(
         "--at-rest",
         metavar="FRAME|first|none",
-        help="no-contact frame that pins are counted from: a file, the first that is taken (an error if the sensor seems pressed in it), "
+        help="frame without contact that pins are counted from: a file, the first frame (an error if the sensor seems pressed in it), "
         "or none (the specification's layout)",
     ),
 ]
-FIRST, NONE = "first", "none"  # as hardware.rig has them
-Given = TypeVar("Given", str, Path)
-Spec = TypeVar("Spec")
-
-
-class Quality(StrEnum):
-    """Presets of the renderer."""
-
-    PREVIEW = "preview"
-    STANDARD = "standard"
-    HIGH = "high"
+# What --at-rest takes besides a file (the constants of hardware.rig, which would load the devices).
+FIRST, NONE = "first", "none"
 
 
 def _even(value: int) -> int:
+    """The number, if it is even."""
     if value % 2:
         raise TwinError(f"--across {value}: give an even number")
     return value
@@ -108,7 +66,7 @@ Across = Annotated[int, typer.Option("--across", min=6, max=64, callback=_even, 
 
 
 def names_in(text: str) -> list[str]:
-    """What stands between commas."""
+    """The names between commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
@@ -121,7 +79,7 @@ def numbers_in(text: str, option: str) -> tuple[int, ...]:
 
 
 def if_given(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
-    """The specification of that name or file; None where no name is given."""
+    """The specification of a name or file; None if none is given."""
     return load(name) if name else None
 
 
@@ -135,3 +93,42 @@ def writable_folder(path: Path) -> Path:
     except OSError as error:
         raise TwinError(f"{path}: can't write there ({error.strerror}); give another folder with --out") from error
     return path
+
+
+class Result(Protocol):
+    """What a function that does the work of a command returns."""
+
+    @property
+    def written(self) -> Sequence[Path]:
+        """The files that it wrote."""
+
+    def lines(self) -> Iterable[str]:
+        """The result in words."""
+
+
+def say(lines: Iterable[str]) -> None:
+    """Print each line as soon as it is known."""
+    for line in lines:
+        print(line, flush=True)
+
+
+def tell(result: Result) -> None:
+    """Print a result and the files that were written."""
+    say(result.lines())
+    say(f"wrote {path}" for path in result.written)
+
+
+@contextmanager
+def arm_let_go() -> Iterator[None]:
+    """Context in which SIGTERM and a closed terminal end the command as Ctrl-C does, so that the arm is let go of.
+
+    If letting go failed, what failed is printed.
+    """
+    from hardware.rig import signals_as_ctrl_c
+
+    with signals_as_ctrl_c():
+        try:
+            yield
+        except KeyboardInterrupt as interrupt:
+            print_notes(interrupt)  # here, because typer ends the program without printing them
+            raise

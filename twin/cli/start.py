@@ -1,43 +1,56 @@
-"""``twin sensors``, ``twin objects``, ``twin experiments`` and ``twin randomisations``: what is shipped, and where one's own go.
+"""Commands to begin with.
 
-``twin doctor``: what is there, what is missing, and the remedy.
-
-``twin demo``: the main job on the shipped specifications.
-
-``twin render``: one contact, rendered, with its exact ground truth."""
+- ``twin sensors``, ``twin objects``, ``twin experiments``, ``twin randomisations``: what is shipped, and where a user's own files go.
+- ``twin doctor``: what this machine has, what is missing, and the remedy.
+- ``twin demo``: the whole chain on the shipped specifications.
+- ``twin render``: one contact, rendered, with its exact ground truth.
+"""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from scenes import catalog
 from twin.cli import app
-from twin.cli.options import Object, Out, Pair, Quality, Sensor, say, writable_folder
+from twin.cli.options import Object, Out, Pair, Quality, Sensor, say, tell, writable_folder
 from twin.types import Form
 
 
 @app.command("sensors")
 def sensors() -> None:
-    """List the sensor specifications, and where to put one's own."""
+    """List the sensors, and where to put one's own."""
+    from scenes import catalog
+
     say(catalog.sensors().lines())
 
 
 @app.command("objects")
 def objects() -> None:
-    """List the object specifications, and where to put one's own."""
+    """List the objects, and where to put one's own."""
+    from scenes import catalog
+
     say([*catalog.objects().lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
 
 
 @app.command("experiments")
 def experiments() -> None:
-    """List the experiments (which contacts are made, in the robot's coordinates), and where to put one's own."""
+    """List the experiments, and where to put one's own.
+
+    An experiment says which contacts are made, in the robot's coordinates.
+    """
+    from scenes import catalog
+
     say(catalog.experiments().lines())
 
 
 @app.command("randomisations")
 def randomisations() -> None:
-    """List what can differ from one simulated frame to the next, and where to put one's own."""
+    """List the randomisations, and where to put one's own.
+
+    A randomisation says what differs from one simulated frame to the next.
+    """
+    from scenes import catalog
+
     say(catalog.randomisations().lines())
 
 
@@ -45,11 +58,10 @@ def randomisations() -> None:
 def doctor() -> None:
     """Say what is there and what is missing, with the remedy.
 
-    Covers Mitsuba's variants and which one will be used and why, LLVM, GPU, offscreen 3D, camera and serial devices. Exit
-    code 1 if nothing can be rendered on this machine.
+    It looks at packages, Mitsuba's variants (and which one is used, and why), LLVM, GPU, offscreen 3D, cameras and serial ports. The
+    exit code is 1 if nothing can be rendered on this machine.
     """
     from hardware.doctor import examine_machine
-    from twin.cli.options import say
 
     machine = examine_machine()
     say(machine.lines())
@@ -59,8 +71,10 @@ def doctor() -> None:
 
 @app.command("demo")
 def demo(out: Out = Path("out/demo")) -> None:
-    """Press, render, detect, graph: two sensors and more, as pictures and one page (index.html)."""
-    from twin.cli.options import say, tell
+    """Run the whole chain on shipped sensors, as one page.
+
+    It presses, renders, finds pins and builds graphs for several sensors and objects. It writes pictures and a page (index.html).
+    """
     from twin.cli.progress import shown
     from twin.demo.make_demo import run_demo
 
@@ -70,7 +84,7 @@ def demo(out: Out = Path("out/demo")) -> None:
     say([f"open {out / 'index.html'} in a browser"])
 
 
-HELP_RENDER = """Press an object against a sensor and render what the camera inside sees.
+HELP_RENDER = """Press an object against a sensor and render the frame.
 
 The pose is the OBJECT's, relative to the sensor. The image shows the sensor's x to the right and y down; z points out of
 the tip at the object. Angles turn right-handed about those axes.
@@ -97,10 +111,15 @@ the tip at the object. Angles turn right-handed about those axes.
                   before it approaches
 
 \b
-Writes: frame.png, frame.exr (linear light on the whole raw frame), truth.npz (caps_mm,
-caps_px, rest_px, visible: one row a pin, specification's order), truth.json (force_n of the
-skin on the object in the sensor's axes, so z > 0 when pressed; torque_nmm about the
-sensor's origin, area_mm2, pose, everything resolved), skin.vtp, skin.png, panel.png.
+Writes:
+  frame.png    the frame
+  frame.exr    linear light on the whole raw frame
+  truth.npz    caps_mm, caps_px, rest_px, visible: one row a pin, in the
+               specification's order; places, normals and forces of the contact
+  truth.json   force_n of the skin on the object in the sensor's axes (z > 0 when
+               pressed), torque_nmm about the sensor's origin, area_mm2, the pose and
+               all resolved specifications
+  skin.vtp, skin.png, panel.png   the deformed skin, and an overview
 
 \b
 Example:
@@ -117,16 +136,15 @@ def render(
     tilt_deg: Annotated[Pair, typer.Option("--tilt-deg", metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
     shear_mm: Annotated[Pair, typer.Option("--shear-mm", metavar="X Y", help="drag after the press")] = (0.0, 0.0),
     twist_deg: Annotated[float, typer.Option("--twist-deg", metavar="RZ", help="turn about z during the drag")] = 0.0,
-    offset_mm: Annotated[Pair, typer.Option("--offset-mm", metavar="X Y", help="sideways place of the object before it approaches")] = (
+    offset_mm: Annotated[Pair, typer.Option("--offset-mm", metavar="X Y", help="sideways shift of the object before it approaches")] = (
         0.0,
         0.0,
     ),
     form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
-    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = Quality.STANDARD,
+    quality: Annotated[Quality, typer.Option(help="samples per pixel")] = "standard",
     seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
 ) -> None:
     from scenes import load_object, load_sensor
-    from twin.cli.options import tell
     from twin.cli.progress import shown
     from twin.mechanics.path import ContactPose
     from twin.one_contact import render_contact
@@ -134,5 +152,5 @@ def render(
     spec, stimulus = load_sensor(sensor), load_object(object_)
     pose = ContactPose(indent_mm=indent_mm, tilt_deg=tilt_deg, shear_mm=shear_mm, twist_deg=twist_deg, offset_mm=offset_mm)
     with shown() as progress:
-        made = render_contact(spec, stimulus, pose, writable_folder(out), form=form, quality=quality.value, seed=seed, progress=progress)
+        made = render_contact(spec, stimulus, pose, writable_folder(out), form=form, quality=quality, seed=seed, progress=progress)
     tell(made)

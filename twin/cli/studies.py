@@ -1,10 +1,10 @@
-"""``twin study``: experiments that compare.
+"""Commands of ``twin study``: experiments that compare models.
 
-``twin study objects``: what a model makes of objects that it never saw.
-
-``twin study sim-to-real``: what the twin is worth on real frames.
-
-``twin study tac-vgnn``: the paper's whole comparison."""
+- ``twin study servo``: several models follow the outlines of several objects.
+- ``twin study objects``: how well a model estimates poses on objects that it never touched.
+- ``twin study sim-to-real``: what training in the twin is worth on real frames.
+- ``twin study tac-vgnn``: the comparison of the Tac-VGNN paper.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -26,15 +26,19 @@ from twin.cli.options import (
     if_given,
     names_in,
     numbers_in,
+    tell,
     writable_folder,
 )
 from twin.types import FINE
 
-OBJECTS = "can,mesh-can,square,prism,tin-box"  # the Tac-VGNN paper's
 study = typer.Typer(help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(study, name="study")
 
-SERVO_HELP = """Follow the paper's five objects with each model, in the twin, and compare.
+# The objects of the Tac-VGNN paper.
+OBJECTS = "can,mesh-can,square,prism,tin-box"
+HELP_STUDY_SERVO = """Follow the Tac-VGNN paper's five objects with each model.
+
+It runs in the twin, and compares how well the models follow.
 
 \b
   twin study servo --model out/gnn --model out/tac-vgnn --out out/study
@@ -43,20 +47,19 @@ Writes to --out: a folder for each model and object as 'twin servo' writes it, s
 """
 
 
-@study.command("servo", help=SERVO_HELP)
+@study.command("servo", help=HELP_STUDY_SERVO)
 def servo_command(
     models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
     out: Out,
     objects: Annotated[str, typer.Option("--objects", help="names with commas between")] = OBJECTS,
     parameters: ServoName = "surface",
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="for each object, instead of once around it")] = None,
-    seed: Annotated[int, typer.Option("--seed", help="of the twin's noise")] = 0,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="steps on each object, instead of once around it")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
     plain_light: PlainLight = False,
 ) -> None:
     from hardware.servo_study import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo
     from training.estimator import load_by_name
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     plan = ServoStudyPlan(
@@ -74,20 +77,20 @@ def servo_command(
 
 TRAIN = "plane,ball-10,sphere,ball-40,ball-80,hexagon-rod,square-rod,round-bar,triangle-rod"
 UNSEEN = "cylinder,edge"
-HELP_STUDY_OBJECTS = """Train in the twin on several objects, and judge on objects that were never touched.
+HELP_STUDY_OBJECTS = """Train on several objects, and judge on others.
 
 \b
   twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod --unseen cylinder,edge --out out/objects
 
-Two models learn from the same number of simulated contacts (pins alone, every state on their way). 'mixed' learns from --count
-contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other contacts of every
-object, seen or not.
+Two models learn from the same number of contacts that are simulated in the twin (pins alone, every state on their way). 'mixed' learns
+from --count contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other
+contacts of every object, including the objects of --unseen.
 
 Labels mean the same on every object. The depth is the indentation along the surface's normal at the place nearest to the dome's
-centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges that are
-judged; the experiment that it names as wider is trained on.
+centre, and the angle is measured from this normal, as if a flat plate were touched there. --experiment gives the ranges in which the
+models are judged; they are trained on the experiment that it names as wider.
 
-The same command goes on where it was ended. The run that learnt several objects can be given wherever a RUN is asked for:
+The same command continues an interrupted study. The run that learnt several objects can be given wherever a RUN is asked for:
 
 \b
   twin servo --object can --model out/objects/mixed --out out/can
@@ -107,16 +110,14 @@ def study_objects(
     count: Annotated[int, typer.Option("--count", min=2, metavar="N", help="contacts of each object to train on")] = 100,
     tests: Annotated[int, typer.Option("--tests", min=1, metavar="N", help="other contacts of each object to judge on")] = 50,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="contacts to judge on ('twin experiments')")] = "objects-2d",
-    randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="what differs from contact to contact")] = "moves",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="of the contacts and the weights")] = 0,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="of both trainings, instead of the study's own number")] = None,
+    randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="randomisation ('twin randomisations')")] = "moves",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the contacts and the weights")] = 0,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
 ) -> None:
-
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.studies import objects
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     plan = objects.Plan(
@@ -137,34 +138,35 @@ def study_objects(
     tell(found)
 
 
-HELP_STUDY_SIM_TO_REAL = """Train in the twin, test on real frames, against training on real frames.
+HELP_STUDY_SIM_TO_REAL = """Train in the twin or on real frames, test on real ones.
 
 \b
   twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 --seed 0 --out out/sim-to-real
 
-The recording's --experiment says how the arm went and what is learnt; --contacts is the experiment that is simulated.
+--experiment says how the arm moved in the recording and what is learnt; --contacts is the experiment that is simulated.
 
---seed draws --labels real frames from four fifths of the recording. The friction of simulated contacts is drawn as it was on these
-frames. What the twin's pins miss on them is learnt as a Gaussian process of the label, and drawn --draws times for every simulated
-contact. With --calibrate the specification is fitted to these frames first ('twin calibrate contact'; about an hour). All models are
-judged on the random fifth that is left:
+First, --labels real frames are drawn at random from four fifths of the recording. The friction of the simulated contacts is drawn
+from the friction found on these frames. The difference between the twin's pins and the real pins on these frames is learnt as a
+Gaussian process of the label, and drawn --draws times for every simulated contact. With --calibrate the specification is fitted to
+these frames first ('twin calibrate contact'; about an hour). All models are judged on the remaining fifth:
 
 \b
   simulated            vgnn trained on simulated contacts alone; its 90 %
-                       intervals are what the labelled frames say
+                       intervals are calibrated on the labelled frames
   simulated and real   the same, averaged with a Gaussian process of the pins
                        of both simulated contacts and labelled frames
-  real                 vgnn and a quadratic regression trained on as many real
+  real                 vgnn and a quadratic regression, trained on as many real
                        frames, on 500 and on all
-  --ablate             simulated: without what the twin misses, with a fifth
-                       of the contacts, a coarse mesh, one friction, any
-                       friction, no moves, tolerances of skin and gel drawn
-                       as well, and uncalibrated; this simulates six more
-                       sets of contacts
+  --ablate             also models trained on simulated contacts with one change
+                       each: without the learnt difference of the pins, with a
+                       fifth of the contacts, a coarse mesh, one friction, any
+                       friction, no moves, drawn tolerances of skin and gel, and
+                       without calibration; this simulates six more sets of
+                       contacts
 
-Contacts are simulated in --out/sim, without pictures, unless --sim (may be given several times: other objects) names finished data
-sets of 'twin dataset' or 'twin study objects'; of one with pictures the pins are those that the pipeline sees. The same command
-goes on where it was ended.
+The contacts are simulated in --out/sim, without pictures. With --sim finished data sets of 'twin dataset' or 'twin study objects'
+are used instead (give it once for each). If a data set has pictures, the pins are those that the pipeline finds in them. The same
+command continues an interrupted study.
 
 \b
 Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv, index.html.
@@ -177,24 +179,23 @@ def study_sim_to_real(
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled real recording")],
     out: Out,
     labels: Annotated[int, typer.Option("--labels", min=8, metavar="N", help="labelled frames beside the simulated ones")] = 40,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="of the frames drawn, the contacts and the weights")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the drawn frames, the contacts and the weights")] = 0,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how the frames were recorded")] = "surface-2d",
     contacts: Annotated[
         str | None,
         typer.Option("--contacts", metavar="E", help="experiment to simulate; if not given, one wider than the frames' own"),
     ] = None,
-    draws: Annotated[int, typer.Option("--draws", min=1, help="of what the twin misses, for each contact")] = 2,
+    draws: Annotated[int, typer.Option("--draws", min=1, help="draws of the learnt difference of the pins, for each contact")] = 2,
     count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts to simulate")] = 500,
     sim: Annotated[list[Path] | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead; several are joined")] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
     ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time")] = False,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="of every training, instead of the model's own number")] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of every training, instead of the model's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
 ) -> None:
     from scenes import load_experiment, load_sensor
     from training.studies import sim_to_real
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     plan = sim_to_real.Plan(
@@ -219,17 +220,19 @@ def study_sim_to_real(
 
 
 MODELS = "gnn,tac-vgnn,vgnn,cnn-v2,cnn-v1"
-HELP_STUDY_TAC_VGNN = """Repeat the Tac-VGNN paper's comparison on a recording: graphs, models, training efficiency, what the areas show.
+HELP_STUDY_TAC_VGNN = """Repeat the Tac-VGNN paper's comparison on a recording.
+
+It compares graphs, models and training efficiency, and shows how the Voronoi areas tell the depth of a contact.
 
 \b
   twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study --max-minutes 120
 
-Models (--models): gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and ours, vgnn. vgnn-without-graph, vgnn-without-modes and
-vgnn-without-kernel show what its parts earn.
+The models (--models) are gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and this project's vgnn. vgnn-without-graph,
+vgnn-without-modes and vgnn-without-kernel show what each part of vgnn contributes.
 
-All are trained on the same rows and labels, and judged on the same fifth. Each run is a folder below --out/runs as 'twin train'
-writes it. The same command goes on where it was ended, so a study can take many evenings. --max-minutes is shared evenly among
-the runs still to come. A run that was ended by it is reported as ended early.
+All models are trained on the same rows and labels, and judged on the same fifth. Each run is a folder below --out/runs as 'twin train'
+writes it. The same command continues an interrupted study, so a study may be spread over several days. --max-minutes is shared
+evenly among the runs that are still to do. A run that this time ended is reported as ended early.
 
 \b
 Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv, curves.png, efficiency.png, contacts.png, index.html, runs/.
@@ -242,14 +245,14 @@ def study_tac_vgnn(
     sensor: Sensor,
     out: Out,
     models: Annotated[str, typer.Option("--models", help="names with commas between")] = MODELS,
-    seeds: Annotated[str, typer.Option("--seeds", help="of weights and order, with commas between")] = "0",
-    labels: Annotated[str, typer.Option("--labels", help="that are learnt: raw (as the paper) or corrected")] = "raw",
+    seeds: Annotated[str, typer.Option("--seeds", help="seeds of weights and order, with commas between")] = "0",
+    labels: Annotated[str, typer.Option("--labels", help="labels to learn: raw (as in the paper) or corrected")] = "raw",
     target: Target = "surface-2d",
     split: Annotated[int, typer.Option("--split", min=0, help="seed of the fifth kept out of training")] = 0,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="instead of each model's own number")] = None,
-    max_minutes: Annotated[float | None, typer.Option("--max-minutes", min=0, help="for all training together")] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of training, instead of each model's own number")] = None,
+    max_minutes: Annotated[float | None, typer.Option("--max-minutes", min=0, help="time for all training together")] = None,
     batches: Annotated[
-        str, typer.Option("--batches", help="of the efficiency figure, with commas between; empty: no figure")
+        str, typer.Option("--batches", help="batch sizes of the efficiency figure, with commas between; empty: no figure")
     ] = "64,256,512",
     contacts: Annotated[bool, typer.Option("--contacts/--no-contacts", help="press and render the contacts of the area figure")] = True,
     device: Device = "auto",
@@ -259,7 +262,6 @@ def study_tac_vgnn(
     from scenes import load_sensor
     from training.studies import tac_vgnn
     from training.train import columns_of
-    from twin.cli.options import tell
     from twin.cli.progress import shown
 
     plan = tac_vgnn.Plan(

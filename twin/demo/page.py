@@ -98,13 +98,13 @@ def write_page(
     tables: Mapping[str, Sequence[DepthRow]],
     seconds: Mapping[str, float],
 ) -> Path:
-    """Write the page with all pictures inside; the path.
+    """Write the page with all pictures inside, and return its path.
 
     Parameters
     ----------
     path : Path
     machine : str
-        What rendered, and where.
+        What rendered on which machine.
     contacts : sequence of ContactContent
     motions : Path
         Chart of `motion_figure`.
@@ -123,36 +123,9 @@ def write_page(
     )
     for contact in contacts:
         _contact_section(page, contact)
-    page.section(
-        "Three motions, three signatures",
-        "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip.",
-    )
-    page.figures(
-        Picture(
-            motions,
-            "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y",
-            f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {motion_sensor}.",
-        )
-    )
-    page.section(
-        "Against real recordings: displacement by depth",
-        "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "
-        "recordings, pure presses in 1 mm bins. Simulated: true cap positions at the middle of each bin, with nominal stiffness; the "
-        "hexagonal sensor's camera distance and pin spacing were chosen with these figures in view.",
-    )
-    columns = [
-        Column("indent_mm", "indentation", "mm", decimals=1),
-        Column("measured_px", "measured", "px", decimals=1),
-        Column("simulated_px", "simulated", "px", decimals=1),
-        Column("contact_area_change_percent", "cell area at the contact", "%", decimals=1, signed=True),
-        Column("force_n", "force", "N", decimals=2),
-    ]
-    for sensor, rows in tables.items():
-        page.table([vars(row) for row in rows], columns, caption=sensor)
-    page.section("Time")
-    total = {"stage": "all", "seconds": sum(seconds.values())}
-    stages = [{"stage": name, "seconds": value} for name, value in seconds.items()]
-    page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
+    _motions_section(page, motions, motion_sensor)
+    _tables_section(page, tables)
+    _time_section(page, seconds)
     return page.write(path, embed=True)
 
 
@@ -182,6 +155,45 @@ def _contact_section(page: Page, contact: ContactContent) -> None:
         )
     )
     page.table([{"name": name, "value": value} for name, value in contact.figures], [Column("name", "figure"), Column("value", "value")])
+
+
+def _motions_section(page: Page, motions: Path, sensor: str) -> None:
+    page.section(
+        "Three motions, three signatures",
+        "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip.",
+    )
+    page.figures(
+        Picture(
+            motions,
+            "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y",
+            f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {sensor}.",
+        )
+    )
+
+
+def _tables_section(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
+    page.section(
+        "Against real recordings: displacement by depth",
+        "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "
+        "recordings, pure presses in 1 mm bins. Simulated: true cap positions at the middle of each bin, with nominal stiffness; the "
+        "hexagonal sensor's camera distance and pin spacing were chosen with these figures in view.",
+    )
+    columns = [
+        Column("indent_mm", "indentation", "mm", decimals=1),
+        Column("measured_px", "measured", "px", decimals=1),
+        Column("simulated_px", "simulated", "px", decimals=1),
+        Column("contact_area_change_percent", "cell area at the contact", "%", decimals=1, signed=True),
+        Column("force_n", "force", "N", decimals=2),
+    ]
+    for sensor, rows in tables.items():
+        page.table([vars(row) for row in rows], columns, caption=sensor)
+
+
+def _time_section(page: Page, seconds: Mapping[str, float]) -> None:
+    page.section("Time")
+    total = {"stage": "all", "seconds": sum(seconds.values())}
+    stages = [{"stage": name, "seconds": value} for name, value in seconds.items()]
+    page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
 
 
 def _graph_figure(look: Look) -> Figure:

@@ -20,7 +20,7 @@ from twin.types import ContactState, Form
 
 Result = TypeVar("Result")
 
-# Contacts of the demo: sensor, object, pose, and the form in which the pins are found.
+# Contacts of the demo: sensor, object, pose, and the form of the frames in which the pins are found.
 CONTACTS = (
     ("ur5-331", "edge", ContactPose(indent_mm=3.5), Form.RAW),
     ("mg400-331", "plane", ContactPose(indent_mm=4.0, tilt_deg=(0.0, 8.0)), Form.RECORDING),

@@ -18,33 +18,45 @@ from twin.optics.light_model import Knobs, LightModel
 from twin.optics.render import Renderer
 from twin.progress import Step
 
-# Reflectance of the caps' brightest channel. Assumed: white printing resin.
 CAP_ALBEDO = 0.8
-# Pixels of bare skin that are taken from a frame.
+"""Reflectance of the caps' brightest channel. Assumed: white printing resin."""
 SKIN_SAMPLES = 250
-# Bare skin is farther from every cap's middle than this share of the pins' spacing.
+"""Pixels of bare skin that are taken from a frame."""
 SKIN_CLEARANCE = 0.6
-# Pixels outside this share of the mask's radius are left out: light from the rim reaches them.
+"""Bare skin is farther from every cap's middle than this share of the pins' spacing."""
 DISC_SHARE = 0.9
-# Gauss-Newton steps.
+"""Pixels outside this share of the mask's radius are left out: light from the rim reaches them."""
 STEPS = 6
-# Slopes are computed anew at one step in this many: the light is nearly linear in the unknowns.
+"""Gauss-Newton steps."""
 SLOPES_EVERY = 2
-# Residual, gray levels, beyond which a sample counts less (Cauchy).
+"""Slopes are computed anew at every step of this number only: the light is nearly linear in the unknowns."""
 ROBUST_LEVELS = 12.0
-# Sd of the logarithm of an LED's share before the frames are seen.
+"""Residual, gray levels, beyond which a sample counts less (Cauchy)."""
 BALANCE_SD = 0.3
-# Largest change of an unknown (a logarithm) in one step.
+"""Sd of the logarithm of an LED's share before the frames are seen."""
 LARGEST_STEP = 0.7
-# Damping of the normal equations, relative to their trace: keeps them solvable.
+"""Largest change of an unknown (a logarithm) in one step."""
 DAMPING = 1e-9
-# Largest haze that is allowed.
+"""Damping of the normal equations, relative to their trace: keeps them solvable."""
 MOST_HAZE = 0.5
+"""Largest haze that is allowed."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Places in one frame: pixels (n, 2), levels (n, channels), light of the blurred frame there, and which are caps (n,)."""
+    """Places in one frame.
+
+    Attributes
+    ----------
+    pixels : (n, 2) int
+        x and y.
+    levels : (n, channels) float
+        Gray levels.
+    veil : (n, channels) float
+        Light of the blurred frame, which haze spreads.
+    caps : (n,) bool
+        Whether the place is a cap; bare skin otherwise.
+    """
 
     pixels: np.ndarray
     levels: np.ndarray
@@ -54,7 +66,14 @@ class Samples:
 
 @dataclass(frozen=True)
 class PhotometryFit:
-    """What was found: rms in gray levels of caps and skin, first and last."""
+    """A fitted specification.
+
+    Attributes
+    ----------
+    spec : SensorSpec
+    caps_rms, skin_rms : (first, last)
+        Rms residual of caps and of bare skin at the first and at the last step, gray levels.
+    """
 
     spec: SensorSpec
     caps_rms: tuple[float, float]
@@ -126,8 +145,7 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> P
     ]
     levels, veil, caps = (np.concatenate([getattr(s, name) for s in samples]) for name in ("levels", "veil", "caps"))
     useful = np.all(levels < SATURATED, axis=1)
-    channels, leds = levels.shape[1], models[0].led_count
-    layout = _Layout(leds, channels)
+    layout = _Layout(models[0].led_count, levels.shape[1])
     x = layout.start(models, to_light(levels[caps & useful], spec.response), caps & useful, spec.gel.haze)
     slopes: dict[str, np.ndarray] = {}
     rms: list[tuple[float, float]] = []
@@ -139,13 +157,7 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> P
         seen = (1 - x[-1]) * light + x[-1] * veil
         residual = np.where(useful[:, None], levels - to_levels(seen, spec.response), 0.0)
         jacobian = layout.jacobian(slopes, light, veil, x[-1], levels_slope(seen, spec.response)) * useful[:, None, None]
-        weight = 1 / (1 + (residual / ROBUST_LEVELS) ** 2)
-        a = jacobian.reshape(-1, len(x))
-        hessian = (a * weight.reshape(-1, 1)).T @ a
-        prior = np.zeros(len(x))
-        prior[:leds] = weight.sum() / len(frames) / leds * (1.0 / BALANCE_SD) ** 2
-        move = np.linalg.solve(hessian + np.diag(prior + DAMPING * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
-        x = x + np.clip(move, -LARGEST_STEP, LARGEST_STEP)
+        x = x + np.clip(layout.move(jacobian, residual, x, len(frames)), -LARGEST_STEP, LARGEST_STEP)
         x[-1] = np.clip(x[-1], 0, MOST_HAZE)
         rms.append((_rms(residual[caps & useful]), _rms(residual[~caps & useful])))
         progress(step + 1, STEPS)
@@ -159,9 +171,9 @@ def _rms(residual: np.ndarray) -> float:
 
 
 class _Layout:
-    """Where each knob stands in the vector of unknowns: logarithms of LEDs, skin, caps; then the haze."""
+    """The place of each knob in the vector of unknowns: logarithms of the factors on LEDs, skin and caps, then the haze."""
 
-    def __init__(self, leds: int, channels: int):
+    def __init__(self, leds: int, channels: int) -> None:
         self.leds, self.channels = leds, channels
         self.count = leds + 2 * channels + 1
         self.skin, self.caps = slice(leds, leds + channels), slice(leds + channels, leds + 2 * channels)
@@ -191,6 +203,18 @@ class _Layout:
         result *= (1 - haze) * curve[..., None]
         result[..., -1] = (veil - light) * curve
         return result
+
+    def move(self, jacobian: np.ndarray, residual: np.ndarray, x: np.ndarray, frames: int) -> np.ndarray:
+        """The Gauss-Newton step (unknowns,) from ``x``, for residuals (n, channels) of so many frames; outliers count less (Cauchy).
+
+        The prior of the LEDs' shares counts as much as one of the frames.
+        """
+        weight = 1 / (1 + (residual / ROBUST_LEVELS) ** 2)
+        a = jacobian.reshape(-1, len(x))
+        hessian = (a * weight.reshape(-1, 1)).T @ a
+        prior = np.zeros(len(x))
+        prior[: self.leds] = weight.sum() / frames / self.leds * (1.0 / BALANCE_SD) ** 2
+        return np.linalg.solve(hessian + np.diag(prior + DAMPING * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
 
     def applied(self, spec: SensorSpec, x: np.ndarray) -> SensorSpec:
         """The specification with the unknowns put in; the ring's own look keeps its brightness."""

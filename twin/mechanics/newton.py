@@ -100,11 +100,22 @@ class LoadStepper:
         looked = np.flatnonzero(self._reachable & (gap < _REACH_MM) | state.held)
         # a point that is driven into the object is anchored where it meets the surface on the way
         driven = (gap_before > 0) & (gap < 0)
-        share = np.where(driven, gap_before / np.where(driven, gap_before - gap, 1.0), 0.0)[:, None]
+        share: FloatArray = np.where(driven, gap_before / np.where(driven, gap_before - gap, 1.0), 0.0)[:, None]
         anchors = np.where(state.held[:, None], state.anchor_mm, (1 - share) * before + share * after)
         penalty = state.penalty_mpa_mm
         for _ in range(_PENALTY_RAISES):
-            problem = Problem(self._body, self._field, self._friction, self._compliance, state, anchors, looked, penalty, T, given)
+            problem = Problem(
+                self._body,
+                self._field,
+                self._friction,
+                self._compliance,
+                state,
+                anchor_mm=anchors,
+                looked=looked,
+                penalty=penalty,
+                T=T,
+                given=given,
+            )
             control, border, balance = self._solve(problem, control, border, control is not state.control_mm)
             left_out = np.setdiff1d(np.arange(len(gap)), looked, assume_unique=True)
             missed = left_out[self._field.distance(self._seen(control, border, T)[left_out]) < 0]

@@ -40,7 +40,7 @@ def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.nd
 def draw_graph(ax: Axes, graph: PinGraph) -> None:
     """The edges of a graph, and its cells where it has a tessellation."""
     once = graph.edges[graph.edges[:, 0] < graph.edges[:, 1]] if graph.kind != "knn" else graph.edges
-    ax.add_collection(LineCollection(graph.nodes_px[once], colors=EDGE, linewidths=0.7, alpha=0.85))
+    ax.add_collection(LineCollection(list(graph.nodes_px[once]), colors=EDGE, linewidths=0.7, alpha=0.85))
     if graph.cells:
         ax.add_collection(PolyCollection(graph.cells, facecolors="none", edgecolors="#ffffff", linewidths=0.5, alpha=0.6))
 

@@ -28,7 +28,7 @@ class Contact:
     """An object of `scenes` and how the sensor is pressed against it."""
 
     name: str
-    stimulus: str
+    object_name: str
     pose: ContactPose
 
 
@@ -63,13 +63,13 @@ def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
         rest = rest_pins(spec.geometry)
         return PinState(rest.base_mm, rest.axis, rest.caps_mm)
 
-    def solve():
-        state = SkinSolver(spec).press(load_object(contact.stimulus), contact.pose)
+    def solve() -> dict[str, np.ndarray]:
+        state = SkinSolver(spec).press(load_object(contact.object_name), contact.pose)
         return {"base_mm": state.base_mm, "axis": state.axis, "caps_mm": state.caps_mm}
 
     optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px"}
     key = {part: getattr(spec, part).model_dump(mode="json", exclude=optical) for part in ("skin", "gel", "lens", "pins")}
-    key |= {"stimulus": load_object(contact.stimulus).model_dump(mode="json"), "pose": vars(contact.pose)}
+    key |= {"object": load_object(contact.object_name).model_dump(mode="json"), "pose": vars(contact.pose)}
     return PinState(**cached_arrays("pins-under-contact", key, solve))
 
 

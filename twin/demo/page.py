@@ -134,6 +134,16 @@ def write_page(
             f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {motion_sensor}.",
         )
     )
+    _depth_section(page, tables)
+    page.section("Time")
+    total = {"stage": "all", "seconds": sum(seconds.values())}
+    stages = [{"stage": name, "seconds": value} for name, value in seconds.items()]
+    page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
+    return page.write(path, embed=True)
+
+
+def _depth_section(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
+    """Simulated and measured displacement by depth, a table for each sensor."""
     page.section(
         "Against real recordings: displacement by depth",
         "Mean displacement of all pins on a flat plate, in pixels of the uncropped camera frame. Measured: the Tac-VGNN release's "
@@ -149,11 +159,6 @@ def write_page(
     ]
     for sensor, rows in tables.items():
         page.table([vars(row) for row in rows], columns, caption=sensor)
-    page.section("Time")
-    total = {"stage": "all", "seconds": sum(seconds.values())}
-    stages = [{"stage": name, "seconds": value} for name, value in seconds.items()]
-    page.table([*stages, total], [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
-    return page.write(path, embed=True)
 
 
 def _contact_section(page: Page, contact: ContactContent) -> None:

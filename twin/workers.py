@@ -3,15 +3,24 @@
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from twin.errors import DatasetError, TwinError
 from twin.store import fingerprint
 
-AHEAD = 2  # tasks for each worker on the way: a free one need not wait, and little is lost when all ends
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+AHEAD = 2
+"""Tasks on the way for each worker: a free worker need not wait, and little is lost when the work is stopped."""
 LOOK_S = 1.0
-JOIN_S = 60.0  # for the scheduler's first worker
+"""Seconds to wait for a task before the connection is looked at again."""
+JOIN_S = 60.0
+"""Seconds to wait for the scheduler's first worker."""
 LOOPBACK = "127.0.0.1"
+"""Address of this machine for itself."""
 AGAIN = "what is done is kept, and the same command goes on from there"
+"""End of every message about work that was broken off."""
 
 
 def outcomes(make: Callable, text: str, todo: list[int], *, workers: int, scheduler: str) -> Iterator:
@@ -78,7 +87,8 @@ def _silenced() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _by_cluster(client, make: Callable, text: str, todo: list[int], scheduler: str) -> Iterator:
+def _by_cluster(client: "Client", make: Callable, text: str, todo: list[int], scheduler: str) -> Iterator:
+    """What the workers made, in the order in which they end; only a few tasks are on the way at a time."""
     from distributed import CancelledError, wait
 
     where = f"scheduler {scheduler}" if scheduler else "the worker processes"
@@ -86,7 +96,8 @@ def _by_cluster(client, make: Callable, text: str, todo: list[int], scheduler: s
         client.wait_for_workers(1, timeout=JOIN_S)
     except TimeoutError as error:
         raise DatasetError(f"{where}: no worker has come within {JOIN_S:g} s; start some with 'dask worker {scheduler}'") from error
-    waiting, flying, own = list(reversed(todo)), {}, fingerprint(make)
+    waiting, own = list(reversed(todo)), fingerprint(make)
+    flying: dict[Future, int] = {}
     while waiting or flying:
         try:
             room = AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"])) - len(flying)
@@ -105,7 +116,14 @@ def _by_cluster(client, make: Callable, text: str, todo: list[int], scheduler: s
             yield _result(future, index, where)
 
 
-def _result(future, index: int, where: str):
+def _result(future: "Future", index: int, where: str) -> object:
+    """What a task made.
+
+    Raises
+    ------
+    DatasetError
+        The task or its worker failed.
+    """
     from distributed.scheduler import KilledWorker
 
     if future.status == "finished":
@@ -120,7 +138,8 @@ def _result(future, index: int, where: str):
     raise DatasetError(f"{where}: contact {index}: {type(error).__name__}: {error}; {AGAIN}") from error
 
 
-def _checked(make: Callable, text: str, index: int, expected: str):
+def _checked(make: Callable, text: str, index: int, expected: str) -> object:
+    """Make one thing on a worker that runs the same code as the caller."""
     if fingerprint(make) != expected:
         raise DatasetError("a worker runs another version of this program, its frames would differ; install the same one there")
     return make(text, index)

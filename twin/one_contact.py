@@ -38,7 +38,7 @@ class RenderedContact:
 
 def render_contact(
     sensor: SensorSpec,
-    stimulus: ObjectSpec,
+    touched: ObjectSpec,
     pose: ContactPose,
     out: Path,
     *,
@@ -71,12 +71,12 @@ def render_contact(
     """
     simulator = Simulator(sensor, quality=quality)
     simulator.check_form(form)
-    with stage(progress, f"press {stimulus.name}") as step:
-        state = simulator.press(stimulus, pose, progress=step)
+    with stage(progress, f"press {touched.name}") as step:
+        state = simulator.press(touched, pose, progress=step)
     with stage(progress, "render"):
         shot = simulator.shoot(state, form=form, seed=seed)
     with stage(progress, "pictures"):
-        written = write_contact(out, simulator, stimulus, pose, state, shot)
+        written = write_contact(out, simulator, touched, pose, state, shot)
     return RenderedContact(state, shot, written)
 
 

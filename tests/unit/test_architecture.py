@@ -16,6 +16,28 @@ MAY_IMPORT = {
     "training": {"scenes", "twin", "training"},
     "hardware": {"scenes", "twin", "hardware"},
 }
+TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may import those before it
+    "errors",
+    "types",
+    "progress",
+    "store",
+    "workers",
+    "geometry",
+    "objects",
+    "report",
+    "frames",
+    "camera",
+    "mechanics",
+    "rig",
+    "optics",
+    "pins",
+    "simulator",
+    "one_contact",
+    "judge",
+    "fit",
+    "demo",
+    "cli",
+)
 COMPOSITION_ROOTS = ("twin/cli/",)  # the outermost layer may join everything; nothing joins it (test_command_line)
 
 
@@ -24,12 +46,14 @@ def imports_of(path: Path) -> set[str]:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module in MAY_IMPORT:  # "from twin import store" names twin.store
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.add(node.module)
     return found
 
 
-def sources(package: str):
+def sources(package: str) -> list[Path]:
     return [p for p in sorted((ROOT / package).rglob("*.py")) if not str(p.relative_to(ROOT)).startswith(COMPOSITION_ROOTS)]
 
 
@@ -40,12 +64,84 @@ def test_imports_point_one_way(package):
         assert ours <= MAY_IMPORT[package], f"{path.relative_to(ROOT)} imports {ours - MAY_IMPORT[package]}"
 
 
+def twin_part(name: str) -> str:
+    """Package or module of twin that a dotted name belongs to; "" for a name outside twin."""
+    parts = name.split(".")
+    return parts[1] if parts[0] == "twin" and len(parts) > 1 else ""
+
+
+def against_the_order(part: str, names: set[str], layers: tuple[str, ...]) -> set[str]:
+    """Imported names that stand outside the part's own layer and those before it. Names outside twin do not count."""
+    allowed = layers[: layers.index(part) + 1]
+    return {name for name in names if name.split(".")[0] == "twin" and twin_part(name) not in allowed}
+
+
+def test_every_part_of_twin_has_a_place_in_the_order():
+    parts = {path.stem for path in (ROOT / "twin").iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    assert parts - {"__init__"} == set(TWIN_LAYERS)
+
+
+@pytest.mark.parametrize("part", TWIN_LAYERS)
+def test_twin_imports_only_what_lies_further_in(part):
+    folder = ROOT / "twin" / part
+    for path in sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]:
+        wrong = against_the_order(part, imports_of(path), TWIN_LAYERS)
+        assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}, which lies further out"
+
+
+def test_the_order_refuses_an_import_that_points_outwards():
+    names = {"numpy", "twin.types", "twin.pins.graph", "twin.fit.optics", "twin"}
+    assert against_the_order("pins", names, TWIN_LAYERS) == {"twin.fit.optics", "twin"}
+
+
+def test_twin_itself_imports_nothing_of_ours():
+    assert not {name for name in imports_of(ROOT / "twin" / "__init__.py") if name.split(".")[0] in MAY_IMPORT}
+
+
+def test_imports_name_their_package_in_full():
+    for package in MAY_IMPORT:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            relative = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.ImportFrom) and n.level]
+            assert not relative, f"{path.relative_to(ROOT)}: line {relative[0].lineno} imports relatively"
+
+
 def test_only_the_optics_name_mitsuba():
     for package in MAY_IMPORT:
         for path in sorted((ROOT / package).rglob("*.py")):
-            if "optics" not in path.parts:
-                named = {name.split(".")[0] for name in imports_of(path)} & {"mitsuba", "drjit"}
-                assert not named, f"{path.relative_to(ROOT)} imports {named}"
+            if path.is_relative_to(ROOT / "twin" / "optics"):
+                continue
+            named = {name.split(".")[0] for name in imports_of(path)} & {"mitsuba", "drjit"}
+            assert not named, f"{path.relative_to(ROOT)} imports {named}"
+
+
+RENAMING = {"replace", "rename", "renames"}  # functions of os
+
+
+def renames_files(source: str) -> bool:
+    """Whether a module gives files their names by ``os.replace`` or ``os.rename``, however it imports them."""
+    tree = list(ast.walk(ast.parse(source)))
+    called = {n.attr for n in tree if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name) and n.value.id == "os"}
+    imported = {alias.name for n in tree if isinstance(n, ast.ImportFrom) and n.module == "os" for alias in n.names}
+    return bool((called | imported) & RENAMING)
+
+
+@pytest.mark.parametrize(
+    ("source", "found"), [("import os\nos.replace(a, b)", True), ("from os import rename", True), ("a.replace('b', 'c')", False)]
+)
+def test_renames_are_recognised(source, found):
+    assert renames_files(source) is found
+
+
+def test_only_the_store_gives_files_their_names():
+    modules = [path for package in MAY_IMPORT for path in sorted((ROOT / package).rglob("*.py"))]
+    assert {path.parent for path in modules if renames_files(path.read_text())} == {ROOT / "twin" / "store"}
+
+
+def test_no_module_is_a_drawer_for_everything():
+    for package in MAY_IMPORT:
+        for path in (ROOT / package).rglob("*.py"):
+            names = {part.removesuffix(".py") for part in path.relative_to(ROOT).parts}
+            assert not names & {"utils", "util", "helpers", "misc", "common"}, f"{path.relative_to(ROOT)}: name it after what it does"
 
 
 def test_specifications_import_nothing_heavy():

@@ -37,7 +37,7 @@ def test_the_object_is_drawn_where_its_pose_puts_it():
 
     T = np.eye(4)
     T[:3, 3] = [1, 2, 15]
-    surface = skin3d.stimulus_surface(build_field(load_object("sphere")).distance, T, bounds_mm=skin3d.SCENE_BOUNDS_MM)
+    surface = skin3d.object_surface(build_field(load_object("sphere")).distance, T, bounds_mm=skin3d.SCENE_BOUNDS_MM)
     radius = np.linalg.norm(surface.points - [1, 2, 25], axis=1)
     assert np.abs(radius - 10).max() < 0.1
 

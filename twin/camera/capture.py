@@ -1,10 +1,9 @@
-"""Video streams of luma and colour differences, as cameras send them, and the 8-bit colours that come out of them.
+"""The capture side: from light on the film to the frames that a camera and its recorder deliver.
 
-Studio range: luma from 16 to 235, colour differences from 16 to 240. The way back is the usual integer arithmetic
-(products with 256 times the coefficients, rounded), so that only about 18 % of all colours ever appear in such a frame.
-
-
-The capture side: from light on the film to the frames a camera and its recorder deliver."""
+Cameras send luma and colour differences, and 8-bit colours come out of them. Both are in studio range: luma from 16 to 235, colour
+differences from 16 to 240. The way back is the usual integer arithmetic (products with 256 times the coefficients, rounded), so that
+only about 18 % of all colours ever appear in such a frame.
+"""
 
 import cv2
 import numpy as np
@@ -28,63 +27,9 @@ CHROMA_MIDDLE = 128
 ON_STREAM = 0.98
 """A frame came by a stream if at least this share of its pixels has colours that the stream can give."""
 CLIPPED = (2, 253)
-"""Pixels with a level at or beyond these are left out: their colours may have been cut off."""
+"""Pixels with a level at or beyond these are not looked at: their colours may have been cut off."""
 MOST_PIXELS = 20_000
-"""At most this many pixels are looked at."""
-
-
-def luma_weights(stream: str) -> FloatArray:
-    """(3,) shares of red, green and blue in the luma."""
-    red, blue = RED_BLUE[stream]
-    return np.array([red, 1 - red - blue, blue], np.float32)
-
-
-def encoded(gray: FloatArray, stream: str) -> IntArray:
-    """Whole numbers (..., 3) of luma, blue and red difference, of gray levels (..., 3)."""
-    weights = luma_weights(stream)
-    luma = gray @ weights
-    difference = [(gray[..., k] - luma) * (0.5 / (1 - weights[k]) * CHROMA_RANGE / 255) + CHROMA_MIDDLE for k in (2, 0)]
-    return np.clip(np.rint(np.stack([luma * (LUMA_RANGE / 255) + LUMA_FLOOR, *difference], axis=-1)), 0, 255).astype(np.int32)
-
-
-def decoded(numbers: IntArray, stream: str) -> ImageArray:
-    """Colours (..., 3) uint8 of luma and colour differences (..., 3)."""
-    red, green, blue = (float(w) for w in luma_weights(stream))
-    gain, difference = round(256 * 255 / LUMA_RANGE), 256 * 255 / CHROMA_RANGE
-    luma = gain * (numbers[..., 0] - LUMA_FLOOR) + 128
-    b, r = (numbers[..., k] - CHROMA_MIDDLE for k in (1, 2))
-    to_red, to_blue = 2 * (1 - red) * difference, 2 * (1 - blue) * difference
-    from_blue, from_red = round(to_blue * blue / green), round(to_red * red / green)
-    colours = np.stack([luma + round(to_red) * r, luma - from_blue * b - from_red * r, luma + round(to_blue) * b], axis=-1)
-    return np.clip(colours >> 8, 0, 255).astype(np.uint8)
-
-
-def through_stream(gray: FloatArray, stream: str) -> ImageArray:
-    """Colours (H, W, 3) uint8 that gray levels (H, W, 3) leave a stream with; "rgb": only rounded."""
-    if stream == "rgb":
-        return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
-    return decoded(encoded(np.clip(gray, 0, 255), stream), stream)
-
-
-def stream_of(images: list[ImageArray]) -> str:
-    """The stream that frames (H, W, 3) uint8 came by, told by which colours they have; "rgb" where none explains them."""
-    pixels = np.concatenate([image.reshape(-1, 3) for image in images if image.ndim == 3] or [np.zeros((0, 3), np.uint8)])
-    pixels = pixels[((pixels > CLIPPED[0]) & (pixels < CLIPPED[1])).all(axis=1)]
-    pixels = pixels[:: max(len(pixels) // MOST_PIXELS, 1)]
-    if not len(pixels):
-        return "rgb"
-    shares = {stream: float(_possible(pixels, stream).mean()) for stream in STREAMS}
-    best = max(shares, key=lambda stream: shares[stream])
-    return best if shares[best] >= ON_STREAM else "rgb"
-
-
-def _possible(pixels: ImageArray, stream: str) -> BoolArray:
-    """(n,) bool: colours (n, 3) that the stream can give."""
-    near = encoded(pixels.astype(np.float32), stream)
-    steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
-    return (decoded(near + steps, stream) == pixels).all(axis=2).any(axis=0)
-
-
+"""At most this many pixels are looked at to tell a stream."""
 JPEG_BLOCK_PX = 16
 """Side of the blocks of a JPEG whose chroma has half the resolution."""
 MEDIAN_PX = 5
@@ -269,6 +214,58 @@ def record(raw: ImageArray, recording: RecordingSpec, *, origin_px: tuple[int, i
     size = (recording.width_px, recording.height_px)
     stored = binary if binary.shape[::-1] == size else cv2.resize(binary, size, interpolation=cv2.INTER_AREA)
     return stored.astype(np.uint8, copy=False)
+
+
+def luma_weights(stream: str) -> FloatArray:
+    """(3,) shares of red, green and blue in the luma."""
+    red, blue = RED_BLUE[stream]
+    return np.array([red, 1 - red - blue, blue], np.float32)
+
+
+def encoded(gray: FloatArray, stream: str) -> IntArray:
+    """Whole numbers (..., 3) of luma, blue and red difference, of gray levels (..., 3)."""
+    weights = luma_weights(stream)
+    luma = gray @ weights
+    difference = [(gray[..., k] - luma) * (0.5 / (1 - weights[k]) * CHROMA_RANGE / 255) + CHROMA_MIDDLE for k in (2, 0)]
+    return np.clip(np.rint(np.stack([luma * (LUMA_RANGE / 255) + LUMA_FLOOR, *difference], axis=-1)), 0, 255).astype(np.int32)
+
+
+def decoded(numbers: IntArray, stream: str) -> ImageArray:
+    """Colours (..., 3) uint8 of luma and colour differences (..., 3)."""
+    red, green, blue = (float(w) for w in luma_weights(stream))
+    gain, difference = round(256 * 255 / LUMA_RANGE), 256 * 255 / CHROMA_RANGE
+    luma = gain * (numbers[..., 0] - LUMA_FLOOR) + 128
+    b, r = (numbers[..., k] - CHROMA_MIDDLE for k in (1, 2))
+    to_red, to_blue = 2 * (1 - red) * difference, 2 * (1 - blue) * difference
+    from_blue, from_red = round(to_blue * blue / green), round(to_red * red / green)
+    colours = np.stack([luma + round(to_red) * r, luma - from_blue * b - from_red * r, luma + round(to_blue) * b], axis=-1)
+    return np.clip(colours >> 8, 0, 255).astype(np.uint8)
+
+
+def through_stream(gray: FloatArray, stream: str) -> ImageArray:
+    """Colours (H, W, 3) uint8 that gray levels (H, W, 3) leave a stream with; "rgb": only rounded."""
+    if stream == "rgb":
+        return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+    return decoded(encoded(np.clip(gray, 0, 255), stream), stream)
+
+
+def stream_of(images: list[ImageArray]) -> str:
+    """The stream that frames (H, W, 3) uint8 came by, told by which colours they have; "rgb" where none explains them."""
+    pixels = np.concatenate([image.reshape(-1, 3) for image in images if image.ndim == 3] or [np.zeros((0, 3), np.uint8)])
+    pixels = pixels[((pixels > CLIPPED[0]) & (pixels < CLIPPED[1])).all(axis=1)]
+    pixels = pixels[:: max(len(pixels) // MOST_PIXELS, 1)]
+    if not len(pixels):
+        return "rgb"
+    shares = {stream: float(_possible(pixels, stream).mean()) for stream in STREAMS}
+    best = max(shares, key=lambda stream: shares[stream])
+    return best if shares[best] >= ON_STREAM else "rgb"
+
+
+def _possible(pixels: ImageArray, stream: str) -> BoolArray:
+    """(n,) bool: colours (n, 3) that the stream can give."""
+    near = encoded(pixels.astype(np.float32), stream)
+    steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
+    return (decoded(near + steps, stream) == pixels).all(axis=2).any(axis=0)
 
 
 def _scaled(plane: FloatArray, scale: float, centre: float, shift: float) -> FloatArray:

@@ -13,8 +13,8 @@ x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),
 y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y;
 or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 + k2 theta^4).
 
-
-The part of the raw frame that shows the gel: the housing's aperture."""
+`lens_disc` gives the part of the raw frame that shows the gel: the housing's aperture.
+"""
 
 from dataclasses import dataclass
 
@@ -31,6 +31,8 @@ GRAZING = 1e6
 """Tangent beyond which a ray counts as parallel to the window."""
 LEAST_FISHEYE_SLOPE = 0.05
 """Slope of the fisheye's radius by the angle that Newton's method assumes at least, near the distortion's fold."""
+CORNERS = 360
+"""Corners of the polygon that stands for the aperture's rim."""
 
 
 def sensor_to_camera(camera: CameraSpec) -> FloatArray:
@@ -137,26 +139,6 @@ def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArr
     return place, direction
 
 
-def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:
-    """Heights of air, window and gel between the planes ``from_mm`` (in the air) and ``z_mm``, and their indices."""
-    back, front = view.lens.back_mm, view.lens.z_mm
-    z = np.asarray(z_mm, float)
-    heights = np.minimum(z, back) - from_mm, np.clip(z, back, front) - back, np.maximum(z - front, 0)
-    return heights, (1.0, view.lens.refractive_index, view.gel_index)
-
-
-def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:
-    return angle * (1 + camera.k1 * angle**2 + camera.k2 * angle**4)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-# Corners of the polygon that stands for the aperture's rim.
-CORNERS = 360
-
-
 @dataclass(frozen=True)
 class Disc:
     """The lens disc in the raw frame.
@@ -193,3 +175,19 @@ def lens_disc(spec: SensorSpec) -> Disc:
     center = rim_px.mean(axis=0)
     radius = float(np.linalg.norm(rim_px - center, axis=1).mean())
     return round_disc((spec.camera.width_px, spec.camera.height_px), center, radius)
+
+
+def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:
+    """Heights of air, window and gel between the planes ``from_mm`` (in the air) and ``z_mm``, and their indices."""
+    back, front = view.lens.back_mm, view.lens.z_mm
+    z = np.asarray(z_mm, float)
+    heights = np.minimum(z, back) - from_mm, np.clip(z, back, front) - back, np.maximum(z - front, 0)
+    return heights, (1.0, view.lens.refractive_index, view.gel_index)
+
+
+def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:
+    return angle * (1 + camera.k1 * angle**2 + camera.k2 * angle**4)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -60,15 +60,17 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     contacts: list[ContactContent] = []
     seconds: dict[str, float] = {}
     notes: set[str] = set()
-    for sensor, stimulus, pose, form in CONTACTS:
+    for sensor, object_name, pose, form in CONTACTS:
         start = perf_counter()
-        with bar(f"{sensor}: press the {stimulus}, render, detect") as step:
+        with bar(f"{sensor}: press the {object_name}, render, detect") as step:
             simulator = simulators[sensor] = Simulator(load_sensor(sensor))
-            result = run_contact(simulator, stimulus, pose, form, progress=step)
-        seconds[f"{sensor} against {stimulus}"] = perf_counter() - start
+            result = run_contact(simulator, object_name, pose, form, progress=step)
+        seconds[f"{sensor} against {object_name}"] = perf_counter() - start
         with bar(f"{sensor}: pictures"):
-            skin = pictures / f"{sensor}-{stimulus}-skin.png"
-            notes.add(draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_field(load_object(stimulus)), skin))
+            skin = pictures / f"{sensor}-{object_name}-skin.png"
+            notes.add(
+                draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_field(load_object(object_name)), skin)
+            )
             contacts.append(_contact_content(simulator, result, skin, pictures))
 
     motion_sensor = CONTACTS[0][0]
@@ -112,8 +114,8 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
     contact_px = from_raw(spec.recording, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
     return ContactContent(
-        title=f"{spec.name} against {result.stimulus}",
-        description=f"{spec.description}. {load_object(result.stimulus).description}, pressed in by {result.pose.indent_mm:g} mm.",
+        title=f"{spec.name} against {result.object_name}",
+        description=f"{spec.description}. {load_object(result.object_name).description}, pressed in by {result.pose.indent_mm:g} mm.",
         pictures=written | {"skin": skin},
         raw_size=f"{width} x {height} px",
         figures=contact_figures(result, contact_px),

@@ -58,7 +58,7 @@ class ContactResult:
     """One contact through the whole chain."""
 
     sensor: str
-    stimulus: str
+    object_name: str
     pose: ContactPose
     state: ContactState
     raw: Shot
@@ -66,15 +66,15 @@ class ContactResult:
     seconds: dict[str, float]
 
 
-def run_contact(simulator: Simulator, stimulus: str, pose: ContactPose, form: Form, *, progress: Step | None = None) -> ContactResult:
+def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step | None = None) -> ContactResult:
     """Press, render, capture, detect, build the graph: one contact beside no contact."""
     timed = Timed()
-    state = timed.run("press", lambda: simulator.press(load_object(stimulus), pose, progress=progress))
+    state = timed.run("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
     raw = timed.run("render", lambda: simulator.shoot(state))
     shot = raw if form is Form.RAW else timed.run("capture", lambda: simulator.as_recorded(raw, state))
     look = look_at(simulator, shot)
     seconds = timed.seconds | {"pins and graph": look.observation.ms["total"] / 1e3}
-    return ContactResult(simulator.spec.name, stimulus, pose, state, raw, look, seconds)
+    return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds)
 
 
 @dataclass(frozen=True)

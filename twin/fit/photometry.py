@@ -1,10 +1,9 @@
-"""The light of chosen pixels of real frames as a differentiable function of what lights and colours the sensor.
-
-Lights and colours from the gray levels of caps and skin, by Gauss-Newton on the differentiable renderer.
+"""Lights and colours from the gray levels of caps and skin, by Gauss-Newton on the differentiable renderer.
 
 Only the product of LED power, exposure and reflectance is seen. Therefore the caps' largest reflectance is held at ``CAP_ALBEDO``
-(printed white) and the exposure as it is; the power follows. Caps that differ from the others count less (robust weights);
-``caps`` finds their own reflectance afterwards."""
+(printed white) and the exposure stays as it is; the power follows. Caps that differ from the others count less (robust weights);
+``twin.fit.caps`` finds their own reflectance afterwards.
+"""
 
 from dataclasses import dataclass
 
@@ -13,155 +12,51 @@ import numpy as np
 
 from scenes.sensor import BlobSpec, GelSpec, ResponseSpec, SensorSpec
 from twin.camera.capture import blurred
-from twin.errors import RenderError
 from twin.judge.pictures.aligned import SATURATED, Aligned, levels_slope, require_cameras_own, revised, to_levels, to_light
 from twin.judge.pictures.spots import clear_of_pins, pin_spacing_px
-from twin.optics.arrays import with_room
-from twin.optics.render import BOUNCES, GelView, Renderer
-from twin.optics.tracer import spectrum
-from twin.optics.variant import DrJit, use_variant
+from twin.optics.light_model import Knobs, LightModel
+from twin.optics.render import Renderer
 from twin.progress import Step
-from twin.types import FloatArray, IntArray, PinState
 
-SAMPLES = 32
-"""Samples per pixel."""
-
-
-@dataclass(frozen=True)
-class Knobs:
-    """What the fit turns: factors on the specification's light and reflectances, (3,) linear RGB where coloured.
-
-    Attributes
-    ----------
-    leds : (k,) float
-        Of each lit LED.
-    fill : float
-        Of the ring's light into the gel.
-    skin, caps, stems : (3,) float
-    """
-
-    leds: FloatArray
-    fill: float
-    skin: FloatArray
-    caps: FloatArray
-    stems: FloatArray
-
-    @classmethod
-    def neutral(cls, leds: int) -> "Knobs":
-        """Every factor 1."""
-        return cls(np.ones(leds), 1.0, np.ones(3), np.ones(3), np.ones(3))
-
-
-class LightModel:
-    """Light in the gel at chosen pixels of one state, and its derivatives by forward differentiation.
-
-    Parameters
-    ----------
-    renderer : Renderer
-        Of the specification where the fit starts, the whole frame, with a variant that differentiates.
-    state : object
-        As ``Renderer.render`` takes it.
-    pixels : (n,) int
-        Of the raw frame, row by row.
-    seed : int
-
-    Raises
-    ------
-    RenderError
-        Where only the scalar variant works.
-    """
-
-    def __init__(self, renderer: Renderer, state: PinState, pixels: IntArray, seed: int) -> None:
-        if renderer.choice.backend == "scalar":
-            raise RenderError(
-                "calibration differentiates the renderer, which the scalar variant can't: run 'twin doctor' for what is missing"
-            )
-        import drjit as dr
-
-        self._mi, self._dr, self._seed = use_variant(renderer.choice), dr, seed
-        mi = self._mi
-        self._view = GelView(mi, renderer.spec, renderer.window_px, renderer.surfaces(state), BOUNCES)
-        self._pixels = mi.UInt32(with_room(pixels, np.uint32))
-        emitters = self._view.tracer.emitters
-        self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
-        self._radiance = [mi.Spectrum(r) for r in emitters.radiance]
-        self._shapes = {shape.id(): mi.ShapePtr(shape) for shape in self._view.tracer.scene.shapes()}
-
-    @property
-    def led_count(self) -> int:
-        """Lit LEDs."""
-        return self._led_count
-
-    def light(self, knobs: Knobs) -> FloatArray:
-        """(n, channels) light of the gel on the film."""
-        self._turn(knobs, {})
-        return np.array(self._view.trace(self._pixels, SAMPLES, self._seed)).T
-
-    def slopes(self, knobs: Knobs) -> dict[str, FloatArray]:
-        """Derivatives (n, channels) by the logarithm of each knob: ``led0``..., ``fill``, ``skin``, ``caps``, ``stems``.
-
-        A coloured knob acts on each channel alone, so that one pass serves all channels; all passes share one kernel.
-        """
-        mi, dr = self._mi, self._dr
-        names = [*(f"led{k}" for k in range(self._led_count)), "skin", "caps", "stems"]
-        if len(self._radiance) > self._led_count:
-            names.append("fill")
-        found = {}
-        for name in names:
-            steps = {each: mi.Float(0.0) for each in names}
-            dr.enable_grad(steps)
-            for each, step in steps.items():
-                dr.set_grad(step, dr.opaque(mi.Float, float(each == name)))
-            self._turn(knobs, steps)
-            image = self._view.trace(self._pixels, SAMPLES, self._seed)
-            found[name] = np.array(dr.forward_to(image)).T
-        return found
-
-    def _turn(self, knobs: Knobs, steps: dict[str, DrJit]) -> None:
-        """Set the knobs, each with its step (zero, but with a gradient) in its logarithm."""
-        mi, dr, tracer = self._mi, self._dr, self._view.tracer
-
-        def factor(knob: str, value: DrJit) -> DrJit:
-            return value * (1 + steps[knob]) if knob in steps else value
-
-        leds = [*((f"led{k}", float(v)) for k, v in enumerate(knobs.leds)), ("fill", float(knobs.fill))]
-        tracer.emitters.radiance[:] = [
-            base * factor(knob, dr.opaque(mi.Float, v)) for base, (knob, v) in zip(self._radiance, leds, strict=False)
-        ]
-        tracer.tints[:] = []
-        for part, shape in self._shapes.items():
-            tint = spectrum(mi, getattr(knobs, part))
-            dr.make_opaque(tint)
-            tracer.tints.append((shape, factor(part, tint)))
-
-
-# Reflectance of the caps' brightest channel. Assumed: white printing resin.
 CAP_ALBEDO = 0.8
-# Pixels of bare skin that are taken from a frame.
+"""Reflectance of the caps' brightest channel. Assumed: white printing resin."""
 SKIN_SAMPLES = 250
-# Bare skin is farther from every cap's middle than this share of the pins' spacing.
+"""Pixels of bare skin that are taken from a frame."""
 SKIN_CLEARANCE = 0.6
-# Pixels outside this share of the mask's radius are left out: light from the rim reaches them.
+"""Bare skin is farther from every cap's middle than this share of the pins' spacing."""
 DISC_SHARE = 0.9
-# Gauss-Newton steps.
+"""Pixels outside this share of the mask's radius are left out: light from the rim reaches them."""
 STEPS = 6
-# Slopes are computed anew at one step in this many: the light is nearly linear in the unknowns.
+"""Gauss-Newton steps."""
 SLOPES_EVERY = 2
-# Residual, gray levels, beyond which a sample counts less (Cauchy).
+"""Slopes are computed anew at every step of this number only: the light is nearly linear in the unknowns."""
 ROBUST_LEVELS = 12.0
-# Sd of the logarithm of an LED's share before the frames are seen.
+"""Residual, gray levels, beyond which a sample counts less (Cauchy)."""
 BALANCE_SD = 0.3
-# Largest change of an unknown (a logarithm) in one step.
+"""Sd of the logarithm of an LED's share before the frames are seen."""
 LARGEST_STEP = 0.7
-# Damping of the normal equations, relative to their trace: keeps them solvable.
+"""Largest change of an unknown (a logarithm) in one step."""
 DAMPING = 1e-9
-# Largest haze that is allowed.
+"""Damping of the normal equations, relative to their trace: keeps them solvable."""
 MOST_HAZE = 0.5
+"""Largest haze that is allowed."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Places in one frame: pixels (n, 2), levels (n, channels), light of the blurred frame there, and which are caps (n,)."""
+    """Places in one frame.
+
+    Attributes
+    ----------
+    pixels : (n, 2) int
+        x and y.
+    levels : (n, channels) float
+        Gray levels.
+    veil : (n, channels) float
+        Light of the blurred frame, which haze spreads.
+    caps : (n,) bool
+        Whether the place is a cap; bare skin otherwise.
+    """
 
     pixels: np.ndarray
     levels: np.ndarray
@@ -171,7 +66,14 @@ class Samples:
 
 @dataclass(frozen=True)
 class PhotometryFit:
-    """What was found: rms in gray levels of caps and skin, first and last."""
+    """A fitted specification.
+
+    Attributes
+    ----------
+    spec : SensorSpec
+    caps_rms, skin_rms : (first, last)
+        Rms residual of caps and of bare skin at the first and at the last step, gray levels.
+    """
 
     spec: SensorSpec
     caps_rms: tuple[float, float]
@@ -243,8 +145,7 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> P
     ]
     levels, veil, caps = (np.concatenate([getattr(s, name) for s in samples]) for name in ("levels", "veil", "caps"))
     useful = np.all(levels < SATURATED, axis=1)
-    channels, leds = levels.shape[1], models[0].led_count
-    layout = _Layout(leds, channels)
+    layout = _Layout(models[0].led_count, levels.shape[1])
     x = layout.start(models, to_light(levels[caps & useful], spec.response), caps & useful, spec.gel.haze)
     slopes: dict[str, np.ndarray] = {}
     rms: list[tuple[float, float]] = []
@@ -256,13 +157,7 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> P
         seen = (1 - x[-1]) * light + x[-1] * veil
         residual = np.where(useful[:, None], levels - to_levels(seen, spec.response), 0.0)
         jacobian = layout.jacobian(slopes, light, veil, x[-1], levels_slope(seen, spec.response)) * useful[:, None, None]
-        weight = 1 / (1 + (residual / ROBUST_LEVELS) ** 2)
-        a = jacobian.reshape(-1, len(x))
-        hessian = (a * weight.reshape(-1, 1)).T @ a
-        prior = np.zeros(len(x))
-        prior[:leds] = weight.sum() / len(frames) / leds * (1.0 / BALANCE_SD) ** 2
-        move = np.linalg.solve(hessian + np.diag(prior + DAMPING * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
-        x = x + np.clip(move, -LARGEST_STEP, LARGEST_STEP)
+        x = x + np.clip(layout.move(jacobian, residual, x, len(frames)), -LARGEST_STEP, LARGEST_STEP)
         x[-1] = np.clip(x[-1], 0, MOST_HAZE)
         rms.append((_rms(residual[caps & useful]), _rms(residual[~caps & useful])))
         progress(step + 1, STEPS)
@@ -276,9 +171,9 @@ def _rms(residual: np.ndarray) -> float:
 
 
 class _Layout:
-    """Where each knob stands in the vector of unknowns: logarithms of LEDs, skin, caps; then the haze."""
+    """The place of each knob in the vector of unknowns: logarithms of the factors on LEDs, skin and caps, then the haze."""
 
-    def __init__(self, leds: int, channels: int):
+    def __init__(self, leds: int, channels: int) -> None:
         self.leds, self.channels = leds, channels
         self.count = leds + 2 * channels + 1
         self.skin, self.caps = slice(leds, leds + channels), slice(leds + channels, leds + 2 * channels)
@@ -295,7 +190,7 @@ class _Layout:
     def knobs(self, x: np.ndarray) -> Knobs:
         """The light model's knobs; stems go with the skin."""
         skin, caps = (np.broadcast_to(np.exp(x[part]), 3) for part in (self.skin, self.caps))
-        return Knobs(np.exp(x[: self.leds]), 1.0, skin, caps, skin)
+        return Knobs(np.exp(x[: self.leds]), skin, caps, skin)
 
     def jacobian(self, slopes: dict[str, np.ndarray], light: np.ndarray, veil: np.ndarray, haze: float, curve: np.ndarray) -> np.ndarray:
         """Derivatives (n, channels, unknowns) of the gray levels."""
@@ -308,6 +203,18 @@ class _Layout:
         result *= (1 - haze) * curve[..., None]
         result[..., -1] = (veil - light) * curve
         return result
+
+    def move(self, jacobian: np.ndarray, residual: np.ndarray, x: np.ndarray, frames: int) -> np.ndarray:
+        """The Gauss-Newton step (unknowns,) from ``x``, for residuals (n, channels) of so many frames; outliers count less (Cauchy).
+
+        The prior of the LEDs' shares counts as much as one of the frames.
+        """
+        weight = 1 / (1 + (residual / ROBUST_LEVELS) ** 2)
+        a = jacobian.reshape(-1, len(x))
+        hessian = (a * weight.reshape(-1, 1)).T @ a
+        prior = np.zeros(len(x))
+        prior[: self.leds] = weight.sum() / frames / self.leds * (1.0 / BALANCE_SD) ** 2
+        return np.linalg.solve(hessian + np.diag(prior + DAMPING * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
 
     def applied(self, spec: SensorSpec, x: np.ndarray) -> SensorSpec:
         """The specification with the unknowns put in; the ring's own look keeps its brightness."""

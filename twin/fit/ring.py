@@ -1,6 +1,7 @@
-"""The edge of the disc through which the gel is seen: where the housing's opening lies, from the still picture.
+"""The housing's opening and the bright ring around it, fitted to the still picture.
 
-The bright ring and wall around the disc: their light, from the still picture."""
+First the edge of the disc through which the gel is seen: it tells where the opening lies. Then the light of ring and wall outside it.
+"""
 
 from dataclasses import dataclass
 
@@ -15,22 +16,52 @@ from twin.fit.still import ROBUST_LEVELS, Still, fit_bounded, level_misfit, samp
 from twin.judge.pictures.aligned import revised, to_light
 from twin.optics.static_layer import housing_light
 
-# Rays from the disc's centre along which the edge is looked for.
 RAYS = 720
-# Where the edge is looked for in each pass, as shares of the radius found so far: the first pass forgives a wrong specification.
+"""Rays from the disc's centre along which the edge is looked for."""
 REACHES = ((0.75, 1.3), (0.9, 1.1), (0.9, 1.1))
-# Step along a ray, px.
+"""Where each pass looks for the edge, as shares of the radius found so far. The first pass is wide: the specification may be wrong."""
 STEP_PX = 0.25
-# The ring's light is read this far outside the place where the ring begins, px.
+"""Step along a ray, px."""
 TOP_PX = 4.0
-# Share of the brightest mean light along a ray at which the ring begins.
+"""The ring's light is read this far outside the place where the ring begins, px."""
 RING_BEGINS = 0.9
-# Half of the width over which the ring's light is averaged, in steps along a ray.
+"""The ring begins where the mean light along the rays reaches this share of its largest value."""
 TOP_HALF_STEPS = 4
-# Residual, px, beyond which a place of the edge counts less: cables and flaws of the rim stand out by more.
+"""Half of the width over which the ring's light is averaged, in steps along a ray."""
 EDGE_PX = 0.5
-# Least share of the rays that must cross an edge.
+"""Residual, px, beyond which a place of the edge counts less. Cables and flaws of the rim stand out by more."""
 LEAST_RAYS = 0.5
+"""Least share of the rays that must cross an edge."""
+EVERY = 6
+"""Of this many pixels one is compared, in both directions: the ring's light is smooth."""
+RIM_PX = 3.0
+"""Pixels this close to the disc's edge are left out, px, because the edge itself is blurred."""
+BOUNDS = {
+    "ambient": (0.01, 50.0),
+    "ambient_falloff_mm": (1.0, 300.0),
+    "glow": (0.01, 300.0),
+    "glow_radius_mm": (0.9, 1.25),
+    "glow_height_mm": (0.2, 15.0),
+    "glow_exponent": (0.7, 10.0),
+    "wall_fraction": (0.01, 1.0),
+    "lip_width_mm": (0.05, 6.0),
+    "red": (0.1, 3.0),
+    "blue": (0.1, 3.0),
+}
+"""Least and largest value of each fitted quantity; their logarithms are fitted. ``glow_radius_mm`` is relative to the opening's radius;
+``red`` and ``blue`` are the wall's reflectance relative to green."""
+START_LIPS_MM = (0.4, 1.0, 2.0, 3.5)
+"""Widths of the lip to start from, mm. The step at the lip makes local optima: each start is tried, and the best one is refined."""
+TRIAL_STEPS = 8
+"""Steps of the fit from each of these starts."""
+SMOOTH_STEPS = 40
+"""Steps of the fit without a step at the lip."""
+LEAST_STEP_GAIN = 0.05
+"""There is a step at the lip only if it lowers the misfit by at least this share against the fit without one."""
+LEAST_START = 1e-3
+"""Least starting value, because its logarithm is taken."""
+NO_STEP = -1e-6
+"""Lower bound of the logarithm of ``wall_fraction`` where there is no step: the wall is as bright as the lip."""
 
 
 def fit_disc_edge(spec: SensorSpec, still: Still) -> SensorSpec:
@@ -90,34 +121,6 @@ def _circle_through(points: np.ndarray, start: list[float], scale: float) -> tup
     return x, y, radius
 
 
-# One pixel in this many, in both directions, is compared: the ring's light is smooth.
-EVERY = 6
-# Pixels this close to the disc's edge are left out, px: the edge itself is blurred.
-RIM_PX = 3.0
-# Least and largest value of what is fitted, as logarithms. ``glow_radius_mm`` is relative to the opening's radius; ``red`` and ``blue``
-# are the wall's reflectance relative to green.
-BOUNDS = {
-    "ambient": (0.01, 50.0),
-    "ambient_falloff_mm": (1.0, 300.0),
-    "glow": (0.01, 300.0),
-    "glow_radius_mm": (0.9, 1.25),
-    "glow_height_mm": (0.2, 15.0),
-    "glow_exponent": (0.7, 10.0),
-    "wall_fraction": (0.01, 1.0),
-    "lip_width_mm": (0.05, 6.0),
-    "red": (0.1, 3.0),
-    "blue": (0.1, 3.0),
-}
-# Starting values of the lip's width, mm. The step at the lip makes local optima: each start is tried, and the best one is refined.
-START_LIPS_MM = (0.4, 1.0, 2.0, 3.5)
-# Steps of the fit from each of these starts, and of the fit without a step at the lip.
-TRIAL_STEPS, SMOOTH_STEPS = 8, 40
-# A step at the lip must lower the misfit by this share against the fit without one: else there is none.
-LEAST_STEP_GAIN = 0.05
-# A starting value is at least this large, because its logarithm is taken.
-LEAST_START = 1e-3
-
-
 @dataclass(frozen=True)
 class _Wall:
     """Pixels of the still picture that are compared, thinned out, and what lies behind their light.
@@ -166,7 +169,7 @@ def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
         return float(np.sum(np.log1p((residual(found) / ROBUST_LEVELS) ** 2))), found
 
     without_step = low.copy()
-    without_step[names.index("wall_fraction")] = -1e-6  # logarithm: the wall is as bright as the lip
+    without_step[names.index("wall_fraction")] = NO_STEP
     smooth_misfit, smooth = fitted({"wall_fraction": 1.0}, without_step, SMOOTH_STEPS)
     tried = [fitted({"lip_width_mm": width_mm}, low, TRIAL_STEPS) for width_mm in START_LIPS_MM]
     step_misfit, stepped = min(tried, key=lambda fit: fit[0])

@@ -1,6 +1,7 @@
-"""The still picture: what stays in place while contacts come and go, as the median of many frames.
+"""The still picture of many frames, and fits of modelled light to its gray levels.
 
-Comparing modelled light with gray levels, and fitting parameters to the difference."""
+The still picture is the median of the frames: it holds what stays in place while contacts come and go.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +14,17 @@ from scenes.sensor import ResponseSpec, SensorSpec
 from twin.camera.projection import pixel_rays
 from twin.frames.forms import gray_levels
 from twin.judge.pictures.aligned import SATURATED
+
+ROBUST_LEVELS = 16.0
+"""Residual, in gray levels, beyond which a pixel counts less (scale of the soft-L1 loss)."""
+SLOPE_STEP = 0.01
+"""Step for slopes, as a share of a parameter's range. It is large because the models have small jumps at pixel borders."""
+BOUND_MARGIN = 0.01
+"""Least squares starts at least this far from its bounds, as a share of the range."""
+SUBPIXELS = 2
+"""Places inside a pixel, in each direction, over which a model with small details is averaged."""
+Residual = Callable[[np.ndarray], np.ndarray]
+"""From values (p,) to their misfit (n,) in gray levels."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +65,6 @@ def sampled(field: np.ndarray, at_px: np.ndarray) -> np.ndarray:
     x, y = (at_px[..., k].reshape(len(at_px), -1).astype(np.float32) for k in (0, 1))
     found = cv2.remap(field.astype(np.float32), x, y, cv2.INTER_LINEAR)
     return found.reshape(at_px.shape[:-1] + field.shape[2:]).astype(float)
-
-
-# Residual, in gray levels, beyond which a pixel counts less (scale of the soft-L1 loss).
-ROBUST_LEVELS = 16.0
-# Step for slopes, as a share of a parameter's range. It is large because the models have small jumps at pixel borders.
-SLOPE_STEP = 0.01
-# Least squares starts at least this far from its bounds, as a share of the range.
-BOUND_MARGIN = 0.01
-# Places inside a pixel, each way, over which a model with small details is averaged.
-SUBPIXELS = 2
-
-Residual = Callable[[np.ndarray], np.ndarray]  # values (p,) -> misfit (n,) in gray levels
 
 
 def level_misfit(light: np.ndarray, real: np.ndarray, response: ResponseSpec) -> np.ndarray:

@@ -1,6 +1,8 @@
-"""Silence for the libraries below OpenCV: they print their messages to the process's stderr, where no Python code can catch them.
+"""One picture from a file, as 8-bit levels, and back to a file.
 
-One picture from a file, as 8-bit levels."""
+The libraries below OpenCV print their messages to the process's stderr, where no Python code can catch them. `quiet` turns stderr away
+for the length of one decoder call.
+"""
 
 import contextlib
 import os
@@ -15,53 +17,18 @@ import numpy as np
 from twin.errors import FrameError
 from twin.store import write_bytes
 
-# File descriptor of the process's stderr.
+PNG_START = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a PNG file."""
+DEPTHS = (8, 10, 12, 14, 16)
+"""Numbers of bits that cameras deliver in 16-bit files."""
 STDERR = 2
+"""File descriptor of the process's stderr."""
+
 _lock = threading.Lock()
-_inside = 0
+_inside = 0  # number of calls that keep stderr turned away
 _kept: int | None = None  # the real stderr while it is turned away
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET; read by OpenCV when it opens its first video
-
-
-def _turn_away() -> None:
-    global _inside, _kept
-    with _lock:
-        _inside += 1
-        if _inside > 1:
-            return
-        try:
-            _kept = os.dup(STDERR)
-        except OSError:  # no stderr at all
-            return
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, STDERR)
-        os.close(nowhere)
-
-
-def _turn_back() -> None:
-    global _inside, _kept
-    with _lock:
-        _inside -= 1
-        if _inside == 0 and _kept is not None:
-            os.dup2(_kept, STDERR)
-            os.close(_kept)
-            _kept = None
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Drop what any thread prints to stderr inside. Use it for the length of one decoder call only."""
-    _turn_away()
-    try:
-        yield
-    finally:
-        _turn_back()
-
-
-PNG_START = b"\x89PNG\r\n\x1a\n"
-# Bits that cameras deliver in 16-bit files.
-DEPTHS = (8, 10, 12, 14, 16)
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET; OpenCV reads it when it opens its first video
 
 
 def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
@@ -70,12 +37,13 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
     Parameters
     ----------
     bits : int
-        At least so many bits of a 16-bit file are in use (of the recording it belongs to); its own levels may show more.
+        At least this many bits of a 16-bit file are in use: the recording that it belongs to shows it. The file's own levels may show
+        more.
 
     Raises
     ------
     FrameError
-        It can't be read: missing, empty, truncated, not a picture.
+        The file cannot be read: it is missing, empty, truncated or no picture.
     """
     image, note = to_eight_bits(decode(path), bits)
     if image.ndim == 3:
@@ -89,7 +57,7 @@ def write_image(path: Path, image: np.ndarray) -> Path:
     Raises
     ------
     StoreError
-        It can't be written.
+        The file cannot be written.
     """
     return write_bytes(path, cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes())
 
@@ -100,7 +68,7 @@ def decode(path: Path) -> np.ndarray:
     Raises
     ------
     FrameError
-        It can't be read: missing, empty, truncated, not a picture.
+        The file cannot be read: it is missing, empty, truncated or no picture.
     """
     try:
         data = path.read_bytes()
@@ -153,3 +121,40 @@ def to_eight_bits(image: np.ndarray, bits: int = 0) -> tuple[np.ndarray, str]:
         return image, ""
     bits = max(bits, bits_used(image))
     return np.round(image * (255.0 / ((1 << bits) - 1))).astype(np.uint8), f"16-bit levels taken as {bits}-bit data and scaled to 8 bits"
+
+
+def _turn_away() -> None:
+    """Send stderr to nowhere, unless another call has done so already."""
+    global _inside, _kept
+    with _lock:
+        _inside += 1
+        if _inside > 1:
+            return
+        try:
+            _kept = os.dup(STDERR)
+        except OSError:  # no stderr at all
+            return
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, STDERR)
+        os.close(nowhere)
+
+
+def _turn_back() -> None:
+    """Bring stderr back when the last call inside has ended."""
+    global _inside, _kept
+    with _lock:
+        _inside -= 1
+        if _inside == 0 and _kept is not None:
+            os.dup2(_kept, STDERR)
+            os.close(_kept)
+            _kept = None
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Drop what any thread prints to stderr inside. Use it for the length of one decoder call only."""
+    _turn_away()
+    try:
+        yield
+    finally:
+        _turn_back()

@@ -1,12 +1,8 @@
 """The sensor's body as hexahedra, for views, files and the renderer: the same nodes for every contact.
 
 The nodes stand on a square grid that is bent over the dome (``chart``), in straight columns through the skin and
-the gel down to the lens. The spline solid (``solid``) computes how they move.
-
-
-The mesh as VTK data sets, for views and files.
-
-The solid's motion on the nodes of the sensor's mesh, which is the same for all contacts."""
+the gel down to the lens. The spline solid (``solid``) computes how they move; `NodeView` carries its motion to the nodes.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +16,7 @@ from twin.geometry.solid import Solid, body_points, surface_operators
 from twin.types import ComplexArray, FloatArray, IntArray
 
 SKIN, GEL = 0, 1
+"""Materials of an element."""
 _ACROSS = 21
 """Nodes along each side of the square."""
 _SKIN_LAYERS = 1
@@ -29,6 +26,7 @@ _GEL_LAYERS = 4
 _FOCUS_SHARE = 0.62
 """The mesh is fine within this share of the largest polar angle, around the apex."""
 _HEX_CORNERS = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1))
+"""Corners of a hexahedron in VTK's order, as steps along the grid."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,8 @@ import numpy as np
 from twin.errors import ContactError
 from twin.mechanics.contact import ContactForces, ContactPoints, contact_forces, positions, spread_forces
 from twin.mechanics.elements import Elements
+from twin.objects import ObjectField
+from twin.types import BoolArray, FloatArray, IntArray
 
 FORCE_FLOOR_N = 1e-3  # the residual's scale is never less
 
@@ -28,7 +30,7 @@ class Body:
 
     kinds: tuple[Elements, ...]
     points: ContactPoints
-    free: np.ndarray
+    free: BoolArray
     sealed: bool
 
     @property
@@ -58,7 +60,7 @@ class Friction:
     weakening_mm: float = 0.1
     shear_strength_mpa: float = np.inf
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not (0 <= self.kinetic <= self.static < np.inf and self.weakening_mm > 0 and self.shear_strength_mpa > 0):
             raise ContactError(f"friction needs 0 <= kinetic <= static, weakening_mm > 0 and shear_strength_mpa > 0, got {self}")
 
@@ -83,13 +85,13 @@ class LoadState:
         Energy stored in the body, and lost to friction in the step that led here.
     """
 
-    control_mm: np.ndarray
-    border: np.ndarray
-    anchor_mm: np.ndarray
-    held: np.ndarray
-    slid_mm: np.ndarray
+    control_mm: FloatArray
+    border: FloatArray
+    anchor_mm: FloatArray
+    held: BoolArray
+    slid_mm: FloatArray
     penalty_mpa_mm: float
-    T: np.ndarray
+    T: FloatArray
     elastic_nmm: float = 0.0
     dissipated_nmm: float = 0.0
 
@@ -114,11 +116,11 @@ class Balance:
         See ``Body``.
     """
 
-    elastic: np.ndarray
-    residual: np.ndarray
-    border_residual: np.ndarray
+    elastic: FloatArray
+    residual: FloatArray
+    border_residual: FloatArray
     contact: ContactForces
-    point_force_n: np.ndarray
+    point_force_n: FloatArray
     scale_n: float
     elastic_nmm: float
     volume_force_n_per_mm3: float
@@ -135,16 +137,51 @@ class Balance:
         return self.absolute / self.scale_n
 
 
-def in_object(points_mm: np.ndarray, T: np.ndarray, border: np.ndarray) -> np.ndarray:
+def in_object(points_mm: FloatArray, T: FloatArray, border: FloatArray) -> FloatArray:
     """Points (k, 3) of the sensor's frame in that of the object at ``T``, which has given way by ``border[0]`` along z."""
     return (points_mm - T[:3, 3] - [0, 0, border[0]]) @ T[:3, :3]
 
 
 class Problem:
-    """The equations of one load step: anchors, penalty, pose and what is left of the past held."""
+    """The equations of one load step. Anchors, penalty, the object's pose and the stress left of the past are held.
 
-    def __init__(self, body: Body, stimulus, law: Friction, compliance: float, state: LoadState, anchor_mm, looked, penalty, T, given):
-        self.body, self.compliance, self._stimulus = body, compliance, stimulus
+    Parameters
+    ----------
+    body : Body
+    field : ObjectField
+        The object that presses.
+    friction : Friction
+    compliance_mm_per_n : float
+        How far the object gives way along z under a force.
+    state : LoadState
+        Where the step begins: how far each point has slid decides its coefficient of friction.
+    anchor_mm : (p, 3) float
+        Friction's anchors of all contact points in the object's frame.
+    looked : (q,) int
+        Contact points that the equations look at; the others are known to be free.
+    penalty : float
+        Contact pressure for a unit of penetration, MPa/mm.
+    T : (4, 4) float
+        The object's pose before it gives way.
+    given : list of float arrays
+        Stress left of the past, for each kind of elements (see ``Elements.add_forces``).
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        field: ObjectField,
+        friction: Friction,
+        compliance_mm_per_n: float,
+        state: LoadState,
+        *,
+        anchor_mm: FloatArray,
+        looked: IntArray,
+        penalty: float,
+        T: FloatArray,
+        given: list[FloatArray],
+    ) -> None:
+        self.body, self.compliance, self._field = body, compliance_mm_per_n, field
         self.volume_force_n_per_mm3 = body.volume_force_n_per_mm3
         self._given, self.T = given, T
         self.looked, self.penalty = looked, penalty
@@ -153,14 +190,15 @@ class Problem:
         self.lift = points.lift_mm[looked]
         self.anchor_mm = anchor_mm[looked]
         self.stiff = penalty * points.area_mm2[looked]
-        self.bound_n = law.shear_strength_mpa * points.area_mm2[looked]
-        self.friction = law.kinetic + (law.static - law.kinetic) * np.exp(-state.slid_mm[looked] / law.weakening_mm)
+        self.bound_n = friction.shear_strength_mpa * points.area_mm2[looked]
+        weakened = np.exp(-state.slid_mm[looked] / friction.weakening_mm)
+        self.friction = friction.kinetic + (friction.static - friction.kinetic) * weakened
 
-    def contact(self, at, soften: float = 1.0) -> ContactForces:
+    def contact(self, at: FloatArray, soften: float = 1.0) -> ContactForces:
         """Contact with the points looked at in places (q, 3) of the object's frame."""
-        return contact_forces(self._stimulus, at, self.stiff, self.anchor_mm, self.friction, bound_n=self.bound_n, soften=soften)
+        return contact_forces(self._field, at, self.stiff, self.anchor_mm, self.friction, bound_n=self.bound_n, soften=soften)
 
-    def balance(self, control, border) -> Balance | None:
+    def balance(self, control: FloatArray, border: FloatArray) -> Balance | None:
         """The equations; None if an element is inside out."""
         body = self.body
         residual = np.zeros_like(control)
@@ -184,11 +222,11 @@ class Problem:
             elastic, residual[body.free].ravel(), border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3
         )
 
-    def stiffness(self, control, border, blocks) -> None:
+    def stiffness(self, control: FloatArray, border: FloatArray, blocks: list[FloatArray]) -> None:
         """The elements' tangents into ``blocks``."""
         for number, (kind, given, block) in enumerate(zip(self.body.kinds, self._given, blocks, strict=True)):
             kind.stiffness(control, given, border[1] if number else 0.0, block)
 
-    def volume(self, control, out) -> float:
+    def volume(self, control: FloatArray, out: FloatArray) -> float:
         """How much the gel's volume has grown, mm^3; adds its gradient to ``out``."""
         return sum(kind.add_volume(control, out) for kind in self.body.kinds[1:])

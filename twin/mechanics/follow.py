@@ -12,7 +12,7 @@ from twin.mechanics.ongoing import OngoingContact
 from twin.mechanics.path import ContactPath, carried, deepest_mm, dome_directions
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
-from twin.types import ContactState
+from twin.types import ContactState, FloatArray
 
 STEP_MM = 1.2  # largest motion across the contact in one load step
 FINE_STEP_MM = 0.6  # the same beside wires: a longer step carries skin past a wire's middle, where it then hooks
@@ -51,7 +51,7 @@ class Follower:
         self._dome_mm = self._radius_mm * dome_directions(solver.spec.skin, _DIRECTIONS)
         self._rest = solver.rest()
         self._contact: OngoingContact | None = None
-        self._reached = np.zeros((0, 3))
+        self._reached: FloatArray = np.zeros((0, 3))
         self._T: np.ndarray | None = None
         self._time_s = 0.0
         self._state = self._rest

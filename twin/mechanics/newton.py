@@ -14,7 +14,7 @@ from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangen
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
 from twin.objects import ObjectField
-from twin.types import FloatArray, IntArray
+from twin.types import BoolArray, FloatArray, IntArray
 
 GAP_BOUND_MM = 0.01
 """No contact point ends deeper inside the object than this."""
@@ -73,7 +73,7 @@ class LoadStepper:
         local[kept_controls] = np.arange(len(kept_controls))
         self._local = local[body.points.controls]
         # a point may be carried by kept and by clamped controls only
-        self._reachable = ((self._local >= 0) | ~body.free[body.points.controls]).all(axis=1)
+        self._reachable: BoolArray = np.all((self._local >= 0) | ~body.free[body.points.controls], axis=1)
         self._tangent: Tangent | None = None
         self._shift = 0.0
         self._near: tuple[Tangent, IntArray, Near] | None = None
@@ -104,7 +104,18 @@ class LoadStepper:
         anchors = np.where(state.held[:, None], state.anchor_mm, (1 - share) * before + share * after)
         penalty = state.penalty_mpa_mm
         for _ in range(_PENALTY_RAISES):
-            problem = Problem(self._body, self._field, self._friction, self._compliance, state, anchors, looked, penalty, T, given)
+            problem = Problem(
+                self._body,
+                self._field,
+                self._friction,
+                self._compliance,
+                state,
+                anchor_mm=anchors,
+                looked=looked,
+                penalty=penalty,
+                T=T,
+                given=given,
+            )
             control, border, balance = self._solve(problem, control, border, control is not state.control_mm)
             left_out = np.setdiff1d(np.arange(len(gap)), looked, assume_unique=True)
             missed = left_out[self._field.distance(self._seen(control, border, T)[left_out]) < 0]

@@ -1,6 +1,4 @@
-"""A wire mesh wrapped on a solid.
-
-From an object's specification to its signed-distance field."""
+"""From an object's specification to its signed-distance field, with a wire mesh wrapped on it where it has one."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -18,6 +16,54 @@ _BLEND = 0.15
 """Length over which wires and base are blended into each other, as a share of the wire's diameter."""
 _CREASE_MM = 1e-3
 """Nearer to a wire's axis than this the field counts as not curved."""
+
+
+class ObjectField(Protocol):
+    """A solid in the object frame, as a signed-distance field at points (k, 3) in mm."""
+
+    def distance(self, points_mm: FloatArray) -> FloatArray:
+        """(k,) in mm, positive outside."""
+        ...
+
+    def gradient(self, points_mm: FloatArray) -> FloatArray:
+        """(k, 3) unit, outwards."""
+        ...
+
+    def probe(self, points_mm: FloatArray) -> Probe:
+        """Distance (k,), gradient (k, 3) and Hessian (k, 3, 3) in 1/mm, in one evaluation.
+
+        The Hessian is the second derivative of the distance: symmetric, with the gradient in its null space, zero across
+        creases. Where a field is no exact distance it is the derivative of the unit gradient along the level set.
+        """
+        ...
+
+
+def build_field(spec: ObjectSpec) -> ObjectField:
+    """The signed-distance field of an object, with its texture.
+
+    Raises
+    ------
+    MeshError
+        If a mesh file is not closed, in the wrong unit, empty or unreadable.
+    """
+    shape = spec.shape
+    base: Wrapped
+    match shape:
+        case PlaneShape():
+            base = Plane()
+        case SphereShape():
+            base = Sphere(shape.radius_mm)
+        case CylinderShape():
+            base = Cylinder(shape.radius_mm)
+        case EdgeShape():
+            base = Edge(shape.fillet_mm)
+        case PrismShape():
+            base = Prism(shape.sides, shape.inradius_mm, shape.fillet_mm, np.radians(shape.taper_deg))
+        case MeshShape():
+            base = load_mesh_field(shape)
+    if spec.texture is not None:
+        return WireMesh(base, spec.texture.pitch_mm, spec.texture.wire_diameter_mm)
+    return base
 
 
 @dataclass(frozen=True)
@@ -82,51 +128,3 @@ def _lay_wires(
                     hessian[k, j, i] = hessian[k, i, j]
             for i in range(3):
                 slope[k, i] = (1 - w) * slope[k, i] + w * wire[i]
-
-
-class ObjectField(Protocol):
-    """A solid in the object frame, as a signed-distance field at points (k, 3) in mm."""
-
-    def distance(self, points_mm: FloatArray) -> FloatArray:
-        """(k,) in mm, positive outside."""
-        ...
-
-    def gradient(self, points_mm: FloatArray) -> FloatArray:
-        """(k, 3) unit, outwards."""
-        ...
-
-    def probe(self, points_mm: FloatArray) -> Probe:
-        """Distance (k,), gradient (k, 3) and Hessian (k, 3, 3) in 1/mm, in one evaluation.
-
-        The Hessian is the second derivative of the distance: symmetric, with the gradient in its null space, zero across
-        creases. Where a field is no exact distance it is the derivative of the unit gradient along the level set.
-        """
-        ...
-
-
-def build_field(spec: ObjectSpec) -> ObjectField:
-    """The signed-distance field of an object, with its texture.
-
-    Raises
-    ------
-    MeshError
-        If a mesh file is not closed, in the wrong unit, empty or unreadable.
-    """
-    shape = spec.shape
-    base: Wrapped
-    match shape:
-        case PlaneShape():
-            base = Plane()
-        case SphereShape():
-            base = Sphere(shape.radius_mm)
-        case CylinderShape():
-            base = Cylinder(shape.radius_mm)
-        case EdgeShape():
-            base = Edge(shape.fillet_mm)
-        case PrismShape():
-            base = Prism(shape.sides, shape.inradius_mm, shape.fillet_mm, np.radians(shape.taper_deg))
-        case MeshShape():
-            base = load_mesh_field(shape)
-    if spec.texture is not None:
-        return WireMesh(base, spec.texture.pitch_mm, spec.texture.wire_diameter_mm)
-    return base

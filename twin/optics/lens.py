@@ -1,6 +1,7 @@
-"""Which way each place of the film looks, as a table: exact for any distortion, and cheap to look up.
+"""Rays of the raw frame's pixels through lens and window into the gel.
 
-Rays of the raw frame's pixels through lens and window into the gel, in Dr.Jit's terms."""
+A table tells which way each place of the film looks. It is exact for any distortion, and cheap to look up on Dr.Jit's side.
+"""
 
 from functools import lru_cache
 from types import ModuleType

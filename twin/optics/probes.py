@@ -1,10 +1,8 @@
-"""Shared libraries that Dr.Jit needs and its wheel does not bring.
+"""Proofs, each in a process of its own, that a Dr.Jit backend runs here; and the library that Dr.Jit needs and does not bring.
 
-Proofs, each in a process of its own, that a Dr.Jit backend runs here.
-
-A backend with an unsuitable LLVM or driver ends the process instead of raising, so it is
-tried in a child. Verdicts are kept in the cache folder (see ``twin.store``), keyed by everything
-that could change them; where the cache is off, every process probes for itself."""
+A backend with an unsuitable LLVM or driver ends the process instead of raising, so it is tried in a child. Verdicts are kept in the
+cache folder (see ``twin.store``), keyed by everything that could change them. Where the cache is off, every process probes for itself.
+"""
 
 import ctypes
 import importlib.metadata
@@ -24,6 +22,28 @@ from twin.store import cache_folder, fingerprint, write_json
 PRIVATE_FOLDER = Path(sys.prefix) / "lib" / "private"
 """Where 'make setup' puts its own copies of libraries if it may not install them."""
 REMEDY = "install it (Debian, Ubuntu: apt-get install libatomic1)"
+"""What to do where libatomic is missing."""
+PROBE_TIMEOUT_S = 60.0
+"""A probe that takes longer than this, s, has failed."""
+
+# The empty home keeps Dr.Jit from answering with a kernel it compiled (with another LLVM) before.
+_PROBE = """
+import drjit as dr
+from drjit.{backend} import Float
+x = dr.arange(Float, 64)
+y = dr.minimum(dr.maximum(dr.sin(x), 0.25), dr.rcp(x + 1.5))
+dr.eval(y)
+assert 0 < dr.sum(y)[0] < 64
+version = dr.detail.llvm_version() if "{backend}" == "llvm" and hasattr(dr.detail, "llvm_version") else ""
+print("probe-ok", version)
+"""
+_NO_CORE_DUMP = """
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except ImportError:
+    pass
+"""
 
 
 def load_needed_libraries(folder: Path = PRIVATE_FOLDER) -> str:
@@ -43,21 +63,6 @@ def load_needed_libraries(folder: Path = PRIVATE_FOLDER) -> str:
         except OSError:
             continue
     return f"libatomic.so.1 is missing, which Mitsuba needs: {REMEDY}"
-
-
-PROBE_TIMEOUT_S = 60.0
-
-# The empty home keeps Dr.Jit from answering with a kernel it compiled (with another LLVM) before.
-_PROBE = """
-import drjit as dr
-from drjit.{backend} import Float
-x = dr.arange(Float, 64)
-y = dr.minimum(dr.maximum(dr.sin(x), 0.25), dr.rcp(x + 1.5))
-dr.eval(y)
-assert 0 < dr.sum(y)[0] < 64
-version = dr.detail.llvm_version() if "{backend}" == "llvm" and hasattr(dr.detail, "llvm_version") else ""
-print("probe-ok", version)
-"""
 
 
 @dataclass(frozen=True)
@@ -118,15 +123,6 @@ def _run(backend: str, library: Path) -> Verdict:
     telling = [line for line in lines if "LLVM ERROR" in line or "Error" in line or "failed" in line] or lines[-1:] or ["no message"]
     how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
     return Verdict(False, "", f"a tiny kernel does not run ({how}: {telling[0][:160]})")
-
-
-_NO_CORE_DUMP = """
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-except ImportError:
-    pass
-"""
 
 
 def _read(store: Path) -> dict:

@@ -1,8 +1,8 @@
-"""Outlines of pins on the film: of stem, cap side and cap face, in px of the raw frame.
+"""Outlines of pins on the film, and polygons and triangles drawn into float images.
 
-Polygons with exact coverage and smoothly shaded triangles, drawn into float images.
-
-Places are (x, y) in px, integers at pixel centres; images are (H, W, C) and are drawn into."""
+Polygons are drawn with exact coverage, triangles with smooth shading. Places are (x, y) in px of the raw frame, integers at pixel
+centres; images are (H, W, C) and are drawn into.
+"""
 
 import numba
 import numpy as np
@@ -20,6 +20,8 @@ EVENLY = np.sqrt(np.sin(np.pi / 12) / (np.pi / 12) * (2 * np.pi / SIDES) / np.si
 """Factor on the radius that gives the polygon the area of its round outline."""
 TURN = np.arange(SIDES) * 2 * np.pi / SIDES
 """Azimuths of an outline's corners (rad)."""
+ON_EDGE = 1e-9
+"""A pixel whose centre is this close to an edge, px, belongs to both triangles, so that no gap opens between them."""
 
 
 class PinOutlines:
@@ -64,7 +66,7 @@ class PinOutlines:
 
 
 def _hull(*discs: FloatArray) -> FloatArray:
-    """Outline (N, K, 2) around similar closed outlines (N, K, 2) each: of their points number k the one that lies furthest out."""
+    """Outline (N, K, 2) around similar closed outlines (N, K, 2) each: its point k is the one of their points k that lies furthest out."""
     tangent = np.roll(discs[0], -1, axis=1) - np.roll(discs[0], 1, axis=1)
     outward = np.stack([tangent[..., 1], -tangent[..., 0]], axis=-1)
     arm = discs[0] - discs[0].mean(axis=1, keepdims=True)
@@ -74,10 +76,6 @@ def _hull(*discs: FloatArray) -> FloatArray:
         reach = np.sum(disc * outward, axis=-1)
         hull, far = np.where((reach > far)[..., None], disc, hull), np.maximum(far, reach)
     return hull
-
-
-ON_EDGE = 1e-9
-"""px. A pixel whose centre is this close to an edge belongs to both triangles, so that no gap opens between them."""
 
 
 @numba.njit(cache=True, error_model="numpy")

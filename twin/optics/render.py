@@ -1,6 +1,4 @@
-"""Linear images on disk.
-
-From a sensor's state to the linear light on its camera's film."""
+"""From a sensor's state to the linear light on its camera's film."""
 
 from functools import cached_property
 from pathlib import Path
@@ -25,23 +23,8 @@ from twin.optics.variant import DrJit, VariantChoice, choose_variant, use_varian
 from twin.optics.window import Window
 from twin.types import FloatArray, IntArray, PinState
 
-
-def write_exr(path: Path, linear: FloatArray, choice: VariantChoice) -> None:
-    """Write linear light as a half-float OpenEXR file.
-
-    Parameters
-    ----------
-    path : Path
-    linear : (H, W, 3) or (H, W) float32
-    choice : VariantChoice
-        The variant that rendered it.
-    """
-    mi = use_variant(choice)
-    pixels = np.ascontiguousarray(linear if linear.ndim == 3 else linear[..., None])
-    mi.Bitmap(pixels).convert(component_format=mi.Struct.Type.Float16).write(str(path))
-
-
 Quality = Literal["preview", "standard", "high"]
+"""How many samples a render takes."""
 SAMPLES = {"preview": 4, "standard": 16, "high": 64}
 """Samples per pixel, by quality."""
 SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}
@@ -59,7 +42,7 @@ class Renderer:
     ----------
     spec : SensorSpec
     variant : str or VariantChoice, optional
-        As for `twin.optics.variant.choose_variant`; the best that works by default.
+        As `twin.optics.variant.choose_variant` takes it; by default the best variant that works.
     quality : {"preview", "standard", "high"}
     mesh : SensorMesh, optional
         The mechanics' mesh (``nodes_mm``, ``inner_quads``). With it the skin follows the nodes on its
@@ -67,7 +50,7 @@ class Renderer:
     window_px : (x0, y0, x1, y1), optional
         Part of the raw frame to render, end exclusive; the whole frame by default.
     spp : int, optional
-        Samples per pixel instead of the quality's: where pins are; bare skin gets a quarter (`twin.optics.sampling`).
+        Samples per pixel where pins are, instead of the quality's; bare skin gets a quarter (`twin.optics.sampling`).
     bounces : int
         Scatterings of a path after its first.
     """
@@ -210,8 +193,23 @@ class GelView:
         return mi.Spectrum(*(dr.block_sum(channel, spp) / spp for channel in light))
 
     def _light(self, pixel: DrJit, number: DrJit, spp: int, seed: int) -> DrJit:
-        """Light of samples: of the pixel and the number, below ``spp``, of each."""
+        """Light of samples, given the pixel of each and its number in the pixel, below ``spp``."""
         mi, dr = self._mi, self._dr
         random = PixelSamples(mi, dr, pixel, number, spp, seed)
         place, direction, transmittance = self.rays.sample(mi, dr, pixel, random)
         return self.tracer.radiance(mi, dr, place, direction, random) * transmittance
+
+
+def write_exr(path: Path, linear: FloatArray, choice: VariantChoice) -> None:
+    """Write linear light as a half-float OpenEXR file.
+
+    Parameters
+    ----------
+    path : Path
+    linear : (H, W, 3) or (H, W) float32
+    choice : VariantChoice
+        The variant that rendered it.
+    """
+    mi = use_variant(choice)
+    pixels = np.ascontiguousarray(linear if linear.ndim == 3 else linear[..., None])
+    mi.Bitmap(pixels).convert(component_format=mi.Struct.Type.Float16).write(str(path))

@@ -1,6 +1,7 @@
-"""Which pixels need many samples: those of pins, whose edges are noisy. Dark bare skin is even after a few samples.
+"""How pixels are sampled: which ones need many samples, and well-distributed random numbers for them on Dr.Jit's side.
 
-Well-distributed random numbers for the samples of pixels, in Dr.Jit's terms."""
+Pixels of pins need many samples, because their edges are noisy. Dark bare skin is even after a few.
+"""
 
 from types import ModuleType
 
@@ -18,6 +19,8 @@ MARGIN_PX = 2.0
 """Added to the radius of each pin: the estimate of where its edge is may be wrong by this."""
 SUBPIXEL_BITS = 4
 """OpenCV draws lines with places in units of 1 / 16 px."""
+GOLDEN = 0x9E3779B9
+"""2^32 over the golden ratio: spreads consecutive dimensions over the seeds of the hash."""
 
 
 def near_pins(
@@ -41,13 +44,9 @@ def near_pins(
 
 
 def _largest_outline(appearance: AppearanceSpec) -> float:
-    """Of the caps' outlines, relative to a circle."""
+    """Largest radius of the caps' outlines, relative to a circle."""
     shapes = np.array(appearance.cap_shapes or [[0.0]])
     return float(1 + np.abs(shapes).sum(axis=1).max())
-
-
-GOLDEN = 0x9E3779B9
-"""2^32 over the golden ratio: spreads consecutive dimensions over the seeds of the hash."""
 
 
 class PixelSamples:

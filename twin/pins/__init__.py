@@ -1,8 +1,8 @@
 """From frames to labelled pins and their graphs.
 
-Ways to find pins, ours and others', behind one call; and their parameters found from frames.
-
-A sensor's state of health, told from a few of its frames."""
+The pipeline and other ways to find pins stand behind one call (`make_detector`); `tune` finds their parameters from frames. `examine`
+tells a sensor's state of health from a few of its frames.
+"""
 
 from twin.pins.check import Finding, Grade, examine
 from twin.pins.detector import Detector, Found, make_detector

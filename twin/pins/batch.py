@@ -1,6 +1,4 @@
-"""A picture of what the pipeline saw.
-
-The pipeline over a whole recording, written to a folder."""
+"""The pipeline over a whole recording, written to a folder: pins, a summary, and pictures of what the pipeline saw."""
 
 from collections.abc import Callable
 from itertools import chain, count
@@ -13,97 +11,25 @@ from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames import Recording, open_recording
 from twin.frames.forms import blob_spec, gray_levels
+from twin.frames.images import write_image
 from twin.frames.recording import BadFrame
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, nominal_reference
-from twin.store import made_by, unwritten, write_bytes, write_json, write_npz
+from twin.store import made_by, unwritten, write_json, write_npz
 from twin.types import Form, Frame, Observation
 
-# Colours of edges, found pins, places of lost pins, and rejected blobs.
-EDGE_RGB, FOUND_RGB, LOST_RGB, EXTRA_RGB = (90, 110, 160), (60, 220, 60), (255, 60, 60), (255, 210, 0)
-# What is drawn is at most this far from the frame's origin, px: farther off, OpenCV's integers would overflow.
+EDGE_RGB = (90, 110, 160)
+"""Colour of a graph's edges in a picture."""
+FOUND_RGB = (60, 220, 60)
+"""Colour of found pins."""
+LOST_RGB = (255, 60, 60)
+"""Colour of the predicted places of lost pins."""
+EXTRA_RGB = (255, 210, 0)
+"""Colour of rejected blobs."""
 FARTHEST_PX = 1e4
-
-
-def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: the frame, its graph, found pins (green), predicted places of lost ones (red), rejected blobs (yellow)."""
-    gray = cv2.resize(gray_levels(frame.image), None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
-    canvas = cv2.cvtColor(gray // 2, cv2.COLOR_GRAY2RGB)
-
-    def place(px: np.ndarray) -> list[list[int]]:
-        px = px[np.isfinite(px).all(axis=1)]
-        return np.round((np.clip(px, -FARTHEST_PX, FARTHEST_PX) + 0.5) * scale - 0.5).astype(int).tolist()
-
-    if observation.graph is not None:
-        nodes = place(observation.graph.nodes_px)
-        for i, j in observation.graph.edges:
-            if i < j:
-                cv2.line(canvas, nodes[i], nodes[j], EDGE_RGB, 1, cv2.LINE_AA)
-    for px in place(observation.pins_px):
-        cv2.circle(canvas, px, 2, FOUND_RGB, -1, cv2.LINE_AA)
-    for px in place(observation.predicted_px):
-        cv2.circle(canvas, px, 5, LOST_RGB, 1, cv2.LINE_AA)
-    for px in place(observation.extra_px):
-        cv2.circle(canvas, px, 6, EXTRA_RGB, 1, cv2.LINE_AA)
-    text = f"{frame.name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
-    cv2.putText(canvas, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
-    return canvas
-
-
-def overlay_name(frame_name: str, taken: set[str]) -> str:
-    """File name for a frame's picture, distinct from those in ``taken`` (in lower case), to which it is added."""
-    stem = Path(frame_name).stem
-    tries = chain((f"{stem}.png", f"{frame_name}.png"), (f"{stem}_{k}.png" for k in count(2)))
-    name = next(name for name in tries if name.casefold() not in taken)
-    taken.add(name.casefold())
-    return name
-
-
-UNMEASURED = "specification"  # in place of a no-contact frame's name
-
-
-def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
-    """The recording's own no-contact layout and its frame's name; without a usable no-contact frame the specification's layout.
-
-    The reason why a no-contact frame cannot be used is added to ``problems``.
-    """
-    if recording.reference is not None:
-        try:
-            return measure_reference(spec, recording.form, recording.reference), recording.reference.name
-        except FrameError as error:
-            problems.append(str(error))
-    return nominal_reference(spec, recording.form), UNMEASURED
-
-
-def _timing(observations: list[Observation]) -> dict[str, dict[str, float]]:
-    """Median, 95 and 99 % of the milliseconds of each stage, without the first frame, which also loads the compiled code."""
-    if not observations:
-        return {}
-    warm = observations[1:] or observations
-    stages = {stage: [o.ms[stage] for o in warm] for stage in observations[0].ms}
-    return {s: dict(zip(("p50", "p95", "p99"), np.percentile(ms, (50, 95, 99)).round(4).tolist(), strict=True)) for s, ms in stages.items()}
-
-
-def _arrays(names: list[str], observations: list[Observation], n: int) -> dict[str, np.ndarray]:
-    """What ``pins.npz`` holds of M frames with ``n`` pins."""
-    none = np.full(n, np.nan)
-    areas = [none if o.graph is None else o.graph.area_px2 for o in observations]
-    return {
-        "image_name": np.array(names, str),
-        "pins_px": np.array([o.pins_px for o in observations], float).reshape(-1, n, 2),
-        "predicted_px": np.array([o.predicted_px for o in observations], float).reshape(-1, n, 2),
-        "area_px2": np.array(areas, float).reshape(-1, n),
-        "found": np.array([o.found for o in observations], int),
-        "valid": np.array([o.valid for o in observations], bool),
-    }
-
-
-def _nothing_found(path: str | Path, summary: dict, summary_path: Path) -> str:
-    bad = summary["invalid"] + summary["failed"]
-    return (
-        f"{path}: the pins were found in none of {len(bad)} frames; the first, {bad[0]['image_name']}: {bad[0]['reason']}; "
-        f"check --sensor, --form and the [pipeline] section of the specification (details in {summary_path})"
-    )
+"""What is drawn is at most this far from the frame's origin, px. Farther off, OpenCV's integers would overflow."""
+UNMEASURED = "specification"
+"""Stands in place of a no-contact frame's name where the specification's layout is the reference."""
 
 
 def preprocess_recording(
@@ -143,31 +69,15 @@ def preprocess_recording(
     """
     recording = open_recording(path, spec, form)
     out_dir = Path(out_dir)
+    pictures_dir = out_dir / "overlay" if overlay else None
     try:
-        (out_dir / "overlay" if overlay else out_dir).mkdir(parents=True, exist_ok=True)
+        (pictures_dir or out_dir).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise unwritten(out_dir, error) from error
     notes: list[str] = []
     reference, reference_name = recording_reference(spec, recording, notes)
     pipeline = Pipeline(spec, recording.form, reference)
-    names: list[str] = []
-    observations: list[Observation] = []
-    unfit: list[BadFrame] = []
-    pictures: set[str] = set()
-    for frame in recording:
-        try:
-            observation = pipeline(frame)
-        except FrameError as error:
-            unfit.append({"image_name": frame.name, "reason": str(error).removeprefix(f"{frame.name}: ")})
-            continue
-        names.append(frame.name)
-        observations.append(observation)
-        if overlay:
-            picture = cv2.cvtColor(draw_overlay(frame, observation), cv2.COLOR_RGB2BGR)
-            write_bytes(out_dir / "overlay" / overlay_name(frame.name, pictures), cv2.imencode(".png", picture)[1].tobytes())
-        if progress:
-            progress(frame.sequence + 1, len(recording))
-    failed = recording.failed + unfit
+    names, observations, unfit = _observed(recording, pipeline, pictures_dir, progress)
     arrays = _arrays(names, observations, spec.pins.count)
     all_found = arrays["valid"] & (arrays["found"] == spec.pins.count)
     summary = {
@@ -184,7 +94,7 @@ def preprocess_recording(
             "detection": blob_spec(spec.pipeline, recording.form).model_dump(mode="json"),
         },
         "invalid": [{"image_name": name, "reason": o.reason} for name, o in zip(names, observations, strict=True) if not o.valid],
-        "failed": failed,
+        "failed": recording.failed + unfit,
         "problems": recording.problems + notes,
         "made_by": made_by(preprocess_recording, inputs=[spec, recording.path.resolve(), recording.names]),
     }
@@ -193,3 +103,105 @@ def preprocess_recording(
     if not arrays["valid"].any():
         raise FrameError(_nothing_found(path, summary, out_dir / "summary.json"))
     return summary
+
+
+def _observed(
+    recording: Recording, pipeline: Pipeline, pictures_dir: Path | None, progress: Callable[[int, int], None] | None
+) -> tuple[list[str], list[Observation], list[BadFrame]]:
+    """Names and observations of a recording's frames, and the frames that do not suit the pipeline; pictures where there is a folder."""
+    names: list[str] = []
+    observations: list[Observation] = []
+    unfit: list[BadFrame] = []
+    pictures: set[str] = set()
+    for frame in recording:
+        try:
+            observation = pipeline(frame)
+        except FrameError as error:
+            unfit.append({"image_name": frame.name, "reason": str(error).removeprefix(f"{frame.name}: ")})
+            continue
+        names.append(frame.name)
+        observations.append(observation)
+        if pictures_dir is not None:
+            write_image(pictures_dir / overlay_name(frame.name, pictures), draw_overlay(frame, observation))
+        if progress:
+            progress(frame.sequence + 1, len(recording))
+    return names, observations, unfit
+
+
+def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
+    """The recording's own no-contact layout and its frame's name; without a usable no-contact frame the specification's layout.
+
+    The reason why a no-contact frame cannot be used is added to ``problems``.
+    """
+    if recording.reference is not None:
+        try:
+            return measure_reference(spec, recording.form, recording.reference), recording.reference.name
+        except FrameError as error:
+            problems.append(str(error))
+    return nominal_reference(spec, recording.form), UNMEASURED
+
+
+def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
+    """(H, W, 3) uint8 RGB: the frame, its graph, found pins (green), predicted places of lost ones (red), rejected blobs (yellow)."""
+    gray = cv2.resize(gray_levels(frame.image), None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    canvas = cv2.cvtColor(gray // 2, cv2.COLOR_GRAY2RGB)
+
+    def place(px: np.ndarray) -> list[list[int]]:
+        px = px[np.isfinite(px).all(axis=1)]
+        return np.round((np.clip(px, -FARTHEST_PX, FARTHEST_PX) + 0.5) * scale - 0.5).astype(int).tolist()
+
+    if observation.graph is not None:
+        nodes = place(observation.graph.nodes_px)
+        for i, j in observation.graph.edges:
+            if i < j:
+                cv2.line(canvas, nodes[i], nodes[j], EDGE_RGB, 1, cv2.LINE_AA)
+    for px in place(observation.pins_px):
+        cv2.circle(canvas, px, 2, FOUND_RGB, -1, cv2.LINE_AA)
+    for px in place(observation.predicted_px):
+        cv2.circle(canvas, px, 5, LOST_RGB, 1, cv2.LINE_AA)
+    for px in place(observation.extra_px):
+        cv2.circle(canvas, px, 6, EXTRA_RGB, 1, cv2.LINE_AA)
+    text = f"{frame.name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
+    cv2.putText(canvas, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
+    return canvas
+
+
+def overlay_name(frame_name: str, taken: set[str]) -> str:
+    """File name for a frame's picture, distinct from those in ``taken`` (in lower case), to which it is added."""
+    stem = Path(frame_name).stem
+    tries = chain((f"{stem}.png", f"{frame_name}.png"), (f"{stem}_{k}.png" for k in count(2)))
+    name = next(name for name in tries if name.casefold() not in taken)
+    taken.add(name.casefold())
+    return name
+
+
+def _timing(observations: list[Observation]) -> dict[str, dict[str, float]]:
+    """Median, 95 and 99 % of the milliseconds of each stage, without the first frame, which also loads the compiled code."""
+    if not observations:
+        return {}
+    warm = observations[1:] or observations
+    stages = {stage: [o.ms[stage] for o in warm] for stage in observations[0].ms}
+    return {s: dict(zip(("p50", "p95", "p99"), np.percentile(ms, (50, 95, 99)).round(4).tolist(), strict=True)) for s, ms in stages.items()}
+
+
+def _arrays(names: list[str], observations: list[Observation], n: int) -> dict[str, np.ndarray]:
+    """What ``pins.npz`` holds of M frames with ``n`` pins."""
+    none = np.full(n, np.nan)
+    areas = [none if o.graph is None else o.graph.area_px2 for o in observations]
+    return {
+        "image_name": np.array(names, str),
+        "pins_px": np.array([o.pins_px for o in observations], float).reshape(-1, n, 2),
+        "predicted_px": np.array([o.predicted_px for o in observations], float).reshape(-1, n, 2),
+        "area_px2": np.array(areas, float).reshape(-1, n),
+        "found": np.array([o.found for o in observations], int),
+        "valid": np.array([o.valid for o in observations], bool),
+    }
+
+
+def _nothing_found(path: str | Path, summary: dict, summary_path: Path) -> str:
+    """The message for a recording without a valid frame."""
+    bad = summary["invalid"] + summary["failed"]
+    return (
+        f"{path}: the pins were found in none of {len(bad)} frames; the first, {bad[0]['image_name']}: {bad[0]['reason']}; "
+        f"check --sensor, --form and the [pipeline] section of the specification (details in {summary_path})"
+    )

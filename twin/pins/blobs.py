@@ -1,6 +1,4 @@
-"""The circular mask: only the disc with the pins is looked at.
-
-Bright blobs of a masked gray image: threshold, erosion, connected components, sub-pixel centroids."""
+"""Bright blobs inside the circular mask of a frame: threshold, erosion, connected components, sub-pixel centroids."""
 
 from dataclasses import dataclass
 
@@ -9,6 +7,21 @@ import numpy as np
 from numba import njit
 
 from scenes.sensor import BlobSpec
+
+GROWTH_PX = 4
+"""A component is grown by at most this much beyond its bounding box, px."""
+SPECK_LEVELS = 48
+"""A pixel that differs from the median of its 3 x 3 neighbourhood by more gray levels than this is a fault of the chip."""
+SPECK_USUAL = 0.8
+"""Share of the pixels by which a frame's usual difference from the median is told. In a noisy frame the limit above rises with it."""
+SPECK_RATIO = 4.0
+"""A fault differs by more than this many times the usual difference."""
+MOST_ABOVE = 98
+"""Percentile of the levels above the local mean. Brighter levels (glare, LEDs) are set to it before Otsu's method."""
+NOISE_SIGMA_PX = 0.7
+"""Sd of the smoothing before an adaptive threshold, px. It halves white noise and leaves a cap of 6 px its edge."""
+LEAST_FILL = 0.25
+"""Least share of its bounding box that a cap fills. Arcs of the housing fill less."""
 
 
 @dataclass(frozen=True)
@@ -39,22 +52,6 @@ def circular_mask(size_px: tuple[int, int], center_px: tuple[float, float], radi
     grid_y, grid_x = np.mgrid[rows, columns]
     inside = (grid_x - x) ** 2 + (grid_y - y) ** 2 <= radius_px**2
     return Mask((rows, columns), np.array([columns.start, rows.start], float), (255 * inside).astype(np.uint8))
-
-
-# A component is grown by at most this much beyond its bounding box, px.
-GROWTH_PX = 4
-# A pixel that differs from the median of its 3 x 3 neighbourhood by more gray levels than this is a fault of the chip.
-SPECK_LEVELS = 48
-# In a noisy frame that limit rises: this share of the pixels shows what difference is usual ...
-SPECK_USUAL = 0.8
-# ... and a fault differs by more than this many times the usual.
-SPECK_RATIO = 4.0
-# Percentile of the levels above the local mean to which brighter ones (glare, LEDs) are set before Otsu's method.
-MOST_ABOVE = 98
-# Sd of the smoothing before an adaptive threshold, px. It halves white noise and leaves a cap of 6 px its edge.
-NOISE_SIGMA_PX = 0.7
-# Least share of its bounding box that a cap fills. Arcs of the housing fill less.
-LEAST_FILL = 0.25
 
 
 @dataclass(frozen=True)

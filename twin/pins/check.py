@@ -1,6 +1,8 @@
-"""How far a camera has moved since its calibration, told from the outermost pins, which a contact moves least.
+"""A sensor's state of health, told from a few of its frames.
 
-Light, focus, pins, glare and place of a sensor's frames, against what its specification promises."""
+Light, focus, pins, glare and the camera's place are compared with what the sensor's specification promises. How far the camera has moved
+since its calibration is told from the outermost pins, because a contact moves them least.
+"""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -22,77 +24,31 @@ from twin.pins.reference import Reference, make_reference, nominal_reference
 from twin.progress import Step
 from twin.types import Form, Frame, Observation
 
-# Least share of the outermost pins that must be seen.
 LEAST_RIM = 0.5
-# Relative growth of the rim for a contact that moves the pins by rms one radius of the rim. Measured: 0.90, 0.98 and 1.09 in recordings
-# of three sensors, 0.7 to 1.4 in the twin.
+"""Least share of the outermost pins that must be seen."""
 BULGE = 1.0
-
-
-@dataclass(frozen=True)
-class Drift:
-    """The similarity that carries the calibrated rim of pins to the one seen.
-
-    Attributes
-    ----------
-    shift_px : (2,) float
-        Shift of the rim's centre.
-    turn_deg : float
-        From x towards y.
-    scale : float
-    contact : float
-        Rms of the pins' motion without the similarity, in the rim's mean radius: how much a contact deforms the skin.
-    """
-
-    shift_px: np.ndarray
-    turn_deg: float
-    scale: float
-    contact: float
-
-    @property
-    def scale_at_rest(self) -> float:
-        """The scale without the contact's part: the gel keeps its volume, so that it bulges at the rim when it is pressed in the middle."""
-        return self.scale / (1 + BULGE * self.contact)
-
-
-def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray) -> Drift | None:
-    """Drift by least squares over the outermost pins (m,) of pins (N, 2), NaN where lost; None where too few are seen.
-
-    With complex coordinates about the means: ``a = sum conj(r) p / sum |r|^2`` (Horn 1987, in the plane).
-    """
-    rim = outmost[np.isfinite(pins_px[outmost, 0])]
-    if len(rim) < LEAST_RIM * len(outmost):
-        return None
-    seen, rest = pins_px @ [1, 1j], rest_px @ [1, 1j]
-    middle, rest_middle = seen[rim].mean(), rest[rim].mean()
-    a = np.vdot(rest[rim] - rest_middle, seen[rim] - middle) / np.vdot(rest[rim] - rest_middle, rest[rim] - rest_middle)
-    carried = middle + a * (rest - rest_middle)
-    shift = carried[outmost].mean() - rest[outmost].mean()
-    radius = np.abs(rest[outmost] - rest[outmost].mean()).mean()
-    contact = np.sqrt(np.nanmean(np.abs(seen - carried) ** 2)) / radius
-    return Drift(np.array([shift.real, shift.imag]), float(np.degrees(np.angle(a))), float(abs(a)), float(contact))
-
-
-# Gray level from which on a pixel counts as white.
+"""Relative growth of the rim, for a unit of the pins' rms motion in the rim's mean radius. Measured: 0.90, 0.98 and 1.09 in recordings
+of three sensors, 0.7 to 1.4 in the twin."""
 SATURATED_LEVEL = 250
-# A pin that is lost, or a spot that is seen, in this share of the frames is a fault of the sensor, not of a contact.
+"""Gray level from which on a pixel counts as white."""
 STEADY = 0.5
-# Spots nearer to each other than this many spacings are the same.
+"""A pin that is lost, or a spot that is seen, in this share of the frames is a fault of the sensor, not of a contact."""
 SAME_SPOT = 0.3
-# Most frames in which caps are measured, evenly spread: light and focus hardly differ between frames.
+"""Spots nearer to each other than this many spacings are the same."""
 CAPS_MEASURED = 3
-# The camera's place is told from this share of the frames, those with the least contact.
+"""Most frames in which caps are measured, evenly spread: light and focus hardly differ between frames."""
 LEAST_DEFORMED = 0.3
-# A contact that changes the rim's size by less than this share is not mentioned.
+"""The camera's place is told from this share of the frames: those with the least contact."""
 TOLD_BULGE = 0.002
-# Most numbers of pins in a sentence.
+"""A contact that changes the rim's size by less than this share is not mentioned."""
 LISTED = 8
-# Percentile of the disc's gray levels that stands for the caps where no pin is found.
+"""Most pins that a sentence lists by number."""
 BRIGHT_PERCENTILE = 99
-# Diameter of a cap, px, where none can be measured.
+"""Percentile of the disc's gray levels that stands for the caps where no pin is found."""
 USUAL_CAP_PX = 8.0
-# A white patch larger than this many caps is glare.
+"""Diameter of a cap, px, where none can be measured."""
 GLARE_CAPS = 2
+"""A white patch larger than this many caps is glare."""
 
 
 class Grade(StrEnum):
@@ -157,8 +113,52 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     return findings if form == Form.RECORDING else [*_light(frames, seen, promised_caps(spec), pipeline.mask), *findings]
 
 
+@dataclass(frozen=True)
+class Drift:
+    """The similarity that carries the calibrated rim of pins to the one seen.
+
+    Attributes
+    ----------
+    shift_px : (2,) float
+        Shift of the rim's centre.
+    turn_deg : float
+        From x towards y.
+    scale : float
+    contact : float
+        Rms of the pins' motion that the similarity leaves, in the rim's mean radius: how much a contact deforms the skin.
+    """
+
+    shift_px: np.ndarray
+    turn_deg: float
+    scale: float
+    contact: float
+
+    @property
+    def scale_at_rest(self) -> float:
+        """The scale without the contact's part: the gel keeps its volume, so it bulges at the rim when it is pressed in the middle."""
+        return self.scale / (1 + BULGE * self.contact)
+
+
+def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray) -> Drift | None:
+    """Drift by least squares over the outermost pins (m,) of pins (N, 2), NaN where lost; None where too few are seen.
+
+    With complex coordinates about the means: ``a = sum conj(r) p / sum |r|^2`` (Horn 1987, in the plane).
+    """
+    rim = outmost[np.isfinite(pins_px[outmost, 0])]
+    if len(rim) < LEAST_RIM * len(outmost):
+        return None
+    seen, rest = pins_px @ [1, 1j], rest_px @ [1, 1j]
+    middle, rest_middle = seen[rim].mean(), rest[rim].mean()
+    a = np.vdot(rest[rim] - rest_middle, seen[rim] - middle) / np.vdot(rest[rim] - rest_middle, rest[rim] - rest_middle)
+    carried = middle + a * (rest - rest_middle)
+    shift = carried[outmost].mean() - rest[outmost].mean()
+    radius = np.abs(rest[outmost] - rest[outmost].mean()).mean()
+    contact = np.sqrt(np.nanmean(np.abs(seen - carried) ** 2)) / radius
+    return Drift(np.array([shift.real, shift.imag]), float(np.degrees(np.angle(a))), float(abs(a)), float(contact))
+
+
 def _verdict(value: float, watch: float, bad: float) -> Grade:
-    """Grade on a value by two limits. If ``bad`` is above ``watch``, large values are bad; else small ones. NaN is bad."""
+    """Grade of a value by two limits. If ``bad`` is above ``watch``, large values are bad; else small ones. NaN is bad."""
     sign = 1 if bad > watch else -1
     if not np.isfinite(value) or sign * value > sign * bad:
         return Grade.BAD

@@ -1,6 +1,7 @@
-"""Other blob detectors: a masked gray window goes in, places and areas of blobs come out.
+"""Each way to find pins behind one call: a frame goes in; claimed places, pins by name and a graph come out.
 
-Each way to find pins behind one call: a frame goes in; claimed places, pins by name and a graph come out."""
+The ways are this program's pipeline, the published method, and plain blob detectors of OpenCV and scikit-image.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -23,88 +24,31 @@ from twin.pins.pipeline import MIN_FOUND, Pipeline
 from twin.pins.reference import Reference, make_reference, nominal_reference
 from twin.types import Form, Frame, PinGraph
 
-# Gray levels of full contrast.
 LEVELS = 255.0
-# Sizes between the smallest and the largest that the scale-space detectors look for.
+"""Gray levels of full contrast."""
 LOG_STEPS = 3
-# Response of scikit-image's blob_log (and blob_dog) to a disc of its own size and contrast 1, roughly.
+"""Number of sizes, from the smallest to the largest, that the scale-space detectors look for."""
 LOG_PEAK = 0.5
-# Response of blob_doh to such a disc; it grows with the contrast squared.
+"""Response of scikit-image's blob_log (and blob_dog) to a disc of its own size and contrast 1, roughly."""
 DOH_PEAK = 0.05
-# Ratio of neighbouring sizes of blob_dog.
+"""Response of blob_doh to such a disc; it grows with the contrast squared."""
 DOG_RATIO = 1.4
-# Share of a smaller blob that may overlap with a larger one.
+"""Ratio of neighbouring sizes of blob_dog."""
 OVERLAP = 0.3
-# Gray levels between the thresholds of SimpleBlobDetector, and the highest first one.
-SIMPLE_STEP, SIMPLE_HIGHEST = 10.0, 240.0
-# Largest area of a blob, in areas of the largest cap.
+"""Share of a smaller blob that may overlap with a larger one."""
+SIMPLE_STEP = 10.0
+"""Gray levels between the thresholds of SimpleBlobDetector."""
+SIMPLE_HIGHEST = 240.0
+"""Highest first threshold of SimpleBlobDetector, gray levels."""
 MOST_CAPS = 4
-
-
-def find(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Places (K, 2), px of the frame, and areas (K,) of the blobs in a mask's window (h, w) uint8."""
-    return FINDERS[detector.method](window, mask, detector)
-
-
-def _components(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Connected components above a fixed or adaptive threshold."""
-    blob = detector.blob if detector.method == "adaptive" else _fixed(detector.blob)
-    binary = threshold(window, mask.disc, blob)
-    if blob.erosion_px > 1:
-        binary = cv2.erode(binary, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
-    _, _, stats, centroids = cv2.connectedComponentsWithStats(binary, connectivity=8)
-    area = stats[1:, cv2.CC_STAT_AREA].astype(float)
-    keep = (area >= blob.min_area_px2) & (area <= MOST_CAPS * np.pi * detector.radius_px[1] ** 2)
-    return centroids[1:][keep] + mask.corner_px, area[keep]
-
-
-def _fixed(blob: BlobSpec) -> BlobSpec:
-    """The same with a fixed threshold."""
-    return blob.model_copy(update={"threshold_block_px": 0})
-
-
-def _simple(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """OpenCV's SimpleBlobDetector."""
-    settings = cv2.SimpleBlobDetector.Params()
-    settings.blobColor = 255
-    settings.minThreshold = min(detector.blob.threshold, SIMPLE_HIGHEST)
-    settings.maxThreshold, settings.thresholdStep = 255.0, SIMPLE_STEP
-    settings.minDistBetweenBlobs, settings.minRepeatability = max(detector.radius_px[0], 1.0), 1
-    settings.filterByArea, settings.minArea = True, max(detector.blob.min_area_px2, 1.0)
-    settings.maxArea = MOST_CAPS * np.pi * detector.radius_px[1] ** 2
-    settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
-    found = cv2.SimpleBlobDetector.create(settings).detect(cv2.bitwise_and(window, mask.disc))
-    px = np.array([point.pt for point in found], float).reshape(-1, 2)
-    return px + mask.corner_px, np.array([np.pi / 4 * point.size**2 for point in found])
-
-
-def _scale_space(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """scikit-image's Laplacian or difference of Gaussians, or determinant of Hessian."""
-    contrast = detector.blob.threshold / LEVELS
-    small, large = (radius / np.sqrt(2) for radius in detector.radius_px)
-    inside = mask.disc > 0
-    image = np.where(inside, window, np.median(window[inside])) / LEVELS
-    if detector.method == "log":
-        found = blob_log(image, min_sigma=small, max_sigma=large, num_sigma=LOG_STEPS, threshold=LOG_PEAK * contrast, overlap=OVERLAP)
-    elif detector.method == "dog":
-        found = blob_dog(image, min_sigma=small, max_sigma=large, sigma_ratio=DOG_RATIO, threshold=LOG_PEAK * contrast, overlap=OVERLAP)
-    else:
-        found = blob_doh(image, min_sigma=small, max_sigma=large, num_sigma=LOG_STEPS, threshold=DOH_PEAK * contrast**2, overlap=OVERLAP)
-    rows, columns = found[:, 0].astype(int), found[:, 1].astype(int)
-    found = found[inside[rows, columns]]
-    return found[:, 1::-1] + mask.corner_px, 2 * np.pi * found[:, 2] ** 2
-
-
-FINDERS = {"adaptive": _components, "fixed": _components, "simple": _simple, "log": _scale_space, "dog": _scale_space, "doh": _scale_space}
-
-
-# A frame with more blobs than this for each pin is refused as clutter.
+"""Largest area of a blob, in areas of the largest cap."""
 MOST_BLOBS = 4
+"""A frame with more than this many blobs for each pin is refused as clutter."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a detector claims of one frame.
+    """What a detector claims to see in one frame.
 
     Attributes
     ----------
@@ -133,7 +77,7 @@ class Detector(Protocol):
     def __call__(self, frame: Frame) -> Found: ...
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph | None:
-        """The graph that its method makes of pins (N, 2) in the specification's order, areas in its own unit."""
+        """The graph that the method makes of pins (N, 2) in the specification's order; areas are in the method's own unit."""
 
 
 def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bool = True) -> Detector:
@@ -231,6 +175,63 @@ class LegacyDetector:
             return legacy_graph(nodes - np.median(nodes), self._pipeline.parameters)
         except QhullError:
             return None
+
+
+def find(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Places (K, 2), px of the frame, and areas (K,) of the blobs in a mask's window (h, w) uint8."""
+    return FINDERS[detector.method](window, mask, detector)
+
+
+def _components(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Connected components above a fixed or adaptive threshold."""
+    blob = detector.blob if detector.method == "adaptive" else _fixed(detector.blob)
+    binary = threshold(window, mask.disc, blob)
+    if blob.erosion_px > 1:
+        binary = cv2.erode(binary, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
+    _, _, stats, centroids = cv2.connectedComponentsWithStats(binary, connectivity=8)
+    area = stats[1:, cv2.CC_STAT_AREA].astype(float)
+    keep = (area >= blob.min_area_px2) & (area <= MOST_CAPS * np.pi * detector.radius_px[1] ** 2)
+    return centroids[1:][keep] + mask.corner_px, area[keep]
+
+
+def _fixed(blob: BlobSpec) -> BlobSpec:
+    """The same parameters with a fixed threshold."""
+    return blob.model_copy(update={"threshold_block_px": 0})
+
+
+def _simple(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """OpenCV's SimpleBlobDetector."""
+    settings = cv2.SimpleBlobDetector.Params()
+    settings.blobColor = 255
+    settings.minThreshold = min(detector.blob.threshold, SIMPLE_HIGHEST)
+    settings.maxThreshold, settings.thresholdStep = 255.0, SIMPLE_STEP
+    settings.minDistBetweenBlobs, settings.minRepeatability = max(detector.radius_px[0], 1.0), 1
+    settings.filterByArea, settings.minArea = True, max(detector.blob.min_area_px2, 1.0)
+    settings.maxArea = MOST_CAPS * np.pi * detector.radius_px[1] ** 2
+    settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
+    found = cv2.SimpleBlobDetector.create(settings).detect(cv2.bitwise_and(window, mask.disc))
+    px = np.array([point.pt for point in found], float).reshape(-1, 2)
+    return px + mask.corner_px, np.array([np.pi / 4 * point.size**2 for point in found])
+
+
+def _scale_space(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
+    """scikit-image's Laplacian or difference of Gaussians, or determinant of Hessian."""
+    contrast = detector.blob.threshold / LEVELS
+    small, large = (radius / np.sqrt(2) for radius in detector.radius_px)
+    inside = mask.disc > 0
+    image = np.where(inside, window, np.median(window[inside])) / LEVELS
+    if detector.method == "log":
+        found = blob_log(image, min_sigma=small, max_sigma=large, num_sigma=LOG_STEPS, threshold=LOG_PEAK * contrast, overlap=OVERLAP)
+    elif detector.method == "dog":
+        found = blob_dog(image, min_sigma=small, max_sigma=large, sigma_ratio=DOG_RATIO, threshold=LOG_PEAK * contrast, overlap=OVERLAP)
+    else:
+        found = blob_doh(image, min_sigma=small, max_sigma=large, num_sigma=LOG_STEPS, threshold=DOH_PEAK * contrast**2, overlap=OVERLAP)
+    rows, columns = found[:, 0].astype(int), found[:, 1].astype(int)
+    found = found[inside[rows, columns]]
+    return found[:, 1::-1] + mask.corner_px, 2 * np.pi * found[:, 2] ** 2
+
+
+FINDERS = {"adaptive": _components, "fixed": _components, "simple": _simple, "log": _scale_space, "dog": _scale_space, "doh": _scale_space}
 
 
 def named(graph: PinGraph, claims_px: np.ndarray, pins_px: np.ndarray) -> PinGraph:

@@ -15,7 +15,7 @@ from twin.store import write_text
 from twin.types import Form
 
 Method = Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"]
-METHODS: dict[str, str] = {
+METHODS: dict[Method, str] = {
     "twin": "this program's pipeline: adaptive threshold, splitting, matching to the layout",
     "legacy": "the published method: the recorder's threshold, resize, SimpleBlobDetector, exact count",
     "adaptive": "adaptive mean threshold and connected components",

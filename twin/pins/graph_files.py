@@ -1,6 +1,4 @@
-"""Graphs of many frames as one set of arrays, and their pictures.
-
-Graphs of a frame, of many frames or of found pins, written as arrays and pictures."""
+"""Graphs of a frame, of many frames or of found pins, written as arrays and pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +20,118 @@ from twin.report.charts import new_figure
 from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
 from twin.store import write_npz
 from twin.types import Form, PinGraph
+
+PINS = ".npz"
+"""Suffix of a file of found pins."""
+PICTURE_INCH = 8
+"""Side of a graph's picture, inch."""
+PICTURE_DPI = 120
+"""Resolution of a graph's picture, dots per inch."""
+
+
+@dataclass(frozen=True)
+class Graphs:
+    """Graphs of many frames and the files they were written to.
+
+    Attributes
+    ----------
+    names : list of str
+        Names of the frames that have a graph.
+    graphs : list of PinGraph
+    left_out : list of str
+        Frames without a graph, and why.
+    written : list of Path
+    """
+
+    names: list[str]
+    graphs: list[PinGraph]
+    left_out: list[str]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """For people: frames left out, and the size of the first graph."""
+        first = self.graphs[0]
+        counted = f"{len(self.graphs)} graphs; the first has {len(first.nodes_px)} nodes and {len(first.edges)} directed edges"
+        return [*(f"skipped {reason}" for reason in self.left_out), counted]
+
+
+def write_graphs_of(
+    path: Path, sensor: SensorSpec, out: Path, *, kind: GraphKind = "voronoi", form: Form | None = None, legacy: bool = False
+) -> Graphs:
+    """Build the graphs of what lies at a path and write them to an existing folder.
+
+    Parameters
+    ----------
+    path : Path
+        A frame, anything that ``open_recording`` takes, or a ``pins.npz`` of found pins.
+    form : Form, optional
+        Form of the frames; by default it is told by their size and content.
+    legacy : bool
+        Use the published release's own method and boundary. It makes Voronoi graphs of frames only.
+
+    Raises
+    ------
+    FrameError
+        No frame has a graph, the file is no ``pins.npz`` of this sensor, or ``legacy`` is asked for where it does not apply.
+    """
+    if legacy and (kind != "voronoi" or path.suffix == PINS):
+        raise FrameError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
+    if path.suffix == PINS:
+        found, nodes_px = read_pins(path, sensor.pins.count)
+        names = list(found)
+        form = form or form_of_pins(sensor, nodes_px)
+        reference, image, left_out = nominal_reference(sensor, form), None, []
+        graphs = [make_graph(kind, nodes, outmost=reference.outmost) for nodes in nodes_px]
+    else:
+        seen = _graphs_of_recording(path, sensor, kind, form, legacy=legacy)
+        names, graphs, left_out = seen.names, seen.graphs, seen.left_out
+        form, reference, image = seen.form, seen.reference, seen.first_image
+    if legacy:
+        pictures = draw_bare_graph(out, graphs[0])
+    else:
+        pictures = draw_graph_pictures(out, sensor.name, frame_size(sensor, form), graphs[0], reference, image)
+    return Graphs(names, graphs, left_out, [write_graphs(out, names, graphs), *pictures])
+
+
+@dataclass(frozen=True)
+class _RecordingGraphs:
+    """Graphs of the good frames of a recording, their reference, and which frames were left out and why."""
+
+    names: list[str]
+    graphs: list[PinGraph]
+    form: Form
+    reference: Reference
+    first_image: np.ndarray
+    left_out: list[str]
+
+
+def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None, *, legacy: bool = False) -> _RecordingGraphs:
+    """The graphs of what ``open_recording`` takes, by the pipeline or by the published release's method.
+
+    Raises
+    ------
+    FrameError
+        If no frame has a graph.
+    """
+    recording = open_recording(path, spec, form)
+    left_out: list[str] = []
+    reference, _ = recording_reference(spec, recording, left_out)
+    pipeline = LegacyPipeline(spec.pins, spec.recording) if legacy else Pipeline(spec, recording.form, reference, graph=kind)
+    names: list[str] = []
+    graphs: list[PinGraph] = []
+    first_image: np.ndarray | None = None
+    for frame in recording:
+        observation = pipeline(frame)
+        if observation.graph is None:
+            left_out.append(f"{frame.name}: {observation.reason}")
+            continue
+        names.append(frame.name)
+        graphs.append(observation.graph)
+        first_image = frame.image if first_image is None else first_image
+    left_out += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
+    if first_image is None:
+        raise FrameError(f"{path}: no frame has a graph; the first: {left_out[0] if left_out else 'no frame in it'}")
+    return _RecordingGraphs(names, graphs, recording.form, reference, first_image, left_out)
 
 
 def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +165,7 @@ def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def form_of_pins(spec: SensorSpec, nodes_px: np.ndarray) -> Form:
-    """The form whose rest layout lies nearer to the pins (their file holds pixels only)."""
+    """The form of frames that found pins (M, N, 2) come from: the one whose rest layout lies nearer. Their file holds pixels only."""
     if spec.recording is None:
         return Form.RAW
     center = np.median(nodes_px.reshape(-1, 2), axis=0)
@@ -82,147 +192,33 @@ def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) ->
 def draw_graph_pictures(
     out: Path, title: str, size_px: tuple[int, int], graph: PinGraph, reference: Reference, image: np.ndarray | None
 ) -> list[Path]:
-    """``graph.png``, and for a Voronoi graph ``surface.png`` against the reference; the files.
+    """Draw ``graph.png``, and for a Voronoi graph ``surface.png`` against the reference; the files.
 
     The graph lies over the frame (H, W[, 3]), or on black of ``size_px`` (width, height) where there is none.
     """
     if image is None:
         image = np.zeros(size_px[::-1], np.uint8)
-    figure, (ax,) = new_figure(1, panel_inch=8)
+    figure, (ax,) = new_figure(1, panel_inch=PICTURE_INCH)
     draw_frame(ax, image, f"{title}: {graph.kind}, {len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
     draw_graph(ax, graph)
     draw_nodes(ax, graph)
     written = [out / "graph.png"]
-    figure.savefig(written[0], dpi=120)
+    figure.savefig(written[0], dpi=PICTURE_DPI)
     if graph.kind == "voronoi":
         rest = make_graph("voronoi", reference.pins_px, outmost=reference.outmost)
         written.append(out / "surface.png")
-        area_surface_figure(rest, graph).savefig(written[1], dpi=120)
+        area_surface_figure(rest, graph).savefig(written[1], dpi=PICTURE_DPI)
     return written
 
 
-def graphs_of_nodes(kind: GraphKind, nodes_px: np.ndarray, reference: Reference) -> list[PinGraph]:
-    """A graph for each of M node sets (M, N, 2)."""
-    return [make_graph(kind, nodes, outmost=reference.outmost) for nodes in nodes_px]
-
-
-@dataclass(frozen=True)
-class RecordingGraphs:
-    """Graphs of the good frames of a recording, what they were measured against, and what was left out and why."""
-
-    names: list[str]
-    graphs: list[PinGraph]
-    form: Form
-    reference: Reference
-    first_image: np.ndarray
-    left_out: list[str]
-
-
 def draw_bare_graph(out: Path, graph: PinGraph) -> list[Path]:
-    """``graph.png`` without a frame, for nodes that are not in a frame's pixels."""
-    figure, (ax,) = new_figure(1, panel_inch=8)
+    """Draw ``graph.png`` without a frame, for nodes that are not in a frame's pixels; the file."""
+    figure, (ax,) = new_figure(1, panel_inch=PICTURE_INCH)
     ax.set_facecolor("#101418")
     draw_graph(ax, graph)
     draw_nodes(ax, graph)
     ax.set(aspect="equal", title=f"{len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
     ax.invert_yaxis()
     path = out / "graph.png"
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, dpi=PICTURE_DPI)
     return [path]
-
-
-def graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None, *, legacy: bool = False) -> RecordingGraphs:
-    """Run the pipeline, or the published release's, on everything ``open_recording`` takes and keep the graphs.
-
-    Raises
-    ------
-    FrameError
-        If no frame has a graph.
-    """
-    recording = open_recording(path, spec, form)
-    left_out: list[str] = []
-    reference, _ = recording_reference(spec, recording, left_out)
-    pipeline = LegacyPipeline(spec.pins, spec.recording) if legacy else Pipeline(spec, recording.form, reference, graph=kind)
-    names: list[str] = []
-    graphs: list[PinGraph] = []
-    first_image: np.ndarray | None = None
-    for frame in recording:
-        observation = pipeline(frame)
-        if observation.graph is None:
-            left_out.append(f"{frame.name}: {observation.reason}")
-            continue
-        names.append(frame.name)
-        graphs.append(observation.graph)
-        first_image = frame.image if first_image is None else first_image
-    left_out += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
-    if first_image is None:
-        raise FrameError(f"{path}: no frame has a graph; the first: {left_out[0] if left_out else 'no frame in it'}")
-    return RecordingGraphs(names, graphs, recording.form, reference, first_image, left_out)
-
-
-PINS = ".npz"  # suffix of a file of found pins
-
-
-@dataclass(frozen=True)
-class Graphs:
-    """What was made.
-
-    Attributes
-    ----------
-    names : list of str
-        Of the frames that have a graph.
-    graphs : list of PinGraph
-    left_out : list of str
-        Frames without a graph, and why.
-    written : list of Path
-    """
-
-    names: list[str]
-    graphs: list[PinGraph]
-    left_out: list[str]
-    written: list[Path]
-
-    def lines(self) -> list[str]:
-        """For people."""
-        first = self.graphs[0]
-        counted = f"{len(self.graphs)} graphs; the first has {len(first.nodes_px)} nodes and {len(first.edges)} directed edges"
-        return [*(f"skipped {reason}" for reason in self.left_out), counted]
-
-
-def write_graphs_of(
-    path: Path, sensor: SensorSpec, out: Path, *, kind: GraphKind = "voronoi", form: Form | None = None, legacy: bool = False
-) -> Graphs:
-    """Build the graphs of what lies at a path and write them to an existing folder.
-
-    Parameters
-    ----------
-    path : Path
-        A frame, anything that ``open_recording`` takes, or a ``pins.npz`` of found pins.
-    form : Form, optional
-        Of the frames; told by size and content by default.
-    legacy : bool
-        The published release's own method and boundary; Voronoi graphs of frames only.
-
-    Raises
-    ------
-    FrameError
-        No frame has a graph, the file is no ``pins.npz`` of this sensor, or ``legacy`` is asked for where it does not apply.
-    """
-    if legacy and (kind != "voronoi" or path.suffix == PINS):
-        raise FrameError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
-    if path.suffix == PINS:
-        found, nodes_px = read_pins(path, sensor.pins.count)
-        names = list(found)
-        form = form or form_of_pins(sensor, nodes_px)
-        reference, image, left_out = nominal_reference(sensor, form), None, []
-        graphs = graphs_of_nodes(kind, nodes_px, reference)
-    else:
-        seen = graphs_of_recording(path, sensor, kind, form, legacy=legacy)
-        names, graphs, left_out = seen.names, seen.graphs, seen.left_out
-        form, reference, image = seen.form, seen.reference, seen.first_image
-    pictures = (
-        draw_bare_graph(out, graphs[0])
-        if legacy
-        else draw_graph_pictures(out, sensor.name, frame_size(sensor, form), graphs[0], reference, image)
-    )
-    return Graphs(names, graphs, left_out, [write_graphs(out, names, graphs), *pictures])

@@ -1,6 +1,4 @@
-"""The motion model: displacement is locally affine over a pin's neighbours.
-
-Which blob is which pin: grow a consistent labelling over the rest layout from a seed, keep the best of several.
+"""Which blob is which pin: grow a consistent labelling over the rest layout from a seed, keep the best of several.
 
 A pin may move by more than the distance to its neighbour, so the nearest blob is not always the right one. But neighbours
 move alike. A labelling starts from one pair of pin and blob. The local affine motion of the pairs found so far predicts the
@@ -9,7 +7,10 @@ from the prediction. The start that explains most blobs wins.
 
 One wrong labelling is nearly as smooth as the true one: each ring of pins is shifted along itself by one pin. Ring i has
 6 i pins, so it is turned by 60 / i degrees, and only the innermost rings, which turn most, fall apart. Therefore each labelling
-is unwound: its rings are shifted back by the number of pins with which they turn most alike, before it is judged."""
+is unwound: its rings are shifted back by the number of pins with which they turn most alike, before it is judged.
+
+Distances are in local spacings: the distance of a pin at rest to its nearest neighbour. All limits were chosen, not derived.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,8 +22,149 @@ from scipy.optimize import linear_sum_assignment
 
 from twin.pins.reference import Reference
 
-# Pull of the local gradient towards zero, as strong as this many neighbours at one spacing.
 RIDGE = 0.25
+"""Pull of the local gradient towards zero: as strong as this many neighbours at one spacing."""
+GROW_GATES = (0.30, 0.45)
+"""Largest distance from a prediction to its blob while a labelling grows: strict first, then looser."""
+FINAL_GATE = 0.40
+"""Largest distance from a prediction to its blob in the final assignment."""
+ADOPT_GATE = 0.7
+"""Largest distance from the prediction of a lost pin to a free blob, if each is the other's nearest."""
+ADOPT_AREA_RATIO = 2.0
+"""Largest ratio, either way, of the area of a blob that is given to a lost pin to that of the pin's neighbours."""
+MOST_ADOPTED = 0.2
+"""Lost pins are given free blobs only if at most this share of the pins is lost."""
+SOFT_RESIDUAL = 0.15
+"""Distance of a pair from the prediction at which its weight is halved."""
+AREA_LOG_WEIGHT = 0.02
+"""Cost of a squared log ratio of areas of 1, against a squared distance in spacings."""
+MIN_AREA_RATIO = 0.2
+"""A blob smaller than this share of its neighbours' mean area is a speck, not a pin."""
+NO_PAIR_COST = 10.0
+"""Cost that stands for "no pair": far above any cost of a pair, so that pairing more pins always pays."""
+REFINE_ROUNDS = 4
+"""Most rounds of predicting and assigning; they end when nothing changes."""
+NEARLY_ALL = 0.985
+"""A labelling that holds this share of the pins is refined at once. So is one that holds the square of this share of the blobs, if it
+holds MIN_SETTLED of the pins."""
+MIN_SETTLED = 0.7
+"""Least share of the pins that a labelling must hold to be refined at once because it holds nearly all blobs."""
+SETTLED = 0.94
+"""No further start is tried after a labelling whose score is at least this share of its number of pins."""
+TURN_WEIGHT = 1.5
+"""Weight in the score, for each pin, of the rings' mean turn (1 minus its cosine)."""
+MAX_WINDING = 3
+"""Rings may be shifted along themselves by this many pins either way."""
+BROKEN_RINGS = 2
+"""This many innermost rings are left out when the shift is found, because they do not hold together in a shifted labelling."""
+EXTENT_MARGIN = 0.02
+"""Share of the points that is left out on each side of their extent. The extent's middle tells how far the whole view is displaced."""
+RIM_SEEDS = 12
+"""Number of pins around the rim from which labellings start."""
+INSIDE_SEEDS = 6
+"""Number of pins inside the rim from which labellings start, about."""
+SEED_RANKS = 3
+"""Nearest blobs that are tried for each of these pins."""
+REFINED = 4
+"""Labellings that are refined where none settles."""
+NEAR = 6
+"""First the labels of this many neighbours of a lost pin are forgotten and grown anew, then those of all its neighbours."""
+LEAST_KEPT = 0.5
+"""Labels are grown anew only if at least this share of the pins stays labelled."""
+MOST_REGROWN = 0.3
+"""Labels are grown anew only if less than this share of the pins is lost."""
+Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
+"""Blobs by square cell: first blob of each cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``)."""
+
+
+class Layout(NamedTuple):
+    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, ring_ends (R + 1,).
+
+    Ring i's pins are ``ring_ends[i - 1]`` to ``ring_ends[i]``, in order around the layout.
+    """
+
+    rest: np.ndarray
+    neighbours: np.ndarray
+    spacing: np.ndarray
+    ring_ends: np.ndarray
+
+
+@dataclass(frozen=True)
+class Match:
+    """A labelling of the blobs.
+
+    Attributes
+    ----------
+    blob : (N,) int
+        Blob of each pin, -1 for none.
+    predicted_px : (N, 2) float
+        Each pin's place as its neighbours' motion predicts it.
+    score : float
+        Number of pins paired, minus their squared distances from the predictions relative to the gate, minus the cost of the rings'
+        turn. Larger is better.
+    """
+
+    blob: np.ndarray
+    predicted_px: np.ndarray
+    score: float
+
+
+def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
+    """Label blobs by the pins of a reference.
+
+    Parameters
+    ----------
+    reference : Reference
+    px : (K, 2) float
+        Blob centroids, px, in any order.
+    area_px2 : (K,) float
+        Blob areas.
+
+    Returns
+    -------
+    Match
+        The best labelling found; it may be poor: see its score.
+    """
+    n = len(reference.pins_px)
+    nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
+    if len(px) < 3:
+        return nothing
+    px = np.ascontiguousarray(px)
+    layout = _layout(reference)
+    cell = float(np.median(reference.spacing_px))
+    buckets = _buckets(px, cell)
+    grown: list[tuple[float, np.ndarray, Match | None]] = []
+    for pin, blob in _seeds(reference, px):
+        start = np.full(n, -1)
+        start[pin] = blob
+        labels = _grow(*layout[:3], px, start, buckets, cell)
+        unwound = _unwound(layout.rest, px, labels, layout.ring_ends)
+        if (unwound >= 0).any() and not np.array_equal(unwound, labels):
+            labels = _grow(*layout[:3], px, unwound, buckets, cell)
+        count = int((labels >= 0).sum())
+        if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
+            found = _refine(layout, px, area_px2, labels, buckets, cell)
+            if found.score >= SETTLED * count:
+                grown = [(found.score, labels, found)]
+                break
+        grown.append((count, labels, None))
+    grown.sort(key=lambda entry: -entry[0])
+    best = nothing
+    for _, labels, refined in grown[:REFINED]:
+        found = refined or _refine(layout, px, area_px2, labels, buckets, cell)
+        best = max(best, found, key=lambda entry: entry.score)
+    lost = int((best.blob < 0).sum())
+    if 0 < lost < MOST_REGROWN * n and len(px) > n - lost:
+        best = _regrown(layout, px, area_px2, best, buckets, cell)
+    return best
+
+
+def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray) -> Match:
+    """Settle a labelling ``blob`` (N,) of nearly all pins on a slightly different set of blobs, as ``match`` would."""
+    px = np.ascontiguousarray(px)
+    cell = float(np.median(reference.spacing_px))
+    layout = _layout(reference)
+    return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)
 
 
 @njit(cache=True)
@@ -96,87 +238,6 @@ def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, m
         out[i, 0] = rest[i, 0] + ux if count else np.nan
         out[i, 1] = rest[i, 1] + uy if count else np.nan
     return out
-
-
-# Distances are in local spacings: the distance of a pin at rest to its nearest neighbour. All limits were chosen, not derived.
-# Largest distance from a prediction to its blob while a labelling grows: strict first, then looser.
-GROW_GATES = (0.30, 0.45)
-# Largest distance from a prediction to its blob in the final assignment.
-FINAL_GATE = 0.40
-# Largest distance from the prediction of a lost pin to a free blob, if each is the other's nearest.
-ADOPT_GATE = 0.7
-# Largest ratio, either way, of such a blob's area to that of its neighbours.
-ADOPT_AREA_RATIO = 2.0
-# Largest share of the pins that may be lost for this to be tried.
-MOST_ADOPTED = 0.2
-# Distance of a pair from the prediction at which its weight is halved.
-SOFT_RESIDUAL = 0.15
-# Cost of a squared log ratio of areas of 1, against a squared distance in spacings.
-AREA_LOG_WEIGHT = 0.02
-# A blob smaller than this share of its neighbours' mean area is a speck, not a pin.
-MIN_AREA_RATIO = 0.2
-# Cost that stands for "no pair": far above any cost of a pair, so that pairing more pins always pays.
-NO_PAIR_COST = 10.0
-# Most rounds of predicting and assigning; they end when nothing changes.
-REFINE_ROUNDS = 4
-# No further start is tried if one labelling holds this share of the pins (or its square of the blobs and MIN_SETTLED of the pins) ...
-NEARLY_ALL = 0.985
-MIN_SETTLED = 0.7
-# ... and its score is this share of their number.
-SETTLED = 0.94
-# Weight in the score, for each pin, of the rings' mean turn (1 minus its cosine).
-TURN_WEIGHT = 1.5
-# Rings may be shifted along themselves by this many pins either way.
-MAX_WINDING = 3
-# So many innermost rings are left out when the shift is found: they do not hold together in a shifted labelling.
-BROKEN_RINGS = 2
-# Share of the points on each side that is left out of an extent, whose middle tells how far the whole view is displaced.
-EXTENT_MARGIN = 0.02
-# Pins around the rim from which labellings start, and pins inside, at most about this many.
-RIM_SEEDS, INSIDE_SEEDS = 12, 6
-# Nearest blobs that are tried for each of these pins.
-SEED_RANKS = 3
-# Labellings that are refined where none settles.
-REFINED = 4
-# Neighbours around a lost pin whose labels are forgotten before they are grown anew; then all of its neighbours'.
-NEAR = 6
-# Share of the pins that must stay labelled for this, and largest share that may be lost.
-LEAST_KEPT, MOST_REGROWN = 0.5, 0.3
-
-# First blob of each square cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``).
-Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
-
-
-class Layout(NamedTuple):
-    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, ring_ends (R + 1,).
-
-    Ring i's pins are ``ring_ends[i - 1]`` to ``ring_ends[i]``, in order around the layout.
-    """
-
-    rest: np.ndarray
-    neighbours: np.ndarray
-    spacing: np.ndarray
-    ring_ends: np.ndarray
-
-
-@dataclass(frozen=True)
-class Match:
-    """A labelling of the blobs.
-
-    Attributes
-    ----------
-    blob : (N,) int
-        Blob of each pin, -1 for none.
-    predicted_px : (N, 2) float
-        Each pin's place as its neighbours' motion predicts it.
-    score : float
-        Number of pins paired, minus their squared distances from the predictions relative to the gate, minus the cost of the rings'
-        turn. Larger is better.
-    """
-
-    blob: np.ndarray
-    predicted_px: np.ndarray
-    score: float
 
 
 @njit(cache=True)
@@ -495,61 +556,3 @@ def _layout(reference: Reference) -> Layout:
     ring = np.arange(rings + 1)
     ring_ends = n - 3 * (rings * (rings + 1) - ring * (ring + 1))
     return Layout(reference.pins_px, reference.neighbours, reference.spacing_px, ring_ends)
-
-
-def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
-    """Label blobs by the pins of a reference.
-
-    Parameters
-    ----------
-    reference : Reference
-    px : (K, 2) float
-        Blob centroids, px, in any order.
-    area_px2 : (K,) float
-        Blob areas.
-
-    Returns
-    -------
-    Match
-        The best labelling found; it may be poor: see its score.
-    """
-    n = len(reference.pins_px)
-    nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
-    if len(px) < 3:
-        return nothing
-    px = np.ascontiguousarray(px)
-    layout = _layout(reference)
-    cell = float(np.median(reference.spacing_px))
-    buckets = _buckets(px, cell)
-    grown: list[tuple[float, np.ndarray, Match | None]] = []
-    for pin, blob in _seeds(reference, px):
-        start = np.full(n, -1)
-        start[pin] = blob
-        labels = _grow(*layout[:3], px, start, buckets, cell)
-        unwound = _unwound(layout.rest, px, labels, layout.ring_ends)
-        if (unwound >= 0).any() and not np.array_equal(unwound, labels):
-            labels = _grow(*layout[:3], px, unwound, buckets, cell)
-        count = int((labels >= 0).sum())
-        if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
-            found = _refine(layout, px, area_px2, labels, buckets, cell)
-            if found.score >= SETTLED * count:
-                grown = [(found.score, labels, found)]
-                break
-        grown.append((count, labels, None))
-    grown.sort(key=lambda entry: -entry[0])
-    best = nothing
-    for _, labels, refined in grown[:REFINED]:
-        found = refined or _refine(layout, px, area_px2, labels, buckets, cell)
-        best = max(best, found, key=lambda entry: entry.score)
-    lost = int((best.blob < 0).sum())
-    if 0 < lost < MOST_REGROWN * n and len(px) > n - lost:
-        best = _regrown(layout, px, area_px2, best, buckets, cell)
-    return best
-
-
-def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray) -> Match:
-    """Settle a labelling ``blob`` (N,) of nearly all pins on a slightly different set of blobs, as ``match`` would."""
-    px = np.ascontiguousarray(px)
-    cell = float(np.median(reference.spacing_px))
-    layout = _layout(reference)
-    return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)

@@ -1,6 +1,8 @@
 """From a frame to an observation, in one way for rendered, recorded and live frames.
 
-Whether the sensor is pressed in a frame that should show no contact: motion of the pins that no camera could make."""
+The limits of an observation were chosen, not derived. A frame that should show no contact is refused where its pins move in a way that
+no camera could make (`require_untouched`).
+"""
 
 from time import perf_counter
 
@@ -16,37 +18,41 @@ from twin.pins.reference import Reference, folded_fraction, make_reference, nomi
 from twin.pins.split import split_chains, split_merged
 from twin.types import Form, Frame, Observation
 
-# Limits of an observation; they were chosen, not derived.
-# Least share of the pins that must be found.
 MIN_FOUND = 0.8
-# Most blobs among the pins that are no pins, as a share of the pins, where some pins are missing.
+"""Least share of the pins that must be found."""
 MAX_EXTRA = 0.35
-# Share of the pins from which on none counts as missing; then there may be as many further blobs as pins.
+"""Most blobs among the pins that are no pins, as a share of the number of pins, in a frame in which pins are missing."""
 NEARLY_ALL = 0.97
-# Largest share of the reference's triangles that may be turned over: more is a wrong labelling.
+"""No pin counts as missing if at least this share is found. Then there may be as many further blobs as pins."""
 MAX_FOLDED = 0.02
-# Largest ratio of the rim's radius to that at rest, either way. The rim is clamped: contact changes it by some percent.
+"""Largest share of the reference's triangles that may be turned over: more is a wrong labelling."""
 MAX_RIM_SCALE = 1.2
-# Largest displacement of the layout, in its radii: a frame displaced further is not this sensor's view.
+"""Largest ratio of the rim's radius to that at rest, either way. The rim is clamped: contact changes it by some percent."""
 MAX_SHIFT = 0.5
-# Largest area of a blob, in squared mean spacings: larger ones are housing or glare.
+"""Largest displacement of the layout, in its radii: a frame displaced further is not this sensor's view."""
 MAX_BLOB_PITCHES2 = 3.0
-# Rounds of splitting caps that touch: each split corrects the predictions for the next.
+"""Largest area of a blob, in squared mean spacings: larger ones are housing or glare."""
 SPLIT_ROUNDS = 3
-# Where a smaller share of the pins than this is found, or MAX_EXTRA further blobs, the frame is looked at again.
+"""Rounds of splitting caps that touch: each split corrects the predictions for the next."""
 ENOUGH = 0.985
-# The thresholds of these looks, in the frame's own threshold half way between caps and skin. The low one finds caps much darker than most.
+"""The frame is looked at again if a smaller share of the pins than this is found, or more than MAX_EXTRA further blobs."""
 OWN_SHARES = (1.0, 0.3)
-# Pins that a further blob costs where looks are compared: noise and clutter make hundreds of blobs.
+"""Thresholds of these further looks, relative to the frame's own threshold between caps and skin. The low one finds caps much darker
+than most."""
 EXTRA_COST = 0.05
-# Displacement of a frame, px, above which its mask is displaced, too ...
+"""Cost of a blob that is no pin, in pins, where looks are compared: noise and clutter make hundreds of blobs."""
 REMASK_PX = 2.0
-# ... if a pin is this close to the mask's edge, in spacings.
+"""The mask is displaced with the whole view if that is displaced by at least this, px, and a pin is close to the mask's edge."""
 MASK_MARGIN = 0.5
-# Share of the pins above which a labelling is taken as a basis for further steps.
+"""A pin this close to the mask's edge, in spacings, may be cut off."""
 PLAUSIBLE = 0.5
-# Weight of a pin that was itself predicted, where pins in a gap are predicted from the gap's edge inwards.
+"""Share of the pins above which a labelling is taken as a basis for further steps."""
 PREDICTED_WEIGHT = 0.1
+"""Weight of a predicted pin in the prediction of the next one: pins in a gap are predicted from the gap's edge inwards."""
+MOST_DENT = 0.008
+"""Largest dent, in the rim's mean radius, of a sensor at rest. Measured: 0.0026 to 0.0041 at rest in three real sensors, 0.005 with a
+camera tilted by 2 deg; in real contacts at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A touch of less than
+about 2 mm is not noticed: it moves the pins less than cameras differ."""
 
 
 class Pipeline:
@@ -271,12 +277,6 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
             f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout"
         )
     return make_reference(observation.graph.nodes_px, spec.pins.rings)
-
-
-# Largest dent, in the rim's mean radius, of a sensor at rest. Measured: 0.0026 to 0.0041 at rest in three real sensors, 0.005 with a camera
-# tilted by 2 deg; in real contacts at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A touch lighter than about 2 mm is
-# not noticed: it moves the pins less than cameras differ.
-MOST_DENT = 0.008
 
 
 def dent_of(pins_px: np.ndarray, reference: Reference) -> float:

@@ -1,6 +1,4 @@
-"""Pins, graphs and Voronoi areas, drawn with matplotlib on an axes the caller gives.
-
-One picture of one contact: skin, frame, pins and graph, area change, displacement."""
+"""Pins, graphs and Voronoi areas drawn on an axes of the caller, and one picture of one contact: skin, frame, pins, areas, displacement."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +16,24 @@ from twin.errors import FrameError
 from twin.report.charts import faint, new_figure, sequential
 from twin.types import Frame, Observation, PinGraph
 
-FOUND, LOST, EXTRA, EDGE = "#19d3a2", "#ff5c5c", "#ffb000", "#5ec8ff"
-FRAME_REACH = 0.6  # of the pins' extent, to each side of their middle: pins and the ring around them
-BORDER = "#00000040"  # of a coloured cell, on any ground
+FOUND = "#19d3a2"
+"""Colour of found pins and of nodes."""
+LOST = "#ff5c5c"
+"""Colour of the predicted places of lost pins."""
+EXTRA = "#ffb000"
+"""Colour of rejected blobs."""
+EDGE = "#5ec8ff"
+"""Colour of a graph's edges."""
+BORDER = "#00000040"
+"""Colour of a coloured cell's border; it shows on any ground."""
+FRAME_REACH = 0.6
+"""A frame around pins shows this share of their extent to each side of their middle: the pins and the ring around them."""
 ENLARGEMENTS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-LONG_PERCENTILE = 95  # of the arrows' lengths; longer ones may reach beyond the next pin
-SURFACE_GRID = 80  # samples across an interpolated surface
+"""Factors by which arrows may be enlarged."""
+LONG_PERCENTILE = 95
+"""Percentile of the arrows' lengths that counts as the longest. Longer ones may reach beyond the next pin."""
+SURFACE_GRID = 80
+"""Samples across an interpolated surface."""
 
 
 def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.ndarray | None = None) -> None:
@@ -40,7 +50,7 @@ def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.nd
 def draw_graph(ax: Axes, graph: PinGraph) -> None:
     """The edges of a graph, and its cells where it has a tessellation."""
     once = graph.edges[graph.edges[:, 0] < graph.edges[:, 1]] if graph.kind != "knn" else graph.edges
-    ax.add_collection(LineCollection(graph.nodes_px[once], colors=EDGE, linewidths=0.7, alpha=0.85))
+    ax.add_collection(LineCollection(list(graph.nodes_px[once]), colors=EDGE, linewidths=0.7, alpha=0.85))
     if graph.cells:
         ax.add_collection(PolyCollection(graph.cells, facecolors="none", edgecolors="#ffffff", linewidths=0.5, alpha=0.6))
 
@@ -79,7 +89,7 @@ def draw_displacement(ax: Axes, rest_px: np.ndarray, pins_px: np.ndarray, title:
 
 
 def enlargement(rest_px: np.ndarray, pins_px: np.ndarray) -> float:
-    """By how much to enlarge arrows between points (N, 2): as far as the usual longest one still fits between two pins."""
+    """Factor by which to enlarge arrows between points (N, 2): the largest one with which a long arrow still fits between two pins."""
     apart = np.median(cKDTree(rest_px).query(rest_px, k=2)[0][:, 1])
     longest = np.percentile(np.hypot(*(pins_px - rest_px).T), LONG_PERCENTILE)
     return max((factor for factor in ENLARGEMENTS if factor * longest <= apart), default=ENLARGEMENTS[0])
@@ -103,18 +113,6 @@ def area_surface_figure(rest: PinGraph, contact: PinGraph) -> Figure:
     draw_area_surface(axes[1], contact.nodes_px, contact.area_px2, "contact: cell area, px²")
     draw_area_surface(axes[2], contact.nodes_px, contact.area_px2 - rest.area_px2, "difference, px²")
     return figure
-
-
-def _without_frame(ax: Axes, title: str) -> None:
-    ax.set(title=title, xticks=[], yticks=[])
-    ax.spines[:].set_visible(False)
-
-
-def _pixel_axes(ax: Axes, points_px: np.ndarray, title: str) -> None:
-    low, high = np.nanmin(points_px, axis=0), np.nanmax(points_px, axis=0)
-    margin = 0.08 * (high - low)
-    ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(high[1] + margin[1], low[1] - margin[1]), aspect="equal")
-    _without_frame(ax, title)
 
 
 @dataclass(frozen=True)
@@ -169,3 +167,17 @@ def area_change_at(look: Look, center_px: np.ndarray, *, count: int) -> float:
     graph, rest = look.graphs()
     near = np.argsort(np.hypot(*(graph.nodes_px - center_px).T))[:count]
     return float(100 * np.mean(graph.area_px2[near] / rest.area_px2[near] - 1))
+
+
+def _without_frame(ax: Axes, title: str) -> None:
+    """Take ticks and frame off an axes, and give it a title."""
+    ax.set(title=title, xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)
+
+
+def _pixel_axes(ax: Axes, points_px: np.ndarray, title: str) -> None:
+    """An axes in pixels around points (N, 2), y down."""
+    low, high = np.nanmin(points_px, axis=0), np.nanmax(points_px, axis=0)
+    margin = 0.08 * (high - low)
+    ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(high[1] + margin[1], low[1] - margin[1]), aspect="equal")
+    _without_frame(ax, title)

@@ -49,13 +49,13 @@ def pins_surface(pins: PinsSpec, state: ContactState) -> pv.PolyData:
     return pv.merge(parts)
 
 
-def draw_contact_skin(mesh: SensorMesh, pins: PinsSpec, state: ContactState, stimulus: ObjectField, path: Path) -> str:
+def draw_contact_skin(mesh: SensorMesh, pins: PinsSpec, state: ContactState, field: ObjectField, path: Path) -> str:
     """Draw a contact: skin, pins and the object's surface near it (see ``draw_skin``)."""
-    surface = stimulus_surface(stimulus.distance, state.T_sensor_object, bounds_mm=SCENE_BOUNDS_MM)
+    surface = object_surface(field.distance, state.T_sensor_object, bounds_mm=SCENE_BOUNDS_MM)
     return draw_skin(displaced_skin(mesh, state), pins_surface(pins, state), surface, path)
 
 
-def draw_skin(skin: pv.PolyData, pins: pv.PolyData, stimulus: pv.PolyData, path: Path) -> str:
+def draw_skin(skin: pv.PolyData, pins: pv.PolyData, touched: pv.PolyData, path: Path) -> str:
     """Write a picture of the skin (coloured by ``displacement_mm``), cut open, with pins and object.
 
     Returns
@@ -64,23 +64,23 @@ def draw_skin(skin: pv.PolyData, pins: pv.PolyData, stimulus: pv.PolyData, path:
         "" if PyVista drew it, else the reason why it was drawn plainly.
     """
     with tempfile.TemporaryDirectory() as folder:
-        for name, surface in (("skin", skin), ("pins", pins), ("stimulus", stimulus)):
+        for name, surface in (("skin", skin), ("pins", pins), ("object", touched)):
             surface.save(Path(folder) / f"{name}.vtp")
         reason = _run_child(folder, str(path))
     if reason:
-        _draw_plain(skin, stimulus, path)
+        _draw_plain(skin, touched, path)
     return reason
 
 
 def probe_offscreen() -> str:
     """Whether VTK can draw without a window on this machine: "" if so, else why not."""
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("skin", "pins", "stimulus"):
+        for name in ("skin", "pins", "object"):
             pv.Sphere().save(Path(folder) / f"{name}.vtp")
         return _run_child(folder, str(Path(folder) / "probe.png"))
 
 
-def stimulus_surface(
+def object_surface(
     distance: Callable[[np.ndarray], np.ndarray], T_sensor_object: np.ndarray, *, bounds_mm: Sequence[float], samples: int = 100
 ) -> pv.PolyData:
     """The zero level of an object's signed distance inside a box of the sensor frame.
@@ -113,7 +113,7 @@ def _run_child(folder: str, path: str) -> str:
 
 
 def _draw_with_pyvista(folder: Path, path: str) -> None:
-    skin, pins, stimulus = (pv.PolyData(str(folder / f"{name}.vtp")) for name in ("skin", "pins", "stimulus"))
+    skin, pins, touched = (pv.PolyData(str(folder / f"{name}.vtp")) for name in ("skin", "pins", "object"))
     plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))
     plotter.set_background("#0d1117", top="#27313f")  # type: ignore[arg-type]  # its decorator hides self from the checker
     scalars = "displacement_mm" if "displacement_mm" in skin.point_data else None
@@ -133,8 +133,8 @@ def _draw_with_pyvista(folder: Path, path: str) -> None:
         },
     )
     plotter.add_mesh(_cut(pins), color="#f2f7ff", smooth_shading=True, split_sharp_edges=True, specular=0.3)
-    if stimulus.n_points:
-        plotter.add_mesh(_cut(stimulus), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
+    if touched.n_points:
+        plotter.add_mesh(_cut(touched), color="#8fb8e8", opacity=0.5, smooth_shading=True, split_sharp_edges=True)
     plotter.camera_position = [(22.0, -84.0, 30.0), (0.0, 0.0, 12.5), (0.0, 0.0, 1.0)]
     plotter.enable_anti_aliasing("ssaa")
     plotter.screenshot(path)
@@ -149,7 +149,7 @@ def _glow() -> ListedColormap:
     return ListedColormap(colormaps["inferno"](np.linspace(0.22, 0.97, 256)))
 
 
-def _draw_plain(skin: pv.PolyData, stimulus: pv.PolyData, path: Path) -> None:
+def _draw_plain(skin: pv.PolyData, touched: pv.PolyData, path: Path) -> None:
     figure = Figure(figsize=(WINDOW_PX[0] / 100, WINDOW_PX[1] / 100), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     half = _cut(skin).triangulate()
@@ -159,8 +159,8 @@ def _draw_plain(skin: pv.PolyData, stimulus: pv.PolyData, path: Path) -> None:
         shell.set_array(half["displacement_mm"][triangles].mean(axis=1))
         shell.set_clim(0, half["displacement_mm"].max())
         figure.colorbar(shell, ax=axes, shrink=0.6, label="skin displacement, mm")
-    if stimulus.n_points:
-        axes.plot_trisurf(*stimulus.points.T, triangles=stimulus.triangulate().regular_faces, color="#7aa7d9", alpha=0.3)
+    if touched.n_points:
+        axes.plot_trisurf(*touched.points.T, triangles=touched.triangulate().regular_faces, color="#7aa7d9", alpha=0.3)
     axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", aspect="equal")
     axes.view_init(elev=15, azim=-75)
     figure.savefig(path, dpi=100)

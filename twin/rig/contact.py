@@ -98,19 +98,21 @@ class RigContact:
 
     Attributes
     ----------
+    field : ObjectField
+        The object's shape.
     law : ContactLaw
     """
 
     def __init__(self, solver: SkinSolver, experiment: ExperimentSpec, touched: ObjectSpec, *, rig: RigSpec | None = None) -> None:
         self.solver, self.experiment = solver, experiment
         self.rig = rig or rig_of(solver.spec)
-        self.stimulus = build_field(touched)
+        self.field = build_field(touched)
         mounting = Mounting.on(self.rig, experiment, solver.spec.skin.outer_radius_mm)
         self.law = contact_law(rig or solver.spec.rig, mounting, touched)
 
     def way(self, label: ArmLabel) -> ArmPath:
         """The object's way as commanded (see ``arm_path``, also for errors)."""
-        return arm_path(self.rig, self.experiment, self.solver.spec.skin, self.stimulus, label)
+        return arm_path(self.rig, self.experiment, self.solver.spec.skin, self.field, label)
 
     def along(self, way: ArmPath, *, friction: float | Friction | None = None) -> Iterator[tuple[float, ContactState]]:
         """Every converged state on the way, with its fraction of the path; the law's friction unless another is given.
@@ -120,8 +122,8 @@ class RigContact:
         ContactError
             As ``SkinSolver.path``.
         """
-        return self.solver.path(self.stimulus, way.path, law=self.law, friction=friction)
+        return self.solver.path(self.field, way.path, law=self.law, friction=friction)
 
     def end(self, label: ArmLabel, *, friction: float | Friction | None = None) -> ContactState:
         """The state at the end of a label's way. Errors as ``along``."""
-        return self.solver.press(self.stimulus, self.way(label).path, law=self.law, friction=friction)
+        return self.solver.press(self.field, self.way(label).path, law=self.law, friction=friction)

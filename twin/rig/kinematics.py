@@ -86,12 +86,12 @@ def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, radi
     return in_image @ T
 
 
-def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, stimulus: ObjectField, label: ArmLabel) -> ArmPath:
+def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: ObjectField, label: ArmLabel) -> ArmPath:
     """The object's way relative to the sensor: first touch, tapped, and moved if the move was executed.
 
     Parameters
     ----------
-    stimulus : ObjectField
+    field : ObjectField
         Its origin is a material point of the object, so that the way from pose to pose is also the way that friction sees.
 
     Raises
@@ -106,7 +106,7 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, stimulus:
 
     tap = np.asarray(experiment.tap) * (1 + CLEAR_MM / experiment.tap[experiment.axis])
     tapped = np.asarray(label.pose, float) - label.move
-    share, touches = _first_touch(stimulus, at(tapped - tap), at(tapped), radius_mm * dome_directions(skin, TOUCH_POINTS))
+    share, touches = _first_touch(field, at(tapped - tap), at(tapped), radius_mm * dome_directions(skin, TOUCH_POINTS))
     still = np.zeros(6)
     labels = [ArmLabel(tapped - (1 - share) * tap, still), ArmLabel(tapped, still)]
     if label.executed:
@@ -117,7 +117,7 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, stimulus:
     return ArmPath(ContactPath(np.stack([at(each.pose) for each in labels])), labels, touches)
 
 
-def _first_touch(stimulus: ObjectField, start: np.ndarray, stop: np.ndarray, dome_mm: np.ndarray) -> tuple[float, bool]:
+def _first_touch(field: ObjectField, start: np.ndarray, stop: np.ndarray, dome_mm: np.ndarray) -> tuple[float, bool]:
     """Share of the straight way from one pose to another at which the object touches the dome, and whether it touches at all.
 
     The object advances by its smallest distance to the dome, again and again. Where distances are exact, that never passes the first
@@ -128,7 +128,7 @@ def _first_touch(stimulus: ObjectField, start: np.ndarray, stop: np.ndarray, dom
     share = 0.0
     free: float | None = None  # the largest share known to be free of contact
     for _ in range(MOST_MARCHES):
-        gap_mm = float(stimulus.distance((dome_mm - start[:3, 3] - share * way) @ turn).min())
+        gap_mm = float(field.distance((dome_mm - start[:3, 3] - share * way) @ turn).min())
         if abs(gap_mm) <= TOUCH_TOLERANCE_MM:
             return share, True
         if gap_mm < 0:

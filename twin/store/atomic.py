@@ -3,8 +3,8 @@
 The content goes to a temporary file in the same folder, is flushed to the disk, and takes the file's name in one step. A
 process that is killed meanwhile leaves the old file as it was, and beside it a temporary file that ``remove_parts`` removes.
 
-
-One run at a time in a folder."""
+`locked` holds a folder for one run at a time.
+"""
 
 import errno
 import io
@@ -22,7 +22,10 @@ from filelock import FileLock, Timeout
 
 from twin.errors import StoreError
 
-PART = ".part"  # ends the name of a temporary file, which begins with a dot
+PART = ".part"
+"""End of a temporary file's name, which begins with a dot."""
+LOCK = ".lock"
+"""Name of the file that the operating system's lock is on; it may stay behind."""
 
 _REMEDIES = {
     errno.ENOSPC: "free some space and give the same command again",
@@ -43,7 +46,7 @@ def write_with(path: Path, fill: Callable[[BinaryIO], object]) -> Path:
     Raises
     ------
     StoreError
-        It can't be written: disk full, folder read-only or missing. What was there before is still there.
+        The file cannot be written: the disk is full, the folder is read-only or missing. What was there before is still there.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}{secrets.token_hex(4)}{PART}")
     try:
@@ -96,7 +99,7 @@ def replace_folder(part: Path, path: Path) -> Path:
     Raises
     ------
     StoreError
-        It can't be moved.
+        The folder cannot be moved.
     """
     try:
         shutil.rmtree(path, ignore_errors=True)
@@ -112,7 +115,7 @@ def remove_parts(folder: Path) -> None:
     Raises
     ------
     StoreError
-        One can't be removed.
+        A file or folder cannot be removed.
     """
     try:
         for part in folder.glob(f".*{PART}"):
@@ -127,9 +130,6 @@ def unwritten(path: Path, error: OSError) -> StoreError:
     return StoreError(f"{path}: can't be written ({error.strerror or error}); {remedy}")
 
 
-LOCK = ".lock"  # the file that the operating system's lock is on; it may stay behind
-
-
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Hold a folder (made if missing) for this run alone; a run that is killed lets go of it.
@@ -137,7 +137,7 @@ def locked(folder: Path) -> Iterator[None]:
     Raises
     ------
     StoreError
-        Another run holds it, or it can't be written to.
+        Another run holds the folder, or it cannot be written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,4 @@
-"""What went into a result, as one digest.
-
-What made a result, as a small record that every output carries."""
+"""What made a result, as a small record that every output carries; and what went into it, as one digest."""
 
 import hashlib
 import json
@@ -14,6 +12,9 @@ from pydantic import BaseModel
 
 from twin.store.fingerprint import Maker, fingerprint, name_of
 
+PROGRAM = "tactip-twin"
+"""Name under which this program is installed."""
+
 
 def inputs_digest(*inputs: object) -> str:
     """Digest of inputs, 64 hexadecimal digits; the order of a dict's keys does not matter.
@@ -21,17 +22,18 @@ def inputs_digest(*inputs: object) -> str:
     Parameters
     ----------
     inputs : objects
-        What JSON can hold, bytes, arrays of numbers, specifications, dataclasses and paths, in each other as deep as need be.
+        What JSON can hold, bytes, arrays of numbers, specifications, dataclasses and paths, nested to any depth.
 
     Raises
     ------
     TypeError
-        One is of another kind.
+        An input is of another kind.
     """
     return hashlib.sha256(json.dumps(inputs, sort_keys=True, default=_plain).encode()).hexdigest()
 
 
 def _plain(value: object) -> object:
+    """A value that JSON cannot hold as something that it can."""
     if isinstance(value, bytes):
         return {"sha256": hashlib.sha256(value).hexdigest()}
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
@@ -47,20 +49,17 @@ def _plain(value: object) -> object:
     raise TypeError(f"a key holds JSON and bytes, arrays of numbers, specifications and dataclasses, not {type(value).__name__}")
 
 
-PROGRAM = "tactip-twin"
-
-
 def made_by(*by: Maker, inputs: object = None, dated: bool = True) -> dict[str, str]:
     """The record of a result.
 
     Parameters
     ----------
     by : functions, classes or names of modules
-        What made it, the first one above all.
+        What made it; the first one gives the record its name.
     inputs : object, optional
         What it was made of, as ``inputs_digest`` takes it.
     dated : bool
-        Whether it tells when: not where the same work is to leave the same bytes.
+        Whether the record has a date. False where the same work must leave the same bytes.
 
     Returns
     -------
@@ -75,7 +74,7 @@ def made_by(*by: Maker, inputs: object = None, dated: bool = True) -> dict[str, 
 
 
 def program_version() -> str:
-    """Version of this program; what it says of itself where it isn't installed."""
+    """Version of this program, or "not installed"."""
     try:
         return metadata.version(PROGRAM)
     except metadata.PackageNotFoundError:

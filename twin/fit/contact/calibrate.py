@@ -1,6 +1,6 @@
 """A contact calibration from a folder of frames to a page."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,18 +13,20 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.fit.contact.fit import fit_contact, held_out_px, simulate
-from twin.fit.contact.parameters import PARAMETERS
+from twin.fit.contact.parameters import PARAMETERS, Parameter
 from twin.fit.contact.report import summary_of, write_calibration
 from twin.fit.contact.simulate import Setup
 from twin.fit.optics import folder_beside
 from twin.fit.sensor_file import write_sensor
 from twin.judge.labelled.model import MeasuredFrames, measure_frames
-from twin.progress import Progress, silent, stage
+from twin.progress import Progress, Step, silent, stage
 from twin.rig.kinematics import rig_of
 from twin.types import FINE, Form
 
-LABELS = 20  # frames that are fitted to
-MOST_HELD_OUT = 20  # frames that are kept out of the fit to state its error
+LABELS = 20
+"""Frames to which the contact is fitted."""
+MOST_HELD_OUT = 20
+"""Most frames that are kept out of the fit; the error on them is stated."""
 
 
 def calibrate_contact(
@@ -36,11 +38,11 @@ def calibrate_contact(
     count: int,
     seed: int,
     *,
-    parameters: tuple = PARAMETERS,
+    parameters: tuple[Parameter, ...] = PARAMETERS,
     workers: int = 1,
     across: int = FINE,
     form: Form | None = None,
-    progress: Callable | None = None,
+    progress: Step | None = None,
 ) -> tuple[SensorSpec, dict, Path]:
     """Fit ``parameters`` to ``count`` random frames of a recording, and judge the result on others.
 
@@ -57,29 +59,31 @@ def calibrate_contact(
         No labels, no pins, too few frames.
     """
     measured = measure_frames(frames, spec, count + min(count, MOST_HELD_OUT), seed, form=form)
-    order = np.random.default_rng(seed).permutation(len(measured))  # they come in the table's order
+    order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
     fitted, held = _part(measured, np.sort(order[:count])), _part(measured, np.sort(order[count:]))
     setup = Setup(spec, experiment, touched, measured.form, across, folder / "contacts", workers, parameters)
     fit = fit_contact(setup, fitted, progress=progress)
     error = held_out_px(setup, fit, held, progress=progress) if len(held) else None
     summary = summary_of(setup, fitted, fit, error, len(held))
-    pairs = ((fit.start, rig_of(spec).turn_sign), (fit.value, fit.sensor.rig.turn_sign))
+    pairs = ((fit.start, rig_of(spec).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign))
     moved = np.stack([simulate(setup, fitted, [values], sign)[0] for values, sign in pairs]).swapaxes(1, 2)
     return fit.sensor, summary, write_calibration(folder, fitted, moved, fit, summary)
 
 
 def _part(measured: MeasuredFrames, rows: np.ndarray) -> MeasuredFrames:
+    """Some of the frames."""
     names, labels = [measured.names[k] for k in rows], [measured.labels[k] for k in rows]
     return replace(measured, names=names, labels=labels, pins_px=measured.pins_px[rows])
 
 
 @dataclass(frozen=True)
 class ContactCalibration:
-    """What was fitted.
+    """A fitted contact and its files.
 
     Attributes
     ----------
     sensor : SensorSpec
+        The specification with the fitted parameters.
     summary : dict
         All figures, as ``calibration.json`` holds them.
     written : list of Path
@@ -94,7 +98,7 @@ class ContactCalibration:
         """The parameters with their uncertainty, and the errors before and after; for people."""
         lines = [f"note: {problem}" for problem in self.summary["problems"]]
         for p in self.summary["parameters"]:
-            doubt = "" if p["known"] else "  (not told by these frames)"
+            doubt = "" if p["known"] else "  (these frames do not tell it)"
             lines.append(f"{p['name']:26s} {p['start']:9.4g} -> {p['value']:9.4g} +- {p['sd']:.2g}{doubt}")
         for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
             if part := self.summary[key]:
@@ -130,9 +134,11 @@ def calibrate_to_file(
     out : Path
         The ``.toml`` file to write.
     touched : ObjectSpec, optional
-        The experiment's own object by default.
+        What the sensor touched; the experiment's own object by default.
     labels : int
-        Frames to fit to, chosen at random with ``seed``.
+        How many frames to fit to; they are chosen at random.
+    seed : int
+        Seed of this choice.
     hold : collection of str
         Names of parameters that stay as they are.
 
@@ -146,10 +152,22 @@ def calibrate_to_file(
         raise FrameError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = folder_beside(out, "contact")
     parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
-    how = {"parameters": parameters, "workers": workers, "across": across, "form": form}
     with stage(progress, "contacts") as step:
         thing = touched or load_object(experiment.object)
-        fitted, summary, page = calibrate_contact(folder, frames, sensor, experiment, thing, labels, seed, progress=step, **how)
+        fitted, summary, page = calibrate_contact(
+            folder,
+            frames,
+            sensor,
+            experiment,
+            thing,
+            labels,
+            seed,
+            parameters=parameters,
+            workers=workers,
+            across=across,
+            form=form,
+            progress=step,
+        )
     said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
     write_sensor(out, fitted, said)
     return ContactCalibration(fitted, summary, [out, page])

@@ -11,7 +11,6 @@ frames that neither story fits. The M-step is one Gauss-Newton step by differenc
 matrix at the end.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -22,17 +21,29 @@ from twin.errors import FrameError
 from twin.fit.contact.parameters import changed, values_of
 from twin.fit.contact.simulate import Setup
 from twin.judge.labelled.model import MeasuredFrames
+from twin.progress import Step
 from twin.rig.kinematics import rig_of
 
-INDEPENDENT = 6.0  # n above: modes of the displacement that carry nearly all of it
+INDEPENDENT = 6.0
+"""n above: number of modes of the displacement that carry nearly all of it."""
 ROUNDS = 3
-SHORTEST = 1 / 8  # of a Gauss-Newton step, before it is given up
-DISTRUST = 9.0  # times the median squared error: 3 sd
-START_FRAMES = 3  # those with the largest turns, and as many with the largest moves, tell the signs
+"""Most rounds of E-step and M-step."""
+SHORTEST = 1 / 8
+"""A Gauss-Newton step is halved down to this share of its length before it is given up."""
+DISTRUST = 9.0
+"""A frame whose squared error exceeds the median by this factor (3 sd) counts less."""
+EXPECT_ROUNDS = 20
+"""Rounds of the E-step between the shares of executed moves and the variance. It settles in fewer."""
+START_FRAMES = 3
+"""This many frames with the largest turns, and as many with the largest moves, decide the signs to start from."""
 TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+"""Turns of the image, deg, that are tried to start from."""
 FEWEST = 4
-LEAST_PX2 = 0.01  # of the squared error: pins are not measured better
+"""Fewest frames to which a contact is fitted."""
+LEAST_PX2 = 0.01
+"""Least variance of a pin's place, px^2: pins are not measured better."""
 SMALLEST_SHARE, LARGEST_SHARE = 0.05, 0.95
+"""Bounds of the share of executed moves, so that its logarithm stays finite."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +54,9 @@ class ContactFit:
     ----------
     sensor : SensorSpec
     start, value, sd : (P,) float
-        What is fitted of the setup's parameters (``Parameter.scale``).
+        Fitted quantities of the setup's parameters (see ``Parameter.scale``): shipped and fitted ones, and their uncertainty.
     told : (P,) float
-        Share of the prior's variance that the frames removed: 1 is told by the frames, 0 is the start as it was.
+        Share of the prior's variance that the frames removed: 1 where the frames tell the parameter, 0 where it stayed at its start.
     correlation : (P, P) float
     executed : (M,) float
         Probability that each frame's move was executed.
@@ -54,7 +65,7 @@ class ContactFit:
     before_px, after_px : (M,) float
         Mean pin error of each frame under its likelier story.
     share : float
-        Of executed moves.
+        Share of the moves that were executed.
     """
 
     sensor: SensorSpec
@@ -80,24 +91,51 @@ class Weights:
     variance_px2: float
 
     def cost(self, squared_px2: np.ndarray) -> float:
-        """Of squared errors (M, 2), after tap and move; a failed contact (NaN) costs nothing."""
+        """Cost of squared errors (M, 2), after tap and move; a failed contact (NaN) costs nothing."""
         squared = np.nan_to_num(squared_px2)
         each = (1 - self.executed) * squared[:, 0] + self.executed * squared[:, 1]
         return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
 
 
-def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Callable | None = None) -> ContactFit:
+def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Step | None = None) -> ContactFit:
     """Fit the setup's parameters and the sign of the turns.
 
     Raises
     ------
     FrameError
-        Too few frames, or no contact of theirs can be simulated.
+        There are too few frames, or none of their contacts can be simulated.
     """
     if len(measured) < FEWEST:
         raise FrameError(f"{len(measured)} frames with pins are too few; give --labels {FEWEST} or more")
     target = measured.pins_px - measured.no_contact_px
     start, sign = _start(setup, measured, target, progress)
+    prior = np.array([p.prior for p in setup.parameters])
+    value, moved, weights = _searched(setup, measured, target, start, sign, progress)
+    slopes = _slopes(setup, measured, value, sign, moved, progress)
+    matrix, _ = _normal(slopes, target[:, None] - moved, weights)
+    covariance = np.linalg.inv(matrix + np.diag(prior**-2))
+    sd = np.sqrt(np.diag(covariance))
+    shipped = values_of(setup.sensor, setup.experiment, setup.parameters)
+    first = simulate(setup, measured, [shipped], rig_of(setup.sensor).turn_sign, progress)[0]
+    return ContactFit(
+        sensor=changed(setup.sensor, setup.experiment, value, sign, setup.parameters),
+        start=shipped,
+        value=value,
+        sd=sd,
+        told=1 - (sd / prior) ** 2,
+        correlation=covariance / np.outer(sd, sd),
+        executed=weights.executed,
+        trust=weights.trust,
+        before_px=likelier_px(first, target),
+        after_px=likelier_px(moved, target),
+        share=weights.share,
+    )
+
+
+def _searched(
+    setup: Setup, measured: MeasuredFrames, target: np.ndarray, start: np.ndarray, sign: int, progress: Step | None
+) -> tuple[np.ndarray, np.ndarray, Weights]:
+    """The values (P,) of least cost, the displacements (M, 2, N, 2) px under them, and the E-step's weights there."""
     prior = np.array([p.prior for p in setup.parameters])
     value = start.copy()
     moved = simulate(setup, measured, [value], sign, progress)[0]
@@ -121,32 +159,14 @@ def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Callable | 
         weights = expect(mean_squared(moved, target))
         if length < SHORTEST:
             break
-    slopes = _slopes(setup, measured, value, sign, moved, progress)
-    matrix, _ = _normal(slopes, target[:, None] - moved, weights)
-    covariance = np.linalg.inv(matrix + np.diag(prior**-2))
-    sd = np.sqrt(np.diag(covariance))
-    shipped = values_of(setup.sensor, setup.experiment, setup.parameters)
-    first = simulate(setup, measured, [shipped], rig_of(setup.sensor).turn_sign, progress)[0]
-    return ContactFit(
-        changed(setup.sensor, setup.experiment, value, sign, setup.parameters),
-        shipped,
-        value,
-        sd,
-        1 - (sd / prior) ** 2,
-        covariance / np.outer(sd, sd),
-        weights.executed,
-        weights.trust,
-        likelier_px(first, target),
-        likelier_px(moved, target),
-        weights.share,
-    )
+    return value, moved, weights
 
 
-def held_out_px(setup: Setup, fit: ContactFit, measured: MeasuredFrames, *, progress: Callable | None = None) -> tuple[float, float]:
+def held_out_px(setup: Setup, fit: ContactFit, measured: MeasuredFrames, *, progress: Step | None = None) -> tuple[float, float]:
     """Mean pin error, before and after, on frames that were not fitted; each under its likelier story."""
     target = measured.pins_px - measured.no_contact_px
     errors = []
-    for values, sign in ((fit.start, rig_of(setup.sensor).turn_sign), (fit.value, fit.sensor.rig.turn_sign)):
+    for values, sign in ((fit.start, rig_of(setup.sensor).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign)):
         errors.append(float(np.nanmean(likelier_px(simulate(setup, measured, [values], sign, progress)[0], target))))
     return errors[0], errors[1]
 
@@ -159,25 +179,25 @@ def likelier_px(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def expect(squared_px2: np.ndarray) -> Weights:
-    """The E-step from squared errors (M, 2), after tap and move: turns to and fro until the shares stay."""
+    """The E-step from squared errors (M, 2), after tap and move: shares and variance are found in turn until they stay."""
     failed = ~np.isfinite(squared_px2).all(axis=1)
     squared = np.where(failed[:, None], 0.0, squared_px2)
     best, share = squared.min(axis=1), 0.5
     variance = max(float(np.median(best[~failed])), LEAST_PX2) if (~failed).any() else LEAST_PX2
-    for _ in range(20):
+    for _ in range(EXPECT_ROUNDS):
         odds = INDEPENDENT * (squared[:, 0] - squared[:, 1]) / (2 * variance) + np.log(share / (1 - share))
         executed = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
         trust = np.where(failed, 0.0, np.minimum(1.0, DISTRUST * variance / np.maximum(best, 1e-12)) ** 2)
         each = (1 - executed) * squared[:, 0] + executed * squared[:, 1]
         if trust.sum() == 0:
             break
-        variance = max(float(np.median(each[~failed])), LEAST_PX2)  # a median: one frame that nothing fits must not widen it
+        variance = max(float(np.median(each[~failed])), LEAST_PX2)  # the median, so that one frame that nothing fits does not widen it
         share = float(np.clip(trust @ executed / trust.sum(), SMALLEST_SHARE, LARGEST_SHARE))
     return Weights(executed, trust, share, variance)
 
 
-def _start(setup: Setup, measured: MeasuredFrames, target: np.ndarray, progress) -> tuple[np.ndarray, int]:
-    """Parameters and the sign of the turns to start from: of all signs and quarter turns of the image, those that fit best."""
+def _start(setup: Setup, measured: MeasuredFrames, target: np.ndarray, progress: Step | None) -> tuple[np.ndarray, int]:
+    """Values (P,) and the sign of the turns to start from: those that fit best among both signs and all quarter turns of the image."""
     value = values_of(setup.sensor, setup.experiment, setup.parameters)
     by_turn = np.argsort([-np.abs(label.pose[3:] - label.move[3:]).max() for label in measured.labels])[:START_FRAMES]
     by_move = np.argsort([-np.abs(label.move[:3]).max() for label in measured.labels])[:START_FRAMES]
@@ -195,13 +215,13 @@ def _start(setup: Setup, measured: MeasuredFrames, target: np.ndarray, progress)
     return tries[int(np.nanargmin(errors))]
 
 
-def simulate(setup: Setup, measured: MeasuredFrames, values: list, sign: int, progress: Callable | None = None) -> np.ndarray:
+def simulate(setup: Setup, measured: MeasuredFrames, values: list, sign: int, progress: Step | None = None) -> np.ndarray:
     """(V, M, 2, N, 2) px for V vectors of values."""
     jobs = [(each, sign, row) for each in values for row in range(len(measured))]
     return setup.displacements(jobs, measured.labels, progress).reshape(len(values), len(measured), 2, -1, 2)
 
 
-def _slopes(setup: Setup, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress) -> np.ndarray:
+def _slopes(setup: Setup, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress: Step | None) -> np.ndarray:
     """(P, M, 2, N, 2) px for a unit of each parameter; 0 where a contact failed."""
     steps = np.diag([p.step for p in setup.parameters])
     there = simulate(setup, measured, [value + step for step in steps], sign, progress)

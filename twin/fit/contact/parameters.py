@@ -9,7 +9,8 @@ from scenes.experiment import ExperimentSpec
 from scenes.sensor import SensorSpec
 from twin.rig.kinematics import TURNING, rig_of
 
-LEAST = 1e-3  # of a number whose logarithm is fitted
+LEAST = 1e-3
+"""Least number whose logarithm is taken (of 1 - 2 nu for a Poisson's ratio nu)."""
 
 
 @dataclass(frozen=True)
@@ -21,13 +22,14 @@ class Parameter:
     name : str
         Dotted key; ``rig.turn_offset_deg`` is the turn in the plane of approach and across.
     prior : float
-        Sd of what is plausible around the start, of what is fitted.
+        Sd of the fitted quantity around its start before any frame is seen.
     step : float
-        For differences.
+        Step of the fitted quantity for difference quotients.
     scale : {"plain", "log", "volume"}
-        What is fitted: the number, its logarithm, or of a Poisson's ratio log(1 - 2 nu), which is how much the volume yields.
+        The fitted quantity: the number itself, its logarithm, or, for a Poisson's ratio nu, log(1 - 2 nu), which tells how much the
+        volume yields.
     least : float
-        Smallest number that makes sense; what is fitted may go below it.
+        Smallest number that makes sense. The fitted quantity may go below it; the number then stays here.
     """
 
     name: str
@@ -37,19 +39,19 @@ class Parameter:
     least: float = -np.inf
 
     def fitted(self, number: float) -> float:
-        """What is fitted of a number of the specification."""
+        """The fitted quantity that belongs to a number of the specification."""
         if self.scale == "plain":
             return number
         return float(np.log(max(number if self.scale == "log" else 1 - 2 * number, LEAST)))
 
     def number(self, fitted: float) -> float:
-        """The other way round."""
+        """The number of the specification that belongs to a fitted quantity."""
         if self.scale == "plain":
             return max(float(fitted), self.least)
         return float(np.exp(fitted) if self.scale == "log" else (1 - np.exp(fitted)) / 2)
 
     def slope(self, fitted: float) -> float:
-        """Absolute change of the number with what is fitted."""
+        """Absolute change of the number for a unit of the fitted quantity."""
         return 1.0 if self.scale == "plain" else float(np.exp(fitted)) / (1 if self.scale == "log" else 2)
 
 
@@ -70,8 +72,8 @@ PARAMETERS = (
 )
 
 
-def values_of(sensor: SensorSpec, experiment: ExperimentSpec, parameters: tuple = PARAMETERS) -> np.ndarray:
-    """(P,) what is fitted of what the specification says of the parameters."""
+def values_of(sensor: SensorSpec, experiment: ExperimentSpec, parameters: tuple[Parameter, ...] = PARAMETERS) -> np.ndarray:
+    """Fitted quantities (P,) of the parameters, as the specification has them."""
     plain = sensor.model_dump(include={"gel", "skin", "pins"}) | {"rig": rig_of(sensor).model_dump()}
     turning = TURNING[experiment.approach] - 3
     out = []
@@ -83,14 +85,14 @@ def values_of(sensor: SensorSpec, experiment: ExperimentSpec, parameters: tuple 
 
 
 def changed(
-    sensor: SensorSpec, experiment: ExperimentSpec, values: np.ndarray, turn_sign: int, parameters: tuple = PARAMETERS
+    sensor: SensorSpec, experiment: ExperimentSpec, values: np.ndarray, turn_sign: int, parameters: tuple[Parameter, ...] = PARAMETERS
 ) -> SensorSpec:
-    """The sensor with other values (P,) of the parameters.
+    """The sensor with other fitted quantities (P,) of the parameters.
 
     Raises
     ------
     ValidationError
-        They make no sensor.
+        The values make no valid sensor.
     """
     plain = sensor.model_dump(mode="json") | {"rig": rig_of(sensor).model_dump(mode="json")}
     plain["rig"]["turn_sign"] = int(turn_sign)

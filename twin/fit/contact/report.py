@@ -17,9 +17,12 @@ from twin.report.table import Cell, Column
 from twin.rig.kinematics import rig_of
 from twin.store import made_by, write_json
 
-TOLD = 0.5  # share of the prior's variance that frames must remove before they count as telling a parameter
+TOLD = 0.5
+"""Frames tell a parameter if they remove at least this share of its prior variance."""
 TRUSTED = 0.5
-ALIKE = 0.9  # correlation from which on two parameters can hardly be told apart
+"""A frame with less trust than this is listed as not trusted, and not drawn."""
+ALIKE = 0.9
+"""From this correlation on, two parameters can hardly be told apart."""
 
 
 def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out: tuple | None, held_frames: int) -> dict:
@@ -36,7 +39,7 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
         for k in range(i)
         if abs(fit.correlation[i, k]) >= ALIKE
     ]
-    frames = [
+    frames: list[dict] = [
         {"image_name": name, "executed": float(executed), "trust": float(trust), "before_px": _number(before), "after_px": _number(after)}
         for name, executed, trust, before, after in zip(measured.names, fit.executed, fit.trust, fit.before_px, fit.after_px, strict=True)
     ]
@@ -62,7 +65,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
     Parameters
     ----------
     moved : (2, 2, M, N, 2) float
-        Simulated displacements before and after the calibration; of each, after the tap and after the move.
+        Simulated displacements, px, before and after the calibration: each after the tap and after the move.
     """
     figures = write_json(folder / "calibration.json", summary | {"made_by": made_by("twin.fit.contact.fit")})
     solved = np.flatnonzero(np.isfinite(fit.after_px) & np.isfinite(fit.before_px) & (fit.trust >= TRUSTED))
@@ -131,10 +134,10 @@ def _parameters_section(page: Page, summary: dict) -> None:
             Column("told", "told by the frames", "%", decimals=0),
         ],
     )
+    independent = f"{summary['independent_numbers_a_frame']:.0f}"
     page.text(
-        "Told: the share of what was uncertain beforehand that the frames took away. What they do not tell (red) stays near its start. The "
-        f"sd counts a frame's pins as {summary['independent_numbers_a_frame']:.0f} independent numbers, as the model's own errors are "
-        "shared by all pins."
+        "Told: the share of the prior uncertainty that the frames took away. A parameter that they do not tell (red) stays near its start. "
+        f"The sd counts a frame's pins as {independent} independent numbers, because all pins share the model's own errors."
     )
     if alike := summary["hardly_told_apart"]:
         said = "; ".join(f"{a} and {b} ({number(r, decimals=2, signed=True)})" for a, b, r in alike)

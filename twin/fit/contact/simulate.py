@@ -1,7 +1,6 @@
 """Simulated displacements of many contacts under many parameter values, each kept on disk as soon as it is there."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -13,8 +12,9 @@ from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError
-from twin.fit.contact.parameters import PARAMETERS, changed
+from twin.fit.contact.parameters import PARAMETERS, Parameter, changed
 from twin.judge.labelled.model import ContactModel
+from twin.progress import Step
 from twin.rig.labels import ArmLabel
 from twin.store import Item, find_arrays, inputs_digest, keep_arrays
 from twin.types import Form
@@ -23,7 +23,26 @@ from twin.workers import outcomes
 
 @dataclass(frozen=True)
 class Setup:
-    """What all contacts of a calibration share; ``parameters`` are those that are fitted."""
+    """What all contacts of a calibration share.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+        The sensor where the fit starts.
+    experiment : ExperimentSpec
+        How the arm approached the object.
+    touched : ObjectSpec
+    form : Form
+        Form of the frames: the displacements are in px of it.
+    across : int
+        Elements along each side of the skin's grid.
+    folder : Path
+        Where the simulated contacts are kept.
+    workers : int
+        Processes.
+    parameters : tuple of Parameter
+        What is fitted.
+    """
 
     sensor: SensorSpec
     experiment: ExperimentSpec
@@ -32,9 +51,9 @@ class Setup:
     across: int
     folder: Path
     workers: int = 1
-    parameters: tuple = PARAMETERS
+    parameters: tuple[Parameter, ...] = PARAMETERS
 
-    def displacements(self, jobs: list[tuple], labels: list[ArmLabel], progress: Callable | None = None) -> np.ndarray:
+    def displacements(self, jobs: list[tuple], labels: list[ArmLabel], progress: Step | None = None) -> np.ndarray:
         """(J, 2, N, 2) px after tap and after move for jobs of (values (P,), turn_sign, row of ``labels``); NaN where one failed."""
         plans = [
             {"values": np.asarray(values).tolist(), "sign": int(sign), "pose": list(labels[row].pose), "move": list(labels[row].move)}

@@ -1,6 +1,4 @@
-"""How severe a condition may grow before a measure crosses its limit.
-
-A sweep that has been run, and what its rows say."""
+"""How severe a condition may grow before a measure crosses its limit: curves and envelopes of a sweep that has been run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,12 +11,12 @@ from twin.judge.degradation.measures import MEASURES, POSE_MEASURES, Measure
 from twin.judge.degradation.sweep import Plan, run_sweep
 from twin.pins.reference import nominal_reference
 
-# Draws of the bootstrap over the frames.
 DRAWS = 400
-# Percentiles of these draws that bound the band: a 90 % interval.
+"""Number of draws of the bootstrap over the frames."""
 BAND = (5, 95)
-# A real sensor with less than this share of the rendered margin has lost some of it. Chosen.
+"""Percentiles of these draws that bound the band: a 90 % interval."""
 SHORT = 0.75
+"""A real sensor with less than this share of the rendered margin has lost some of it. Chosen."""
 
 
 @dataclass(frozen=True)
@@ -74,17 +72,17 @@ class Envelope:
 
     @property
     def reached(self) -> bool:
-        """Whether it fails within the range looked at."""
+        """Whether the pipeline fails within the range looked at."""
         return np.isfinite(self.severity)
 
     @property
     def width(self) -> float:
-        """Severity, at most the severest step: a lower bound where it does not fail."""
+        """Severity, at most that of the severest step: a lower bound where the pipeline does not fail."""
         return min(self.severity, self.looked)
 
     @property
     def label(self) -> str:
-        """In the parameter's unit."""
+        """The severity in the parameter's unit, for people."""
         if not self.reached:
             return f"> {self.case.label(self.looked)}"
         return self.case.label(self.severity) if self.severity > 0 else "fails undegraded"
@@ -92,7 +90,7 @@ class Envelope:
 
 @dataclass(frozen=True)
 class Share:
-    """How much of the margin that rendered frames have the real ones of a sensor have."""
+    """The margin of a sensor's real frames beside that of rendered ones."""
 
     real: Envelope
     rendered: Envelope
@@ -108,6 +106,33 @@ class Share:
     def short(self) -> bool:
         """Whether the real sensor has clearly less margin than the rendered one."""
         return self.value < SHORT
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A sweep that has been run and judged.
+
+    Attributes
+    ----------
+    plan : Plan
+    rows : list of dict
+        As `run_sweep` gives them.
+    curves : list of Curve
+    envelopes : list of Envelope
+    """
+
+    plan: Plan
+    rows: list[dict]
+    curves: list[Curve]
+    envelopes: list[Envelope]
+
+
+def judge_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> Judgement:
+    """Run a sweep, or what is left of it, and judge it."""
+    rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
+    pitch_px = float(np.mean(nominal_reference(plan.source.spec, plan.source.form).spacing_px))
+    curves = curves_of(rows, plan.cases, pitch_px)
+    return Judgement(plan, rows, curves, envelopes_of(curves, plan.cases))
 
 
 def crossing(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndarray) -> float:
@@ -156,6 +181,7 @@ def shares_of(real: list[Envelope], rendered: list[Envelope], pipeline: str) -> 
 
 
 def _curve(case: str, pipeline: str, measure: Measure, limit: float, rows: list[dict]) -> Curve:
+    """The curve of one measure over the rows of one case and pipeline."""
     severities = np.array(sorted({row["severity"] for row in rows}))
     mean, low, high = (np.full(len(severities), np.nan) for _ in range(3))
     rng = np.random.default_rng(0)
@@ -185,30 +211,3 @@ def _poses_against_nominal(rows: list[dict]) -> list[dict]:
                 row[f"pose_{unit}"] = float(np.mean(of_unit)) if of_unit else np.nan
         table.append(row)
     return table
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """Rows of a sweep, its curves and envelopes.
-
-    Attributes
-    ----------
-    plan : Plan
-    rows : list of dict
-        As `run_sweep` gives them.
-    curves : list of Curve
-    envelopes : list of Envelope
-    """
-
-    plan: Plan
-    rows: list[dict]
-    curves: list[Curve]
-    envelopes: list[Envelope]
-
-
-def judge_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> Judgement:
-    """Run a sweep, or what is left of it, and judge it."""
-    rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
-    pitch_px = float(np.mean(nominal_reference(plan.source.spec, plan.source.form).spacing_px))
-    curves = curves_of(rows, plan.cases, pitch_px)
-    return Judgement(plan, rows, curves, envelopes_of(curves, plan.cases))

@@ -1,6 +1,4 @@
-"""A sweep's charts.
-
-A sweep's page and tables."""
+"""A sweep's page, charts and tables."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,57 +19,16 @@ from twin.report.table import Column, write_rows
 from twin.report.themes import BLUE, RED, SERIES
 from twin.store import made_by, write_json
 
-ACROSS = 3  # plots in a row: beside the picture of a frame more would be too small to read
+ACROSS = 3
+"""Plots in a row. Beside the picture of a frame more would be too small to read."""
 SHOWN = ("valid", "recall", "precision", "centroid_px", "area_error", "edges", *(m.name for m in POSE_MEASURES))
+"""Measures of a condition's chart, in their order."""
 TITLES = {m.name: m.title + (f", {m.unit}" if m.unit else "") for m in (*MEASURES, *POSE_MEASURES)}
-
-
-def case_figure(case: Case, curves: Sequence[Curve], rendered: Sequence[Curve]) -> Figure:
-    """Every measure against the parameter, with its band; of rendered frames beside real ones dashed and without."""
-    curves, rendered = ([c for c in group if c.case == case.name] for group in (curves, rendered))
-    names = [name for name in SHOWN if any(c.measure.name == name for c in curves)]
-    pipelines = list(dict.fromkeys(c.pipeline for c in curves))
-    rows, columns = -(-len(names) // ACROSS), min(ACROSS, len(names))
-    figure, axes = sized_figure((3.1 * columns, 2.7 * rows), columns, rows)
-    single, drawn = len(case.conditions) == 1, {}
-    for ax in axes[len(names) :]:
-        ax.axis("off")
-    for ax, name in zip(axes, names, strict=False):
-        for group, line, note in ((curves, ".-", ""), (rendered, "--", ", rendered")):
-            for curve in (c for c in group if c.measure.name == name):
-                at = np.array([case.conditions[0].value(s) for s in curve.severity]) if single else curve.severity
-                color = SERIES[pipelines.index(curve.pipeline) % len(SERIES)]
-                drawn[curve.pipeline + note] = ax.plot(at, curve.mean, line, color=color, lw=1.2)[0]
-                if group is curves:
-                    ax.fill_between(at, curve.low, curve.high, color=color, alpha=0.2)
-        ax.axhline(curve.limit, color=muted(), lw=1.0, ls=":")
-        ax.set_title(TITLES[name], fontsize=9)
-        ax.set_xlabel(f"{case.conditions[0].parameter} {case.conditions[0].unit}".strip() if single else "severity of both", fontsize=8)
-        ax.tick_params(labelsize=7)
-    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=len(drawn))
-    return figure
-
-
-def shares_figure(shares: Sequence[Share]) -> Figure:
-    """Where real frames fail, as dots with intervals, on bars up to where rendered ones do; severities, one line a condition."""
-    figure, (ax,) = sized_figure((9.0, 0.32 * len(shares) + 1.2))
-    for y, share in enumerate(reversed(shares)):
-        real, rendered = share.real, share.rendered
-        ax.barh(y, rendered.width, color=faint(), height=0.7)
-        ax.text(0.005, y, rendered.label, va="center", fontsize=7, color=muted())
-        color = RED if share.short else BLUE
-        low, high = (min(end, 1.0) for end in real.interval)
-        ax.plot([low, high], [y, y], color=color, lw=2.5, alpha=0.4)
-        ax.plot(real.width, y, "o" if real.reached else ">", color=color, ms=6)
-    ax.set_yticks(range(len(shares)), [share.real.case.title for share in reversed(shares)], fontsize=8)
-    ax.grid(axis="y", visible=False)
-    ax.set_xlim(0, 1.03)
-    ax.set_xlabel("severity at the first failure. Bar: rendered frames; dot: real ones; arrow: no failure within the range", fontsize=8)
-    return figure
-
-
+"""Title of each measure with its unit."""
 TWICE = 2.0
-CASE_DPI = 90  # of a condition's chart: there are dozens on a page
+"""Ratio of widths from which on an envelope counts as twice as wide."""
+CASE_DPI = 90
+"""Resolution of a condition's chart, dots per inch: there are dozens of them on a page."""
 
 
 def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str], rendered: Judgement | None = None) -> list[Path]:
@@ -82,11 +39,11 @@ def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str],
     out : Path
     judged : Judgement
     source : str
-        Name of the frames.
+        Name of the frames' folder, or how they were made.
     notes : list of str
-        For the page.
+        Remarks for the page.
     rendered : Judgement, optional
-        Of the same cases on rendered frames, to be shown beside real ones.
+        The same cases on rendered frames, to be shown beside real ones.
     """
     (out / "plots").mkdir(exist_ok=True)
     plan, envelopes = judged.plan, judged.envelopes
@@ -130,6 +87,50 @@ def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str],
     return [page.write(out / "index.html"), *written]
 
 
+def case_figure(case: Case, curves: Sequence[Curve], rendered: Sequence[Curve]) -> Figure:
+    """Every measure against the parameter with its band. Curves of rendered frames beside real ones are dashed and have no band."""
+    curves, rendered = ([c for c in group if c.case == case.name] for group in (curves, rendered))
+    names = [name for name in SHOWN if any(c.measure.name == name for c in curves)]
+    pipelines = list(dict.fromkeys(c.pipeline for c in curves))
+    rows, columns = -(-len(names) // ACROSS), min(ACROSS, len(names))
+    figure, axes = sized_figure((3.1 * columns, 2.7 * rows), columns, rows)
+    single, drawn = len(case.conditions) == 1, {}
+    for ax in axes[len(names) :]:
+        ax.axis("off")
+    for ax, name in zip(axes, names, strict=False):
+        for group, line, note in ((curves, ".-", ""), (rendered, "--", ", rendered")):
+            for curve in (c for c in group if c.measure.name == name):
+                at = np.array([case.conditions[0].value(s) for s in curve.severity]) if single else curve.severity
+                color = SERIES[pipelines.index(curve.pipeline) % len(SERIES)]
+                drawn[curve.pipeline + note] = ax.plot(at, curve.mean, line, color=color, lw=1.2)[0]
+                if group is curves:
+                    ax.fill_between(at, curve.low, curve.high, color=color, alpha=0.2)
+        ax.axhline(curve.limit, color=muted(), lw=1.0, ls=":")
+        ax.set_title(TITLES[name], fontsize=9)
+        ax.set_xlabel(f"{case.conditions[0].parameter} {case.conditions[0].unit}".strip() if single else "severity of both", fontsize=8)
+        ax.tick_params(labelsize=7)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=len(drawn))
+    return figure
+
+
+def shares_figure(shares: Sequence[Share]) -> Figure:
+    """Severities at which real frames fail, as dots with intervals; bars reach up to where rendered frames fail. One line a condition."""
+    figure, (ax,) = sized_figure((9.0, 0.32 * len(shares) + 1.2))
+    for y, share in enumerate(reversed(shares)):
+        real, rendered = share.real, share.rendered
+        ax.barh(y, rendered.width, color=faint(), height=0.7)
+        ax.text(0.005, y, rendered.label, va="center", fontsize=7, color=muted())
+        color = RED if share.short else BLUE
+        low, high = (min(end, 1.0) for end in real.interval)
+        ax.plot([low, high], [y, y], color=color, lw=2.5, alpha=0.4)
+        ax.plot(real.width, y, "o" if real.reached else ">", color=color, ms=6)
+    ax.set_yticks(range(len(shares)), [share.real.case.title for share in reversed(shares)], fontsize=8)
+    ax.grid(axis="y", visible=False)
+    ax.set_xlim(0, 1.03)
+    ax.set_xlabel("severity at the first failure. Bar: rendered frames; dot: real ones; arrow: no failure within the range", fontsize=8)
+    return figure
+
+
 @dataclass(frozen=True)
 class _Entry:
     """What the page says of one case: envelopes by pipeline, its chart, and the worst frame with what it shows."""
@@ -142,9 +143,8 @@ class _Entry:
 
 def _entry(out: Path, case: Case, judged: Judgement, rendered: Judgement | None, cells: list[Cell]) -> _Entry:
     own = {e.pipeline: e for e in judged.envelopes if e.case == case}
-    plot = write_chart(
-        out / "plots" / f"{case.name}.png", lambda: case_figure(case, judged.curves, rendered.curves if rendered else []), dpi=CASE_DPI
-    )
+    beside = rendered.curves if rendered else []
+    plot = write_chart(out / "plots" / f"{case.name}.png", lambda: case_figure(case, judged.curves, beside), dpi=CASE_DPI)
     first = own[judged.plan.detectors[0].name]
     return _Entry(case, own, plot, _worst(out, cells, case, first))
 
@@ -285,7 +285,7 @@ def compare(envelopes: list[Envelope], ours: str, theirs: str) -> dict:
 
 
 def _worst(out: Path, cells: list[Cell], case: Case, envelope: Envelope) -> tuple[Path, str] | None:
-    """The worst frame at the first severity beyond the envelope (else at the severest)."""
+    """Picture and label of the worst frame at the first severity beyond the envelope, or at the severest one."""
     own = [cell for cell in cells if cell.case == case]
     cell = next((c for c in own if c.severity >= envelope.severity and c.severity > 0), own[-1])
     path = out / "pictures" / f"{cell.file}.jpg"

@@ -1,6 +1,7 @@
-"""The contacts over which a sweep judges: solved once, kept, and shared by all conditions that leave the mechanics alone.
+"""Degraded frames with known pins: rendered frames, or real ones whose pins several detectors agree on.
 
-Degraded frames with known pins: rendered frames, or real ones whose pins several detectors agree on."""
+The contacts of rendered frames are solved once and kept. All conditions that leave the mechanics alone share them.
+"""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -28,7 +29,7 @@ class Contact:
     """An object of `scenes` and how the sensor is pressed against it."""
 
     name: str
-    stimulus: str
+    object_name: str
     pose: ContactPose
 
 
@@ -49,31 +50,7 @@ CONTACTS = (
     Contact("edge", "edge", ContactPose(3.5, twist_deg=15.0)),
     Contact("cylinder", "cylinder", ContactPose(3.0, offset_mm=(3.0, 2.0))),
 )
-
-
-def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
-    """The pins under a contact, from the cache where it has been solved before.
-
-    Raises
-    ------
-    ContactError
-        The contact can't be solved.
-    """
-    if contact.pose.indent_mm <= 0:
-        rest = rest_pins(spec.geometry)
-        return PinState(rest.base_mm, rest.axis, rest.caps_mm)
-
-    def solve():
-        state = SkinSolver(spec).press(load_object(contact.stimulus), contact.pose)
-        return {"base_mm": state.base_mm, "axis": state.axis, "caps_mm": state.caps_mm}
-
-    optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px"}
-    key = {part: getattr(spec, part).model_dump(mode="json", exclude=optical) for part in ("skin", "gel", "lens", "pins")}
-    key |= {"stimulus": load_object(contact.stimulus).model_dump(mode="json"), "pose": vars(contact.pose)}
-    return PinState(**cached_arrays("pins-under-contact", key, solve))
-
-
-# A specification whose camera neither blurs, colours nor disturbs: a real frame has gone through a camera already.
+"""Contacts over which a sweep judges."""
 NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...]]] = {
     "response": {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "blur_sigma_px": 0.0, "brightness_drift": 0.0, "read_noise": 0.0,
@@ -82,6 +59,7 @@ NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...]]] = {
     "camera": {"vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0)},
     "gel": {"haze": 0.0},
 }  # fmt: skip
+"""Sections of a specification whose camera neither blurs, colours nor disturbs: a real frame has gone through a camera already."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +69,10 @@ class DegradedShot:
     Attributes
     ----------
     name : str
-        Of the contact, or of the real frame.
+        Name of the contact, or of the real frame.
     frame : Frame
     caps_px : (N, 2) float
+        Where the pins truly are.
     visible : (N,) bool
         The cap is there, within the frame, and nothing stands before it.
     touched : bool
@@ -124,14 +103,13 @@ class RenderedSource:
         return [contact.name for contact in self.contacts]
 
     def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
-        """The frames under a case; contacts that can't be solved are left out."""
+        """The frames under a case. Contacts that cannot be solved are left out."""
         spec = case.on_spec(self.spec, severity)
         view = View.of(spec, np.zeros((spec.pins.count, 2)))
         geometry = _with_light_of(self.spec, spec)
         shots = []
-        for film in _films(
-            spec.model_copy(update={"response": self.spec.response}), geometry, geometry if case.solves else self.spec, self.contacts
-        ):
+        lit = spec.model_copy(update={"response": self.spec.response})
+        for film in _films(lit, geometry, geometry if case.solves else self.spec, self.contacts):
             view = replace(view, caps_px=film.truth.caps_px)
             light = case.on_light(film.light, severity, view, film.draw)
             image = case.on_frame(expose(light, spec.capture, np.random.default_rng(film.draw)), severity, view, film.draw)
@@ -182,7 +160,30 @@ class RealSource:
         return shots
 
 
+def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
+    """The pins under a contact, from the cache where it has been solved before.
+
+    Raises
+    ------
+    ContactError
+        The contact can't be solved.
+    """
+    if contact.pose.indent_mm <= 0:
+        rest = rest_pins(spec.geometry)
+        return PinState(rest.base_mm, rest.axis, rest.caps_mm)
+
+    def solve() -> dict[str, np.ndarray]:
+        state = SkinSolver(spec).press(load_object(contact.object_name), contact.pose)
+        return {"base_mm": state.base_mm, "axis": state.axis, "caps_mm": state.caps_mm}
+
+    optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px"}
+    key = {part: getattr(spec, part).model_dump(mode="json", exclude=optical) for part in ("skin", "gel", "lens", "pins")}
+    key |= {"object": load_object(contact.object_name).model_dump(mode="json"), "pose": vars(contact.pose)}
+    return PinState(**cached_arrays("pins-under-contact", key, solve))
+
+
 def _degraded(name: str, image: np.ndarray, form: Form, case: Case, severity: float, view: View, visible: np.ndarray) -> DegradedShot:
+    """A shot whose pins lie and are visible as the case leaves them."""
     caps_px = case.on_points(view.caps_px, severity, view)
     inside = np.all((caps_px >= 0) & (caps_px <= np.array(image.shape[1::-1]) - 1), axis=1)
     return DegradedShot(name, Frame(image, form, name), caps_px, visible & inside & ~case.gone(severity, view))

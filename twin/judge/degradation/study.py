@@ -1,6 +1,7 @@
-"""Real frames as a source: pins that several detectors agree on are taken as the truth.
+"""A whole robustness study into one folder, on rendered or on real frames.
 
-A whole robustness study into one folder."""
+In real frames nobody knows where the pins are. There, the places on which several detectors agree are taken as the truth.
+"""
 
 import json
 from dataclasses import replace
@@ -18,16 +19,162 @@ from twin.judge.degradation.report import write_report
 from twin.judge.degradation.shots import CONTACTS, RealSource, RenderedSource
 from twin.judge.degradation.sweep import Models, Plan
 from twin.pins import METHODS, DetectorSpec, load_detector, make_detector, shipped_detector, tune, write_detector
-from twin.progress import Progress, silent, stage
+from twin.progress import Progress, Step, silent, stage
 from twin.store import Item, inputs_digest
 from twin.types import Form, Frame
 
-# Two detectors agree on a pin if their places differ by less than this share of the pins' median spacing. Chosen.
 AGREE = 0.15
-# Least share of the pins that must be agreed on: else the frame is refused.
+"""Two detectors agree on a pin if their places differ by less than this share of the pins' median spacing. Chosen."""
 LEAST_KNOWN = 0.97
-# Detectors that must agree on a pin.
+"""A frame is refused if a smaller share of its pins than this is agreed on."""
 LEAST_AGREEING = 2
+"""Number of detectors that must agree on a pin."""
+
+
+def rendered_study(
+    spec: SensorSpec,
+    pipelines: list[str],
+    cases: tuple[Case, ...],
+    severities: tuple[float, ...],
+    out: Path,
+    *,
+    jobs: int = 1,
+    models: Models | None = None,
+    model_digests: dict[str, str] | None = None,
+    progress: Progress = silent,
+) -> tuple[list[Envelope], list[Path]]:
+    """A study on rendered frames; models as `Plan` takes them, other options and results as `study`."""
+    source, bar = RenderedSource(spec, CONTACTS), partial(stage, progress)
+    with bar("contacts, undegraded"):
+        frames = [shot.frame for shot in source.shoot(cases[0], 0.0)]
+    with bar("tuning") as step:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
+    plan = Plan(source, detectors, cases, severities, models, model_digests or {})
+    return study(plan, "rendered", out, jobs=jobs, progress=progress)
+
+
+def real_study(
+    spec: SensorSpec,
+    path: Path,
+    limit: int,
+    pipelines: list[str],
+    cases: tuple[Case, ...],
+    severities: tuple[float, ...],
+    out: Path,
+    *,
+    beside: bool = True,
+    jobs: int = 1,
+    models: Models | None = None,
+    model_digests: dict[str, str] | None = None,
+    progress: Progress = silent,
+) -> tuple[list[Envelope], list[Path]]:
+    """A study on a folder of real frames: image-level conditions only.
+
+    Models as `Plan` takes them, other options and results as `study`. With ``beside``, rendered frames are swept, too, and the envelope
+    of raw frames is shown on theirs.
+    """
+    recording = open_recording(path, spec)
+    frames, bar = evenly_read(recording, limit), partial(stage, progress)
+    with bar("tuning") as step:
+        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
+        judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
+    source, notes = consensus(spec, frames, list(dict.fromkeys((*detectors, *judges))))
+    usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
+    if not usable:
+        raise TwinError("none of the conditions can be applied to frames that are already there; without --frames they are rendered")
+    if left := [c.name for c in cases if c not in usable]:
+        notes.append(f"left out, because they cannot be applied to frames that are already there: {', '.join(left)}")
+    rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
+    plan = Plan(source, detectors, usable, severities, models, model_digests or {})
+    return study(plan, path.name, out, jobs=jobs, notes=notes, rendered=rendered, progress=progress)
+
+
+def study(
+    plan: Plan,
+    source: str,
+    out: Path,
+    *,
+    progress: Progress = silent,
+    jobs: int = 1,
+    notes: list[str] | None = None,
+    rendered: RenderedSource | None = None,
+) -> tuple[list[Envelope], list[Path]]:
+    """Sweep, judge and write; the envelopes and the files written, the page first.
+
+    Parameters
+    ----------
+    plan : Plan
+    source : str
+        Name of the frames for the page.
+    out : Path
+    progress : Progress
+    jobs : int
+        Processes.
+    notes : list of str, optional
+        Remarks for the page.
+    rendered : RenderedSource, optional
+        Rendered frames of the same sensor. They are swept likewise (in ``out/rendered``), and the plan's frames are shown beside them.
+    """
+    with stage(progress, "conditions x steps") as step:
+        judged = judge_sweep(plan, out, jobs=jobs, progress=step)
+    beside = None
+    if rendered is not None:
+        with stage(progress, "the same, rendered") as step:
+            beside = judge_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=step)
+    return judged.envelopes, write_report(out, judged, source=source, notes=notes or [], rendered=beside)
+
+
+def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
+    """Refuse names before anything is solved or drawn.
+
+    Parameters
+    ----------
+    names : list of str
+        Methods, or files of detectors.
+    models : tuple of str
+        Names of the models whose rows stand beside those of the pipelines.
+
+    Raises
+    ------
+    TwinError
+        A name is neither a method nor a readable file, or two names are the same.
+    """
+    for name in names:
+        if name not in METHODS and Path(name).suffix != ".toml":
+            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
+    called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
+    if len(set(called)) < len(called):
+        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
+    if len({*called, *models}) < len(called) + len(models):
+        raise TwinError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
+
+
+def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress: Step) -> tuple[DetectorSpec, ...]:
+    """Detectors by file or by method: ours as the specification has it, others tuned on undegraded frames and kept in ``folder``.
+
+    Raises
+    ------
+    TwinError
+        A file cannot be read. `check_pipelines` tells this before any work is done.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
+    for k, name in enumerate(names):
+        progress(k, len(names))
+        method = next((known for known in METHODS if known == name), None)
+        if method is None:
+            chosen.append(load_detector(Path(name)))
+        elif method == "twin":
+            chosen.append(shipped_detector(spec, frames[0].form))
+        else:
+            item = Item(f"{method}-{spec.name}", (tune,), [method, inputs])
+            kept = folder / f"{item.file}.toml"
+            if not kept.is_file():
+                tuned = tune(frames, spec, method).detector
+                write_detector(kept, tuned, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}")
+            chosen.append(load_detector(kept).model_copy(update={"name": method}))
+        progress(k + 1, len(names))
+    return tuple(chosen)
 
 
 def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpec]) -> tuple[RealSource, list[str]]:
@@ -63,140 +210,6 @@ def _agreed(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(np.isfinite(seen[0]), seen[0], np.nan), near.sum(axis=0)
 
 
-def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress) -> tuple[DetectorSpec, ...]:
-    """Detectors by file, or by method: ours as the specification has it, others tuned on undegraded frames and kept in ``folder``.
-
-    Raises
-    ------
-    TwinError
-        A file can't be read; `check_pipelines` tells so sooner.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
-    for k, name in enumerate(names):
-        progress(k, len(names))
-        if name == "twin":
-            chosen.append(shipped_detector(spec, frames[0].form))
-        elif name in METHODS:
-            item = Item(f"{name}-{spec.name}", (tune,), [name, inputs])
-            kept = folder / f"{item.file}.toml"
-            if not kept.is_file():
-                write_detector(
-                    kept, tune(frames, spec, name).detector, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}"
-                )
-            chosen.append(load_detector(kept).model_copy(update={"name": name}))
-        else:
-            chosen.append(load_detector(Path(name)))
-        progress(k + 1, len(names))
-    return tuple(chosen)
-
-
-def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
-    """Raise ``TwinError`` where a name is neither a method nor a readable file, or two are alike: before anything is solved or drawn.
-
-    ``models``: names of the models whose rows stand beside those of the pipelines.
-    """
-    for name in names:
-        if name not in METHODS and Path(name).suffix != ".toml":
-            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
-    called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
-    if len(set(called)) < len(called):
-        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
-    if len({*called, *models}) < len(called) + len(models):
-        raise TwinError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
-
-
-def rendered_study(
-    spec: SensorSpec,
-    pipelines: list[str],
-    cases: tuple[Case, ...],
-    severities: tuple,
-    out: Path,
-    *,
-    progress: Progress = silent,
-    **options,
-) -> tuple[list[Envelope], list[Path]]:
-    """A study on rendered frames; options and results as `study`."""
-    source, bar = RenderedSource(spec, CONTACTS), partial(stage, progress)
-    with bar("contacts, undegraded"):
-        frames = [shot.frame for shot in source.shoot(cases[0], 0.0)]
-    with bar("tuning") as step:
-        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
-    return study(Plan(source, detectors, cases, severities), "rendered", out, progress=progress, **options)
-
-
-def real_study(
-    spec: SensorSpec,
-    path: Path,
-    limit: int,
-    pipelines: list[str],
-    cases: tuple[Case, ...],
-    severities: tuple,
-    out: Path,
-    *,
-    beside: bool = True,
-    progress: Progress = silent,
-    **options,
-) -> tuple[list[Envelope], list[Path]]:
-    """A study on a folder of real frames: image-level conditions only; options and results as `study`.
-
-    ``beside``: raw frames are shown on the envelope of rendered ones, which are swept too.
-    """
-    recording = open_recording(path, spec)
-    frames, bar = evenly_read(recording, limit), partial(stage, progress)
-    with bar("tuning") as step:
-        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
-        judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
-    source, notes = consensus(spec, frames, list(dict.fromkeys((*detectors, *judges))))
-    usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
-    if not usable:
-        raise TwinError("none of the conditions can be applied to frames that are already there; leave --frames out to render them")
-    if left := [c.name for c in cases if c not in usable]:
-        notes.append(f"left out, as they can't be applied to frames that are already there: {', '.join(left)}")
-    rendered = RenderedSource(spec, CONTACTS) if beside and recording.form == Form.RAW else None
-    return study(Plan(source, detectors, usable, severities), path.name, out, progress=progress, notes=notes, rendered=rendered, **options)
-
-
 def _on_frames(case: Case) -> bool:
-    """Acts on gray levels or settings, not on light: all that is left of a thresholded frame."""
+    """Whether a case acts on gray levels or settings alone. Nothing else can be applied to a thresholded frame."""
     return all(c.light is None and c.spec is None for c in case.conditions)
-
-
-def study(
-    plan: Plan,
-    source: str,
-    out: Path,
-    *,
-    progress: Progress = silent,
-    jobs: int = 1,
-    models: Models | None = None,
-    model_digests: dict[str, str] | None = None,
-    notes: list[str] | None = None,
-    rendered: RenderedSource | None = None,
-) -> tuple[list[Envelope], list[Path]]:
-    """Sweep, judge and write; the envelopes and the files written, the page first.
-
-    Parameters
-    ----------
-    plan : Plan
-    source : str
-        Name of the frames for the page.
-    out : Path
-    progress : Progress
-    jobs : int
-        Processes.
-    models, model_digests : callable, dict of str to str
-        As `Plan` takes them.
-    notes : list of str, optional
-        For the page.
-    rendered : RenderedSource, optional
-        Frames of the same sensor to sweep likewise (in ``out/rendered``) and to show the plan's beside.
-    """
-    plan = replace(plan, models=models, model_digests=model_digests or {})
-    with stage(progress, "conditions x steps") as step:
-        judged = judge_sweep(plan, out, jobs=jobs, progress=step)
-    beside = None
-    if rendered is not None:
-        with stage(progress, "the same, rendered") as step:
-            beside = judge_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=step)
-    return judged.envelopes, write_report(out, judged, source=source, notes=notes or [], rendered=beside)

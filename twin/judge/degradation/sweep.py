@@ -17,10 +17,15 @@ from twin.judge.degradation.measures import judge_shot
 from twin.judge.degradation.shots import DegradedShot, RealSource, RenderedSource
 from twin.pins import DetectorSpec, Found, make_detector
 from twin.store import Item, find_json, inputs_digest, keep_json, write_bytes
+from twin.types import Frame
 
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
-CELLS = "cells"  # folder of the finished ones
-Models = Callable[[], dict]  # gives {name: estimate}, estimate(frame) -> (values, units, valid)
+CELLS = "cells"
+"""Name of the folder with the finished cells."""
+Estimate = Callable[[Frame], tuple[np.ndarray, tuple[str, ...], bool]]
+"""A model's answer for a frame: the pose's values, their units ("mm" or "deg"), and whether the answer is valid."""
+Models = Callable[[], dict[str, Estimate]]
+"""Gives estimates by the models' names; each process calls it once."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +36,14 @@ class Plan:
     ----------
     source : RenderedSource or RealSource
     detectors : tuple of DetectorSpec
-        The first one is the one whose pictures are kept.
+        Pictures are kept of the first one.
     cases : tuple of Case
     severities : tuple of float
-        From 0 up.
+        Ascending, the first is 0.
     models : callable, optional
-        Gives estimators by name; called in each process.
+        Gives models by name; each process calls it once.
     model_digests : dict of str to str
-        By their names: digests of all that their answers depend on.
+        By the models' names: a digest of all that a model's answers depend on.
     """
 
     source: RenderedSource | RealSource
@@ -59,7 +64,7 @@ class Cell:
 
     @property
     def file(self) -> str:
-        """Name of its files, without suffix."""
+        """Name of the cell's files, without suffix."""
         return self.item.file
 
 
@@ -95,7 +100,7 @@ def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, i
     ]
 
 
-def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress) -> None:
+def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress: Callable[[int], None]) -> None:
     if jobs == 1:
         _begin(plan, folder)
         for done, cell in enumerate(cells):
@@ -109,13 +114,13 @@ def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress) -
                 future.result()
                 progress(done + 1)
         except BrokenProcessPool as error:
-            raise TwinError("a process of the sweep ended before its time, for want of memory perhaps; go on with --jobs 1") from error
+            raise TwinError("a process of the sweep ended before its time, perhaps because memory ran out; go on with --jobs 1") from error
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
 
 
-_WORK: dict = {}  # of this process: what `_begin` was given, built once
+_WORK: dict = {}  # what `_begin` was given; each process builds it once
 
 
 def _begin(plan: Plan, folder: Path) -> None:
@@ -137,10 +142,17 @@ def _run(cell: Cell) -> None:
     if worst is not None:
         picture = cv2.imencode(".jpg", overlay(worst[1], worst[2]))[1].tobytes()
         write_bytes(folder / "pictures" / f"{cell.file}.jpg", picture)
-    keep_json(folder / CELLS, cell.item, rows, default=float)
+    keep_json(folder / CELLS, cell.item, rows, default=_plain_number)
 
 
-def _pose(estimate, shot: DegradedShot) -> dict:
+def _plain_number(value: object) -> float:
+    """A number of NumPy as JSON holds it."""
+    if isinstance(value, np.number | np.bool_):
+        return float(value)
+    raise TypeError(f"expected a number, got {type(value).__name__}")
+
+
+def _pose(estimate: Estimate, shot: DegradedShot) -> dict:
     values, units, valid = estimate(shot.frame)
     return {"values": [float(v) for v in values], "units": list(units), "valid": bool(valid), "touched": shot.touched}
 
@@ -169,5 +181,5 @@ def _inputs(plan: Plan) -> list[object]:
     source = plan.source
     shared = [source.spec, plan.detectors, plan.model_digests]
     if isinstance(source, RenderedSource):
-        return [*shared, [[c.name, load_object(c.stimulus), c.pose] for c in source.contacts]]
+        return [*shared, [[c.name, load_object(c.object_name), c.pose] for c in source.contacts]]
     return [*shared, [[frame.name, frame.image] for frame in source.frames], source.caps_px]

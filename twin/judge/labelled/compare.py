@@ -1,14 +1,105 @@
-"""How far simulated pins are from recorded ones.
+"""Pin errors of the twin on labelled frames: with nothing free, and with one friction of its own for a frame."""
 
-Pin errors of the twin on labelled frames: with nothing free, and with one friction a frame."""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from twin.errors import ContactError
 from twin.judge.labelled.model import ContactModel, MeasuredFrames
+from twin.progress import Step
+
+FRICTIONS = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.65, 1.0, 2.0)
+"""Coefficients of friction that are tried for a frame of its own."""
+BINS = 4
+"""Bins of a measure in the table of mean errors."""
+MEASURES = {"depth_mm": "depth, mm", "angle_deg": "turn, deg", "shear_mm": "shear, mm"}
+"""What the errors are tabled by, with its title."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Simulated and recorded pins of M frames with N pins.
+
+    Attributes
+    ----------
+    measured : MeasuredFrames
+    simulated_px : (M, N, 2) float
+        NaN where the contact failed.
+    error_px : (M,) float
+        Mean over the pins; NaN where the contact failed.
+    executed : (M,) bool
+        Whether the arm executed the frame's move.
+    by : dict of str to (M,) float
+        ``depth_mm`` (the label along the approach), ``angle_deg`` (size of all turns), ``shear_mm`` (size of the executed move).
+    friction, friction_error_px : (M,) float
+        The frame's own friction and its error; NaN where it was not sought.
+    failures : dict of str to str
+        Why a contact failed, by image name.
+    """
+
+    measured: MeasuredFrames
+    simulated_px: np.ndarray
+    error_px: np.ndarray
+    executed: np.ndarray
+    by: dict[str, np.ndarray]
+    friction: np.ndarray
+    friction_error_px: np.ndarray
+    failures: dict[str, str]
+
+
+def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: int = 0, progress: Step | None = None) -> Comparison:
+    """Simulate every frame's contact, and seek the own friction of some frames.
+
+    ``friction_frames``: number of frames whose friction is sought. They are spread evenly over the frames with an executed move.
+    """
+    executed = np.array([label.executed for label in measured.labels])
+    sought = _evenly(np.flatnonzero(executed), friction_frames)
+    total, done = len(measured) + len(sought) * len(FRICTIONS), 0
+    simulated, failures = np.full(measured.pins_px.shape, np.nan), {}
+
+    def simulate(row: int, friction: float | None = None) -> np.ndarray:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done, total)
+        return measured.no_contact_px + model.displacement_px(measured.labels[row], friction)
+
+    for row, name in enumerate(measured.names):
+        try:
+            simulated[row] = simulate(row)
+        except ContactError as failure:
+            failures[name] = str(failure)
+    errors = np.full(len(measured), np.nan)
+    solved = ~np.isnan(simulated[:, 0, 0])
+    errors[solved] = pin_errors(simulated[solved], measured.pins_px[solved])
+    best, best_error = np.full(len(measured), np.nan), np.full(len(measured), np.nan)
+    best[sought], best_error[sought] = model.rig.friction, errors[sought]
+    for row in sought.tolist():
+        for friction in FRICTIONS:
+            try:
+                error = float(pin_errors(simulate(row, friction), measured.pins_px[row]))
+            except ContactError:
+                continue
+            if not error >= best_error[row]:  # also where the rig's friction failed (NaN)
+                best[row], best_error[row] = friction, error
+    return Comparison(measured, simulated, errors, executed, _measures(model, measured), best, best_error, failures)
+
+
+def table_of(found: Comparison) -> list[dict]:
+    """Mean errors of executed, not executed and all moves: ``group``, ``frames``, ``error_px`` and ``by`` each measure."""
+    rows = []
+    for group, chosen in (("move executed", found.executed), ("move not executed", ~found.executed), ("all", np.ones_like(found.executed))):
+        solved = chosen & np.isfinite(found.error_px)
+        if not solved.any():
+            continue
+        by = {}
+        for key, values in found.by.items():
+            edges = np.linspace(values.min(), values.max(), BINS + 1).tolist()
+            if edges[0] < edges[-1]:
+                by[key] = {"edges": edges, "means": binned_means(found.error_px[solved], values[solved], edges).tolist()}
+        rows.append({"group": group, "frames": int(solved.sum()), "error_px": float(found.error_px[solved].mean()), "by": by})
+    return rows
 
 
 def pin_errors(simulated_px: np.ndarray, measured_px: np.ndarray) -> np.ndarray:
@@ -39,101 +130,20 @@ def ring_bias(rest_px: np.ndarray, simulated_px: np.ndarray, measured_px: np.nda
 
 
 def binned_means(values: np.ndarray, by: np.ndarray, edges: Sequence[float]) -> np.ndarray:
-    """Mean of the values whose ``by`` lies in each bin (the last one closed); NaN where a bin is empty."""
+    """Mean of the values whose ``by`` lies in each bin (the last bin is closed); NaN where a bin is empty."""
     where = np.clip(np.searchsorted(edges, by, side="right") - 1, 0, len(edges) - 2)
     return np.array([values[where == k].mean() if (where == k).any() else np.nan for k in range(len(edges) - 1)])
 
 
-FRICTIONS = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.65, 1.0, 2.0)  # tried for a frame of its own
-BINS = 4
-MEASURES = {"depth_mm": "depth, mm", "angle_deg": "turn, deg", "shear_mm": "shear, mm"}
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """What came of M frames with N pins.
-
-    Attributes
-    ----------
-    measured : MeasuredFrames
-    simulated_px : (M, N, 2) float
-        NaN where the contact failed.
-    error_px : (M,) float
-        Mean over the pins; NaN where the contact failed.
-    executed : (M,) bool
-    by : dict of str to (M,) float
-        ``depth_mm`` (the label along the approach), ``angle_deg`` (size of all turns), ``shear_mm`` (size of the executed move).
-    friction, friction_error_px : (M,) float
-        The frame's own friction and its error; NaN where it was not sought.
-    failures : dict of str to str
-        Why a contact failed, by image name.
-    """
-
-    measured: MeasuredFrames
-    simulated_px: np.ndarray
-    error_px: np.ndarray
-    executed: np.ndarray
-    by: dict
-    friction: np.ndarray
-    friction_error_px: np.ndarray
-    failures: dict
-
-
-def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: int = 0, progress: Callable | None = None) -> Comparison:
-    """Simulate every frame's contact; for ``friction_frames`` of those with an executed move, seek their own friction, too."""
-    executed = np.array([label.executed for label in measured.labels])
-    moved = np.flatnonzero(executed)
-    sought = (
-        moved[np.linspace(0, len(moved) - 1, min(friction_frames, len(moved))).astype(int)] if friction_frames and len(moved) else moved[:0]
-    )
-    total, done = len(measured) + len(sought) * len(FRICTIONS), 0
-    simulated, failures = np.full(measured.pins_px.shape, np.nan), {}
-
-    def simulate(row, friction=None):
-        nonlocal done
-        done += 1
-        if progress:
-            progress(done, total)
-        return measured.no_contact_px + model.displacement_px(measured.labels[row], friction)
-
-    for row, name in enumerate(measured.names):
-        try:
-            simulated[row] = simulate(row)
-        except ContactError as error:
-            failures[name] = str(error)
-    errors = np.full(len(measured), np.nan)
-    solved = ~np.isnan(simulated[:, 0, 0])
-    errors[solved] = pin_errors(simulated[solved], measured.pins_px[solved])
-    best, best_error = np.full(len(measured), np.nan), np.full(len(measured), np.nan)
-    best[sought], best_error[sought] = model.rig.friction, errors[sought]
-    for row in sought:
-        for friction in FRICTIONS:
-            try:
-                error = float(pin_errors(simulate(row, friction), measured.pins_px[row]))
-            except ContactError:
-                continue
-            if not error >= best_error[row]:
-                best[row], best_error[row] = friction, error
-    return Comparison(measured, simulated, errors, executed, _measures(model, measured), best, best_error, failures)
-
-
-def table_of(found: Comparison) -> list[dict]:
-    """Mean errors of executed, not executed and all moves: ``group``, ``frames``, ``error_px`` and ``by`` each measure."""
-    rows = []
-    for group, chosen in (("move executed", found.executed), ("move not executed", ~found.executed), ("all", np.ones_like(found.executed))):
-        solved = chosen & np.isfinite(found.error_px)
-        if not solved.any():
-            continue
-        row = {"group": group, "frames": int(solved.sum()), "error_px": float(found.error_px[solved].mean()), "by": {}}
-        for key, values in found.by.items():
-            edges = np.linspace(values.min(), values.max(), BINS + 1)
-            if edges[0] < edges[-1]:
-                row["by"][key] = {"edges": edges.tolist(), "means": binned_means(found.error_px[solved], values[solved], edges).tolist()}
-        rows.append(row)
-    return rows
+def _evenly(rows: np.ndarray, count: int) -> np.ndarray:
+    """At most ``count`` of the rows, evenly spread, the first and the last among them."""
+    if not count or not len(rows):
+        return rows[:0]
+    return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
 
 
 def _measures(model: ContactModel, measured: MeasuredFrames) -> dict[str, np.ndarray]:
+    """The measures (M,) of each frame that the errors are tabled by."""
     axis = model.experiment.axis
     poses = np.array([label.pose - (0 if label.executed else label.move) for label in measured.labels])
     moves = np.array([label.move * label.executed for label in measured.labels])

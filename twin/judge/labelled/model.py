@@ -4,7 +4,6 @@ Pins are compared in px of the frames as they are. A simulated pin is the record
 displacement: where each pin of a printed sensor really sits is not the mechanics' matter.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline
 from twin.pins.batch import recording_reference
+from twin.progress import Step
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, read_arm_labels
@@ -46,18 +46,18 @@ class MeasuredFrames:
     """
 
     form: Form
-    names: list
-    labels: list
+    names: list[str]
+    labels: list[ArmLabel]
     pins_px: np.ndarray
     no_contact_px: np.ndarray
-    problems: list
+    problems: list[str]
 
     def __len__(self) -> int:
         return len(self.names)
 
 
 def measure_frames(
-    folder: Path, spec: SensorSpec, count: int | None, seed: int, *, form: Form | None = None, progress: Callable | None = None
+    folder: Path, spec: SensorSpec, count: int | None, seed: int, *, form: Form | None = None, progress: Step | None = None
 ) -> MeasuredFrames:
     """The pins of ``count`` frames of a labelled recording, chosen at random (None: of all), in the table's order.
 
@@ -77,14 +77,14 @@ def measure_frames(
     for done, row in enumerate(np.sort(chosen)):
         try:
             seen = pipeline(recording.read(int(row)))
+            if seen.valid:
+                kept.append(int(row))
+                pins.append(seen.pins_px)
             reason = seen.reason
         except FrameError as error:
-            seen, reason = None, str(error)
+            reason = str(error)
         if reason:
             problems.append(f"{recording.names[row]}: left out: {reason}")
-        else:
-            kept.append(int(row))
-            pins.append(seen.pins_px)
         if progress:
             progress(done + 1, len(chosen))
     if not kept:

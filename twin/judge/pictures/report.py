@@ -139,9 +139,16 @@ def _spectrum_figure(found: Statistics) -> Figure:
     return figure
 
 
+def _plain_number(value: object) -> object:
+    """A number of NumPy as JSON holds it."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"expected a number, got {type(value).__name__}")
+
+
 def write_metrics(path: Path, metrics: dict) -> Path:
-    """metrics.json, numpy numbers and all."""
-    return write_json(path, metrics | {"made_by": made_by(__name__)}, default=lambda thing: thing.item())
+    """Write ``metrics.json``; numbers of NumPy are allowed in the metrics."""
+    return write_json(path, metrics | {"made_by": made_by(__name__)}, default=_plain_number)
 
 
 def image_columns(*, mark_best: bool = False) -> list[Column]:

@@ -1,19 +1,27 @@
-"""Measures of caps by their distance from the disc's centre, real and rendered side by side.
-
-Noise floor and radial power spectrum of gray frames."""
+"""Measures by the distance from the disc's centre, the noise floor, and the radial power spectrum of frames."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-# Bins of the distance from the disc's centre.
 BINS = 8
+"""Bins of the distance from the disc's centre."""
+SPECTRUM_BINS = 24
+"""Rings of the spectrum."""
+LOWEST_CYCLES = 4.0
+"""Lowest frequency, cycles for each diameter of the disc. Below it the Hann window's own spectrum is seen."""
+GAUSSIAN_MAD = 1.4826
+"""Sd of a Gaussian relative to its median absolute deviation."""
+CLIP_ROUNDS = 3
+"""Rounds in which residuals beyond three sd are left out."""
+NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+"""Kernel that leaves nothing of constant, linear and twisted surfaces and has unit gain for white noise (Immerkaer 1996)."""
 
 
 @dataclass(frozen=True)
 class RadialRow:
-    """One measure in one bin: mean of the real and of the rendered caps, and the relative difference."""
+    """One measure in one bin: its mean over the real caps and over the rendered ones."""
 
     measure: str
     inner_px: float
@@ -23,7 +31,7 @@ class RadialRow:
 
     @property
     def difference(self) -> float:
-        """Rendered against real, relative."""
+        """Relative difference of rendered from real."""
         return self.rendered / self.real - 1
 
 
@@ -49,18 +57,6 @@ def radial_rows(
         means.append([float(v.mean()) if len(v) else np.nan for v in each])
     pairs = zip(edges_px[:-1], edges_px[1:], *means, strict=True)
     return [RadialRow(measure, float(inner), float(outer), a, b) for inner, outer, a, b in pairs]
-
-
-# Rings of the spectrum.
-SPECTRUM_BINS = 24
-# Lowest frequency, cycles for each diameter of the disc: below it the Hann window's own spectrum is seen.
-LOWEST_CYCLES = 4.0
-# Sd of a Gaussian relative to its median absolute deviation.
-GAUSSIAN_MAD = 1.4826
-# Rounds of leaving out what lies beyond three sd.
-CLIP_ROUNDS = 3
-# Kernel that leaves nothing of constant, linear and twisted surfaces and has unit gain for white noise (Immerkaer 1996).
-NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 
 
 def noise_sd(gray: np.ndarray, where: np.ndarray) -> float:

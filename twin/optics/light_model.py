@@ -1,0 +1,116 @@
+"""Light in the gel at chosen pixels as a differentiable function of LEDs and reflectances.
+
+The derivatives come from the renderer itself: Dr.Jit differentiates the paths of light in forward mode.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.errors import RenderError
+from twin.optics.arrays import with_room
+from twin.optics.render import BOUNCES, GelView, Renderer
+from twin.optics.tracer import spectrum
+from twin.optics.variant import DrJit, use_variant
+from twin.types import FloatArray, IntArray, PinState
+
+SAMPLES = 32
+"""Samples per pixel."""
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """Factors on the specification's light and reflectances, (3,) linear RGB where coloured.
+
+    Attributes
+    ----------
+    leds : (k,) float
+        Factor on the power of each lit LED.
+    skin, caps, stems : (3,) float
+        Factors on the reflectances.
+    """
+
+    leds: FloatArray
+    skin: FloatArray
+    caps: FloatArray
+    stems: FloatArray
+
+
+class LightModel:
+    """Light in the gel at chosen pixels of one state, and its derivatives by forward differentiation.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Renders the whole frame of the specification whose light has neutral knobs. Its variant must be able to differentiate.
+    state : PinState
+        Pins as ``Renderer.render`` takes them.
+    pixels : (n,) int
+        Pixel numbers of the raw frame, counted row by row.
+    seed : int
+
+    Raises
+    ------
+    RenderError
+        Only the scalar variant works on this machine; it cannot differentiate.
+    """
+
+    def __init__(self, renderer: Renderer, state: PinState, pixels: IntArray, seed: int) -> None:
+        if renderer.choice.backend == "scalar":
+            raise RenderError(
+                "calibration differentiates the renderer, which the scalar variant can't: run 'twin doctor' for what is missing"
+            )
+        import drjit as dr
+
+        self._mi, self._dr, self._seed = use_variant(renderer.choice), dr, seed
+        mi = self._mi
+        self._view = GelView(mi, renderer.spec, renderer.window_px, renderer.surfaces(state), BOUNCES)
+        self._pixels = mi.UInt32(with_room(pixels, np.uint32))
+        emitters = self._view.tracer.emitters
+        self._led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
+        self._radiance = [mi.Spectrum(r) for r in emitters.radiance]
+        self._shapes = {shape.id(): mi.ShapePtr(shape) for shape in self._view.tracer.scene.shapes()}
+
+    @property
+    def led_count(self) -> int:
+        """Number of lit LEDs."""
+        return self._led_count
+
+    def light(self, knobs: Knobs) -> FloatArray:
+        """Light (n, channels) of the gel on the film."""
+        self._turn(knobs, {})
+        return np.array(self._view.trace(self._pixels, SAMPLES, self._seed)).T
+
+    def slopes(self, knobs: Knobs) -> dict[str, FloatArray]:
+        """Derivatives (n, channels) by the logarithm of each knob: ``led0``..., ``skin``, ``caps``, ``stems``.
+
+        A coloured knob acts on each channel alone, so that one pass serves all channels; all passes share one kernel.
+        """
+        mi, dr = self._mi, self._dr
+        names = [*(f"led{k}" for k in range(self._led_count)), "skin", "caps", "stems"]
+        found = {}
+        for name in names:
+            steps = {each: mi.Float(0.0) for each in names}
+            dr.enable_grad(steps)
+            for each, step in steps.items():
+                dr.set_grad(step, dr.opaque(mi.Float, float(each == name)))
+            self._turn(knobs, steps)
+            image = self._view.trace(self._pixels, SAMPLES, self._seed)
+            found[name] = np.array(dr.forward_to(image)).T
+        return found
+
+    def _turn(self, knobs: Knobs, steps: dict[str, DrJit]) -> None:
+        """Set the knobs, each with its step (zero, but with a gradient) in its logarithm."""
+        mi, dr, tracer = self._mi, self._dr, self._view.tracer
+
+        def factor(knob: str, value: DrJit) -> DrJit:
+            return value * (1 + steps[knob]) if knob in steps else value
+
+        lit = self._radiance[: self._led_count]
+        turned = [base * factor(f"led{k}", dr.opaque(mi.Float, float(knobs.leds[k]))) for k, base in enumerate(lit)]
+        tracer.emitters.radiance[:] = [*turned, *self._radiance[self._led_count :]]
+        tracer.tints[:] = []
+        for part, shape in self._shapes.items():
+            tint = spectrum(mi, getattr(knobs, part))
+            dr.make_opaque(tint)
+            tracer.tints.append((shape, factor(part, tint)))

@@ -50,7 +50,7 @@ class ContactContent:
 
 def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
     """Write the pictures of one contact; the skin's own picture is drawn elsewhere."""
-    look, stem = result.look, f"{result.sensor}-{result.touched}"
+    look, stem = result.look, f"{result.sensor}-{result.object_name}"
     graph, rest = look.graphs()
     written = {
         "raw": write_image(folder / f"{stem}-frame.png", result.raw.frame.image),

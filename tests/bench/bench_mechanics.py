@@ -30,7 +30,11 @@ from scenes import load_object, load_sensor  # noqa: E402
 from twin.errors import ContactError  # noqa: E402
 from twin.mechanics.path import ContactPose  # noqa: E402
 from twin.mechanics.solver import SkinSolver  # noqa: E402
-from twin.objects.mesh_field import sample_mesh  # noqa: E402
+
+if (Path(twin.__file__).parent / "stimulus").is_dir():  # this file also runs in the tree of the first version
+    from twin.stimulus.mesh_field import sample_mesh
+else:
+    from twin.objects.mesh_field import sample_mesh
 
 FIRST_VERSION = "c3e0227"
 SENSOR = "mg400-331"

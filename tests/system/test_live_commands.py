@@ -181,7 +181,7 @@ def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
 
 
 def test_a_replay_takes_no_other_frame_at_rest(tmp_path):
-    with pytest.raises(DeviceError, match="leave it out"):
+    with pytest.raises(DeviceError, match="leave --at-rest out"):
         run("live", "--replay", tmp_path, "--at-rest", "first", "--headless")
 
 

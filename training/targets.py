@@ -109,7 +109,7 @@ def choose_targets(
     if both:
         move = np.column_stack([_numbers(recording.labels[name], name, []) for name in ("move_1", "move_6")])[rows]
     executed = np.full(len(rows), np.nan)
-    known = read_executed(recording.path, problems) if both else {}
+    known = read_executed(recording.path, [recording.names[row] for row in rows], problems) if both else {}
     if known:
         executed = np.array([known.get(recording.names[row], np.nan) for row in rows])
     x_mm = _numbers(recording.labels["pose_1"], "pose_1", [])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))

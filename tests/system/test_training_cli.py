@@ -145,7 +145,8 @@ def test_an_audit_writes_labels_that_training_reads(recording, tmp_path):
     said = twin("audit", recording, "--sensor", "mg400-127", "--out", tmp_path)
     assert "70 frames" in said
     assert set(json.loads((tmp_path / "audit.json").read_text())) >= {"no_contact", "wrong_sign", "drift"}
-    assert len(read_executed(tmp_path, [])) == FRAMES and "<h1>" in (tmp_path / "audit.html").read_text()
+    names, problems = [f"f_{k}.png" for k in range(FRAMES)], []
+    assert len(read_executed(tmp_path, names, problems)) == FRAMES and not problems and "<h1>" in (tmp_path / "audit.html").read_text()
 
 
 def test_mistakes_are_named(recording, run, tmp_path):

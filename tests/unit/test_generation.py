@@ -83,7 +83,7 @@ def test_the_table_and_the_truth_agree(made):
     assert summary.frames == len(rows) == truth["path_id"].shape[0] and summary.contacts == COUNT
     assert [int(row["path_id"]) for row in rows] == truth["path_id"][:].tolist()
     assert np.allclose([[float(row[f"pose_{k}"]) for k in range(1, 7)] for row in rows], truth["pose"][:])
-    executed = read_executed(folder, [])
+    executed = read_executed(folder, [row["image_name"] for row in rows], [])
     assert [bool(executed[row["image_name"]]) for row in rows] == truth["executed"][:].tolist()
     assert set(truth["path_id"][:]) == set(range(COUNT)) and len(rows_of(folder, "draws.csv")) == COUNT
     meta = json.loads((folder / "meta.json").read_text())

@@ -26,7 +26,7 @@ def base_name(path: str) -> str:
     return re.split(r"[\\/]", path.strip(AROUND_CELLS))[-1]
 
 
-def _bare_name(name: str) -> str:
+def bare_name(name: str) -> str:
     """A picture's name without its suffix, if it has one, and without regard to case."""
     stem, dot, suffix = name.casefold().rpartition(".")
     return stem if dot + suffix in IMAGE_SUFFIXES else name.casefold()
@@ -71,26 +71,32 @@ def _cells(path: Path) -> list[list[str]]:
 def _distinct(header: list[str]) -> list[str]:
     """Column names, those that came before with _2, _3, ... appended."""
     distinct: list[str] = []
+    taken: set[str] = set()
+    tries: dict[str, int] = {}
     for name in header:
-        tries = 2
         new = name
-        while new and new in distinct:
-            new, tries = f"{name}_{tries}", tries + 1
+        while new and new in taken:
+            tries[name] = tries.get(name, 1) + 1
+            new = f"{name}_{tries[name]}"
         distinct.append(new)
+        taken.add(new)
     return distinct
 
 
-def read_table(path: Path, problems: list[str]) -> Table | None:
-    """A table; None, with the reason added to ``problems``, if it names no pictures."""
+def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are taken in natural order") -> Table | None:
+    """A table; None if it names no pictures.
+
+    The reason and its consequence, ``otherwise``, are then added to ``problems``.
+    """
     try:
         rows = _cells(path)
     except (OSError, csv.Error) as error:
-        problems.append(f"{path.name}: can't be read ({error}); frames are taken in natural order")
+        problems.append(f"{path.name}: can't be read ({error}); {otherwise}")
         return None
     header = rows[0] if rows else []
     name_columns = [k for k, column in enumerate(header) if column.casefold() in NAME_COLUMNS]
     if not name_columns:
-        problems.append(f"{path.name}: no column {' or '.join(NAME_COLUMNS)}; frames are taken in natural order")
+        problems.append(f"{path.name}: no column {' or '.join(NAME_COLUMNS)}; {otherwise}")
         return None
     ragged = sum(len(row) != len(header) for row in rows[1:])
     if ragged:
@@ -131,7 +137,7 @@ class Pairing:
 def pair_rows(names: list[str], files: list[Path]) -> Pairing:
     """Pair names and pictures: as written, then without regard to case, then without suffix."""
     pairing = Pairing({}, [], [], list(range(len(names))))
-    for key in (str, str.casefold, _bare_name):
+    for key in (str, str.casefold, bare_name):
         taken = set(pairing.files.values())
         free: dict[str, Path] = {}
         for file in files:

@@ -4,7 +4,8 @@ In the published Tac-VGNN recordings (Apache-2.0) the shear move had not been ex
 frame was taken. An audit writes which ones into a file beside the table; without that file every move counts as executed.
 """
 
-import csv
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +14,11 @@ import numpy as np
 from scenes.rig import RigSpec
 from twin.errors import FrameError
 from twin.frames import Recording
+from twin.frames.tables import bare_name, counted, pair_rows, read_table
 
 EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")  # in the order in which they are looked for
 EXECUTED_COLUMNS = ("executed", "executed_estimate")
+NOT_USED = "it is not used, and every move counts as executed"
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ def read_arm_labels(recording: Recording) -> list[ArmLabel]:
     if odd.any():
         names = [recording.names[k] for k in np.flatnonzero(odd)[:3]]
         raise FrameError(f"{recording.path}: {odd.sum()} rows hold no number in a pose or move ({', '.join(names)}); mend or remove them")
-    executed = read_executed(Path(recording.path), recording.problems)
+    executed = read_executed(Path(recording.path), recording.names, recording.problems)
     done = [executed.get(name, 1.0) > 0.5 for name in recording.names]
     return [ArmLabel(*row) for row in zip(values["pose"], values["move"], done, strict=True)]
 
@@ -76,29 +79,74 @@ def label_slope(rig: RigSpec | None) -> float:
     return plate_slope(rig) if rig is None or rig.label_depth_per_move is None else rig.label_depth_per_move
 
 
-def read_executed(folder: Path, problems: list[str]) -> dict[str, float]:
-    """Whether each frame's move was executed (1 or 0, or an estimate between), by image name, from the audit's file beside the table.
+def read_executed(folder: Path, names: Sequence[str], problems: list[str]) -> dict[str, float]:
+    """Whether each frame's move was executed, from the audit's file beside the table.
 
-    Empty without such a file. What is wrong with a file is added to ``problems``.
+    The file is read like the table: any separator and encoding that tables may have, names in any case, with or without a path.
+
+    Parameters
+    ----------
+    folder : Path
+    names : sequence of str
+        Frames' names.
+    problems : list of str
+        Every row that is not used, and every frame without a row, is added here.
+
+    Returns
+    -------
+    dict of str to float
+        By frame's name: 1 executed, 0 not executed, or an estimate between. Empty without such a file.
     """
     for name in EXECUTED_FILES:
         path = folder / name
-        if not path.is_file():
+        if not os.path.lexists(path):
             continue
-        with path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            header = reader.fieldnames or ()
-            column = next((c for c in EXECUTED_COLUMNS if c in header), None)
-            if column is None or "image_name" not in header:
-                problems.append(f"{name}: no columns image_name and {EXECUTED_COLUMNS[0]}; not used")
-                continue
-            return {row["image_name"]: value for row in reader if 0 <= (value := _number(row[column])) <= 1}
+        if not path.is_file():
+            problems.append(f"{name}: not a regular file; {NOT_USED}")
+            continue
+        table = read_table(path, problems, otherwise=NOT_USED)
+        if table is None:
+            continue
+        column = next((cells for key, cells in table.columns.items() if key.casefold() in EXECUTED_COLUMNS), None)
+        if column is None:
+            problems.append(f"{name}: no column {' or '.join(EXECUTED_COLUMNS)}; {NOT_USED}")
+            continue
+        return _paired(name, table.name_lists[0], [_share(cell) for cell in column], names, problems)
     return {}
 
 
-def _number(cell: str | None) -> float:
-    """A cell as a number; NaN where it holds none."""
+def _paired(file: str, listed: list[str], shares: list[float], names: Sequence[str], problems: list[str]) -> dict[str, float]:
+    """Shares by frame's name; what does not fit is added to ``problems``."""
+    pairing = pair_rows(listed, [Path(name) for name in names])
+    found = {picture.name: shares[row] for row, picture in pairing.files.items()}
+    same = {bare_name(name): name for name in found}
+    contradicting = [row for row in pairing.doubled if shares[row] != found.get(same.get(bare_name(listed[row]), ""))]
+    for row in contradicting:
+        found.pop(same.get(bare_name(listed[row]), ""), None)
+    unreadable = [row for row, share in enumerate(shares) if np.isnan(share)]
+    odd = {
+        "rows hold no number from 0 to 1, no true or false and no yes or no, and are not used": [
+            row for row, share in enumerate(shares) if np.isnan(share)
+        ],
+        "rows contradict an earlier row of the same frame, and neither is used": contradicting,
+        "rows name no frame here": pairing.missing,
+    }
+    problems += [f"{file}: {counted(len(rows), what, [listed[k] for k in rows])}" for what, rows in odd.items() if rows]
+    known = {name: share for name, share in found.items() if not np.isnan(share)}
+    if without := [name for name in names if name not in known]:
+        problems.append(f"{file}: {counted(len(without), 'frames have no usable row; their moves count as executed', without)}")
+    return known
+
+
+def _share(cell: str) -> float:
+    """A cell as a number from 0 (not executed) to 1 (executed); NaN where it says nothing of the kind."""
+    text = cell.strip().casefold()
+    if text in ("true", "yes"):
+        return 1.0
+    if text in ("false", "no"):
+        return 0.0
     try:
-        return float(cell) if cell is not None else float("nan")
+        share = float(text)
     except ValueError:
         return float("nan")
+    return share if 0 <= share <= 1 else float("nan")

@@ -125,11 +125,11 @@ def _paired(file: str, listed: list[str], shares: list[float], names: Sequence[s
         found.pop(same.get(bare_name(listed[row]), ""), None)
     unreadable = [row for row, share in enumerate(shares) if np.isnan(share)]
     odd = {
-        "rows hold no number from 0 to 1, no true or false and no yes or no, and are not used": [
-            row for row, share in enumerate(shares) if np.isnan(share)
-        ],
+        "rows hold no number from 0 to 1, no true or false and no yes or no, and are not used": unreadable,
         "rows contradict an earlier row of the same frame, and neither is used": contradicting,
         "rows name no frame here": pairing.missing,
+        "rows name a frame with another suffix or case": pairing.loose,
+        "rows repeat an earlier row": [row for row in pairing.doubled if row not in contradicting],
     }
     problems += [f"{file}: {counted(len(rows), what, [listed[k] for k in rows])}" for what, rows in odd.items() if rows]
     known = {name: share for name, share in found.items() if not np.isnan(share)}

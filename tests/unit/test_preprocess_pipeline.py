@@ -111,7 +111,7 @@ def test_a_threshold_that_does_not_suit_the_frame_is_replaced(levels, offset):
     assert seen.found == len(rest) and rms(errors_px(seen, rest)) < 0.6
     assert sum(ms for stage, ms in seen.ms.items() if stage != "total") == pytest.approx(seen.ms["total"], rel=0.1)
     if offset == -60.0 and levels[1] < 200:
-        assert seen.ms["look again"] > seen.ms["complete"]  # by far: it is a whole look
+        assert seen.ms["look again"] > 0  # its time is told where the frame was looked at again
         assert Pipeline(spec, Form.RAW, second_look=False)(Frame(image, Form.RAW)).found == 0
 
 

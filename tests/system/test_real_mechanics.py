@@ -11,7 +11,7 @@ import pytest
 
 from scenes import load_experiment, load_object, load_sensor
 from twin.judge.labelled import ContactModel, compare, measure_frames, table_of
-from twin.judge.labelled.compare import pin_errors, ring_bias
+from twin.judge.labelled.compare import pin_errors
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
@@ -46,7 +46,7 @@ def test_pins_with_one_set_of_parameters(comparison):
     assert solved.mean() >= 1 - MOST_FAILED
     still = pin_errors(np.broadcast_to(measured.no_contact_px, measured.pins_px.shape), measured.pins_px)
     error = np.where(solved, found.error_px, still)
-    bias = ring_bias(measured.no_contact_px, found.simulated_px[solved], measured.pins_px[solved], model.spec.pins.rings)
+    bias = _ring_bias(measured.no_contact_px, found.simulated_px[solved], measured.pins_px[solved], model.spec.pins.rings)
     at_rest = np.linalg.norm(model.rest_px - measured.no_contact_px, axis=1).mean()
     print(f"\n{name}: {len(measured)} frames, friction {model.rig.friction}; prototype, one friction a frame: {PROTOTYPE_PX[name]} px")
     for row in table_of(found):
@@ -71,3 +71,25 @@ def test_pins_with_one_friction_a_frame(comparison):
     print(f"\n{model.spec.name}: {len(own)} executed frames, one friction each: {own.mean():.2f} px")
     print(f"  frictions {np.sort(found.friction[np.isfinite(found.friction)])}")
     assert own.mean() < MOST_PER_FRAME_PX[model.spec.name]
+
+
+def _ring_bias(rest_px: np.ndarray, simulated_px: np.ndarray, measured_px: np.ndarray, rings: int) -> np.ndarray:
+    """Mean outward error of each ring of pins, from the innermost.
+
+    Parameters
+    ----------
+    rest_px : (N, 2) float
+        No contact, in the specification's pin order.
+    simulated_px, measured_px : (M, N, 2) float
+    rings : int
+
+    Returns
+    -------
+    (rings,) float
+        px; positive: the simulated pins lie too far out.
+    """
+    across = rest_px - rest_px[0]
+    outward = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    error = np.nanmean(np.sum((simulated_px - measured_px) * outward, axis=2), axis=0)
+    first = [1 + 3 * ring * (ring - 1) for ring in range(1, rings + 2)]
+    return np.array([error[start:stop].mean() for start, stop in zip(first[:-1], first[1:], strict=True)])

@@ -38,7 +38,6 @@ LIBRARIES = (  # whose import takes long; Mitsuba is not among them, as it start
     "scipy.sparse.linalg",
     "scipy.spatial",
     "skimage",
-    "sklearn.decomposition",
     "tomlkit",
     "torch",
     "trimesh",

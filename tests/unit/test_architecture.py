@@ -1,12 +1,18 @@
 """Imports point one way, and heavy or global things stay where they belong."""
 
 import ast
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from hostile.forked_program import LIBRARIES as FORKED_LIBRARIES
+
+from twin.store.fingerprint import LIBRARIES as FINGERPRINTED
 
 ROOT = Path(__file__).parents[2]
 OWN_ARRAYS = ("scenes/sensors/", "tests/golden/")  # tables of the specifications, and renders of ours to compare with
@@ -38,6 +44,8 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "demo",
     "cli",
 )
+BY_HAND = {"pyoidn"}  # installed by hand for the one measurement that needs it, as its head says
+NAMED_OTHERWISE = {"rerun": "rerun-sdk"}  # imported under another name than it is installed by, and not installed everywhere
 COMPOSITION_ROOTS = ("twin/cli/",)  # the outermost layer may join everything; nothing joins it (test_command_line)
 
 
@@ -157,3 +165,27 @@ def test_the_repository_holds_no_foreign_data():
     assert not strange
     too_large = [name for name in tracked if (ROOT / name).is_file() and (ROOT / name).stat().st_size > 2_000_000]
     assert not too_large
+
+
+def declared(*extras: str) -> set[str]:
+    """Distributions that pyproject.toml asks for, with those of some of its extras."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = project["dependencies"] + [line for extra in extras for line in project["optional-dependencies"][extra]]
+    return {re.split(r"[><=!\[ ]", line)[0].lower() for line in asked}
+
+
+@pytest.mark.parametrize(("folders", "extras"), [(tuple(MAY_IMPORT), ("rerun",)), (("tests",), ("rerun", "dev"))], ids=["product", "tests"])
+def test_what_is_imported_is_asked_for(folders, extras):
+    """A library that only happens to be installed is missing on the next machine."""
+    of_import = metadata.packages_distributions()
+    own = BY_HAND | set(MAY_IMPORT) | set(sys.stdlib_module_names) | {path.stem for path in (ROOT / "tests").rglob("*")}
+    for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
+        for name in sorted({name.split(".")[0] for name in imports_of(path)} - own):
+            distributions = {name.lower() for name in of_import.get(name, [NAMED_OTHERWISE.get(name, name)])}
+            assert distributions & declared(*extras), f"{path.relative_to(ROOT)} imports {name}: not in pyproject.toml"
+
+
+def test_what_is_named_as_a_library_is_asked_for():
+    assert set(FINGERPRINTED.values()) <= declared()
+    known = {name for name, distributions in metadata.packages_distributions().items() if {d.lower() for d in distributions} & declared()}
+    assert {name.split(".")[0] for name in FORKED_LIBRARIES} <= known

@@ -31,7 +31,6 @@ LIBRARIES = {  # import name -> distribution, of those whose version may change 
     "numpy": "numpy",
     "scipy": "scipy",
     "skimage": "scikit-image",
-    "sklearn": "scikit-learn",
     "torch": "torch",
     "trimesh": "trimesh",
 }

@@ -1,19 +1,19 @@
 """What an arm may do: a pure decision with a code before every move. Limits are data."""
 
-import tomllib
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, ValidationError
+from pydantic import AfterValidator
 
 from hardware.arms.arm import ArmState
 from hardware.arms.kinematics import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError
 from hardware.arms.motion import check_line, turn_between_deg
 from hardware.errors import DeviceError
-from scenes.base import NonNegative, Positive, Section
+from scenes.base import NonNegative, Positive, Section, SpecError
+from scenes.load import read_section
 
 SHIPPED_LIMITS = Path(__file__).parent / "limits"
 
@@ -57,12 +57,10 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
     if path.suffix != ".toml":
         path = SHIPPED_LIMITS / f"{name_or_path}.toml"
     try:
-        return SafetyLimits.model_validate(tomllib.loads(path.read_text()))
-    except OSError as error:
+        return read_section(path, SafetyLimits)
+    except SpecError as error:
         shipped = ", ".join(sorted(file.stem for file in SHIPPED_LIMITS.glob("*.toml")))
-        raise DeviceError(f"{path}: no such limits ({error.strerror}); give one of {shipped}, or the path of a TOML file") from error
-    except (tomllib.TOMLDecodeError, ValidationError) as error:
-        raise DeviceError(f"{path}: not valid limits: {error}; see {SHIPPED_LIMITS / 'mg400.toml'} for an example") from error
+        raise DeviceError(f"{error}; give one of {shipped}, or the path of a TOML file like {SHIPPED_LIMITS / 'mg400.toml'}") from error
 
 
 class Code(StrEnum):

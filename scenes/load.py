@@ -9,12 +9,12 @@ from pydantic import BaseModel, ValidationError
 
 from scenes.base import SpecError
 from scenes.experiment import ExperimentSpec
+from scenes.files import LONGEST_SHOWN, read_toml, shown
 from scenes.object import MeshShape, ObjectSpec
 from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
 from scenes.servo import ServoSpec
 from scenes.tables import fill_in_tables
-from scenes.toml_file import LONGEST_SHOWN, read_toml, shown
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
@@ -60,7 +60,7 @@ def load_sensor(name_or_path: str | Path) -> SensorSpec:
     SpecError
         If there is no such sensor, or its file is wrong: names file, key and remedy.
     """
-    return _read(_find(name_or_path, "sensors"), SensorSpec)
+    return read_section(_find(name_or_path, "sensors"), SensorSpec)
 
 
 def load_object(name_or_path: str | Path) -> ObjectSpec:
@@ -78,7 +78,7 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
         mesh = MeshShape(kind="mesh", file=str(path.resolve()))
         return _checked({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
     spec_path = _find(name_or_path, "objects")
-    spec = _read(spec_path, ObjectSpec)
+    spec = read_section(spec_path, ObjectSpec)
     if isinstance(spec.shape, MeshShape):
         file = (spec_path.parent / spec.shape.file).resolve()
         if not file.is_file():
@@ -95,7 +95,7 @@ def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
     SpecError
         If there is no such experiment, or its file is wrong: names file, key and remedy.
     """
-    return _read(_find(name_or_path, "experiments"), ExperimentSpec)
+    return read_section(_find(name_or_path, "experiments"), ExperimentSpec)
 
 
 def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
@@ -106,12 +106,12 @@ def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
     SpecError
         If there is no such randomisation, or its file is wrong: names file, key and remedy.
     """
-    return _read(_find(name_or_path, "randomisations"), RandomisationSpec)
+    return read_section(_find(name_or_path, "randomisations"), RandomisationSpec)
 
 
 def load_servo(name_or_path: str | Path) -> ServoSpec:
     """Load servo parameters by name or by the path of their TOML file; ``SpecError`` as the others."""
-    return _read(_find(name_or_path, "servos"), ServoSpec)
+    return read_section(_find(name_or_path, "servos"), ServoSpec)
 
 
 def _list(kind: str) -> dict[str, Path]:
@@ -139,8 +139,16 @@ def _find(name_or_path: str | Path, kind: str) -> Path:
     raise SpecError(f"no {kind[:-1]} named '{name_or_path}': {hint} ('twin {kind}' lists them; own files go to {user_spec_dir() / kind})")
 
 
-def _read(path: Path, model: type[Spec]) -> Spec:
-    return _checked({"name": path.stem} | read_toml(path), path, model)
+def read_section(path: Path, model: type[Spec]) -> Spec:
+    """A TOML file as the section that it must be; a section with a ``name`` has the file's stem, if the file gives no other.
+
+    Raises
+    ------
+    SpecError
+        The file can't be read, or is wrong: names file, key and remedy, on one line.
+    """
+    name = {"name": path.stem} if "name" in model.model_fields else {}
+    return _checked(name | read_toml(path), path, model)
 
 
 def _checked(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
@@ -156,7 +164,7 @@ def _checked(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
 
 def _explain(error: ValidationError, model: type[BaseModel]) -> str:
     problems = []
-    found = error.errors(include_url=False)
+    found = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")  # a misspelt key is missing, too
     for item in found[:MOST_PROBLEMS]:
         key = ".".join(shown(part) for part in item["loc"]) or "file"
         if item["type"] == "extra_forbidden":

@@ -10,9 +10,11 @@ not the reference: its dump and its digest cover them.
 """
 
 from collections.abc import Mapping, Sequence
-from math import prod
+from math import isfinite, prod
 from pathlib import Path
 from typing import TypeAlias
+
+from scenes.files import INT64, LARGEST_BYTES, read_regular, shown
 
 Nested: TypeAlias = "int | float | list[Nested] | tuple[Nested, ...]"
 """A number, or evenly nested lists of numbers."""
@@ -95,11 +97,13 @@ def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list
     if Path(file).name != file or not file.endswith(".csv"):
         raise ValueError(f"{key}: csv = '{file}' must be the name of a .csv file in the folder of the specification, without a folder")
     try:
-        lines = (folder / file).read_text(encoding="utf-8").splitlines()
+        lines = read_regular(folder / file, LARGEST_BYTES).decode("utf-8-sig").splitlines()
     except FileNotFoundError:
         raise ValueError(f"{key}: the table {folder / file} is missing; copy it together with the specification") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{key}: the table {folder / file} is not readable as text: {error}") from error
+    except OSError as error:
+        raise ValueError(f"{key}: the table {folder / file} can't be read ({error.strerror}); copy it anew with the specification") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{key}: the table {folder / file} is no UTF-8 text (byte {error.start}); save it as UTF-8") from error
     rows = [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
     if len(rows) != shape[0]:
         raise ValueError(f"{key}: {file} has {len(rows)} lines of numbers, but shape = {shape} needs {shape[0]}")
@@ -111,16 +115,22 @@ def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list
         try:
             values = [_number(word) for word in words]
         except ValueError as error:
-            raise ValueError(f"{key}: {file}, line {number}: {error}; give numbers with commas between them") from None
+            raise ValueError(f"{key}: {file}, line {number}: {shown(error)}; give numbers with commas between them") from None
         table.append(_folded(values, shape[1:]))
     return table
 
 
 def _number(word: str) -> int | float:
     try:
-        return int(word)
+        number = int(word)
     except ValueError:
-        return float(word)
+        value = float(word)
+        if not isfinite(value):
+            raise ValueError(f"'{word}' is no finite number") from None
+        return value
+    if number not in INT64:
+        raise ValueError("a whole number has more than 64 bits")
+    return number
 
 
 def _folded(values: Sequence[int | float], shape: Sequence[int]) -> Nested:

@@ -7,9 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hardware.safety import load_limits
 from scenes import SpecError, load_experiment, load_object, load_randomisation, load_sensor, load_servo
+from scenes.files import DEEPEST, LARGEST_BYTES
 from scenes.load import SHIPPED
-from scenes.toml_file import DEEPEST, LARGEST_BYTES
+from twin.errors import TwinError
+from twin.judge.degradation.plan import load_plan
+from twin.pins import load_detector
 
 LONGEST_MESSAGE = 1000  # characters: what a terminal shows at once
 BALL = 'description = "a ball"\nshape = { kind = "sphere", radius_mm = 4.0 }\n'
@@ -24,7 +28,7 @@ def one_line(caught, *words) -> None:
 
 
 def refused(load, path: Path, *words) -> None:
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises((SpecError, TwinError)) as caught:
         load(path)
     one_line(caught, str(path), *words)
 
@@ -75,7 +79,10 @@ def test_whole_numbers_serve_where_any_number_does(tmp_path):
     assert load_object(path).shape.radius_mm == 4.0
 
 
-@pytest.mark.parametrize("load", [load_sensor, load_object, load_experiment, load_randomisation, load_servo])
+LOADERS = [load_sensor, load_object, load_experiment, load_randomisation, load_servo, load_detector, load_plan, load_limits]
+
+
+@pytest.mark.parametrize("load", LOADERS)
 @pytest.mark.parametrize(
     ("content", "word"),
     [
@@ -89,14 +96,21 @@ def test_whole_numbers_serve_where_any_number_does(tmp_path):
         (b"\xff\xfea\x00=\x001\x00", "UTF-8"),
         (b"a = \x00", "TOML"),
         (b"\x80\x02]q\x00.", "UTF-8"),
-        (b"", "missing"),
+        (b"a = 1", "unknown key 'a'"),
     ],
-    ids=["open", "nested", "dotted", "digits", "hex", "bits", "large", "utf16", "nul", "pickle", "empty"],
+    ids=["open", "nested", "dotted", "digits", "hex", "bits", "large", "utf16", "nul", "pickle", "key"],
 )
 def test_a_file_without_bound_is_refused_in_one_line(tmp_path, load, content, word):
     path = tmp_path / "mine.toml"
     path.write_bytes(content)
     refused(load, path, word)
+
+
+@pytest.mark.parametrize("load", [load for load in LOADERS if load is not load_plan])  # a sweep without a key is everything as it is
+def test_an_empty_file_is_told_what_it_lacks(tmp_path, load):
+    path = tmp_path / "mine.toml"
+    path.write_bytes(b"")
+    refused(load, path, "missing")
 
 
 def test_a_long_value_is_shown_by_its_beginning(tmp_path):
@@ -118,10 +132,45 @@ def test_a_byte_order_mark_is_no_content(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_a_named_pipe_is_not_waited_for(tmp_path):
+@pytest.mark.parametrize("load", LOADERS)
+def test_a_named_pipe_is_not_waited_for(tmp_path, load):
     path = tmp_path / "mine.toml"
     os.mkfifo(path)
-    refused(load_sensor, path, "no such file")
+    refused(load, path)
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs an endless device")
+@pytest.mark.parametrize("load", LOADERS)
+def test_an_endless_device_is_not_read(tmp_path, load):
+    path = tmp_path / "mine.toml"
+    path.symlink_to("/dev/zero")
+    refused(load, path)
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        (b"9" * 5000, "line 1"),
+        (b"9" * 4000, "64 bits"),
+        (b"x" * 5000, "line 1"),
+        (b"\xff\xfe1\x00", "UTF-8"),
+        (b"1," * LARGEST_BYTES, "larger"),
+    ],
+    ids=["digits", "bits", "text", "utf16", "large"],
+)
+def test_a_hostile_table_of_a_specification_is_one_line(tmp_path, content, word):
+    path = tmp_path / "mine.toml"
+    path.write_text(BALL.replace("4.0", '{ csv = "mine.csv", shape = [1] }'))
+    (tmp_path / "mine.csv").write_bytes(content)
+    refused(load_object, path, "mine.csv", word)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_table_that_is_a_named_pipe_is_not_waited_for(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(BALL.replace("4.0", '{ csv = "mine.csv", shape = [1] }'))
+    os.mkfifo(tmp_path / "mine.csv")
+    refused(load_object, path, "mine.csv", "named pipe")
 
 
 def test_a_folder_is_no_specification(tmp_path):
@@ -206,13 +255,16 @@ def test_any_value_of_any_key_loads_or_is_explained(tmp_path_factory, key, value
 
 
 @settings(max_examples=150, deadline=None)
-@given(content=st.binary(max_size=400) | st.text(max_size=400).map(str.encode))
-def test_any_bytes_are_one_line(tmp_path_factory, content):
+@given(load=st.sampled_from(LOADERS), content=st.binary(min_size=1, max_size=400) | st.text(min_size=1, max_size=400).map(str.encode))
+def test_any_bytes_are_one_line(tmp_path_factory, load, content):
     path = tmp_path_factory.mktemp("any") / "mine.toml"
     path.write_bytes(content)
-    with pytest.raises(SpecError) as caught:
-        load_sensor(path)
-    one_line(caught, str(path))
+    try:
+        load(path)
+    except (SpecError, TwinError) as error:
+        assert str(path) in str(error) and len(str(error).splitlines()) == 1 and len(str(error)) < LONGEST_MESSAGE
+    else:
+        assert load is load_plan, "a comment or white space alone is a sweep of everything, and nothing else"
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,13 +1,13 @@
 """The parameters of a way to find pins: what ``twin tune`` writes and ``--pipeline`` takes."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import tomlkit
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from scenes.base import Fraction, Positive, Section
+from scenes.base import Fraction, Name, Positive, Section, SpecError
+from scenes.load import read_section
 from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec
@@ -54,7 +54,7 @@ class DetectorSpec(Section):
     rest, in the specification's order (without them: the specification's own layout).
     """
 
-    name: str
+    name: Name
     method: Method
     form: Annotated[Form, Field(strict=False)] = Form.RAW  # files hold its text
     blob: BlobSpec
@@ -89,20 +89,9 @@ def load_detector(path: Path) -> DetectorSpec:
         It is no such file; names key and remedy.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-        return DetectorSpec.model_validate({"name": path.stem} | data)
-    except OSError as error:
-        raise FrameError(
-            f"{path}: can't be read ({error.strerror}); give a file written by 'twin tune', or one of {', '.join(METHODS)}"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FrameError(
-            f"{path}: not readable as TOML ({error}); give a file written by 'twin tune', or one of {', '.join(METHODS)}"
-        ) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise FrameError(f"{path}: {key}: {first['msg']}; give a file written by 'twin tune'") from error
+        return read_section(path, DetectorSpec)
+    except SpecError as error:
+        raise FrameError(f"{error}; give a file written by 'twin tune', or one of {', '.join(METHODS)}") from error
 
 
 def write_detector(path: Path, detector: DetectorSpec, comment: str = "") -> None:

@@ -1,14 +1,14 @@
 """A sweep as a file: which conditions, how far, in which steps, which pairs."""
 
-import tomllib
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from scenes.base import Section
+from scenes.base import Section, SpecError
+from scenes.load import read_section
 from twin.errors import TwinError
 from twin.judge.degradation.condition import Case, Condition
 from twin.judge.degradation.conditions import CONDITIONS, condition
@@ -84,12 +84,6 @@ def load_plan(path: Path) -> SweepPlan:
         It can't be read, or a key or name is unknown.
     """
     try:
-        return SweepPlan.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise TwinError(f"{path}: can't be read ({error.strerror}); give a TOML file as 'twin robustness --help' shows it") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise TwinError(f"{path}: not readable as TOML: {error}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise TwinError(f"{path}: {key}: {first['msg']}; known: steps, pairs, and [[condition]] with name and severe") from error
+        return read_section(path, SweepPlan)
+    except SpecError as error:
+        raise TwinError(f"{error}; 'twin robustness --help' shows such a file") from error

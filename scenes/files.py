@@ -1,12 +1,14 @@
-"""Reading a TOML file from anywhere: bounded in size, depth and numbers, whatever was written into it."""
+"""Reading files from anywhere, bounded: any file in size; a TOML file also in depth and numbers, whatever was written into it."""
 
+import errno
+import stat
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 from scenes.base import SpecError
 
-LARGEST_BYTES = 4_000_000  # the largest shipped specification, with measured light and caps, has 0.17 MB
+LARGEST_BYTES = 4_000_000  # of a TOML file; the largest shipped specification, with measured light and caps, has 0.17 MB
 DEEPEST = 16  # tables and arrays within each other; the shipped ones have at most 5
 INT64 = range(-(2**63), 2**63)  # the whole numbers of TOML (v1.0.0, "Integer")
 
@@ -20,6 +22,37 @@ def shown(part: object, most: int = LONGEST_SHOWN) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
+def require_regular(path: Path) -> None:
+    """Refuse what would never end or never begin to be read: named pipes, devices, sockets; and folders.
+
+    Raises
+    ------
+    OSError
+        There is no file, or it is none of these; ``strerror`` says which.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        raise OSError(errno.EISDIR, "a folder, not a file", str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "a named pipe or a device, not a file", str(path))
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """The content of a regular file of at most ``most_bytes`` bytes.
+
+    Raises
+    ------
+    OSError
+        It can't be read, is larger, or is no regular file; ``strerror`` says why.
+    """
+    require_regular(path)
+    with path.open("rb") as file:
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise OSError(errno.EFBIG, f"larger than {most_bytes / 1e6:g} MB", str(path))
+    return content
+
+
 def read_toml(path: Path) -> dict[str, object]:
     """The content of a TOML file; a byte order mark is no part of it.
 
@@ -29,12 +62,9 @@ def read_toml(path: Path) -> dict[str, object]:
         It can't be read, is no TOML, or goes beyond the bounds above; names the file and the remedy, on one line.
     """
     try:
-        with path.open("rb") as file:
-            raw = file.read(LARGEST_BYTES + 1)
+        raw = read_regular(path, LARGEST_BYTES)
     except OSError as error:
-        raise SpecError(f"{path}: can't be read ({error.strerror})") from error
-    if len(raw) > LARGEST_BYTES:
-        raise SpecError(f"{path}: larger than {LARGEST_BYTES / 1e6:g} MB, which no specification is; give another file")
+        raise SpecError(f"{path}: can't be read ({error.strerror}); give the path of a TOML file") from error
     try:
         data = tomllib.loads(raw.decode("utf-8-sig"))
     except UnicodeDecodeError as error:

@@ -4,6 +4,8 @@ The classes of errors are those that users of LeRobot expect. A ``Connection`` i
 is left.
 """
 
+import errno
+import socket
 from abc import ABC, abstractmethod
 from typing import Self
 
@@ -24,6 +26,15 @@ class DeviceAlreadyConnectedError(DeviceError, ConnectionError):
 
 class StaleDataError(DeviceError):
     """The newest frame or feedback is older than allowed."""
+
+
+def cannot_listen(who: str, host: str, port: int, error: OSError, *, option: str = "--port") -> DeviceError:
+    """The error to raise where a server can't listen: names address, reason and remedy; ``option`` is that of the port."""
+    foreign = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
+    remedy = (
+        "give an address of this machine with --host, such as 127.0.0.1" if foreign else f"end what uses the port, or give another {option}"
+    )
+    return DeviceError(f"{who}: can't listen on {host}:{port} ({error.strerror}); {remedy}")
 
 
 class Connection(ABC):

@@ -1,6 +1,6 @@
 """Whether the sensor in hand is well: frames of a camera, or of what was recorded, examined."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from hardware.cameras.choose import open_camera
@@ -17,9 +17,10 @@ LIMIT = 20  # frames that are looked at
 
 @dataclass(frozen=True)
 class Examination:
-    """What was found."""
+    """What was found, and what was odd in the recording."""
 
     findings: list[Finding]
+    notes: list[str] = field(default_factory=list)
 
     @property
     def bad(self) -> bool:
@@ -27,8 +28,8 @@ class Examination:
         return any(found.verdict is Grade.BAD for found in self.findings)
 
     def lines(self) -> list[str]:
-        """For people: each finding, and below it what to do."""
-        lines = []
+        """For people: each finding, and below it what to do; and what was odd."""
+        lines = [f"note: {note}" for note in self.notes]
         for found in self.findings:
             lines.append(f"{found.verdict.upper():5} {found.name:10} {found.text}")
             if found.remedy:
@@ -67,15 +68,16 @@ def examine_sensor(
         raise FrameError(
             f"{detector.name}: tuned for method '{detector.method}', --pipeline takes method 'twin'; run 'twin tune' without --method"
         )
-    frames = frames_of(source, sensor, form, limit)
+    frames, notes = frames_of(source, sensor, form, limit)
     with stage(progress, "frames") as step:
-        return Examination(examine(frames, sensor, detector, progress=step))
+        return Examination(examine(frames, sensor, detector, progress=step), notes)
 
 
-def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: int) -> list[Frame]:
-    """The next ``limit`` frames of a camera, or as many, evenly spread, of what was recorded."""
+def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: int) -> tuple[list[Frame], list[str]]:
+    """The next ``limit`` frames of a camera, or as many, evenly spread, of what was recorded; and what was odd in the recording."""
     camera = open_camera(source, sensor, form)
     if not camera.is_live:
-        return evenly_read(open_recording(Path(source), sensor, form), limit)
+        recording = open_recording(Path(source), sensor, form)
+        return evenly_read(recording, limit), recording.problems
     with camera:
-        return [await_frame(camera) for _ in range(limit)]
+        return [await_frame(camera) for _ in range(limit)], []

@@ -27,6 +27,10 @@ GIVE_UP_S = 5.0
 # Rate in Hz from which the loop's period is set if no rate is given. Then each decision waits for the move before it, and the period is
 # only the pause after a frame that could not be used.
 STREAM_HZ = 10.0
+# Decisions a second that may be asked for: no camera is faster than the last, and an arm does not wait longer than with the first.
+SLOWEST_HZ, FASTEST_HZ = 0.1, 1000.0
+# Steps that may be asked for: the arm would be at work for days.
+MOST_STEPS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,12 @@ class FollowPlan:
     plain_light: bool = False
     known_place: bool = False
     at_rest: str = FIRST
+
+    def __post_init__(self) -> None:
+        if self.stream_hz is not None and not SLOWEST_HZ <= self.stream_hz <= FASTEST_HZ:
+            raise DeviceError(f"--rate {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
+        if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
+            raise DeviceError(f"--steps {self.steps}: expected 1 to {MOST_STEPS}")
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hardware.cameras.choose import open_camera
+from hardware.cameras.recorded import SequentialSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.rig import FIRST, NONE, counting_from_first, given_frame
@@ -23,6 +24,7 @@ from hardware.timing import Spread, Timing
 from hardware.view.draw import WindowView, draw_view, has_window
 from hardware.view.rerun import RerunView
 from hardware.view.server import BrowserView
+from twin.errors import FrameError
 from twin.pins import Pipeline
 from twin.types import Frame
 
@@ -77,6 +79,8 @@ class LiveSession:
         ------
         DeviceError
             The camera has ended, or delivers no frame.
+        FrameError
+            A frame is not one of the model's sensor.
         """
         self._begun_s = time.monotonic()
         while going() and (most is None or self.count < most) and (seconds is None or time.monotonic() - self._begun_s < seconds):
@@ -87,7 +91,10 @@ class LiveSession:
             except TimeoutError as error:
                 raise DeviceError(f"{error}; check the camera") from error
             taken_s = time.monotonic()
-            estimate = self.estimator(frame)
+            try:
+                estimate = self.estimator(frame)
+            except FrameError as error:
+                raise FrameError(f"{self.source.name}: {error}") from error
             now_s = time.monotonic()
             if self.source.is_live:
                 self._ages.append(taken_s - frame.time_s)
@@ -272,6 +279,8 @@ class Watched:
         Folder of the recorded session.
     frames : int
         Number of frames.
+    notes : list of str
+        What was odd in the recording or session.
     """
 
     timing: Timing
@@ -279,10 +288,12 @@ class Watched:
     same: tuple[int, int] | None
     record: Path | None
     frames: int
+    notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """The result in words."""
         lines = ["ended"] if self.interrupted else []
+        lines += [f"note: {note}" for note in self.notes]
         lines += self.timing.lines()
         if self.same is not None:
             lines.append(f"{self.same[0]} of {self.same[1]} estimates are those that were recorded")
@@ -348,7 +359,8 @@ def watch(
         except KeyboardInterrupt:
             interrupted = True
         same = (same_estimates(source.steps, found), len(found)) if isinstance(source, SessionSource) else None
-        return Watched(session.timing(), interrupted, same, plan.record, session.count)
+        notes = source.notes() if isinstance(source, SequentialSource) else []
+        return Watched(session.timing(), interrupted, same, plan.record, session.count, notes)
 
 
 def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Frame | None) -> tuple[SensorModel, Frame | None]:

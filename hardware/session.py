@@ -12,9 +12,12 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from hardware.cameras.recorded import SequentialSource
 from hardware.errors import DeviceError
+from scenes.base import Name
+from scenes.files import read_regular, shown
 from twin.errors import FrameError
 from twin.frames.images import read_image, write_image
 from twin.store import write_json
@@ -22,6 +25,8 @@ from twin.types import Form, Frame
 
 ABOUT, STEPS, FRAMES, REST = "session.json", "steps.jsonl", "frames", "rest.png"
 VERSION = 1
+LARGEST_BYTES = 1_000_000_000  # of the steps: a million of them, which a day at 10 Hz has
+LARGEST_ABOUT_BYTES = 1_000_000  # of what the session is
 
 
 def is_session(path: str | Path) -> bool:
@@ -80,15 +85,53 @@ class SessionWriter:
         self.close()
 
 
+class _FrameLine(BaseModel):
+    """What a step's line says about its frame."""
+
+    file: Name
+    name: str
+    form: Form
+    time_s: float
+    sequence: int
+
+
+class _StepLine(BaseModel):
+    """What a replay needs of a step's line."""
+
+    step: int
+    frame: _FrameLine
+    value: list[float | None] = []
+
+
 def read_steps(folder: str | Path) -> list[dict]:
-    """Every complete step of a session; a line that was being written when it ended is left out."""
-    steps = []
-    for line in (Path(folder) / STEPS).read_text(encoding="utf-8", errors="replace").split("\n")[:-1]:
+    """Every complete step of a session; a line that was being written when it ended is left out, with all after it.
+
+    Raises
+    ------
+    FrameError
+        The file can't be read.
+    """
+    return _steps_and_note(Path(folder))[0]
+
+
+def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
+    """A session's complete steps, and what is wrong with the line after them ("" if there is none)."""
+    try:
+        text = read_regular(folder / STEPS, LARGEST_BYTES).decode("utf-8", "replace")
+    except OSError as error:
+        raise FrameError(f"{folder}: {STEPS} can't be read ({error.strerror}); give the folder of a session") from error
+    steps: list[dict] = []
+    lines = text.split("\n")
+    for line in lines[:-1]:
         try:
-            steps.append(json.loads(line))
-        except ValueError:
+            step = json.loads(line)
+        except (ValueError, RecursionError):
             break
-    return steps
+        if not isinstance(step, dict):
+            break
+        steps.append(step)
+    whole = len(steps) == len(lines) - 1 and not lines[-1]
+    return steps, "" if whole else f"{STEPS}: line {len(steps) + 1} is cut or damaged; the {len(steps)} steps before it are read"
 
 
 class SessionSource(SequentialSource):
@@ -97,30 +140,79 @@ class SessionSource(SequentialSource):
     Parameters
     ----------
     folder : path
+
+    Raises
+    ------
+    FrameError
+        The folder holds no session, one of another version, or a damaged one. A line that was being written when the session ended is
+        no damage.
     """
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         if not is_session(self.folder):
             raise FrameError(f"{folder}: holds no recorded session ({ABOUT} and {STEPS} are expected); '--record DIR' writes one")
-        self.about = json.loads((self.folder / ABOUT).read_text())
-        self.steps = read_steps(self.folder)
+        self.about = self._read_about()
+        self.steps, note = _steps_and_note(self.folder)
         if not self.steps:
-            raise FrameError(f"{folder}: the session ended before its first step; nothing to replay")
-        super().__init__(str(folder), Form(self.steps[0]["frame"]["form"]))
+            raise FrameError(f"{folder}: {note or 'the session ended before its first step'}; nothing to replay, record it again")
+        self._lines = [self._checked(number, step).frame for number, step in enumerate(self.steps, 1)]
+        loose = {path.name for path in (self.folder / FRAMES).glob("*.png")} - {line.file for line in self._lines}
+        loose_note = f"{len(loose)} pictures in {FRAMES}/ have no step in {STEPS}: the session was cut" if loose else ""
+        self._notes = [each for each in (note, loose_note) if each]
+        super().__init__(str(folder), self._lines[0].form)
+
+    def _read_about(self) -> dict:
+        try:
+            about = json.loads(read_regular(self.folder / ABOUT, LARGEST_ABOUT_BYTES).decode("utf-8-sig"))
+        except OSError as error:
+            raise FrameError(f"{self.folder}: {ABOUT} can't be read ({error.strerror}); copy the session again") from error
+        except (ValueError, RecursionError) as error:
+            raise FrameError(f"{self.folder}: {ABOUT} is no JSON; copy the session again") from error
+        if not isinstance(about, dict) or "version" not in about:
+            raise FrameError(f"{self.folder}: {ABOUT} is not that of a session; copy the session again")
+        if about["version"] != VERSION:
+            version = shown(about["version"])
+            raise FrameError(
+                f"{self.folder}: {ABOUT} is of version {version}, expected {VERSION}; replay it with the program that wrote it"
+            )
+        return about
+
+    def _checked(self, number: int, step: dict) -> _StepLine:
+        try:
+            line = _StepLine.model_validate(step)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            key, problem = ".".join(shown(part) for part in first["loc"]), shown(first["msg"].removeprefix("Value error, "))
+            raise FrameError(f"{self.folder}: {STEPS}, line {number}: {key}: {problem}; copy the session again") from error
+        if line.step != number - 1:
+            raise FrameError(f"{self.folder}: {STEPS}, line {number} is of step {line.step}: lines are missing; copy the session again")
+        return line
+
+    def _picture(self, name: str) -> np.ndarray:
+        """A picture of the session by its path in the folder; one that lies elsewhere is not read, even where a link leads to it."""
+        path = self.folder / name
+        if not path.resolve().is_relative_to(self.folder.resolve()):
+            raise FrameError(f"{self.folder}: {name} is a link to outside the session; put the picture itself there")
+        try:
+            return read_image(path)[0]
+        except FrameError as error:
+            raise FrameError(f"{self.folder}: {error}") from error
 
     @property
     def rest(self) -> Frame | None:
         """The frame without contact that pins were counted from; None if they were counted from the nominal layout."""
         if not (self.folder / REST).is_file():
             return None
-        return Frame(read_image(self.folder / REST)[0], self.form, REST)
+        return Frame(self._picture(REST), self.form, REST)
+
+    def notes(self) -> list[str]:
+        return self._notes
 
     def _frames(self) -> Iterator[Frame]:
-        for step in self.steps:
-            about = step["frame"]
-            image, _ = read_image(self.folder / FRAMES / about["file"])
-            yield Frame(image, Form(about["form"]), about["name"], about["time_s"], about["sequence"])
+        for line in self._lines:
+            image = self._picture(f"{FRAMES}/{line.file}")
+            yield Frame(image, line.form, line.name, line.time_s, line.sequence)
 
 
 def plain(value: object) -> object:

@@ -159,10 +159,11 @@ def _checked(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise SpecError(f"{path}: {_explain(error, model)}") from error
+        raise SpecError(f"{path}: {explained(error, model)}") from error
 
 
-def _explain(error: ValidationError, model: type[BaseModel]) -> str:
+def explained(error: ValidationError, model: type[BaseModel]) -> str:
+    """What is wrong, key by key, in one line."""
     problems = []
     found = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")  # a misspelt key is missing, too
     for item in found[:MOST_PROBLEMS]:

@@ -101,7 +101,7 @@ def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list
     except FileNotFoundError:
         raise ValueError(f"{key}: the table {folder / file} is missing; copy it together with the specification") from None
     except OSError as error:
-        raise ValueError(f"{key}: the table {folder / file} can't be read ({error.strerror}); copy it anew with the specification") from error
+        raise ValueError(f"{key}: the table {folder / file} can't be read ({error.strerror}); copy it anew") from error
     except UnicodeDecodeError as error:
         raise ValueError(f"{key}: the table {folder / file} is no UTF-8 text (byte {error.start}); save it as UTF-8") from error
     rows = [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]

@@ -5,6 +5,7 @@ import json
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from pickle import UnpicklingError
 from time import perf_counter
@@ -102,11 +103,7 @@ class PoseEstimator:
         run = folder_of(run)
         packed = (run / WEIGHTS).is_file()
         if not packed and not (run / "weights.pt").is_file():
-            hint = (
-                "it was begun and not finished; continue it with 'twin train'"
-                if (run / "checkpoint.pt").is_file()
-                else f"'twin train' writes one; weights for {', '.join(shipped_names())} go with the package: give the name instead"
-            )
+            hint = "it was begun and not finished; continue it with 'twin train'" if (run / "checkpoint.pt").is_file() else _instead_of(run)
             raise TrainingError(f"{run}: holds no trained model: {hint}")
         try:
             config = json.loads((run / "config.json").read_text())
@@ -209,6 +206,16 @@ class PoseEstimator:
         if not isinstance(self.part, PinModel):
             raise TrainingError(f"{self.model} estimates from pictures, not from pins; give the frames themselves")
         return self.part
+
+
+def _instead_of(run: Path) -> str:
+    """What to give in place of a folder that holds no model: the shipped or neighbouring one with the nearest name, if there is one."""
+    shipped = shipped_names()
+    beside = [folder.name for folder in run.parent.iterdir() if (folder / "config.json").is_file()] if run.parent.is_dir() else []
+    near = get_close_matches(run.name, [*(shipped if run.name == str(run) else []), *beside], n=1)
+    if near:
+        return f"did you mean '{near[0] if near[0] in shipped and near[0] not in beside else run.with_name(near[0])}'?"
+    return f"'twin train' writes one; weights for {', '.join(shipped)} go with the package: give the name instead"
 
 
 def folder_of(run: str | Path) -> Path:

@@ -96,11 +96,13 @@ def choose_targets(
     """
     names = PRESETS.get(columns, (columns,)) if isinstance(columns, str) else tuple(columns)
     if not recording.labels:
-        raise FrameError(f"{recording.path}: no table of labels; targets.csv with {', '.join(names)} is expected beside the frames")
+        raise FrameError(
+            f"{recording.path}: no labels ({recording.labels_found()}); targets.csv with {', '.join(names)} is expected beside the frames"
+        )
     missing = [name for name in names if name not in recording.labels]
     if missing:
         raise FrameError(
-            f"{recording.path}: column {', '.join(missing)} is missing; found {', '.join(recording.labels)}; "
+            f"{recording.path}: column {', '.join(missing)} is missing; {recording.labels_found()}; "
             f"choose columns of these, or one of {', '.join(PRESETS)}"
         )
     raw = np.column_stack([_numbers(recording.labels[name], name, problems) for name in names])[rows]

@@ -54,6 +54,12 @@ def outcomes(make: Callable[[str, int], Made], text: str, todo: list[int], *, wo
         yield from _by_cluster(client, make, text, todo, scheduler)
 
 
+def require_scheduler(address: str) -> None:
+    """Raise ``DatasetError`` where no Dask scheduler answers, before anything is written for its workers."""
+    with _client(1, address):
+        pass
+
+
 @contextmanager
 def _client(workers: int, scheduler: str) -> Iterator["Client"]:
     """A client of a running scheduler, or of a cluster on this machine that ends with the context."""

@@ -33,6 +33,10 @@ class SequentialSource(Connection):
     def _frames(self) -> Iterator[Frame]:
         """All frames from the first on."""
 
+    def notes(self) -> list[str]:
+        """What was odd in what has been read so far, one line each."""
+        return []
+
     @property
     def is_connected(self) -> bool:
         return self._left is not None
@@ -77,6 +81,10 @@ class RecordedSource(SequentialSource):
     def __init__(self, path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> None:
         self.recording: Recording = open_recording(path, spec, form)
         super().__init__(str(path), self.recording.form)
+
+    def notes(self) -> list[str]:
+        failed = (f"skipped {bad['image_name']}: {bad['reason']}" for bad in self.recording.failed)
+        return [*self.recording.problems, *failed]
 
     def _frames(self) -> Iterator[Frame]:
         return iter(self.recording)

@@ -10,7 +10,7 @@ import numpy as np
 from hardware.cameras.mjpeg import CONTENT_TYPE, jpeg_of, write_part
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import Faults
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, cannot_listen
 from twin.errors import TwinError
 
 CLIENT_WAIT_S = 0.5
@@ -77,9 +77,7 @@ class CameraEmulator:
         try:
             self._server = _Server(self._address, _handler_of(self))
         except OSError as error:
-            raise DeviceError(
-                f"camera emulator: can't listen on {self._address[0]}:{self._address[1]} ({error.strerror}); give another --port"
-            ) from error
+            raise cannot_listen("camera emulator", *self._address, error) from error
         self._end.clear()
         self._source.connect()
         try:

@@ -26,6 +26,7 @@ from hardware.emulators.faults import Faults
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
 from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
+from hardware.errors import cannot_listen
 from twin.errors import TwinError
 
 PORTS = (DASHBOARD_PORT, MOTION_PORT, *FEEDBACK_PERIOD_S)
@@ -131,8 +132,8 @@ class Mg400Emulator:
 
         Raises
         ------
-        TwinError
-            A port is taken.
+        DeviceError
+            A port is taken, or the host is not this machine's.
         """
         deaf = {MOTION_PORT} if "motion-port-closed" in self.faults else set()
         deaf |= set(FEEDBACK_PERIOD_S) if "no-feedback" in self.faults else {30004} if "no-fast-feedback" in self.faults else set()
@@ -144,10 +145,7 @@ class Mg400Emulator:
                 listener.bind((self.host, 0 if self._port_offset is None else port + self._port_offset))
             except OSError as error:
                 self.stop()
-                raise TwinError(
-                    f"can't listen on {self.host}:{port + (self._port_offset or 0)} ({error.strerror}); "
-                    "end what uses the port (another emulator?), or give another --port-offset"
-                ) from error
+                raise cannot_listen("mg400", self.host, port + (self._port_offset or 0), error, option="--port-offset") from error
             self.ports[port] = listener.getsockname()[1]
             if port not in deaf:
                 listener.listen()

@@ -8,7 +8,9 @@ from typing import Any
 
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import OLD_FIRMWARE, Mg400Emulator
+from hardware.errors import DeviceError
 
+SLOWEST, FASTEST = 1e-3, 1e3  # times the real arm's speed: beyond these a move takes hours, or no time at all
 CHECK_S = 0.5  # between two looks at whether the emulator failed
 
 
@@ -70,6 +72,7 @@ def emulate_mg400(
     lenient : bool
         As firmware 1.5.5, whatever ``firmware`` says: bare echoes, no reply to moves.
     """
+    _require_time_scale(time_scale)
     version = OLD_FIRMWARE if lenient else firmware
     arm = Mg400Emulator(host=host, port_offset=port_offset, faults=faults, firmware=version, time_scale=time_scale)
     run_until_told(arm, lambda: f"mg400 {host} {' '.join(str(port) for port in arm.ports.values())}", on_ready=on_ready)
@@ -79,8 +82,14 @@ def emulate_magician(
     *, link: Path | None = None, faults: tuple[str, ...] = (), time_scale: float = 1.0, on_ready: Callable[[str], None] = say
 ) -> None:
     """Emulate a Dobot Magician on a pseudo-terminal until told to end; see ``MagicianEmulator``."""
+    _require_time_scale(time_scale)
     arm = MagicianEmulator(link=link, faults=faults, time_scale=time_scale)
     run_until_told(arm, lambda: f"magician {link or arm.device}", on_ready=on_ready)
+
+
+def _require_time_scale(time_scale: float) -> None:
+    if not SLOWEST <= time_scale <= FASTEST:
+        raise DeviceError(f"--time-scale {time_scale:g}: expected {SLOWEST:g} to {FASTEST:g} times the real arm's speed")
 
 
 def fault_lines(known: dict[str, tuple[float | None, str]]) -> list[str]:

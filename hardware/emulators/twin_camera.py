@@ -92,7 +92,8 @@ def emulate_camera(
         Without path tracing at the start; see ``hardware.rig.drawn``.
     """
     placed = PlacedObject(stimulus, servo.placement, Mounting.of(sensor, load_experiment(servo.experiment)))
-    with FeedbackPose.of(arm) as pose:
-        source = twin_camera(sensor, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
-        device = CameraEmulator(source, host=host, port=port, faults=faults)
+    pose = FeedbackPose.of(arm)
+    source = twin_camera(sensor, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
+    device = CameraEmulator(source, host=host, port=port, faults=faults)
+    with pose:
         run_until_told(device, lambda: f"camera {device.url}", lambda: device.error, on_ready=on_ready)

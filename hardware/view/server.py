@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 
 from hardware.cameras.mjpeg import CONTENT_TYPE, jpeg_of, write_part
-from hardware.errors import DeviceError
+from hardware.errors import cannot_listen
 from twin.report.page import render_page
 
 # Interval in s at which a stream looks whether the view was closed.
@@ -33,7 +33,7 @@ class BrowserView:
         try:
             self._server = ThreadingHTTPServer((host, port), self._handler())
         except OSError as error:
-            raise DeviceError(f"view: can't listen on {host}:{port} ({error.strerror}); give another --port") from error
+            raise cannot_listen("view", host, port, error) from error
         self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, name="view", daemon=True)
 

@@ -271,3 +271,16 @@ def test_labels_say_where_the_arm_was_sent_however_far_it_gives_way(tmp_path):
         told.append(load_dataset(tmp_path / name, sensor, "surface-2d").targets.corrected)
         pressed.append(zarr.open_group(tmp_path / name / "truth.zarr", mode="r")["force_n"][:, 2])
     assert np.abs(told[0] - told[1]).max() < ARC_MM and (pressed[1] < 0.95 * pressed[0]).all()
+
+
+@pytest.mark.parametrize("count", [0, -1, 2_000_000_000, 99_999_999_999_999_999_999])
+def test_a_count_beyond_all_bounds_is_refused_before_anything_is_made(tmp_path, count):
+    with pytest.raises(DatasetError, match=rf"--count {count}: a data set has 1 to \d+ contacts"):
+        generate(tmp_path / "out", small_config(tmp_path), count)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scheduler_that_does_not_answer_leaves_nothing_behind(tmp_path):
+    with pytest.raises(DatasetError, match="--scheduler nowhere: no scheduler answers"):
+        generate(tmp_path / "out", small_config(tmp_path), 1, scheduler="nowhere")
+    assert not (tmp_path / "out").exists()

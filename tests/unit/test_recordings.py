@@ -9,13 +9,17 @@ import cv2
 import numpy as np
 import pytest
 from drawn_frames import drawn_frame, smooth_warp
+from PIL import Image
 
 from scenes import load_sensor
+from training.targets import choose_targets
 from twin.errors import FrameError, StoreError
 from twin.frames import natural_key, open_recording, read_image
 from twin.frames.images import write_image
+from twin.frames.recording import _is_cut
 from twin.pins import nominal_reference
 from twin.pins.batch import overlay_name, preprocess_recording
+from twin.rig.labels import read_arm_labels
 from twin.types import Form
 
 
@@ -190,6 +194,113 @@ def test_a_video_gives_its_frames(video, spec, tmp_path):
     assert preprocess_recording(video, spec, tmp_path / "out")["exact_fraction"] == 1.0
 
 
+@pytest.mark.parametrize("share", [0.4, 0.55, 0.7, 0.9, 0.98])
+def test_the_last_frame_of_a_cut_video_is_left_out_as_it_may_be_half_there(video, spec, share):
+    whole = [frame.image for frame in open_recording(video, spec)]
+    data = video.read_bytes()
+    video.write_bytes(data[: int(share * len(data))])
+    recording = open_recording(video, spec)
+    read = list(recording)
+    assert 1 <= len(read) == len(recording) < 12
+    assert all(np.array_equal(frame.image, image) for frame, image in zip(read, whole, strict=False)), "none is made up"
+    assert any("tap.avi: cut" in problem and "left out" in problem for problem in recording.problems)
+
+
+def test_a_video_cut_within_its_first_frame_is_refused(video, spec, monkeypatch):
+    data = video.read_bytes()
+    first = data.index(b"00dc")
+    for at in range(first, data.index(b"00dc", first + 4), 4000):
+        video.write_bytes(data[:at])
+        with pytest.raises(FrameError, match="tap.avi: (no frame can be decoded|cut within its first frame)"):
+            open_recording(video, spec)
+    monkeypatch.setattr("twin.frames.recording._count_frames", lambda path: (1, 12, np.zeros((480, 640, 3), np.uint8)))
+    with pytest.raises(FrameError, match="tap.avi: cut within its first frame"):  # where the decoder made it up
+        open_recording(video, spec)
+
+
+def test_an_mp4_whose_data_come_last_is_cut_where_a_box_says_so(tmp_path):
+    box = (16).to_bytes(4, "big") + b"ftyp" + bytes(8)
+    path = tmp_path / "a.mp4"
+    for data, cut in (
+        (box + (24).to_bytes(4, "big") + b"mdat" + bytes(16), False),
+        (box + (24).to_bytes(4, "big") + b"mdat" + bytes(15), True),
+        (box + (1).to_bytes(4, "big") + b"mdat" + (32).to_bytes(8, "big") + bytes(16), False),
+        (box + (1).to_bytes(4, "big") + b"mdat" + (33).to_bytes(8, "big") + bytes(16), True),
+        (box + (0).to_bytes(4, "big") + b"mdat" + bytes(16), False),  # up to the end
+        (box + (3).to_bytes(4, "big") + b"junk", True),
+        (b"\x1a\x45\xdf\xa3" + bytes(20), False),  # another container
+    ):
+        path.write_bytes(data)
+        assert _is_cut(path) is cut
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize("name", ["f.png", "clip.avi", "frames"])
+def test_a_named_pipe_is_refused_at_once(tmp_path, spec, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(FrameError, match=f"{name}: a named pipe or a device"):
+        open_recording(tmp_path / name, spec)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="needs an endless device")
+@pytest.mark.parametrize("name", ["f.png", "clip.avi"])
+def test_an_endless_device_is_refused_at_once(tmp_path, spec, name):
+    (tmp_path / name).symlink_to("/dev/zero")
+    with pytest.raises(FrameError, match=f"{name}: a named pipe or a device"):
+        open_recording(tmp_path / name, spec)
+    with pytest.raises(FrameError, match=f"{name}: can't be read .a named pipe or a device"):
+        read_image(tmp_path / name)
+
+
+def test_what_has_a_pictures_name_and_is_no_file_is_told(tmp_path, spec, pictures):
+    write_pictures(tmp_path, {"a.png": pictures[1]})
+    (tmp_path / "b.png").mkdir()
+    (tmp_path / "c.png").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "d.png")
+    (tmp_path / "e.png").symlink_to("e.png")
+    recording = open_recording(tmp_path, spec)
+    assert recording.names == ["a.png"]
+    told = [problem.split(":")[0] for problem in recording.problems if problem.endswith("; left out")]
+    assert told == ["b.png", "c.png", "d.png", "e.png"]
+    with pytest.raises(FrameError, match="c.png: a link to nothing"):
+        open_recording(tmp_path / "c.png", spec)
+
+
+@pytest.mark.parametrize("kind", ["png", "tiff", "webp"])
+def test_of_several_pictures_in_a_file_the_first_is_read_and_that_is_told(tmp_path, spec, pictures, kind):
+    path = tmp_path / f"a.{kind}"
+    if kind == "tiff":
+        path.write_bytes(cv2.imencodemulti(".tiff", [pictures[1], pictures[2]])[1].tobytes())
+    else:
+        images = [Image.fromarray(picture) for picture in pictures[1:3]]
+        images[0].save(path, save_all=True, append_images=images[1:], **({"lossless": True} if kind == "webp" else {}))
+    image, note = read_image(path)
+    assert np.array_equal(image if image.ndim == 2 else image[..., 0], pictures[1]) and "several pictures" in note
+    recording = open_recording(path, spec)
+    list(recording)
+    assert any("several pictures" in problem for problem in recording.problems)
+    cv2.imwrite(str(path), pictures[1])
+    assert read_image(path)[1] == ""
+
+
+def test_a_table_of_thousands_of_columns_is_refused_at_once_and_is_the_reason_why_there_are_no_labels(tmp_path, spec, pictures):
+    names = write_set(tmp_path, "frames_bw", "f_{}.png", pictures, [0, 1, 2])
+    for table, why in (
+        ("\n".join(f"{name}," + ",".join("1" * 100_000) for name in ["image_name", *names]), "row 1 has 100001 cells"),
+        ("\n".join(["name,pose_2", *(f"{name},1" for name in names)]), "no column image_name"),
+        ("image_name,pose_2\ng.png,1", "no row names a picture here"),
+    ):
+        (tmp_path / "targets.csv").write_text(table)
+        recording = open_recording(tmp_path, spec)
+        assert not recording.labels and why in recording.labels_found()
+        with pytest.raises(FrameError, match=why):
+            choose_targets(recording, "surface-2d", np.arange(3), 0.0, [])
+        with pytest.raises(FrameError, match=why):
+            read_arm_labels(recording)
+    (tmp_path / "targets.csv").unlink()
+    assert open_recording(tmp_path, spec).labels_found() == "found no table"
+
+
 def test_a_video_that_ends_early_gives_what_is_there(video, spec):
     data = video.read_bytes()
     video.write_bytes(data[: int(0.55 * len(data))])
@@ -251,7 +362,7 @@ def test_the_first_frame_decides_between_equal_numbers(tmp_path, spec, pictures)
 
 def test_a_form_that_no_frame_has_is_an_error(tmp_path, spec, pictures):
     write_pictures(tmp_path, {"a.png": pictures[1]})
-    with pytest.raises(FrameError, match="a.png: expected 640x480 .raw.*got 256x256.*--form"):
+    with pytest.raises(FrameError, match=r"a.png: expected 640x480 \(raw form\).*got 256x256 \(recording form\)"):
         open_recording(tmp_path, spec, Form.RAW)
 
 

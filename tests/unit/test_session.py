@@ -13,6 +13,7 @@ import pytest
 from hardware.errors import DeviceError
 from hardware.session import FRAMES, REST, STEPS, SessionSource, SessionWriter, is_session, read_steps
 from twin.errors import FrameError
+from twin.frames.images import write_image
 from twin.types import Form, Frame
 
 WRITER = """
@@ -97,3 +98,97 @@ def test_a_session_overwrites_nothing(tmp_path):
     assert not is_session(tmp_path)
     with pytest.raises(FrameError, match="no recorded session"):
         SessionSource(tmp_path)
+
+
+def recorded(folder):
+    with SessionWriter(folder, {"sensor": "s"}) as session:
+        for k in range(2):
+            session.append(frame(k), {"value": [float(k)]})
+    return folder
+
+
+def replayed(folder):
+    with SessionSource(folder) as source:
+        return [source.read() for _ in source.steps], source.notes()
+
+
+@pytest.mark.parametrize("name", ["../../secret.png", "/etc/passwd", "..", "a/b.png", "", "a\u0000b"])
+def test_a_picture_is_named_without_a_folder(tmp_path, name):
+    folder = recorded(tmp_path / "s")
+    lines = (folder / STEPS).read_text().splitlines()
+    step = json.loads(lines[1])
+    step["frame"]["file"] = name
+    (folder / STEPS).write_text("\n".join([lines[0], json.dumps(step)]) + "\n")
+    with pytest.raises(FrameError, match="steps.jsonl, line 2: frame.file"):
+        SessionSource(folder)
+
+
+@pytest.mark.parametrize("linked", ["frames/frame_000001.png", "frames", REST])
+def test_a_picture_outside_the_session_is_not_read_by_a_link(tmp_path, linked):
+    folder = recorded(tmp_path / "s")
+    write_image(folder / REST, frame(7).image)
+    (folder / linked).rename(tmp_path / "elsewhere")
+    (folder / linked).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FrameError, match="outside the session"):
+        replayed(folder)
+        _ = SessionSource(folder).rest
+
+
+def test_a_session_behind_a_link_is_read(tmp_path):
+    recorded(tmp_path / "s")
+    (tmp_path / "link").symlink_to("s")
+    assert len(replayed(tmp_path / "link")[0]) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("session.json", b"", "session.json is no JSON"),
+        ("session.json", b"[" * 100_000, "session.json is no JSON"),
+        ("session.json", b"[1]", "session.json is not that of a session"),
+        ("session.json", b'{"version": 99}', "version 99, expected 1"),
+        ("session.json", b"\xff\xfe", "session.json is no JSON"),
+        ("session.json", b" " * 2_000_000, "larger than"),
+        (STEPS, b"", "ended before its first step"),
+        (STEPS, b"1\n2\n", "line 1 is cut or damaged"),
+        (STEPS, b'{"step": 0}\n', "line 1: frame: Field required"),
+        (STEPS, b'{"step": 0, "frame": 3}\n', "line 1: frame: "),
+        (
+            STEPS,
+            b'{"step": 0, "frame": {"file": "a.png", "name": "a", "form": "cooked", "time_s": 0, "sequence": 0}}\n',
+            "line 1: frame.form: ",
+        ),
+        (
+            STEPS,
+            b'{"step": 0, "frame": {"file": "a.png", "name": "a", "form": "raw", "time_s": 0, "sequence": 0}, "value": ["x"]}\n',
+            "value.0: ",
+        ),
+    ],
+)
+def test_a_damaged_session_is_refused_in_one_line(tmp_path, name, content, says):
+    folder = recorded(tmp_path / "s")
+    (folder / name).write_bytes(content)
+    with pytest.raises(FrameError, match=says) as caught:
+        SessionSource(folder)
+    assert str(folder) in str(caught.value) and len(str(caught.value).splitlines()) == 1
+
+
+def test_what_follows_a_damaged_line_is_left_out_and_told(tmp_path):
+    folder = recorded(tmp_path / "s")
+    with (folder / STEPS).open("a") as file:
+        file.write('{"frame": \n{"step": 3}\n')
+    frames, notes = replayed(folder)
+    assert len(frames) == 2 and notes == ["steps.jsonl: line 3 is cut or damaged; the 2 steps before it are read"]
+
+
+def test_missing_lines_are_not_passed_over(tmp_path):
+    folder = tmp_path / "s"
+    with SessionWriter(folder, {}) as session:
+        for k in range(4):
+            session.append(frame(k), {})
+    lines = (folder / STEPS).read_text().splitlines(keepends=True)
+    (folder / STEPS).write_text("".join(lines[:2]))
+    assert replayed(folder)[1] == ["2 pictures in frames/ have no step in steps.jsonl: the session was cut"]
+    (folder / STEPS).write_text("".join([*lines[:1], *lines[2:]]))
+    with pytest.raises(FrameError, match="steps.jsonl, line 2 is of step 2: lines are missing"):
+        SessionSource(folder)

@@ -7,12 +7,16 @@ from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, lo
 from training.generation.config import GenerationConfig, Images, Quality, States
 from training.generation.make import REST, make_contact
 from training.generation.store import Store, refuse_foreign
+from twin.errors import DatasetError
 from twin.frames.forms import frame_size
 from twin.progress import Progress, Step, silent, stage
 from twin.rig.contact import friction_between
 from twin.store import locked
 from twin.types import FINE
-from twin.workers import outcomes
+from twin.workers import outcomes, require_scheduler
+
+MOST_CONTACTS = 1_000_000
+"""Contacts of a data set: at one second each, a core is at work for twelve days."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +59,16 @@ def generate(
     ------
     DatasetError
         The folder holds another data set or more contacts than wanted, can't be written to, the workers are lost, or a
-        contact can't be made.
+        contact can't be made; ``count`` is beyond ``MOST_CONTACTS``; no scheduler answers.
     RenderError
         Nothing can be rendered there.
     StoreError
         Another run is at work in the folder, or another version of the program made what it holds.
     """
+    if not 1 <= count <= MOST_CONTACTS:
+        raise DatasetError(f"--count {count}: a data set has 1 to {MOST_CONTACTS} contacts")
+    if scheduler:
+        require_scheduler(scheduler)
     refuse_foreign(folder)
     with locked(folder):
         store = Store(folder, config)

@@ -36,9 +36,12 @@ class Predictions:
             yield frame.name, self.estimator(frame)
 
     def lines(self) -> Iterator[str]:
-        """Lines for people: each frame's pose as soon as it is estimated, and at the end the frames that can't be read."""
+        """Lines for people: what is odd in the recording, each frame's pose once it is estimated, and the frames that can't be read."""
+        told = len(self.recording.problems)
+        yield from (f"note: {problem}" for problem in self.recording.problems)
         for name, made in self:
             yield f"{name}: {_said(made)}"
+        yield from (f"note: {problem}" for problem in self.recording.problems[told:])
         for bad in self.recording.failed:
             yield f"skipped {bad['image_name']}: {bad['reason']}"
 

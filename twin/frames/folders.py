@@ -4,6 +4,7 @@ import os
 import re
 from pathlib import Path
 
+from scenes.files import require_regular
 from twin.errors import FrameError
 from twin.types import Form
 
@@ -22,6 +23,20 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
     found = (p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith("."))
     return sorted(found, key=lambda p: natural_key(p.name))
+
+
+def odd_entries(folder: Path) -> list[str]:
+    """What has the name of a picture in a folder and is no file, one line each: links to nothing, folders, named pipes, devices."""
+    found = []
+    for path in sorted(folder.iterdir(), key=lambda p: natural_key(p.name)):
+        if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith("."):
+            continue
+        try:
+            require_regular(path)
+        except OSError as error:
+            reason = "a link to nothing" if path.is_symlink() and isinstance(error, FileNotFoundError) else error.strerror
+            found.append(f"{path.name}: {reason}; left out")
+    return found
 
 
 def _is_reference(path: Path) -> bool:

@@ -171,9 +171,10 @@ def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form 
         return told
     expected = known.size_px.get(form)
     if expected is None:
-        raise FrameError(f"{name}: sensor {known.sensor} has no {form} form (no [{form}] section); leave out --form")
+        raise FrameError(f"{name}: sensor {known.sensor} has no {form} form (no [{form}] section); give frames of its {told} form as such")
     if expected != _size_px(image):
-        raise FrameError(f"{name}: expected {times(expected)} ({form}) for {known.sensor}, got {times(_size_px(image))}; leave out --form")
+        wanted, got = f"{times(expected)} ({form} form)", f"{times(_size_px(image))} ({told} form)"
+        raise FrameError(f"{name}: expected {wanted} of {known.sensor}, got {got}; give frames of the form that is asked for")
     return form
 
 

@@ -14,11 +14,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from scenes.files import read_regular
 from twin.errors import FrameError
 from twin.store import write_bytes
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG file."""
+PNG_CHUNK_FRAME = 12
+"""Bytes of a PNG's chunk besides its data: length, kind and checksum, 4 each."""
+LARGEST_BYTES = 500_000_000
+"""Bytes of a picture's file: ten times those of an uncompressed 16-bit colour picture of a 8-megapixel camera."""
+SEVERAL_FROM_START = (b"II*\0", b"MM\0*", b"RIFF")
+"""First bytes of TIFF and WebP files, which may hold several pictures."""
 DEPTHS = (8, 10, 12, 14, 16)
 """Numbers of bits that cameras deliver in 16-bit files."""
 STDERR = 2
@@ -45,7 +52,9 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
     FrameError
         The file cannot be read: it is missing, empty, truncated or no picture.
     """
-    image, note = to_eight_bits(decode(path), bits)
+    stored, several = _stored(path)
+    image, note = to_eight_bits(stored, bits)
+    note = "; ".join(filter(None, [several, note]))
     if image.ndim == 3:
         image = image[..., 0] if image.shape[2] < 3 else cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2RGB)
     return np.ascontiguousarray(image), note
@@ -70,8 +79,13 @@ def decode(path: Path) -> np.ndarray:
     FrameError
         The file cannot be read: it is missing, empty, truncated or no picture.
     """
+    return _stored(path)[0]
+
+
+def _stored(path: Path) -> tuple[np.ndarray, str]:
+    """Levels as of ``decode``, and a note if the file holds further pictures ("" if not)."""
     try:
-        data = path.read_bytes()
+        data = read_regular(path, LARGEST_BYTES)
     except OSError as error:
         raise FrameError(f"{path.name}: can't be read ({error.strerror})") from error
     if not data:
@@ -87,24 +101,39 @@ def decode(path: Path) -> np.ndarray:
         raise FrameError(f"{path.name}: not a readable picture (broken or unknown format); copy or convert it again")
     if image.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{path.name}: expected 8-bit levels, got {image.dtype}; convert it to 8 bits")
-    return image
+    return image, "holds several pictures; only the first is read" if _holds_several(path, data) else ""
+
+
+def _holds_several(path: Path, data: bytes) -> bool:
+    """Whether a picture's file is an animation or has several pages."""
+    if data.startswith(PNG_START):
+        return any(kind == b"acTL" for kind, _, _ in _png_chunks(data))
+    with quiet():
+        return data.startswith(SEVERAL_FROM_START) and cv2.imcount(str(path)) > 1
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, start and end of each whole chunk of a PNG, up to its last; the chunk's own frame (length, kind, checksum) included."""
+    start = len(PNG_START)
+    while start + PNG_CHUNK_FRAME <= len(data):
+        end = start + PNG_CHUNK_FRAME + int.from_bytes(data[start : start + 4], "big")
+        if end > len(data):
+            return
+        kind = data[start + 4 : start + 8]
+        yield kind, start, end
+        if kind == b"IEND":
+            return
+        start = end
 
 
 def _png_fault(data: bytes) -> str:
     """What is wrong with the chunks of a PNG; "" if they are whole. Data after its end does not matter."""
-    start = len(PNG_START)
-    while start + 12 <= len(data):
-        end = start + 12 + int.from_bytes(data[start : start + 4], "big")
-        kind = data[start + 4 : start + 8]
-        if end > len(data):
-            break
+    kind = b""
+    for kind, start, end in _png_chunks(data):
         critical = kind[:1].isupper()
         if critical and zlib.crc32(data[start + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             return f"damaged PNG (checksum of its {kind.decode('ascii', 'replace')} chunk)"
-        if kind == b"IEND":
-            return ""
-        start = end
-    return f"truncated PNG ({len(data)} bytes, its end is missing)"
+    return "" if kind == b"IEND" else f"truncated PNG ({len(data)} bytes, its end is missing)"
 
 
 def bits_used(image: np.ndarray) -> int:

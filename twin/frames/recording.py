@@ -8,13 +8,16 @@ from typing import TypedDict
 import cv2
 import numpy as np
 
+from scenes.files import require_regular
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
-from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, references_in, the_video_in
+from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
 from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_of, known_frames, times
 from twin.frames.images import quiet, read_image
 from twin.frames.tables import TABLES, order_by_table, read_metadata
 from twin.types import Form, Frame
+
+MOST_NAMED = 20  # columns that a message names; the widest tables in use have about 40
 
 
 class BadFrame(TypedDict):
@@ -93,6 +96,13 @@ class Recording:
             raise FrameError(f"{self.path.name}: has no frame {index}; it ends after {len(self)}")
         return self._frame(self._image(self._files[index]), index)
 
+    def labels_found(self) -> str:
+        """What there is of labels, for a message: the table's columns, or why no table serves."""
+        if self.labels:
+            columns = list(self.labels)
+            return f"found {', '.join(columns[:MOST_NAMED])}{', ...' if len(columns) > MOST_NAMED else ''}"
+        return "; ".join(p for p in self.problems if p.startswith(TABLES)) or "found no table"
+
     def _image(self, file: Path) -> np.ndarray:
         image, note = read_image(file, self._bits)
         if note and note not in self._noted:
@@ -169,12 +179,45 @@ def _count_frames(path: Path) -> tuple[int, int, np.ndarray]:
 
 
 def _open_video(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
+    try:
+        require_regular(path)
+    except OSError as error:
+        raise FrameError(f"{path}: can't be read ({error.strerror}); give a video") from error
     count, promised, first = _count_frames(path)
     problems: list[str] = []
-    if promised > count:
-        problems.append(f"{path.name}: ends early, {count} of {promised} frames can be decoded")
+    if promised > count or _is_cut(path):
+        # The decoder makes up what is missing of a frame that was cut, and does not say so.
+        decoded = f"{count} of {max(promised, count)} frames can be decoded"
+        problems.append(f"{path.name}: cut, {decoded}; the last of them may lack a part and is left out")
+        count -= 1
+    if not count:
+        raise FrameError(f"{path}: cut within its first frame; copy it again, or record it again")
     names = [f"{path.stem}_{k:06d}" for k in range(count)]
     return Recording(path, form_of(first, path.name, known, form), names, (first.shape[1], first.shape[0]), problems=problems)
+
+
+def _is_cut(path: Path) -> bool:
+    """Whether an AVI or MP4 file is shorter than its own chunks say."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(8)
+        if head[:4] == b"RIFF":
+            return size < len(head) + int.from_bytes(head[4:], "little")
+        if head[4:] != b"ftyp":
+            return False
+        start = 0
+        while start < size:
+            file.seek(start)
+            head = file.read(16)
+            length = int.from_bytes(head[:4], "big")
+            if length == 1:  # the length follows, in 8 bytes
+                length = int.from_bytes(head[8:], "big")
+            elif length == 0:  # up to the file's end
+                return False
+            if length < 8:  # no box
+                return True
+            start += length
+        return start > size
 
 
 def _choose_folder(
@@ -205,6 +248,7 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Re
     folders = image_folders(path, form)
     if folders:
         folder, files, kind = _choose_folder(path, folders, known, form, problems)
+        problems += odd_entries(folder)
         # given the inner folder of a recording, its table and no-contact frame lie beside it
         inner = folder == path and path.name in IMAGE_FOLDERS
         homes = list(dict.fromkeys([path, folder] + ([path.parent] if inner else [])))
@@ -239,10 +283,13 @@ def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form 
     """
     path = Path(path)
     if not path.exists():
-        raise FrameError(f"{path}: no such file or folder; give a picture, a folder of frames, a recording or a video")
+        link = "a link to nothing" if path.is_symlink() else "no such file or folder"
+        raise FrameError(f"{path}: {link}; give a picture, a folder of frames, a recording or a video")
     known = None if spec is None else known_frames(spec)
     if path.is_dir():
         return _open_folder(path, known, form)
+    if not path.is_file():
+        raise FrameError(f"{path}: a named pipe or a device, not a file; give a picture, a folder of frames, a recording or a video")
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _open_video(path, known, form)
     kind = common_kind([path], known, form)

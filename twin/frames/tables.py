@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scenes.files import read_regular
 from twin.frames.folders import IMAGE_SUFFIXES
 
 # Names of a recording's table, the likelier first.
@@ -17,6 +18,10 @@ TABLES = ("targets.csv", "targets_images.csv")
 NAME_COLUMNS = ("image_name", "sensor_image")
 # What may stand between the cells of a row; the one that is most frequent in the header counts.
 SEPARATORS = (",", ";", "\t")
+# Bytes of a table or of metadata: a million rows of a hundred characters.
+LARGEST_BYTES = 100_000_000
+# Columns of a table: the widest in use have about 40.
+MOST_COLUMNS = 1000
 # Characters that are taken away around a cell.
 AROUND_CELLS = " \t\"'"
 
@@ -33,7 +38,7 @@ def bare_name(name: str) -> str:
 
 
 def _text(path: Path) -> str:
-    data = path.read_bytes()
+    data = read_regular(path, LARGEST_BYTES)
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", "replace")
     if b"\0" in data[:2]:
@@ -51,10 +56,19 @@ class Table:
 
 
 def _cells(path: Path) -> list[list[str]]:
+    """The rows' cells, without empty rows.
+
+    Raises
+    ------
+    OSError, csv.Error
+        The file can't be read, a cell is too long, or a row has more cells than a table has.
+    """
     lines = [line for line in _text(path).splitlines() if line.strip()]
     separator = max(SEPARATORS, key=lines[0].count) if lines else ","
     rows = []
-    for line in lines:
+    for number, line in enumerate(lines, 1):
+        if line.count(separator) >= MOST_COLUMNS:
+            raise csv.Error(f"row {number} has {line.count(separator) + 1} cells, a table has at most {MOST_COLUMNS}")
         unclosed = line.count('"') % 2 == 1  # read as quoted, such a line would take in the lines after it
         if unclosed:
             (row,) = csv.reader([line], delimiter=separator, quoting=csv.QUOTE_NONE, skipinitialspace=True)
@@ -90,7 +104,10 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
     """
     try:
         rows = _cells(path)
-    except (OSError, csv.Error) as error:
+    except OSError as error:
+        problems.append(f"{path.name}: can't be read ({error.strerror}); {otherwise}")
+        return None
+    except csv.Error as error:
         problems.append(f"{path.name}: can't be read ({error}); {otherwise}")
         return None
     header = rows[0] if rows else []

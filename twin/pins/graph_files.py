@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
+from scenes.files import require_regular
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames import open_recording
@@ -15,7 +16,7 @@ from twin.pins.batch import recording_reference
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.legacy import LegacyPipeline
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import Reference, nominal_reference
+from twin.pins.reference import Reference, nominal_reference, spread_out
 from twin.report.charts import new_figure
 from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
 from twin.store import write_npz
@@ -23,6 +24,8 @@ from twin.types import Form, PinGraph
 
 PINS = ".npz"
 """Suffix of a file of found pins."""
+LARGEST_BYTES = 2_000_000_000
+"""Unpacked size of a file of found pins, bytes: a hundred thousand frames of 331 pins have 1.3 GB."""
 PICTURE_INCH = 8
 """Side of a graph's picture, inch."""
 PICTURE_DPI = 120
@@ -41,18 +44,21 @@ class Graphs:
     left_out : list of str
         Frames without a graph, and why.
     written : list of Path
+    notes : list of str
+        What was odd in the recording.
     """
 
     names: list[str]
     graphs: list[PinGraph]
     left_out: list[str]
     written: list[Path]
+    notes: list[str]
 
     def lines(self) -> list[str]:
-        """For people: frames left out, and the size of the first graph."""
+        """For people: what was odd, frames left out, and the size of the first graph."""
         first = self.graphs[0]
         counted = f"{len(self.graphs)} graphs; the first has {len(first.nodes_px)} nodes and {len(first.edges)} directed edges"
-        return [*(f"skipped {reason}" for reason in self.left_out), counted]
+        return [*(f"note: {note}" for note in self.notes), *(f"skipped {reason}" for reason in self.left_out), counted]
 
 
 def write_graphs_of(
@@ -80,17 +86,17 @@ def write_graphs_of(
         found, nodes_px = read_pins(path, sensor.pins.count)
         names = list(found)
         form = form or form_of_pins(sensor, nodes_px)
-        reference, image, left_out = nominal_reference(sensor, form), None, []
+        reference, image, left_out, notes = nominal_reference(sensor, form), None, [], []
         graphs = [make_graph(kind, nodes, outmost=reference.outmost) for nodes in nodes_px]
     else:
         seen = _graphs_of_recording(path, sensor, kind, form, legacy=legacy)
-        names, graphs, left_out = seen.names, seen.graphs, seen.left_out
+        names, graphs, left_out, notes = seen.names, seen.graphs, seen.left_out, seen.notes
         form, reference, image = seen.form, seen.reference, seen.first_image
     if legacy:
         pictures = draw_bare_graph(out, graphs[0])
     else:
         pictures = draw_graph_pictures(out, sensor.name, frame_size(sensor, form), graphs[0], reference, image)
-    return Graphs(names, graphs, left_out, [write_graphs(out, names, graphs), *pictures])
+    return Graphs(names, graphs, left_out, [write_graphs(out, names, graphs), *pictures], notes)
 
 
 @dataclass(frozen=True)
@@ -103,6 +109,7 @@ class _RecordingGraphs:
     reference: Reference
     first_image: np.ndarray
     left_out: list[str]
+    notes: list[str]
 
 
 def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None, *, legacy: bool = False) -> _RecordingGraphs:
@@ -115,7 +122,8 @@ def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Fo
     """
     recording = open_recording(path, spec, form)
     left_out: list[str] = []
-    reference, _ = recording_reference(spec, recording, left_out)
+    notes: list[str] = []
+    reference, _ = recording_reference(spec, recording, notes)
     pipeline = LegacyPipeline(spec.pins, spec.recording) if legacy else Pipeline(spec, recording.form, reference, graph=kind)
     names: list[str] = []
     graphs: list[PinGraph] = []
@@ -131,7 +139,7 @@ def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Fo
     left_out += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
     if first_image is None:
         raise FrameError(f"{path}: no frame has a graph; the first: {left_out[0] if left_out else 'no frame in it'}")
-    return _RecordingGraphs(names, graphs, recording.form, reference, first_image, left_out)
+    return _RecordingGraphs(names, graphs, recording.form, reference, first_image, left_out, recording.problems + notes)
 
 
 def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -145,12 +153,16 @@ def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
         If the file is no ``pins.npz``, belongs to a sensor with another number of pins, or has no valid frame.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
-            names, pins, predicted, valid = (data[key] for key in ("image_name", "pins_px", "predicted_px", "valid"))
+        names, pins, predicted, valid = _arrays_of(path, ("image_name", "pins_px", "predicted_px", "valid"))
     except FileNotFoundError as error:
         raise FrameError(f"{path}: no such file; 'twin preprocess' writes it") from error
-    except (OSError, KeyError, ValueError, EOFError, BadZipFile) as error:
+    except OSError as error:
+        raise FrameError(f"{path}: can't be read ({error.strerror}); write it anew with 'twin preprocess'") from error
+    except ValueError as error:
         raise FrameError(f"{path}: not a pins.npz, or a damaged one; write it anew with 'twin preprocess'") from error
+    kinds = [names.dtype.kind, pins.dtype.kind, predicted.dtype.kind, valid.dtype.kind]
+    if kinds != ["U", "f", "f", "b"]:
+        raise FrameError(f"{path}: its arrays are not texts, numbers, numbers and truths; write it anew with 'twin preprocess'")
     frames = names.shape[0] if names.ndim else 0
     if pins.ndim != 3 or pins.shape[2] != 2 or predicted.shape != pins.shape or valid.shape != (frames,) or len(pins) != frames:
         raise FrameError(f"{path}: its arrays do not fit each other; write it anew with 'twin preprocess'")
@@ -161,7 +173,32 @@ def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     nodes_px = np.where(np.isnan(pins), predicted, pins)[valid]
     if not np.isfinite(nodes_px).all():
         raise FrameError(f"{path}: a valid frame lacks a pin and its prediction; write it anew with 'twin preprocess'")
+    if not all(spread_out(nodes) for nodes in nodes_px):
+        raise FrameError(f"{path}: the pins of a valid frame lie in one place, on a line or far off; write it anew with 'twin preprocess'")
     return names[valid], nodes_px
+
+
+def _arrays_of(path: Path, names: Sequence[str]) -> list[np.ndarray]:
+    """Arrays of an ``.npz`` by name.
+
+    Raises
+    ------
+    OSError
+        It can't be read, or is no regular file.
+    ValueError
+        It is damaged, lacks an array, holds pickles, or unpacks to more than ``LARGEST_BYTES``.
+    """
+    require_regular(path)
+    try:
+        with ZipFile(path) as packed:
+            if sum(part.file_size for part in packed.infolist()) > LARGEST_BYTES:
+                raise ValueError(f"unpacks to more than {LARGEST_BYTES / 1e9:g} GB")
+        with np.load(path, allow_pickle=False) as data:
+            return [data[name] for name in names]
+    except OSError:
+        raise
+    except Exception as error:  # damaged bytes raise whatever zipfile and numpy run into; one that claims too much, a MemoryError
+        raise ValueError(str(error)) from error
 
 
 def form_of_pins(spec: SensorSpec, nodes_px: np.ndarray) -> Form:

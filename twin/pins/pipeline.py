@@ -129,7 +129,7 @@ class Pipeline:
         if image.ndim not in (2, 3) or image.shape[:2] != (height, width) or (image.ndim == 3 and image.shape[2] not in (1, 3)):
             raise FrameError(
                 f"{where}: expected {width}x{height} gray or RGB ({self.form} form of {self.spec.name}), got shape {image.shape};"
-                " give the right --sensor or --form, or the unresized frame"
+                " give frames of this sensor and form as the camera or the recorder wrote them"
             )
         if frame.form != self.form:
             raise FrameError(f"{where}: expected a {self.form} frame, got a {frame.form} one; make a Pipeline of that form for it")

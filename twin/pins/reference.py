@@ -7,6 +7,7 @@ from scipy.spatial import Delaunay, cKDTree
 
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
+from twin.errors import FrameError
 from twin.frames.forms import from_raw
 from twin.geometry.pins import rest_pins
 from twin.pins.voronoi import voronoi
@@ -14,6 +15,10 @@ from twin.types import Form
 
 # Neighbours of a pin: two rings of a triangular lattice, enough for a local affine fit without the pin itself.
 NEIGHBOURS = 18
+# Pins spread at least so far in every direction (smallest singular value of their places), px. Those of the shipped sensors: 460 to 1600.
+LEAST_SPREAD_PX = 1.0
+# Pins are at most so far from the frame's origin, px: farther than any camera sees.
+FARTHEST_PX = 1e6
 
 
 @dataclass(frozen=True)
@@ -43,9 +48,27 @@ class Reference:
     area_px2: np.ndarray
 
 
+def spread_out(pins_px: np.ndarray) -> bool:
+    """Whether pins (N, 2) spread over an area, as those of every frame do: not in one place, on a line or farther than any camera sees."""
+    if not np.isfinite(pins_px).all() or np.abs(pins_px).max() > FARTHEST_PX:
+        return False
+    return bool(np.linalg.svd(pins_px - pins_px.mean(axis=0), compute_uv=False)[-1] > LEAST_SPREAD_PX)
+
+
 def make_reference(pins_px: np.ndarray, rings: int) -> Reference:
-    """Reference from rest positions (N, 2) of a layout whose last 6 ``rings`` pins are the outmost ones, in order."""
+    """Reference from rest positions (N, 2) of a layout whose last 6 ``rings`` pins are the outmost ones, in order.
+
+    Raises
+    ------
+    FrameError
+        The pins lie in one place, on a line, or farther off than any camera sees.
+    """
     pins_px = np.ascontiguousarray(pins_px, float)
+    if not spread_out(pins_px):
+        raise FrameError(
+            "the pins at rest lie in one place, on a line or far off any frame; mend [camera] and [pins] of the sensor's specification, "
+            "or pins_px of the tuned file"
+        )
     n = len(pins_px)
     distance, index = cKDTree(pins_px).query(pins_px, k=min(NEIGHBOURS + 1, n))
     triangles = Delaunay(pins_px).simplices.astype(np.int64)

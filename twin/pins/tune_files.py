@@ -27,12 +27,15 @@ class TunedOnFrames:
         Of the sensor.
     written : list of Path
         The file, where one was wanted.
+    odd : list of str
+        What was odd in the recording.
     """
 
     tuned: Tuned
     evidence: Evidence
     pins: int
     written: list[Path]
+    odd: list[str]
 
     def lines(self) -> list[str]:
         """How sure it is, the parameters, and what speaks against them; for people."""
@@ -50,7 +53,7 @@ class TunedOnFrames:
             lines.append(
                 f"threshold {blob.threshold:g}{over}, slack {evidence.threshold_slack:g} gray levels; least area {blob.min_area_px2:g} px2"
             )
-        return [*lines, *(f"note: {note}" for note in self.tuned.notes)]
+        return [*lines, *(f"note: {note}" for note in [*self.tuned.notes, *self.odd])]
 
 
 def tune_on_frames(
@@ -79,11 +82,12 @@ def tune_on_frames(
     """
     if out is not None and out.suffix != ".toml":
         raise FrameError(f"--out {out}: give the name of a .toml file")
-    frames = evenly_read(open_recording(path, sensor, form), limit)
+    recording = open_recording(path, sensor, form)
+    frames = evenly_read(recording, limit)
     with stage(progress, "tuning") as step:
         found = tune(frames, sensor, method, progress=step)
     evidence = found.detector.evidence
     assert evidence is not None  # whoever tunes says how sure it is
     if out is not None:
         write_detector(out, found.detector, f"Found by 'twin tune' from {len(frames)} frames of {path.name}; {evidence.sure}.")
-    return TunedOnFrames(found, evidence, sensor.pins.count, [] if out is None else [out])
+    return TunedOnFrames(found, evidence, sensor.pins.count, [] if out is None else [out], recording.problems)

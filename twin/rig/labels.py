@@ -54,8 +54,8 @@ def read_arm_labels(recording: Recording) -> list[ArmLabel]:
         for kind in ("pose", "move")
     }
     if not columns["pose"]:
-        found = ", ".join(recording.labels) or "no table"
-        raise FrameError(f"{recording.path}: no labels pose_1..6 (found {found}); targets.csv with them is expected beside the frames")
+        found = recording.labels_found()
+        raise FrameError(f"{recording.path}: no labels pose_1..6 ({found}); targets.csv with them is expected beside the frames")
     values = {kind: np.zeros((len(recording), 6)) for kind in columns}
     for kind, named in columns.items():
         for axis, cells in named:

@@ -1,0 +1,94 @@
+"""Numbers, addresses and names beyond all bounds: refused at once, with the range or the remedy."""
+
+import socket
+
+import numpy as np
+import pytest
+
+from hardware.emulators.mg400 import Mg400Emulator
+from hardware.emulators.running import emulate_magician, emulate_mg400
+from hardware.emulators.twin_camera import emulate_camera
+from hardware.errors import DeviceError
+from hardware.following import FollowPlan
+from hardware.view.server import BrowserView
+from scenes import SpecError, load_object, load_sensor, load_servo
+from scenes.load import SHIPPED
+from scenes.sensor import MOST_POISSON
+from training.estimator import PoseEstimator
+from training.recipes import TrainingError
+from twin.errors import FrameError, TwinError
+from twin.frames.forms import form_of, known_frames
+from twin.geometry.solid import Resolution
+from twin.mechanics.path import ContactPose
+from twin.mechanics.solver import SkinSolver
+from twin.types import Form
+
+
+@pytest.mark.parametrize("number", [float("inf"), float("nan"), 0.0, -1.0, 1e9])
+def test_rates_that_are_none_are_refused_with_their_range(number):
+    with pytest.raises(DeviceError, match="--time-scale .*: expected 0.001 to 1000"):
+        emulate_mg400(time_scale=number)
+    with pytest.raises(DeviceError, match="--time-scale .*: expected 0.001 to 1000"):
+        emulate_magician(time_scale=number)
+    with pytest.raises(DeviceError, match="--rate .*: expected 0.1 to 1000 decisions a second"):
+        FollowPlan(load_object("can"), load_servo("surface"), stream_hz=number)
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2_000_000_000])
+def test_steps_beyond_all_bounds_are_refused(steps):
+    with pytest.raises(DeviceError, match=f"--steps {steps}: expected 1 to"):
+        FollowPlan(load_object("can"), load_servo("surface"), steps=steps)
+
+
+def test_a_fault_that_is_none_is_told_before_an_arm_is_looked_for():
+    with pytest.raises(TwinError, match="no fault 'frosen' .did you mean frozen"):
+        emulate_camera(
+            "mg400:127.0.0.1:1", load_sensor("mg400-127"), load_object("plane"), load_servo("surface"), plain_light=True, faults=("frosen",)
+        )
+
+
+def test_an_address_of_no_machine_here_and_a_port_in_use_have_remedies_of_their_own():
+    with pytest.raises(DeviceError, match=r"can't listen on 999\.1\.1\.1:\d+ .*; give an address of this machine with --host"):
+        Mg400Emulator(host="999.1.1.1").start()
+    with pytest.raises(DeviceError, match=r"can't listen on 192\.0\.2\.1:\d+ .*; give an address of this machine with --host"):
+        BrowserView("x", host="192.0.2.1")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(DeviceError, match=f"can't listen on 127.0.0.1:{port} .*; end what uses the port, or give another --port"):
+            BrowserView("x", port=port)
+
+
+SENSOR = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
+
+
+@pytest.mark.parametrize("part", ["skin", "gel"])
+def test_the_largest_poisson_ratio_converges_and_a_larger_one_is_refused_with_the_remedy(tmp_path, part):
+    path = tmp_path / "mine.toml"
+    before, _, after = SENSOR.partition(f"[{part}]")
+    line = next(line for line in after.splitlines() if line.startswith("poisson_ratio"))
+    for ratio in (MOST_POISSON, 0.4999999):
+        path.write_text(f"{before}[{part}]{after.replace(line, f'poisson_ratio = {ratio}', 1)}")
+        if ratio == MOST_POISSON:
+            spec = load_sensor(path)
+    with pytest.raises(SpecError, match=rf"{part}.*poisson_ratio: a contact does not converge above .*got 0.4999999"):
+        load_sensor(path)
+    state = SkinSolver(spec, resolution=Resolution(6)).press(load_object("plane"), ContactPose(indent_mm=0.5))
+    assert state.force_n[2] > 0
+
+
+def test_a_mistyped_run_gets_the_nearest_name(tmp_path):
+    (tmp_path / "first_run").mkdir()
+    (tmp_path / "first_run" / "config.json").write_text("{}")
+    for name, near in (("mg400-13", "mg400-331|mg400-127"), (str(tmp_path / "frist_run"), f"{tmp_path}/first_run")):
+        with pytest.raises(TrainingError, match=f"holds no trained model: did you mean '({near})'"):
+            PoseEstimator.load(name)
+    for name in (tmp_path / "nothing_like_it", tmp_path / "nowhere" / "mg400-127"):
+        with pytest.raises(TrainingError, match="'twin train' writes one"):
+            PoseEstimator.load(name)
+
+
+def test_frames_of_another_form_are_refused_without_the_name_of_an_option():
+    known = known_frames(load_sensor("mg400-127"))
+    with pytest.raises(FrameError, match="f.png: expected 640x480 .raw form. of mg400-127, got 256x256 .recording form.") as caught:
+        form_of(np.zeros((256, 256), np.uint8), "f.png", known, Form.RAW)
+    assert "--" not in str(caught.value), "twin predict has no --form"

@@ -27,6 +27,7 @@ from hardware.safe_arm import try_each
 from hardware.step import Guard
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
+from scenes.files import shown
 from twin.frames.images import write_image
 from twin.pins import require_untouched
 from twin.progress import Progress, Step, silent, stage
@@ -89,9 +90,11 @@ class Collection:
         meta, about = self.folder / META, json.loads(json.dumps(self.about))
         if meta.is_file():
             try:
-                before = json.loads(meta.read_text())
-            except ValueError as error:
-                raise DeviceError(f"{meta}: is damaged ({error}); remove it if the folder holds no contacts yet") from error
+                before = json.loads(meta.read_text(encoding="utf-8"))
+                if not isinstance(before, dict):
+                    raise ValueError("expected keys and values")
+            except (ValueError, RecursionError) as error:
+                raise DeviceError(f"{meta}: is damaged ({shown(error)}); remove it if the folder holds no contacts yet") from error
             if other := [key for key in about if before.get(key) != about[key]]:
                 raise DeviceError(
                     f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
@@ -110,9 +113,22 @@ class Collection:
 
     @property
     def count(self) -> int:
-        """Contacts collected so far."""
-        with (self.folder / TABLE).open(newline="") as file:
-            return sum(1 for _ in csv.reader(file)) - 1
+        """Contacts collected so far.
+
+        Raises
+        ------
+        DeviceError
+            The table is damaged.
+        """
+        table = self.folder / TABLE
+        try:
+            with table.open(newline="", encoding="utf-8") as file:
+                rows = list(csv.reader(file))
+        except (ValueError, csv.Error) as error:
+            raise DeviceError(f"{table}: is damaged ({shown(error)}); give another --out") from error
+        if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
+            raise DeviceError(f"{table}: is not the table of a collection; give another --out")
+        return len(rows) - 1
 
     @property
     def has_rest(self) -> bool:
@@ -142,7 +158,10 @@ class Collection:
 
     @staticmethod
     def _drop_torn_line(lines: Path) -> None:
-        text = lines.read_text()
+        try:
+            text = lines.read_text(encoding="utf-8")
+        except ValueError as error:
+            raise DeviceError(f"{lines}: is damaged ({shown(error)}); give another --out") from error
         if not text.endswith("\n"):
             write_text(lines, text[: text.rfind("\n") + 1])
 

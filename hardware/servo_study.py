@@ -95,7 +95,7 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
     for label, model in plan.models.items():
         for thing in plan.objects:
             asked = FollowPlan(thing, plan.servo, steps=plan.steps, seed=plan.seed, plain_light=plan.plain_light)
-            folder = out / re.sub(r"[^\w.-]+", "_", label) / thing.name
+            folder = out / folder_name(label) / thing.name
             folder.mkdir(parents=True, exist_ok=True)
             try:
                 found[label, thing.name] = follow(asked, model, folder, about={"model": label})
@@ -108,6 +108,11 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
     if pictures:
         made.written.append(save_figure(out / "study.png", comparison_figure(pictures)))
     return made
+
+
+def folder_name(label: str) -> str:
+    """A model's name as that of a folder: one part of a path, and never the folder above."""
+    return re.sub(r"^\.+|[^\w.-]+", "_", label) or "_"
 
 
 def _write_rows(path: Path, rows: list[dict[str, Any]]) -> Path:

@@ -196,8 +196,7 @@ def _pictures() -> list[Entry]:
             if command not in READ_ALL_PICTURES and what not in SOME_PICTURES:
                 continue
             make = {"data": edited("frames", BAD, edit)}
-            listed = what not in ("folder", "named pipe", "dangling link", "link to itself", "endless device")
-            says = (BAD,) if listed and command in ("preprocess", "graph", "predict") and what not in ("animated", "two pages") else ()
+            says = (BAD,) if command in ("preprocess", "graph", "predict") else ()
             sample = command == "preprocess" and what in ("cut", "text", "half the size", "folder")
             found.append(Entry("pictures", what, call, make, right, says, sample=sample))
             alone = {"data": _alone(edit)}
@@ -208,7 +207,7 @@ def _pictures() -> list[Entry]:
         for what, edit in given.VIDEOS.items():
             partly = what.startswith(("damaged", "a picture"))  # some of it can be read
             ends = (DONE, REFUSED, 2) if partly or what == "cut at half" else (REFUSED,)
-            make, says = {"data": edited("video", "", edit)}, () if partly else ("clip",)
+            make, says = {"data": edited("video", "", edit)}, () if partly else ("clip", "cut") if what == "cut at half" else ("clip",)
             leaves = ("pins.npz", "summary.json") if partly else ()
             found.append(Entry("videos", what, call, make, ends, says, leaves, sample=command == "predict" and what == "text"))
         for what, make in FOLDERS.items():
@@ -454,7 +453,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--firmware": "x",
         "--time-scale": "0 -1 nan inf",
     },
-    "emulate magician": {"--link": "{frames}/f_0.png /proc/nowhere", "--fault": "nonsense", "--time-scale": "0 -1 nan"},
+    "emulate magician": {"--link": "{frames}/f_0.png /proc/nowhere", "--fault": "nonsense", "--time-scale": "0 -1 nan inf"},
     f"emulate camera {S} --object plane": {
         "--arm": "nowhere mg400:127.0.0.1:1",
         "--arm mg400:127.0.0.1:1 --fps": "0 nan",

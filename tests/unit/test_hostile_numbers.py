@@ -1,15 +1,19 @@
 """Numbers, addresses and names beyond all bounds: refused at once, with the range or the remedy."""
 
 import socket
+from pathlib import PurePosixPath, PureWindowsPath
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import emulate_magician, emulate_mg400
 from hardware.emulators.twin_camera import emulate_camera
 from hardware.errors import DeviceError
 from hardware.following import FollowPlan
+from hardware.servo_study import folder_name
 from hardware.view.server import BrowserView
 from scenes import SpecError, load_object, load_sensor, load_servo
 from scenes.load import SHIPPED
@@ -74,6 +78,15 @@ def test_the_largest_poisson_ratio_converges_and_a_larger_one_is_refused_with_th
         load_sensor(path)
     state = SkinSolver(spec, resolution=Resolution(6)).press(load_object("plane"), ContactPose(indent_mm=0.5))
     assert state.force_n[2] > 0
+
+
+@given(st.text(max_size=20) | st.sampled_from(["..", ".", "../x", "a/b", "/etc", "...", ".hidden", "a\\b", "mg400-331", "run.2"]))
+def test_a_models_name_is_a_folder_below(label):
+    name = folder_name(label)
+    assert (PurePosixPath("/out") / name).parent == PurePosixPath("/out") and name not in (".", "..")
+    assert (PureWindowsPath("C:/out") / name).parent == PureWindowsPath("C:/out")
+    if label in ("mg400-331", "run.2"):
+        assert name == label
 
 
 def test_a_mistyped_run_gets_the_nearest_name(tmp_path):

@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save
 
+from hardware.collect import Collection
 from hardware.session import SessionSource, SessionWriter, read_steps
 from scenes import SpecError, load_sensor
 from training.packed import unpack
@@ -25,6 +26,7 @@ from twin.frames import open_recording, read_image
 from twin.frames.tables import order_by_table, read_metadata, read_table
 from twin.pins import nominal_reference
 from twin.pins.graph_files import read_pins
+from twin.rig.labels import read_executed
 from twin.store import Item, find_arrays, find_json, keep_arrays, keep_json
 from twin.types import Form
 
@@ -144,6 +146,65 @@ def test_damaged_pins_are_pins_or_our_error(tmp_path, spec, pins_bytes, data):
         assert path.name in str(error)
     else:
         assert nodes_px.shape == (len(names), spec.pins.count, 2) and np.isfinite(nodes_px).all()
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory, frame):
+    path = tmp_path_factory.mktemp("video") / "clip.avi"
+    height, width = frame.image.shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (width, height))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no MJPG video")
+    for k in range(4):
+        writer.write(cv2.cvtColor(np.roll(frame.image, 3 * k, axis=1), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+@MANY
+@given(data=st.data())
+def test_a_damaged_video_is_read_or_refused(tmp_path, spec, video, data):
+    path = tmp_path / "clip.avi"
+    path.write_bytes(data.draw(damage(video.read_bytes()) | st.binary(max_size=200)))
+    try:
+        recording = open_recording(path, spec)
+        frames = list(recording)
+    except OURS as error:
+        assert path.name in str(error) and len(str(error).splitlines()) == 1
+    else:
+        assert len(frames) <= len(recording) and all(each.image.shape[:2] == (256, 256) for each in frames)
+
+
+@MANY
+@given(data=st.data())
+def test_of_a_cut_video_every_frame_read_is_a_whole_one(tmp_path, spec, video, data):
+    whole = [each.image for each in open_recording(video, spec)]
+    content = video.read_bytes()
+    path = tmp_path / "clip.avi"
+    path.write_bytes(content[: data.draw(st.integers(0, len(content) - 1))])
+    try:
+        recording = open_recording(path, spec)
+    except OURS as error:
+        assert path.name in str(error)
+    else:
+        frames = list(recording)
+        assert frames and all(np.array_equal(each.image, image) for each, image in zip(frames, whole, strict=False))
+        assert len(frames) < len(whole) and any("cut" in problem for problem in recording.problems)
+
+
+EXECUTED = st.text(max_size=8) | st.sampled_from(["0", "1", "True", "no", "nan", "7", "", "1e999"])
+
+
+@MANY
+@given(column=st.lists(EXECUTED, max_size=4), name=st.sampled_from(["executed", "move_executed", "", "a,b"]))
+def test_any_table_of_moves_gives_shares_between_0_and_1_or_a_problem(tmp_path, column, name):
+    lines = [f"image_name,{name}", *(f"f_{k}.png,{cell}" for k, cell in enumerate(column))]
+    (tmp_path / "move_executed.csv").write_text("\n".join(lines), encoding="utf-8", errors="replace")
+    names, problems = [f"f_{k}.png" for k in range(4)], []
+    found = read_executed(tmp_path, names, problems)
+    assert set(found) <= set(names) and all(0 <= share <= 1 for share in found.values())
+    assert len(found) == len(names) or problems, "every frame is accounted for"
+    assert all("\n" not in problem for problem in problems)
 
 
 def pins_file(path: Path, spec, **arrays) -> Path:
@@ -276,3 +337,26 @@ def test_a_damaged_session_is_replayed_or_refused(tmp_path, session, data, name)
 def test_any_bytes_are_steps_up_to_the_first_that_is_none(tmp_path, content):
     (tmp_path / "steps.jsonl").write_bytes(content)
     assert isinstance(read_steps(tmp_path), list)
+
+
+@pytest.fixture(scope="module")
+def collection(tmp_path_factory, frame):
+    folder = tmp_path_factory.mktemp("collected") / "collection"
+    made = Collection(folder, {"seed": 1}, Form.RECORDING)
+    for k in range(2):
+        made.keep(k, frame, np.arange(6.0), np.zeros(6), {"attempt": 0})
+    assert made.count == 2
+    return folder
+
+
+@MANY
+@given(data=st.data(), name=st.sampled_from(["meta.json", "targets.csv", "contacts.jsonl"]), content=st.none() | st.binary(max_size=60))
+def test_a_damaged_collection_is_gone_on_with_or_refused(tmp_path, collection, data, name, content):
+    folder = tmp_path / "collection"
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(collection, folder)
+    (folder / name).write_bytes(data.draw(damage((folder / name).read_bytes())) if content is None else content)
+    try:
+        assert 0 <= Collection(folder, {"seed": 1}, Form.RECORDING).count
+    except OURS as error:
+        assert str(folder) in str(error) and len(str(error).splitlines()) == 1

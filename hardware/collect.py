@@ -46,6 +46,8 @@ MOVE_TIMEOUT_S = 30.0
 SPARE = 2.0
 # Longest wait in s for a frame of the arm where it stands.
 FRAME_TIMEOUT_S = 5.0
+# Contacts of a collection: at a few seconds each, an arm is at work for months.
+MOST_CONTACTS = 1_000_000
 # Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
@@ -419,6 +421,10 @@ class CollectPlan:
     form: Form | None = None
     limits: str | None = None
     plain_light: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= MOST_CONTACTS:
+            raise DeviceError(f"--count {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
 
     @property
     def drawn_with(self) -> int:

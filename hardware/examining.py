@@ -13,6 +13,7 @@ from twin.progress import Progress, silent, stage
 from twin.types import Form, Frame
 
 LIMIT = 20  # frames that are looked at
+MOST_LIVE = 1000  # frames of a camera that are kept: 6 GB at 1920 x 1080 in colour
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,18 @@ def examine_sensor(
 
 
 def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: int) -> tuple[list[Frame], list[str]]:
-    """The next ``limit`` frames of a camera, or as many, evenly spread, of what was recorded; and what was odd in the recording."""
+    """The next ``limit`` frames of a camera, or as many, evenly spread, of what was recorded; and what was odd in the recording.
+
+    Raises
+    ------
+    FrameError
+        There are no frames, or more than ``MOST_LIVE`` of a camera are asked for.
+    """
     camera = open_camera(source, sensor, form)
     if not camera.is_live:
         recording = open_recording(Path(source), sensor, form)
         return evenly_read(recording, limit), recording.problems
+    if limit > MOST_LIVE:
+        raise FrameError(f"--limit {limit}: at most {MOST_LIVE} frames of a camera, as they are kept until the end")
     with camera:
         return [await_frame(camera) for _ in range(limit)], []

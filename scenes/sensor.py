@@ -436,9 +436,9 @@ class RecordingSpec(Section):
     """
 
     crop_px: tuple[int, int, int, int]
-    width_px: Annotated[int, Field(ge=16)]
-    height_px: Annotated[int, Field(ge=16)]
-    threshold_block_px: Annotated[int, Field(ge=3)]
+    width_px: Annotated[int, Field(ge=16, le=8192)]
+    height_px: Annotated[int, Field(ge=16, le=8192)]
+    threshold_block_px: Annotated[int, Field(ge=3, le=8192)]
     threshold_offset: float
 
     @model_validator(mode="after")
@@ -468,10 +468,10 @@ class BlobSpec(Section):
     """
 
     threshold: float
-    threshold_block_px: Annotated[int, Field(ge=0)] = 0
-    erosion_px: Annotated[int, Field(ge=1)] = 1
+    threshold_block_px: Annotated[int, Field(ge=0, le=8192)] = 0
+    erosion_px: Annotated[int, Field(ge=1, le=100)] = 1
     mask_center_px: tuple[float, float]
-    mask_radius_px: Positive
+    mask_radius_px: Annotated[float, Field(gt=0, le=100_000)]
     min_area_px2: NonNegative = 1.0
 
 

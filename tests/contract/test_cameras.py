@@ -24,6 +24,7 @@ from hardware.lerobot import LeRobotCamera
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionWriter
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
+from twin.errors import FrameError
 from twin.frames.images import write_image
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
@@ -347,6 +348,8 @@ def test_check_says_what_to_do_about_a_camera_that_gives_nothing(monkeypatch):
     monkeypatch.setattr(reader, "START_S", 0.1)
     with pytest.raises(DeviceError, match=r"noisy camera: no new frame within 0\.15 s; check the camera"):
         frames_of("0", None, None, 2)
+    with pytest.raises(FrameError, match="--limit 2000000000: at most 1000 frames of a camera"):
+        frames_of("0", None, None, 2_000_000_000)
 
 
 def test_a_first_frame_is_waited_for_as_long_as_its_source_may_need():

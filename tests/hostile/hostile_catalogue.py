@@ -428,7 +428,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--model": "nowhere",
     },
     "servo --object can --out {out}": {
-        "--steps": "0 -1",
+        "--steps": "0 -1 2000000000",
         "--rate": "0 -1 x",
         "--stream --rate": "nan inf",
         "--model": "nowhere",
@@ -438,7 +438,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--servo": "nowhere",
         "--at-rest": "nowhere.png",
     },
-    f"collect --camera twin --arm simulated {S} --out {{out}}": {"--count": "0 -1", "--seed": "-1", "--object": "nowhere"},
+    f"collect --camera twin --arm simulated {S} --out {{out}}": {"--count": "0 -1 2000000000", "--seed": "-1", "--object": "nowhere"},
     f"live --model {SENSOR} --camera {{frames}} --headless": {
         "--count": "0 -1",
         "--seconds": "-1 nan",
@@ -467,8 +467,8 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--model": "nowhere",
     },
     f"study objects {S} --out {{out}} --across 6 --workers 1": {
-        "--count": "0 1 -1",
-        "--tests": "0",
+        "--count": "0 1 -1 2000000000",
+        "--tests": "0 2000000000",
         "--train": "nowhere , plane,plane",
         "--unseen": "nowhere",
         "--epochs": "0",
@@ -476,8 +476,8 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     },
     f"study sim-to-real {S} --frames {{recording}} --out {{out}} --across 6 --workers 1": {
         "--labels": "0 -1 1000000",
-        "--count": "0 -1",
-        "--draws": "0 -1",
+        "--count": "0 -1 2000000000",
+        "--draws": "0 -1 2000000000",
         "--epochs": "0",
         "--seed": "-1",
         "--sim": "nowhere",

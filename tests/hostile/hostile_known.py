@@ -15,9 +15,7 @@ WRONG: dict[str, tuple[str, ...]] = {
         "evaluate, runs: rows in another order",
         "study tac-vgnn, gone on: finished with other labels",
     ),
-    "did not end|took|MemoryError": (
-        "robustness, outputs: none given",
-    ),
+    "did not end|took|MemoryError": ("robustness, outputs: none given",),
     "does not say": (
         "audit, tables: too few frames to tell which moves were executed",
         "study sim-to-real, numbers: --sim nowhere",
@@ -37,9 +35,7 @@ WRONG: dict[str, tuple[str, ...]] = {
         "train, gone on: begun with other frames",
         "train, gone on: begun with other moves",
     ),
-    "left behind": (
-        "study tac-vgnn, numbers: --batches 0",
-    ),
+    "left behind": ("study tac-vgnn, numbers: --batches 0",),
     "library's advice": (
         "predict, runs: config.json no sensor",
         "predict, runs: config.json a sensor with a wrong number",
@@ -140,9 +136,7 @@ WRONG: dict[str, tuple[str, ...]] = {
         "evaluate, runs: config.json no columns",
         "evaluate, runs: config.json columns of another number",
     ),
-    "traceback: json.decoder.JSONDecodeError": (
-        "train, data sets: truth.zarr's attributes empty",
-    ),
+    "traceback: json.decoder.JSONDecodeError": ("train, data sets: truth.zarr's attributes empty",),
     "traceback: pydantic_core._pydantic_core.ValidationError": ("train, data sets: generation.json cut",),
     "warns": ("audit, tables: 2 labelled frames",),
     "weights_only": (

@@ -1,13 +1,15 @@
 """Numbers, addresses and names beyond all bounds: refused at once, with the range or the remedy."""
 
+import re
 import socket
 from pathlib import PurePosixPath, PureWindowsPath
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hardware.collect import CollectPlan
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import emulate_magician, emulate_mg400
 from hardware.emulators.twin_camera import emulate_camera
@@ -15,7 +17,7 @@ from hardware.errors import DeviceError
 from hardware.following import FollowPlan
 from hardware.servo_study import folder_name
 from hardware.view.server import BrowserView
-from scenes import SpecError, load_object, load_sensor, load_servo
+from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
 from scenes.load import SHIPPED
 from scenes.sensor import MOST_POISSON
 from training.estimator import PoseEstimator
@@ -25,7 +27,10 @@ from twin.frames.forms import form_of, known_frames
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
+from twin.pins import Pipeline
 from twin.types import Form
+
+SENSOR = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
 
 
 @pytest.mark.parametrize("number", [float("inf"), float("nan"), 0.0, -1.0, 1e9])
@@ -38,10 +43,37 @@ def test_rates_that_are_none_are_refused_with_their_range(number):
         FollowPlan(load_object("can"), load_servo("surface"), stream_hz=number)
 
 
-@pytest.mark.parametrize("steps", [0, -1, 2_000_000_000])
-def test_steps_beyond_all_bounds_are_refused(steps):
-    with pytest.raises(DeviceError, match=f"--steps {steps}: expected 1 to"):
-        FollowPlan(load_object("can"), load_servo("surface"), steps=steps)
+@pytest.mark.parametrize("count", [0, -1, 2_000_000_000])
+def test_steps_and_contacts_beyond_all_bounds_are_refused(count):
+    thing, servo = load_object("can"), load_servo("surface")
+    with pytest.raises(DeviceError, match=f"--steps {count}: expected 1 to"):
+        FollowPlan(thing, servo, steps=count)
+    with pytest.raises(DeviceError, match=f"--count {count}: a collection has 1 to"):
+        CollectPlan(load_sensor("mg400-127"), thing, load_experiment("surface-2d"), servo, "twin", "simulated", count)
+
+
+NUMBERS = [
+    (number, match.span())
+    for number, line in enumerate(SENSOR.splitlines())
+    for match in re.finditer(r"(?<![\w.\"])-?\d+\.?\d*(?![\w.\"])", line.partition("=")[2] and line)
+    if not line.startswith("#") and match.start() > line.index("=")
+]
+
+
+@settings(max_examples=60, deadline=None)
+@given(place=st.sampled_from(NUMBERS), value=st.sampled_from(["1e308", "-1e308", "1e-308", "9223372036854775807", "-1", "0", "1e9"]))
+def test_any_number_of_a_specification_makes_a_pipeline_or_is_refused(tmp_path_factory, place, value):
+    lines = SENSOR.splitlines()
+    row, (start, end) = place
+    lines[row] = lines[row][:start] + value + lines[row][end:]
+    path = tmp_path_factory.mktemp("any") / "mine.toml"
+    path.write_text("\n".join(lines))
+    try:
+        spec = load_sensor(path)
+        with np.errstate(all="ignore"):
+            Pipeline(spec, Form.RAW)
+    except (SpecError, TwinError) as error:
+        assert len(str(error).splitlines()) == 1
 
 
 def test_a_fault_that_is_none_is_told_before_an_arm_is_looked_for():
@@ -60,9 +92,6 @@ def test_an_address_of_no_machine_here_and_a_port_in_use_have_remedies_of_their_
         port = taken.getsockname()[1]
         with pytest.raises(DeviceError, match=f"can't listen on 127.0.0.1:{port} .*; end what uses the port, or give another --port"):
             BrowserView("x", port=port)
-
-
-SENSOR = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
 
 
 @pytest.mark.parametrize("part", ["skin", "gel"])

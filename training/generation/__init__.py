@@ -1,6 +1,6 @@
 """Simulated data sets: frames in the recordings' own format, with everything that is known about them beside."""
 
-from training.generation.config import DatasetError, GenerationConfig
+from training.generation.config import DatasetError, GenerationConfig, require_count
 from training.generation.run import generate
 
-__all__ = ["DatasetError", "GenerationConfig", "generate"]
+__all__ = ["DatasetError", "GenerationConfig", "generate", "require_count"]

@@ -22,6 +22,16 @@ States = Literal["end", "all"]
 Quality = Literal["preview", "standard", "high"]
 
 
+MOST_CONTACTS = 1_000_000
+"""Contacts of a data set: at one second each, a core is at work for twelve days."""
+
+
+def require_count(count: int, option: str = "--count") -> None:
+    """Raise ``DatasetError`` where a data set can't have so many contacts; ``option`` is where the number comes from."""
+    if not 1 <= count <= MOST_CONTACTS:
+        raise DatasetError(f"{option} {count}: a data set has 1 to {MOST_CONTACTS} contacts")
+
+
 class GenerationConfig(Section):
     """All that the frames of a data set depend on, but for how many there are.
 

@@ -4,19 +4,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_object
-from training.generation.config import GenerationConfig, Images, Quality, States
+from training.generation.config import GenerationConfig, Images, Quality, States, require_count
 from training.generation.make import REST, make_contact
 from training.generation.store import Store, refuse_foreign
-from twin.errors import DatasetError
 from twin.frames.forms import frame_size
 from twin.progress import Progress, Step, silent, stage
 from twin.rig.contact import friction_between
 from twin.store import locked
 from twin.types import FINE
 from twin.workers import outcomes, require_scheduler
-
-MOST_CONTACTS = 1_000_000
-"""Contacts of a data set: at one second each, a core is at work for twelve days."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +61,7 @@ def generate(
     StoreError
         Another run is at work in the folder, or another version of the program made what it holds.
     """
-    if not 1 <= count <= MOST_CONTACTS:
-        raise DatasetError(f"--count {count}: a data set has 1 to {MOST_CONTACTS} contacts")
+    require_count(count)
     if scheduler:
         require_scheduler(scheduler)
     refuse_foreign(folder)

@@ -6,7 +6,7 @@ import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_experiment
 from training.dataset import Dataset, joined
-from training.generation import GenerationConfig
+from training.generation import GenerationConfig, require_count
 from training.recipes import TrainingError
 from training.studies.sim_to_real.twins import contact_of
 from twin.types import FINE
@@ -55,6 +55,8 @@ class Plan:
             raise TrainingError(f"{', '.join(twice)}: given twice; an object is either trained on or never seen")
         if len(self.train) < 2 or not self.unseen:
             raise TrainingError("give at least two objects to train on and one never seen")
+        require_count(self.count)
+        require_count(self.tests, "--tests")
 
     @property
     def wider(self) -> ExperimentSpec:

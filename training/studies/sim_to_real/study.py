@@ -8,7 +8,7 @@ import numpy as np
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object, load_randomisation
 from training.dataset import Dataset, joined, load_dataset
-from training.generation import generate
+from training.generation import generate, require_count
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
 from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.steps import (
@@ -28,6 +28,7 @@ from training.studies.sim_to_real.steps import (
     with_missing,
 )
 from training.studies.sim_to_real.twins import Twin, as_mounted, contact_of, without_one_ingredient
+from twin.errors import DatasetError
 from twin.fit.contact import fit_contact
 from twin.fit.contact.simulate import Setup
 from twin.judge.labelled.model import MeasuredFrames
@@ -37,6 +38,7 @@ from twin.types import FINE
 
 SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
 FULL, BESIDE = "sim_only", "sim_plus_real"  # folders of the twin's own run, and of the run with labelled frames beside it
+MOST_DRAWS = 1000  # of what the twin misses, for each contact; more would not fit into memory
 SHOWN_MODES = 4  # of what the twin misses, that the page names
 
 
@@ -89,6 +91,11 @@ class Plan:
     epochs: int | None = None
     workers: int = 1
     across: int = FINE
+
+    def __post_init__(self) -> None:
+        require_count(self.count)
+        if not 1 <= self.draws <= MOST_DRAWS:
+            raise DatasetError(f"--draws {self.draws}: expected 1 to {MOST_DRAWS} for each contact")
 
     @property
     def touched(self) -> ObjectSpec:

@@ -7,6 +7,7 @@ time. ``rest.png`` is the frame without contact that pins were counted from, if 
 
 import json
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
@@ -192,7 +193,7 @@ class SessionSource(SequentialSource):
     def _picture(self, name: str) -> np.ndarray:
         """A picture of the session by its path in the folder; one that lies elsewhere is not read, even where a link leads to it."""
         path = self.folder / name
-        if not path.resolve().is_relative_to(self.folder.resolve()):
+        if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(self.folder)):
             raise FrameError(f"{self.folder}: {name} is a link to outside the session; put the picture itself there")
         try:
             return read_image(path)[0]

@@ -73,17 +73,19 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
     """
     path = Path(name_or_path)
     if path.suffix.lower() in MESH_SUFFIXES:
-        if not path.is_file():
-            raise SpecError(f"{path}: no such mesh file; give the path of an existing STL, OBJ or PLY")
+        if not os.path.isfile(path):  # unlike ``Path.is_file`` also False for what is no path at all
+            raise SpecError(f"{shown(path)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
         mesh = MeshShape(kind="mesh", file=str(path.resolve()))
         return _checked({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
     spec_path = _find(name_or_path, "objects")
     spec = read_section(spec_path, ObjectSpec)
     if isinstance(spec.shape, MeshShape):
-        file = (spec_path.parent / spec.shape.file).resolve()
-        if not file.is_file():
-            raise SpecError(f"{spec_path}: shape.file: no such mesh file {file}; the path is relative to the specification")
-        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update={"file": str(file)})})
+        file = spec_path.parent / spec.shape.file
+        if not os.path.isfile(file):
+            raise SpecError(
+                f"{spec_path}: shape.file: no such mesh file '{shown(spec.shape.file)}'; the path is relative to the specification"
+            )
+        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update={"file": str(file.resolve())})})
     return spec
 
 
@@ -124,19 +126,21 @@ def _list(kind: str) -> dict[str, Path]:
 
 def _find(name_or_path: str | Path, kind: str) -> Path:
     path = Path(name_or_path)
-    if path.suffix != ".toml" and path.is_file():
+    if path.suffix != ".toml" and os.path.isfile(path):
         suffixes = ", ".join((".toml", *MESH_SUFFIXES) if kind == "objects" else (".toml",))
         raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {suffixes}")
     if path.suffix == ".toml":
-        if not path.is_file():
-            raise SpecError(f"{path}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'")
+        if not os.path.isfile(path):
+            raise SpecError(f"{shown(path)}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'")
         return path
     known = _list(kind)
     if str(name_or_path) in known:
         return known[str(name_or_path)]
     near = difflib.get_close_matches(str(name_or_path), known, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
-    raise SpecError(f"no {kind[:-1]} named '{name_or_path}': {hint} ('twin {kind}' lists them; own files go to {user_spec_dir() / kind})")
+    raise SpecError(
+        f"no {kind[:-1]} named '{shown(name_or_path)}': {hint} ('twin {kind}' lists them; own files go to {user_spec_dir() / kind})"
+    )
 
 
 def read_section(path: Path, model: type[Spec]) -> Spec:

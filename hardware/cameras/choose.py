@@ -1,6 +1,6 @@
 """From what a user writes after ``--camera`` to a frame source."""
 
-from pathlib import Path
+import os
 
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.recorded import RecordedSource
@@ -8,8 +8,10 @@ from hardware.cameras.source import FrameSource
 from hardware.cameras.uvc import UvcCamera, UvcSettings
 from hardware.errors import DeviceError
 from hardware.session import SessionSource, is_session
+from scenes.files import shown
 from scenes.sensor import SensorSpec
 from twin.frames.forms import frame_size
+from twin.frames.recording import LONGEST_PATH
 from twin.types import Form
 
 
@@ -51,6 +53,7 @@ def open_camera(
         return UvcCamera(int(text) if text.isdecimal() else text, spec, live_form, settings)
     if "://" in text:
         return MjpegCamera(text, spec, live_form)
-    if not Path(text).exists():
-        raise DeviceError(f"{text}: no such camera, file or folder; expected a number, /dev/videoN, http://..., twin, a folder or a video")
+    if not os.path.exists(text):
+        expected = "a number, /dev/videoN, http://..., twin, a folder or a video"
+        raise DeviceError(f"{shown(text, LONGEST_PATH)}: no such camera, file or folder; expected {expected}")
     return SessionSource(text) if is_session(text) else RecordedSource(text, spec, form)

@@ -2,19 +2,21 @@
 
 import re
 import socket
-from pathlib import PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hardware.cameras.choose import open_camera
 from hardware.collect import CollectPlan
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import emulate_magician, emulate_mg400
 from hardware.emulators.twin_camera import emulate_camera
 from hardware.errors import DeviceError
 from hardware.following import FollowPlan
+from hardware.safety import load_limits
 from hardware.servo_study import folder_name
 from hardware.view.server import BrowserView
 from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
@@ -23,11 +25,13 @@ from scenes.sensor import MOST_POISSON
 from training.estimator import PoseEstimator
 from training.recipes import TrainingError
 from twin.errors import FrameError, TwinError
+from twin.frames import open_recording
 from twin.frames.forms import form_of, known_frames
 from twin.geometry.solid import Resolution
+from twin.judge.degradation.plan import load_plan
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.pins import Pipeline
+from twin.pins import Pipeline, load_detector
 from twin.types import Form
 
 SENSOR = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
@@ -116,6 +120,15 @@ def test_a_models_name_is_a_folder_below(label):
     assert (PureWindowsPath("C:/out") / name).parent == PureWindowsPath("C:/out")
     if label in ("mg400-331", "run.2"):
         assert name == label
+
+
+@pytest.mark.parametrize("name", ["n" * 300, "n" * 5000, "n/" * 3000])
+def test_what_is_no_path_at_all_is_not_there(name):
+    for load in (load_sensor, load_object, load_experiment, load_servo, load_limits, load_detector, load_plan, open_recording, open_camera):
+        for suffix in ("", ".toml", ".stl", ".png"):
+            with pytest.raises((SpecError, TwinError)) as caught:
+                load(name + suffix if load not in (load_detector, load_plan) else Path(name + suffix))
+            assert len(str(caught.value).splitlines()) == 1 and str(caught.value).isprintable()
 
 
 def test_a_mistyped_run_gets_the_nearest_name(tmp_path):

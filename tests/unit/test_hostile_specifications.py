@@ -211,6 +211,15 @@ def test_names_in_any_script_and_with_spaces_are_names(tmp_path):
         assert load_object(path).name == name
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs links")
+@pytest.mark.parametrize("file", ["loop.stl", "a\\u0000b.stl", "nowhere/" * 1000 + "x.stl", "."])
+def test_a_mesh_that_is_no_file_is_refused(tmp_path, file):
+    (tmp_path / "loop.stl").symlink_to("loop.stl")
+    path = tmp_path / "ball.toml"
+    path.write_text(f'description = ""\nshape = {{ kind = "mesh", file = "{file}" }}\n')
+    refused(load_object, path, "file")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="such a name is a path elsewhere")
 def test_a_mesh_whose_file_has_no_usable_name_is_refused(tmp_path):
     path = tmp_path / "a\\b.stl"

@@ -134,6 +134,14 @@ def test_a_picture_outside_the_session_is_not_read_by_a_link(tmp_path, linked):
         _ = SessionSource(folder).rest
 
 
+def test_a_picture_that_is_a_link_to_itself_is_refused(tmp_path):
+    folder = recorded(tmp_path / "s")
+    (folder / "frames/frame_000001.png").unlink()
+    (folder / "frames/frame_000001.png").symlink_to("frame_000001.png")
+    with pytest.raises(FrameError, match="frame_000001.png: can't be read"):
+        replayed(folder)
+
+
 def test_a_session_behind_a_link_is_read(tmp_path):
     recorded(tmp_path / "s")
     (tmp_path / "link").symlink_to("s")

@@ -1,5 +1,6 @@
 """A recording, opened from whatever the user gives and read frame by frame."""
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import TypedDict
 import cv2
 import numpy as np
 
-from scenes.files import require_regular
+from scenes.files import require_regular, shown
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
@@ -17,6 +18,7 @@ from twin.frames.images import quiet, read_image
 from twin.frames.tables import TABLES, order_by_table, read_metadata
 from twin.types import Form, Frame
 
+LONGEST_PATH = 400  # characters of a path that a message shows
 MOST_NAMED = 20  # columns that a message names; the widest tables in use have about 40
 
 
@@ -282,9 +284,9 @@ def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form 
         Nothing there, or no usable frame.
     """
     path = Path(path)
-    if not path.exists():
-        link = "a link to nothing" if path.is_symlink() else "no such file or folder"
-        raise FrameError(f"{path}: {link}; give a picture, a folder of frames, a recording or a video")
+    if not os.path.exists(path):  # unlike ``Path.exists`` also False for what is no path at all
+        link = "a link to nothing" if os.path.islink(path) else "no such file or folder"
+        raise FrameError(f"{shown(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
     known = None if spec is None else known_frames(spec)
     if path.is_dir():
         return _open_folder(path, known, form)

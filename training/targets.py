@@ -13,6 +13,7 @@ import numpy as np
 
 from twin.errors import FrameError
 from twin.frames import Recording
+from twin.frames.tables import numbers
 from twin.rig.labels import read_executed
 
 PRESETS = {
@@ -139,15 +140,7 @@ def corrected(
 
 def _numbers(cells: np.ndarray, name: str, problems: list[str]) -> np.ndarray:
     """A column as floats; a cell without a finite number becomes NaN, and such cells are counted in ``problems``."""
-    values = cells if cells.dtype.kind == "f" else np.array([_number(cell) for cell in cells])
-    bad = ~np.isfinite(values)
-    if bad.any():
+    values = numbers(cells)
+    if (bad := np.isnan(values)).any():
         problems.append(f"column {name}: {bad.sum()} cells hold no finite number")
-    return np.where(bad, np.nan, values)
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except (TypeError, ValueError):
-        return float("nan")
+    return values

@@ -31,3 +31,5 @@ def test_what_is_missing_is_said(tmp_path):
         read_arm_labels(recording(tmp_path, ""))
     with pytest.raises(FrameError, match=r"1 rows hold no number in a pose or move \(b.png\)"):
         read_arm_labels(recording(tmp_path, "image_name,pose_2\na.png,1\nb.png,nan\n"))
+    with pytest.raises(FrameError, match=r"1 rows hold no number in a pose or move \(b.png\)"):  # not all rows, where one cell is text
+        read_arm_labels(recording(tmp_path, "image_name,pose_2\na.png,1\nb.png,1 mm\n"))

@@ -212,6 +212,19 @@ def _as_array(cells: list[str]) -> np.ndarray:
         return np.array(cells, str)
 
 
+def numbers(cells: np.ndarray) -> np.ndarray:
+    """A column (M,) as floats; NaN where a cell holds no finite number."""
+    values = cells if cells.dtype.kind == "f" else np.array([_number(cell) for cell in cells])
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return float("nan")
+
+
 def read_metadata(path: Path, problems: list[str]) -> object | None:
     """Content of a JSON file; None, with the reason in ``problems``, if it cannot be read.
 

@@ -14,7 +14,7 @@ import numpy as np
 from scenes.rig import RigSpec
 from twin.errors import FrameError
 from twin.frames import Recording
-from twin.frames.tables import bare_name, counted, pair_rows, read_table
+from twin.frames.tables import bare_name, counted, numbers, pair_rows, read_table
 
 EXECUTED_FILES = ("labels_corrected.csv", "move_executed.csv")  # in the order in which they are looked for
 EXECUTED_COLUMNS = ("executed", "executed_estimate")
@@ -59,7 +59,7 @@ def read_arm_labels(recording: Recording) -> list[ArmLabel]:
     values = {kind: np.zeros((len(recording), 6)) for kind in columns}
     for kind, named in columns.items():
         for axis, cells in named:
-            values[kind][:, axis - 1] = cells if cells.dtype.kind == "f" else np.nan
+            values[kind][:, axis - 1] = numbers(cells)
     odd = ~np.isfinite(np.hstack([values["pose"], values["move"]])).all(axis=1)
     if odd.any():
         names = [recording.names[k] for k in np.flatnonzero(odd)[:3]]

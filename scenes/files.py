@@ -13,6 +13,7 @@ DEEPEST = 16  # tables and arrays within each other; the shipped ones have at mo
 INT64 = range(-(2**63), 2**63)  # the whole numbers of TOML (v1.0.0, "Integer")
 
 LONGEST_SHOWN = 60  # characters of a wrong key or value that a message shows
+LONGEST_PATH = 400  # characters of a path that a message shows
 
 
 def shown(part: object, most: int = LONGEST_SHOWN) -> str:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 
 from scenes.base import SpecError
 from scenes.experiment import ExperimentSpec
-from scenes.files import LONGEST_SHOWN, read_toml, shown
+from scenes.files import LONGEST_PATH, LONGEST_SHOWN, read_toml, shown
 from scenes.object import MeshShape, ObjectSpec
 from scenes.randomisation import RandomisationSpec
 from scenes.sensor import SensorSpec
@@ -74,7 +74,7 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
     path = Path(name_or_path)
     if path.suffix.lower() in MESH_SUFFIXES:
         if not os.path.isfile(path):  # unlike ``Path.is_file`` also False for what is no path at all
-            raise SpecError(f"{shown(path)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
+            raise SpecError(f"{shown(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
         mesh = MeshShape(kind="mesh", file=str(path.resolve()))
         return _checked({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
     spec_path = _find(name_or_path, "objects")
@@ -131,7 +131,9 @@ def _find(name_or_path: str | Path, kind: str) -> Path:
         raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {suffixes}")
     if path.suffix == ".toml":
         if not os.path.isfile(path):
-            raise SpecError(f"{shown(path)}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'")
+            raise SpecError(
+                f"{shown(path, LONGEST_PATH)}: no such file; give the path of an existing TOML specification, or a name from 'twin {kind}'"
+            )
         return path
     known = _list(kind)
     if str(name_or_path) in known:

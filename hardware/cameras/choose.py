@@ -8,10 +8,9 @@ from hardware.cameras.source import FrameSource
 from hardware.cameras.uvc import UvcCamera, UvcSettings
 from hardware.errors import DeviceError
 from hardware.session import SessionSource, is_session
-from scenes.files import shown
+from scenes.files import LONGEST_PATH, shown
 from scenes.sensor import SensorSpec
 from twin.frames.forms import frame_size
-from twin.frames.recording import LONGEST_PATH
 from twin.types import Form
 
 

@@ -9,7 +9,7 @@ from typing import TypedDict
 import cv2
 import numpy as np
 
-from scenes.files import require_regular, shown
+from scenes.files import LONGEST_PATH, require_regular, shown
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
@@ -18,7 +18,6 @@ from twin.frames.images import quiet, read_image
 from twin.frames.tables import TABLES, order_by_table, read_metadata
 from twin.types import Form, Frame
 
-LONGEST_PATH = 400  # characters of a path that a message shows
 MOST_NAMED = 20  # columns that a message names; the widest tables in use have about 40
 
 

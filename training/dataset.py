@@ -10,7 +10,7 @@ from training.pins import PIN_COLUMNS, PinTable, pin_table, voronoi_areas
 from training.simulated import is_pins_only, is_simulated, open_simulated, touched_labels
 from training.targets import Targets, choose_targets, joined_targets
 from twin.errors import FrameError
-from twin.frames import Recording, open_recording
+from twin.frames import Recording, natural_key, open_recording
 from twin.pins import nominal_reference
 from twin.progress import Step
 from twin.rig.labels import label_slope, plate_slope
@@ -64,6 +64,23 @@ class Dataset:
         """The same data set with only some rows."""
         group = None if self.group is None else self.group[index]
         return replace(self, pins=self.pins.rows(index), targets=self.targets.rows(index), group=group)
+
+    def natural_order(self) -> np.ndarray:
+        """(M,) int: its rows in the natural order of their frames' names; of copies first the first ones, then the second ones."""
+        copies: dict[str, int] = {}
+        keys = []
+        for name in self.pins.image_name.tolist():
+            copies[name] = copies.get(name, -1) + 1
+            keys.append((copies[name], natural_key(name), name))
+        return np.array(sorted(range(len(keys)), key=keys.__getitem__), int)
+
+    def in_order(self) -> "Dataset":
+        """The same data set in the natural order of its frames' names, whatever order the table has; its groups numbered as they come."""
+        ordered = self.rows(self.natural_order())
+        if ordered.group is None:
+            return ordered
+        _, first, of_row = np.unique(ordered.group, return_index=True, return_inverse=True)
+        return replace(ordered, group=np.argsort(np.argsort(first))[of_row.ravel()])
 
     def beside(self, pins: "list[PinTable]") -> "Dataset":
         """This data set once with its own pins and once more with each of ``pins``; all copies of a row belong together."""
@@ -155,7 +172,10 @@ def joined(parts: list[Dataset]) -> Dataset:
                 raise FrameError(f"{part.folder}: its {what} ({mine}) differs from that of {first.folder} ({others}); train on one kind")
     tables = [part.pins.seen_from(first.pins.reference) for part in parts]
     columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in PIN_COLUMNS}
-    columns["image_name"] = np.concatenate([np.char.add(f"{part.folder.name}/", part.pins.image_name) for part in parts])
+    called = _told_apart([part.folder.resolve() for part in parts])
+    columns["image_name"] = np.concatenate(
+        [np.char.add(f"{name}/", part.pins.image_name) for name, part in zip(called, parts, strict=True)]
+    )
     pins = replace(first.pins.with_columns(columns), measured=all(table.measured for table in tables))
     targets = joined_targets([part.targets for part in parts])
     groups: list[np.ndarray] = []
@@ -168,10 +188,18 @@ def joined(parts: list[Dataset]) -> Dataset:
     return Dataset(pins, targets, tuple(part.folder for part in parts), np.concatenate(groups), problems)
 
 
+def _told_apart(folders: list[Path]) -> list[str]:
+    """The ends of paths, as short as all can be while no two are the same: mostly the folders' names."""
+    longest = max(len(folder.parts) for folder in folders)
+    ends = (["/".join(folder.parts[-count:]) for folder in folders] for count in range(1, longest + 1))
+    return next(names for names in ends if len(set(names)) == len(names))
+
+
 def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Training and validation rows: a random fifth is held out. The rows of recordings are sorted by label, so no block of rows would do.
 
-    With ``group`` (count,) a fifth of the groups is held out, with all their rows.
+    Rows are chosen by their number, so number them in the order of their names (``Dataset.in_order``). With ``group`` (count,) a fifth of
+    the groups is held out, with all their rows.
     """
     if group is not None:
         names, of_row = np.unique(group, return_inverse=True)

@@ -1,13 +1,11 @@
 """A trained model with its sensor and its pipeline: a frame goes in, a pose comes out. This is what a live loop calls."""
 
 import hashlib
-import json
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from pickle import UnpicklingError
 from time import perf_counter
 
 import numpy as np
@@ -21,6 +19,7 @@ from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.pins import PinTable
 from training.recipes import TrainingError
+from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
 from twin.errors import FrameError
 from twin.pins import Pipeline, make_reference, measure_reference
 from twin.store import fingerprint
@@ -102,17 +101,18 @@ class PoseEstimator:
         """
         run = folder_of(run)
         packed = (run / WEIGHTS).is_file()
-        if not packed and not (run / "weights.pt").is_file():
-            hint = "it was begun and not finished; continue it with 'twin train'" if (run / "checkpoint.pt").is_file() else _instead_of(run)
+        if not packed and not (run / TENSORS).is_file():
+            hint = "it was begun and not finished; continue it with 'twin train'" if (run / CHECKPOINT).is_file() else _instead_of(run)
             raise TrainingError(f"{run}: holds no trained model: {hint}")
+        config = read_config(run)
         try:
-            config = json.loads((run / "config.json").read_text())
-            content = unpack(config, run / WEIGHTS) if packed else torch.load(run / "weights.pt", weights_only=True)
+            content = unpack(config, run / WEIGHTS) if packed else read_tensors(run / TENSORS)
+            require_together(run, config, content)
             if "correction" in content:
-                raise ValueError("it is corrected by a regression")
+                raise TrainingError(f"{run}: corrected by a regression, which this version does not know; train again")
             return cls(config, content)
-        except (OSError, ValueError, KeyError, RuntimeError, UnpicklingError) as error:
-            raise TrainingError(f"{run}: not a run of this version, or a damaged one ({error}); train again") from error
+        except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, IndexError) as error:
+            raise damaged(run / (WEIGHTS if packed else TENSORS), f"its weights do not fit {CONFIG}") from error
 
     @property
     def counts_from_rest(self) -> bool:
@@ -226,7 +226,7 @@ def folder_of(run: str | Path) -> Path:
 def digest_of(run: str | Path) -> str:
     """Digest of everything that a model's answers depend on: its weights, its configuration, and the code that runs it."""
     folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
-    for name in ("config.json", WEIGHTS, "weights.pt"):
+    for name in (CONFIG, WEIGHTS, TENSORS):
         if (folder / name).is_file():
             digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())
     return digest.hexdigest()

@@ -17,6 +17,7 @@ import torch
 
 from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
+from training.identity import rows_named
 from training.models.part import Prediction
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
@@ -45,24 +46,26 @@ ERASED_MARGIN = 1.25  # side of the square that is wiped out around a pin, in me
 
 
 def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndarray:
-    """Rows of a data set: with ``validation`` those that the run kept out of its training, with ``all`` every row.
+    """Rows of a data set: with ``validation`` those that the run kept out of its training, by their names; with ``all`` every row.
 
     Raises
     ------
     TrainingError
-        The run kept no rows out, or it was trained on another recording.
+        The run kept no rows out, or the data set is not the one that it was trained on.
     """
     if rows == "all":
         return np.arange(len(data))
-    split, trained_on = estimator.config["split"], estimator.config["rows"]["usable"]
+    split, known = estimator.config["split"], estimator.config["rows"]
     if split is None:
         raise TrainingError("the run was trained on all rows; give a recording it has not seen, and --rows all")
-    if trained_on != len(data):
+    if "kept_out" in known:
+        return rows_named(data, known["kept_out"])
+    if known.get("usable") != len(data):
         raise TrainingError(
-            f"the run was trained on part of {trained_on} rows, this recording has {len(data)}; "
+            f"the run was trained on part of {known.get('usable')} rows, this recording has {len(data)}; "
             "give --rows all for a recording it has not seen"
         )
-    return split_rows(len(data), split, data.group)[1]
+    return data.natural_order()[split_rows(len(data), split, data.in_order().group)[1]]
 
 
 def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:

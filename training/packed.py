@@ -17,6 +17,7 @@ from safetensors.numpy import load_file, save
 from scenes.sensor import SensorSpec
 from training.models import model_named
 from training.recipes import TrainingError
+from training.run_files import CONFIG, TENSORS, read_config, read_tensors
 from twin.pins import make_reference
 from twin.store import write_bytes, write_text
 
@@ -41,10 +42,9 @@ def pack(run: Path, out: Path) -> int:
     TrainingError
         The run is a small copy already, has such processes, or is of a model that has no small copy.
     """
-    if not (run / "weights.pt").is_file():
+    if not (run / TENSORS).is_file():
         raise TrainingError(f"{run}: a small copy already; give the run that it was made of")
-    config = json.loads((run / "config.json").read_text())
-    content = torch.load(run / "weights.pt", weights_only=True)
+    config, content = read_config(run), read_tensors(run / TENSORS)
     if content["kernels"]:
         raise TrainingError(
             f"{run}: has Gaussian processes beside its networks, which a small copy does not hold; only runs with --no-kernel can be packed"
@@ -59,7 +59,7 @@ def pack(run: Path, out: Path) -> int:
     out.mkdir(parents=True, exist_ok=True)
     write_bytes(out / WEIGHTS, save({key: np.ascontiguousarray(value) for key, value in small.items()}))
     about = {key: value for key, value in config.items() if key not in ("data", "problems")}
-    write_text(out / "config.json", json.dumps(about) + "\n")
+    write_text(out / CONFIG, json.dumps(about) + "\n")
     return (out / WEIGHTS).stat().st_size
 
 

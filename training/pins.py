@@ -110,14 +110,14 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
         about = {"rest_px": reference.pins_px, "measured": np.array(named != UNMEASURED), "notes": np.array(notes, str)}
         return {"image_name": np.array(names, str)} | about | arrays
 
-    found = cached_arrays("recorded-pins", _key(recording, spec), compute)
+    found = cached_arrays("recorded-pins", recording_key(recording, spec), compute)
     problems += found.pop("notes").tolist()
     reference = make_reference(found.pop("rest_px"), spec.pins.rings)
     return PinTable(spec, recording.form, reference, measured=bool(found.pop("measured")), **found)
 
 
-def _key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
-    """All that the pins depend on beside the code: files and the specification."""
+def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
+    """All that depends on a recording's frames beside the code depends on: its files and the specification."""
     root = recording.path if recording.path.is_dir() else recording.path.parent
     states = sorted((str(file.relative_to(root)), *_state(file)) for file in root.rglob("*") if file.is_file())
     return {
@@ -129,9 +129,10 @@ def _key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
     }
 
 
-def _state(file: Path) -> tuple[int, int]:
+def _state(file: Path) -> tuple[int, int, int]:
+    """Changes with every change of the file: copying tools set the time of the last change, but not when the file was put there."""
     status = file.stat()
-    return status.st_size, status.st_mtime_ns
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def voronoi_areas(nodes_px: np.ndarray, reference: Reference, *, progress: Step | None = None) -> np.ndarray:

@@ -13,13 +13,14 @@ from training.models import recipe_of
 from training.networks import choose_device
 from training.recipes import TrainingError
 from training.run import RunConfig, train_run
+from training.run_files import CONFIG, TENSORS
 from training.targets import PRESETS
 from twin.progress import Progress, silent, stage
 from twin.types import Form
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helpers of its other labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = ("config.json", "curves.csv", "weights.pt")  # of a finished run
+FILES = (CONFIG, "curves.csv", TENSORS)  # of a finished run
 
 
 @dataclass(frozen=True)

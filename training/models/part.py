@@ -178,6 +178,10 @@ class Model(ABC):
         """Inputs of all M frames of a data set, and what is learnt beforehand from its training rows (m,)."""
 
     @abstractmethod
+    def seen(self, data: Dataset) -> object:
+        """All that the model sees of a data set's frames, as ``inputs_digest`` takes it: frames with the same are the same to it."""
+
+    @abstractmethod
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> nn.Module:
         """A network with random weights, whose outputs are a dict with ``mean`` (B, K).
 
@@ -269,6 +273,11 @@ class PinModel(Model):
     def prepare(self, data: Dataset, train: np.ndarray) -> Prepared:
         """See ``Model``."""
         return self.prepare_pins(data.pins, train)
+
+    def seen(self, data: Dataset) -> object:
+        """See ``Model``: the pins, and where they are at rest."""
+        pins = data.pins
+        return [pins.nodes_px, pins.area_px2, pins.lost, pins.reference.pins_px, pins.measured]
 
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:
         """See ``Model``."""

@@ -8,6 +8,7 @@ from typing import Any
 from training.dataset import joined, load_dataset
 from training.estimator import PoseEstimate, PoseEstimator
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
+from training.identity import changed_since
 from training.recipes import TrainingError
 from twin.frames import Recording, open_recording
 from twin.progress import Progress, silent, stage
@@ -167,6 +168,8 @@ def evaluate_run(
             parts.append(load_dataset(folder, estimator.sensor, estimator.names, form=estimator.form, progress=step))
     found = joined(parts)
     chosen = rows_to_judge(estimator, found, rows)
+    if rows == "validation":
+        found.problems.extend(changed_since(estimator.config, found, estimator.part))
     made = estimator.predict_rows(found, chosen)
     metrics = {"model": estimator.model, "rows": rows, **judge(made, found, chosen), "ms_per_frame": time_frames(estimator, found)}
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []

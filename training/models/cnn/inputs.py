@@ -8,6 +8,7 @@ import torch
 
 from training.dataset import Dataset
 from training.models.cnn.network import INPUT_PX
+from training.pins import recording_key
 from twin.frames import open_recording
 from twin.frames.forms import gray_levels
 from twin.store import cached_arrays
@@ -40,8 +41,9 @@ def small_image(image: np.ndarray) -> np.ndarray:
 def image_inputs(dataset: Dataset, progress: Callable | None = None) -> ImageInputs:
     """The frames of a data set, small, in its order."""
 
+    recording = open_recording(dataset.folder, dataset.pins.sensor, dataset.pins.form)
+
     def compute() -> dict[str, np.ndarray]:
-        recording = open_recording(dataset.folder, dataset.pins.sensor, dataset.pins.form)
         images = {}
         for frame in recording:
             images[frame.name] = small_image(frame.image)
@@ -49,5 +51,5 @@ def image_inputs(dataset: Dataset, progress: Callable | None = None) -> ImageInp
                 progress(frame.sequence + 1, len(recording))
         return {"images": np.stack([images[name] for name in dataset.pins.image_name])}
 
-    key = {"path": str(dataset.folder.resolve()), "names": dataset.pins.image_name.tolist(), "pins": dataset.pins.nodes_px.tobytes()}
-    return ImageInputs(cached_arrays("small-images", key | {"px": INPUT_PX}, compute)["images"])
+    key = recording_key(recording, dataset.pins.sensor) | {"rows": dataset.pins.image_name.tolist(), "px": INPUT_PX}
+    return ImageInputs(cached_arrays("small-images", key, compute)["images"])

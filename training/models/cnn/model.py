@@ -36,6 +36,10 @@ class CnnModel(Model):
         """See ``Model``."""
         return Prepared(image_inputs(data))
 
+    def seen(self, data: Dataset) -> object:
+        """See ``Model``: the small images."""
+        return image_inputs(data).images.numpy()
+
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Cnn:
         """See ``Model``; there are no sizes."""
         refuse_sizes(self, size)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from scenes.object import ObjectSpec
 from training.assemble import intervals
@@ -14,11 +13,13 @@ from training.dataset import Dataset, joined, split_rows
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_check
 from training.gaussian_process import fit_two_fidelities
+from training.identity import identity_of
 from training.loop import epoch_step
-from training.models import recipe_of
+from training.models import model_named, recipe_of
 from training.pins import voronoi_areas
 from training.recipes import TrainingError
-from training.run import RunConfig, is_finished, train_run, write_tensors
+from training.run import RunConfig, is_finished, train_run
+from training.run_files import CONFIG, TENSORS, read_tensors, write_tensors
 from training.simulated import config_of, is_pins_only, open_simulated
 from training.studies.sim_to_real.discrepancy import Discrepancy
 from training.studies.sim_to_real.twins import contact_of
@@ -55,7 +56,7 @@ class Frames:
 
 
 def choose_frames(count: int, labels: int, seed: int) -> Frames:
-    """Draw the frames of a recording of ``count``.
+    """Draw the frames of a recording of ``count``, which is in the order of its names.
 
     Raises
     ------
@@ -101,7 +102,7 @@ def train_in_twin(
     seed: int,
     split: int | None,
     epochs: int | None,
-    labelled: tuple[str, ...] = (),
+    labelled: Dataset | None = None,
     progress: Step | None = None,
 ) -> None:
     """A run on simulated contacts, or what is left of it to do.
@@ -112,11 +113,14 @@ def train_in_twin(
         As in ``RunConfig``.
     epochs : int or None
         None: ``TWIN_EPOCHS``.
-    labelled : tuple of str
-        Names of the real frames that told what the simulated contacts miss.
+    labelled : Dataset, optional
+        The real frames that told what the simulated contacts miss.
     """
     recipe = recipe_of("vgnn", members=1, epochs=epochs or TWIN_EPOCHS, kernel=False)
-    _train(RunConfig("vgnn", recipe, seed=seed, split=split, labelled=labelled), sim, out, progress)
+    taught: dict[str, object] = {}
+    if labelled is not None:
+        taught = identity_of(labelled, model_named("vgnn")) | {"image_names": labelled.pins.image_name.tolist()}
+    _train(RunConfig("vgnn", recipe, seed=seed, split=split, labelled=taught), sim, out, progress)
 
 
 def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Step | None = None) -> None:
@@ -210,14 +214,14 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
         for values in (getattr(labelled.targets, labels), labelled.targets.raw, getattr(simulated.targets, labels))
     )
     process, alone = fit_two_fidelities(known, told, seen, truth, seed=seed)
-    content = torch.load(run / "weights.pt", weights_only=True)
+    content = read_tensors(run / TENSORS)
     missed = [intervals(made, truth, raw, scale, executed) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
     content |= intervals((mean + alone) / 2, truth, raw, scale, executed) | {"beside": process.arrays()}
     out.mkdir(parents=True, exist_ok=True)
-    write_tensors(out / "weights.pt", content)
+    write_tensors(out / TENSORS, content)
     about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}
-    write_text(out / "config.json", json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
+    write_text(out / CONFIG, json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
     return Beside(np.abs(alone - truth).mean(axis=0) * ensemble.scale, wider)
 
 
@@ -226,8 +230,8 @@ def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
 
     Doing it once more with the same intervals changes nothing.
     """
-    content = torch.load(run / "weights.pt", weights_only=True)
-    write_tensors(run / "weights.pt", content | wider)
+    content = read_tensors(run / TENSORS)
+    write_tensors(run / TENSORS, content | wider)
 
 
 def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict[str, Any]:

@@ -206,7 +206,7 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
 def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
     """Read and choose frames, fit the specification if asked to, and see what the twin misses on the labelled ones."""
     with stage(progress, "frames") as step:
-        real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step)
+        real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
     chosen = choose_frames(len(real), plan.labels, plan.seed)
     out.mkdir(parents=True, exist_ok=True)
     few = real.rows(chosen.few)
@@ -282,7 +282,7 @@ def _trained(ground: _Ground, twin: Twin, learnt: list[Dataset], told: bool) -> 
             seed=plan.seed,
             split=plan.seed,
             epochs=plan.epochs,
-            labelled=tuple(ground.measured.names) if told else (),
+            labelled=ground.few if told else None,
             progress=step,
         )
     return folder

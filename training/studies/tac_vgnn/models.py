@@ -3,7 +3,6 @@
 import csv
 import ctypes
 import gc
-import json
 import threading
 import time
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from training.models.part import Inputs
 from training.networks import parameter_count
 from training.pins import PinTable
 from training.run import RunConfig, is_finished, train_run
+from training.run_files import CHECKPOINT, TENSORS, read_config
 from twin.progress import Progress, silent, stage
 
 INITIAL_ROWS = 500  # rows from which a timed network takes its scales and modes; its speed does not depend on their number
@@ -106,15 +106,15 @@ def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None)
         "minutes_now": minutes,
         "state": "not begun",
     }
-    if not (folder / "weights.pt").is_file():
+    if not (folder / TENSORS).is_file():
         return row
     estimator = PoseEstimator.load(folder)
     rows = rows_to_judge(estimator, data, "validation")
     metrics = judge(estimator.predict_rows(data, rows), data, rows)
     curves = read_curves(folder)
     row |= {
-        "state": "ended early" if (folder / "checkpoint.pt").exists() else "finished",
-        "parameters": json.loads((folder / "config.json").read_text())["parameters"],
+        "state": "ended early" if (folder / CHECKPOINT).exists() else "finished",
+        "parameters": read_config(folder)["parameters"],
         "epochs": len(curves),
         "epochs_allowed": plan.config.recipe.epochs * plan.config.recipe.members,
         "training_minutes": sum(point["seconds"] for point in curves) / 60,

@@ -1,6 +1,7 @@
 """Reading specification files: where they lie, and errors that help."""
 
 import difflib
+import hashlib
 import os
 from pathlib import Path
 from typing import TypeVar
@@ -75,7 +76,7 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
     if path.suffix.lower() in MESH_SUFFIXES:
         if not os.path.isfile(path):  # unlike ``Path.is_file`` also False for what is no path at all
             raise SpecError(f"{shown(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
-        mesh = MeshShape(kind="mesh", file=str(path.resolve()))
+        mesh = MeshShape(kind="mesh", file=str(path.resolve()), sha256=_digest(path))
         return _checked({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
     spec_path = _find(name_or_path, "objects")
     spec = read_section(spec_path, ObjectSpec)
@@ -85,8 +86,22 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
             raise SpecError(
                 f"{spec_path}: shape.file: no such mesh file '{shown(spec.shape.file)}'; the path is relative to the specification"
             )
-        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update={"file": str(file.resolve())})})
+        digest = _digest(file)
+        if spec.shape.sha256 not in ("", digest):
+            raise SpecError(
+                f"{spec_path}: shape.sha256: {file} has another content ({digest}); put the right file there, or leave the key out"
+            )
+        found = {"file": str(file.resolve()), "sha256": digest}
+        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update=found)})
     return spec
+
+
+def _digest(mesh: Path) -> str:
+    try:
+        with mesh.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise SpecError(f"{mesh}: can't be read ({error.strerror}); give a mesh file that may be read") from error
 
 
 def load_experiment(name_or_path: str | Path) -> ExperimentSpec:

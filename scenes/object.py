@@ -56,12 +56,16 @@ class MeshShape(Section):
 
     The mesh is turned by ``rotation_deg`` (intrinsic x, y, z), then moved so that the line through its bounding box's
     centre along z first meets it at the origin (where the mesh has a hole there: its lowest vertex has z = 0).
+
+    ``sha256`` is the digest of the file's content. It is found when the object is loaded; a specification that gives it takes no other
+    content.
     """
 
     kind: Literal["mesh"]
     file: str
     unit: Literal["mm", "cm", "m", "inch"] = "mm"
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sha256: str = ""
 
 
 Shape = Annotated[

@@ -109,9 +109,11 @@ def train_run(
     Raises
     ------
     TrainingError
-        ``out`` holds another run, or there are too few frames.
+        ``out`` holds another run, there are too few frames, or ``max_minutes`` is no time.
     """
     started = monotonic()
+    if max_minutes is not None and not max_minutes >= 0:  # NaN would never stop
+        raise TrainingError(f"--max-minutes {max_minutes}: give a time of 0 or more")
     data = data.in_order()
     train = training_rows(config, data)
     parts = len(train if data.group is None else np.unique(data.group[train]))

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import zarr
+from pydantic import ValidationError
 
+from scenes.load import explained
 from scenes.sensor import SensorSpec
 from training.generation.config import GenerationConfig
-from training.generation.store import CONFIG, DRAWS, TRUTH
-from twin.errors import FrameError
+from training.generation.store import CONFIG, DRAWS, TRUTH, image_name, read_record
+from twin.errors import DatasetError, FrameError
 from twin.frames import Recording
 from twin.frames.folders import image_folders
 from twin.frames.forms import frame_size
@@ -21,6 +23,12 @@ from twin.rig.touch import Surface, surface_labels
 from twin.types import Form
 
 TABLE = "targets.csv"
+AGAIN = "copy the data set anew, or make it again"
+NEVER_ZERO = (
+    "pins_px",
+    "rest_px",
+    "visible",
+)  # no part of these arrays is all zeros, so zarr, which reads a missing part as zeros, has all
 
 
 def is_simulated(folder: Path) -> bool:
@@ -41,25 +49,40 @@ def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str,
     FrameError
         It is another sensor's, or its table and truth don't belong together.
     """
-    truth = zarr.open_group(folder / TRUTH, mode="r")
-    if truth.attrs["sensor"] != spec.name:
-        raise FrameError(f"{folder}: simulated for '{truth.attrs['sensor']}', not for '{spec.name}'; give the matching --sensor")
+    truth, sensor, form = _truth(folder)
+    if sensor != spec.name:
+        raise FrameError(f"{folder}: simulated for '{sensor}', not for '{spec.name}'; give the matching --sensor")
     problems: list[str] = []
     table = read_table(folder / TABLE, problems) if (folder / TABLE).is_file() else None
     if table is None:
         raise FrameError(f"{folder}: no {TABLE} of a finished data set; give the command that made it once more")
     _, labels = order_by_table([folder / TABLE], [folder / name for name in table.name_lists[0]], problems)
     names = table.name_lists[0]
-    arrays = _arrays(truth, ("pins_px", "rest_px", "visible"))
-    if len(names) != len(arrays["pins_px"]) or arrays["pins_px"].shape[1] != spec.pins.count:
-        raise FrameError(f"{folder}: {len(names)} rows in the table, pins {arrays['pins_px'].shape} in {TRUTH}; make the data set again")
-    form = Form(str(truth.attrs["form"]))
+    row_of = _row_of(truth)
+    strange = [name for name in names if name not in row_of]
+    if strange or len(names) != len(row_of):
+        said = f", among them {strange[0]}, which is not there" if strange else ""
+        raise FrameError(f"{folder / TABLE}: {len(names)} rows{said}; {TRUTH} has {len(row_of)}: the data set is damaged; {AGAIN}")
+    rows = [row_of[name] for name in names]
+    arrays = {key: array[rows] for key, array in _arrays(truth, ("pins_px", "rest_px", "visible")).items()}
+    if arrays["pins_px"].shape[1] != spec.pins.count:
+        raise FrameError(f"{folder}: pins {arrays['pins_px'].shape} in {TRUTH}, '{spec.name}' has {spec.pins.count}; {AGAIN}")
     return Recording(folder, form, names, frame_size(spec, form), labels, problems=problems), arrays
 
 
 def config_of(folder: Path) -> GenerationConfig:
-    """What a simulated data set was made with."""
-    return GenerationConfig.model_validate_json((folder / CONFIG).read_text())
+    """What a simulated data set was made with.
+
+    Raises
+    ------
+    DatasetError
+        Its record is missing or damaged.
+    """
+    path = folder / CONFIG
+    try:
+        return GenerationConfig.model_validate(read_record(path))
+    except ValidationError as error:
+        raise DatasetError(f"{path}: damaged ({explained(error, GenerationConfig)}); {AGAIN}") from error
 
 
 def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
@@ -82,9 +105,8 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         surface is touched.
     """
     config = config_of(folder)
-    truth = zarr.open_group(folder / TRUTH, mode="r")
-    with (folder / TABLE).open(newline="") as file:
-        row_of = {row["image_name"]: k for k, row in enumerate(csv.DictReader(file))}
+    truth, _, _ = _truth(folder)
+    row_of = _row_of(truth)
     with (folder / DRAWS).open(newline="") as file:
         draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
     rows = np.array([row_of.get(name, -1) for name in names.tolist()], int)
@@ -103,14 +125,38 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     return found
 
 
+def _truth(folder: Path) -> tuple[zarr.Group, str, Form]:
+    """The truth of a data set, the name of its sensor, and the form of its frames."""
+    path = folder / TRUTH
+    try:
+        truth = zarr.open_group(path, mode="r")
+        return truth, str(truth.attrs["sensor"]), Form(str(truth.attrs["form"]))
+    except Exception as error:  # damaged metadata raise whatever zarr runs into
+        raise FrameError(f"{path}: damaged, or of no finished data set; {AGAIN}") from error
+
+
+def _row_of(truth: zarr.Group) -> dict[str, int]:
+    """Row of each frame's name: the truth has the frames in the order of their contacts, whatever order the table has."""
+    found: dict[str, int] = {}
+    states: dict[int, int] = {}
+    for row, contact in enumerate(_arrays(truth, ("path_id",))["path_id"].tolist()):
+        states[contact] = states.get(contact, -1) + 1
+        found[image_name(contact, states[contact])] = row
+    return found
+
+
 def _arrays(truth: zarr.Group, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Arrays of ``truth.zarr`` by name."""
     found = {}
     for name in names:
-        array = truth.get(name)
-        if not isinstance(array, zarr.Array):
-            raise FrameError(f"{truth.store_path}: no array '{name}'; the data set is damaged or of another version: make it again")
-        found[name] = np.asarray(array[:])
+        try:
+            array = truth.get(name)
+            if isinstance(array, zarr.Array) and not (name in NEVER_ZERO and array.nchunks_initialized < array.nchunks):
+                found[name] = np.asarray(array[:])
+        except Exception as error:  # damaged bytes raise whatever zarr and its codecs run into
+            raise FrameError(f"{truth.store_path}: array '{name}' is damaged; {AGAIN}") from error
+        if name not in found:
+            raise FrameError(f"{truth.store_path}: array '{name}' is missing, or a part of it; {AGAIN}")
     return found
 
 

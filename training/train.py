@@ -133,5 +133,14 @@ def train_model(
 
 
 def columns_of(target: str) -> str | tuple[str, ...]:
-    """The ``columns`` of ``load_dataset``: the name of a preset, or a tuple of column names that are separated by commas."""
-    return target if target in PRESETS else tuple(name.strip() for name in target.split(","))
+    """The ``columns`` of ``load_dataset``: the name of a preset, or a tuple of column names that are separated by commas.
+
+    Raises
+    ------
+    TrainingError
+        A name is there twice, or there is none.
+    """
+    names = tuple(name.strip() for name in target.split(",") if name.strip())
+    if not names or len(set(names)) < len(names):
+        raise TrainingError(f"--target {target}: give a preset, or label columns with commas between, each once")
+    return target if target in PRESETS else names

@@ -12,6 +12,7 @@ import io
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zarr
@@ -172,13 +173,9 @@ class Store:
     def _check_config(self) -> None:
         path, text = self.folder / CONFIG, self.config.text()
         if path.is_file():
-            try:
-                before = json.loads(path.read_text())
-            except ValueError as error:
-                raise DatasetError(f"{path}: not readable ({error}); give another folder with --out") from error
-            now = json.loads(text)
+            before, now = read_record(path), json.loads(text)
             if before != now:
-                other = ", ".join(key for key in now if before.get(key) != now[key])
+                other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
                 raise DatasetError(f"{self.folder}: holds a data set made otherwise ({other}); repeat its options, or give another --out")
             require_same_code(self.folder, make_contact, begun=True)
             return
@@ -188,6 +185,24 @@ class Store:
     def _unfinished(self, error: StoreError) -> DatasetError:
         done = len(self.finished() - {REST})
         return DatasetError(f"{error}; {done} contacts are kept, and the same command goes on from there")
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """What a JSON file of a data set says.
+
+    Raises
+    ------
+    DatasetError
+        It can't be read, or does not hold what it should.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(found, dict):
+            return found
+        how = "it holds no record"
+    except (OSError, ValueError, RecursionError) as error:
+        how = getattr(error, "strerror", None) or "no readable JSON"
+    raise DatasetError(f"{path}: damaged ({how}); copy the data set anew, or make it anew in another --out")
 
 
 def refuse_foreign(folder: Path) -> None:

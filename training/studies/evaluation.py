@@ -10,6 +10,7 @@ from training.estimator import PoseEstimate, PoseEstimator
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.identity import changed_since
 from training.recipes import TrainingError
+from twin.errors import FrameError
 from twin.frames import Recording, open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
@@ -37,14 +38,26 @@ class Predictions:
             yield frame.name, self.estimator(frame)
 
     def lines(self) -> Iterator[str]:
-        """Lines for people: what is odd in the recording, each frame's pose once it is estimated, and the frames that can't be read."""
-        told = len(self.recording.problems)
+        """Lines for people: what is odd in the recording, each frame's pose once it is estimated, and the frames that can't be read.
+
+        Raises
+        ------
+        FrameError
+            At the end, if no frame gave a pose.
+        """
+        told, poses, reasons = len(self.recording.problems), 0, []
         yield from (f"note: {problem}" for problem in self.recording.problems)
         for name, made in self:
             yield f"{name}: {_said(made)}"
+            poses += made.valid
+            if not made.valid:
+                reasons.append(f"{name}: {made.reason}")
         yield from (f"note: {problem}" for problem in self.recording.problems[told:])
         for bad in self.recording.failed:
             yield f"skipped {bad['image_name']}: {bad['reason']}"
+            reasons.append(f"{bad['image_name']}: {bad['reason']}")
+        if not poses:
+            raise FrameError(f"{self.recording.path}: none of {len(self.recording)} frames gave a pose ({reasons[0]}); give other frames")
 
 
 def predict_frames(run: str | Path, frames: str | Path) -> Predictions:

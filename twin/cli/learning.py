@@ -14,7 +14,25 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, Device, FormOrAuto, Out, Quality, Sensor, Target, Workers, if_given, say, tell, writable_folder
+from twin.cli.options import (
+    CORES,
+    MOST_SEED,
+    Across,
+    Device,
+    FormOrAuto,
+    Out,
+    Quality,
+    Sensor,
+    Split,
+    Target,
+    Threads,
+    Workers,
+    finite,
+    if_given,
+    say,
+    tell,
+    writable_folder,
+)
 from twin.types import FINE
 
 HELP_DATASET = """Simulate a labelled data set with ground truth.
@@ -150,8 +168,8 @@ def train(
     out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
     target: Target = "surface-2d",
     labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
-    seed: Annotated[int, typer.Option("--seed", help="seed of weights and order")] = 0,
-    split: Annotated[int, typer.Option("--split", help="seed of the fifth kept out of training; -1: none")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and order")] = 0,
+    split: Split = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
     batch: Annotated[int | None, typer.Option("--batch", help="batch size, instead of the model's own")] = None,
     members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
@@ -159,8 +177,10 @@ def train(
         bool | None,
         typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows"),
     ] = None,
-    max_minutes: Annotated[float | None, typer.Option("--max-minutes", help="stop after the epoch that passes this time")] = None,
-    threads: Annotated[int | None, typer.Option("--threads", help="CPU threads")] = None,
+    max_minutes: Annotated[
+        float | None, typer.Option("--max-minutes", min=0, callback=finite, help="stop after the epoch that passes this time")
+    ] = None,
+    threads: Threads = None,
     device: Device = "auto",
     form: FormOrAuto = None,
 ) -> None:

@@ -14,6 +14,7 @@ import typer
 from twin.cli import app
 from twin.cli.options import (
     CORES,
+    MOST_SEED,
     Across,
     Device,
     FormOrAuto,
@@ -22,7 +23,10 @@ from twin.cli.options import (
     Sensor,
     ServoName,
     Target,
+    Threads,
     Workers,
+    each_once,
+    finite,
     if_given,
     names_in,
     numbers_in,
@@ -51,7 +55,7 @@ Writes to --out: a folder for each model and object as 'twin servo' writes it, s
 def servo_command(
     models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
     out: Out,
-    objects: Annotated[str, typer.Option("--objects", help="names with commas between")] = OBJECTS,
+    objects: Annotated[str, typer.Option("--objects", callback=each_once, help="names with commas between")] = OBJECTS,
     parameters: ServoName = "surface",
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="steps on each object, instead of once around it")] = None,
     seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
@@ -111,7 +115,7 @@ def study_objects(
     tests: Annotated[int, typer.Option("--tests", min=1, metavar="N", help="other contacts of each object to judge on")] = 50,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="contacts to judge on ('twin experiments')")] = "objects-2d",
     randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="randomisation ('twin randomisations')")] = "moves",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the contacts and the weights")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the contacts and the weights")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
@@ -179,7 +183,7 @@ def study_sim_to_real(
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled real recording")],
     out: Out,
     labels: Annotated[int, typer.Option("--labels", min=8, metavar="N", help="labelled frames beside the simulated ones")] = 40,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the drawn frames, the contacts and the weights")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the drawn frames, the contacts and the weights")] = 0,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how the frames were recorded")] = "surface-2d",
     contacts: Annotated[
         str | None,
@@ -187,7 +191,10 @@ def study_sim_to_real(
     ] = None,
     draws: Annotated[int, typer.Option("--draws", min=1, help="draws of the learnt difference of the pins, for each contact")] = 2,
     count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts to simulate")] = 500,
-    sim: Annotated[list[Path] | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead; several are joined")] = None,
+    sim: Annotated[
+        list[Path] | None,
+        typer.Option("--sim", metavar="DIR", exists=True, file_okay=False, help="simulated data set instead; several are joined"),
+    ] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
     ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time")] = False,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of every training, instead of the model's own")] = None,
@@ -248,15 +255,17 @@ def study_tac_vgnn(
     seeds: Annotated[str, typer.Option("--seeds", help="seeds of weights and order, with commas between")] = "0",
     labels: Annotated[str, typer.Option("--labels", help="labels to learn: raw (as in the paper) or corrected")] = "raw",
     target: Target = "surface-2d",
-    split: Annotated[int, typer.Option("--split", min=0, help="seed of the fifth kept out of training")] = 0,
+    split: Annotated[int, typer.Option("--split", min=0, max=MOST_SEED, help="seed of the fifth kept out of training")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of training, instead of each model's own number")] = None,
-    max_minutes: Annotated[float | None, typer.Option("--max-minutes", min=0, help="time for all training together")] = None,
+    max_minutes: Annotated[
+        float | None, typer.Option("--max-minutes", min=0, callback=finite, help="time for all training together")
+    ] = None,
     batches: Annotated[
         str, typer.Option("--batches", help="batch sizes of the efficiency figure, with commas between; empty: no figure")
     ] = "64,256,512",
     contacts: Annotated[bool, typer.Option("--contacts/--no-contacts", help="press and render the contacts of the area figure")] = True,
     device: Device = "auto",
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="CPU threads")] = None,
+    threads: Threads = None,
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_sensor
@@ -268,13 +277,13 @@ def study_tac_vgnn(
         data=data,
         sensor=load_sensor(sensor),
         models=tuple(names_in(models)),
-        seeds=numbers_in(seeds, "--seeds"),
+        seeds=numbers_in(seeds, "--seeds", 0),
         labels=labels,
         target=columns_of(target),
         split=split,
         epochs=epochs,
         max_minutes=max_minutes,
-        batches=numbers_in(batches, "--batches"),
+        batches=numbers_in(batches, "--batches", 1),
         contacts=contacts,
         device=device,
         threads=threads,

@@ -47,6 +47,8 @@ LONGEST = 12
 """The page shows lists of at most this many numbers; it tells the length of longer ones."""
 KINDS = {"real": "real", "before": "before", "after": "after", "residual": "what is left, twice amplified about middle gray"}
 """Kinds of pictures of a frame on the page, with their captions."""
+JUDGED = {"psnr_db": "PSNR, dB,", "ssim": "SSIM"}
+"""Figures that a fit may not lower without saying so, with their names."""
 ALWAYS = (
     "the response curve (gamma, black level): held; photograph a gray card at several exposures to know it",
     "LED power, exposure and reflectance: only their product is seen; the caps' brightest channel is taken as white resin",
@@ -83,6 +85,15 @@ class Calibration:
     first: list[np.ndarray]
     last: list[np.ndarray]
 
+    @property
+    def warnings(self) -> list[str]:
+        """What is worse than before the fit; empty if nothing is."""
+        return [
+            f"the fit ended worse than it began: {name} {self.before[key]:.4g} -> {self.after[key]:.4g}; look at the page before you use it"
+            for key, name in JUDGED.items()
+            if not self.after[key] >= self.before[key]
+        ]
+
 
 @dataclass(frozen=True)
 class OpticsCalibration:
@@ -96,6 +107,7 @@ class OpticsCalibration:
         before, after = self.found.before, self.found.after
         return [
             *(f"note: {note}" for note in self.found.notes),
+            *self.found.warnings,
             f"over the disc: PSNR {before['psnr_db']:.2f} -> {after['psnr_db']:.2f} dB, SSIM {before['ssim']:.3f} -> {after['ssim']:.3f}",
         ]
 
@@ -145,7 +157,8 @@ def calibrate_optics(
     """
     folder = folder_beside(out, "calibration")
     found = fit_optics(frames, sensor, folder, limit=limit, no_contact=no_contact, progress=progress)
-    write_sensor(out, found.spec, f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.")
+    said = [f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.", *found.warnings]
+    write_sensor(out, found.spec, "\n".join(said))
     return OpticsCalibration(found, [out, write_page(folder, sensor, found, frames.name)])
 
 
@@ -285,6 +298,7 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
     )
     page = Page(f"Calibration of {found.spec.name}", "twin calibrate", topic="TacTip twin: calibration", lead=lead)
     figures: list[dict[str, object]] = [{"of": "before", **found.before}, {"of": "after", **found.after}]
+    page.notice("Worse than before the fit", found.warnings, tone="bad")
     page.table(figures, [Column("of", ""), *image_columns(mark_best=True)])
     if found.notes:
         page.section("What these frames do not determine")
@@ -302,10 +316,10 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
 def _write_pictures(folder: Path, found: Calibration) -> list[tuple[str, dict[str, Path]]]:
     """Write four pictures of each frame (see ``KINDS``); the frame's name, and the pictures' paths by kind."""
     folder.mkdir(parents=True, exist_ok=True)
-    rows = []
+    rows, stems = [], [Path(frame.name).stem for frame in found.frames]
     for frame, before, after in zip(found.frames, found.first, found.last, strict=True):
         images = {"real": frame.image, "before": before, "after": after, "residual": difference_picture(frame.image, after)}
-        stem = Path(frame.name).stem
+        stem = Path(frame.name).stem if stems.count(Path(frame.name).stem) == 1 else Path(frame.name).name
         rows.append((frame.name, {kind: write_image(folder / f"{stem}-{kind}.png", image) for kind, image in images.items()}))
     return rows
 

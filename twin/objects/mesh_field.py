@@ -76,7 +76,7 @@ def load_mesh_field(shape: MeshShape) -> MeshField:
     Raises
     ------
     MeshError
-        If the file is unreadable, empty, not closed, or its size suggests another unit.
+        If the file is unreadable, empty, not closed, has another content than ``shape`` says, or its size suggests another unit.
     """
     path = Path(shape.file)
     if not path.is_file():
@@ -85,6 +85,10 @@ def load_mesh_field(shape: MeshShape) -> MeshField:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise MeshError(f"{path}: not readable ({error.strerror}); give a file that may be read") from error
+    if shape.sha256 not in ("", digest):
+        raise MeshError(
+            f"{path}: has changed since it was loaded or simulated; put the former file back, or give the object and --out anew"
+        )
     return _sampled(str(path), digest, shape.unit, shape.rotation_deg)
 
 

@@ -140,8 +140,10 @@ def require_same_code(folder: Path, *by: Maker, begun: bool) -> None:
         record = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise StoreError(f"{folder}: does not say what version of the program made it; {remedy}") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise StoreError(f"{path}: not readable ({error}); {remedy}") from error
+    if not isinstance(record, dict) or not all(isinstance(record.get(part), dict) for part in ("modules", "libraries")):
+        raise StoreError(f"{path}: damaged, it does not say what code made the folder; {remedy}")
     changes = code.changes(record)
     if changes:
         more = f" and {len(changes) - _MOST_CHANGES} more" if len(changes) > _MOST_CHANGES else ""

@@ -9,6 +9,8 @@ import numpy as np
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object, load_randomisation
 from training.dataset import Dataset, joined, load_dataset
 from training.generation import generate, require_count
+from training.recipes import TrainingError
+from training.simulated import is_simulated
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
 from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.steps import (
@@ -75,6 +77,11 @@ class Plan:
         Processes that simulate.
     across : int
         Elements along each side of the skin's grid.
+
+    Raises
+    ------
+    TrainingError
+        A folder of ``simulated`` holds no simulated data set.
     """
 
     sensor: SensorSpec
@@ -96,6 +103,9 @@ class Plan:
         require_count(self.count)
         if not 1 <= self.draws <= MOST_DRAWS:
             raise DatasetError(f"--draws {self.draws}: expected 1 to {MOST_DRAWS} for each contact")
+        for folder in self.simulated:
+            if not is_simulated(folder):
+                raise TrainingError(f"--sim {folder}: no simulated data set; give the folder of one that 'twin dataset' has finished")
 
     @property
     def touched(self) -> ObjectSpec:

@@ -77,6 +77,8 @@ class Plan:
             raise TrainingError(f"--labels must be corrected or raw, got {self.labels!r}")
         if not self.models or not self.seeds:
             raise TrainingError("nothing to compare: give at least one of --models and of --seeds")
+        if any(batch < 1 for batch in self.batches):
+            raise TrainingError(f"--batches {','.join(map(str, self.batches))}: a batch has at least 1 frame")
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""

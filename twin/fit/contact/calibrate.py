@@ -103,6 +103,7 @@ class ContactCalibration:
         for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
             if part := self.summary[key]:
                 lines.append(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
+        lines += self.summary["warnings"]
         if self.summary["distrusted"]:
             lines.append(f"not trusted: {', '.join(self.summary['distrusted'])}")
         return lines
@@ -169,5 +170,5 @@ def calibrate_to_file(
             progress=step,
         )
     said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
-    write_sensor(out, fitted, said)
+    write_sensor(out, fitted, "\n".join([said, *summary["warnings"]]))
     return ContactCalibration(fitted, summary, [out, page])

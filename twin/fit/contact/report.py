@@ -52,11 +52,30 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
         "executed_share": fit.share,
         "fitted_px": {"before": float(np.nanmean(fit.before_px)), "after": float(np.nanmean(fit.after_px)), "frames": len(measured)},
         "held_out_px": {"before": held_out[0], "after": held_out[1], "frames": held_frames} if held_out else {},
+        "warnings": _warnings(fit, held_out, held_frames),
         "distrusted": [frame["image_name"] for frame in frames if frame["trust"] < TRUSTED],
         "frames": frames,
         "independent_numbers_a_frame": INDEPENDENT,
         "problems": measured.problems,
     }
+
+
+def _warnings(fit: ContactFit, held_out: tuple | None, held_frames: int) -> list[str]:
+    """What is worse than before the fit, or not known; empty if nothing is."""
+    found = []
+    if not held_out:
+        found.append(
+            "no frame was left to keep out of the fit: how well it does on other frames is not known; give more frames, or less --labels"
+        )
+    pairs = {"the fitted frames": (float(np.nanmean(fit.before_px)), float(np.nanmean(fit.after_px)))}
+    if held_out:
+        pairs[f"the {held_frames} frames kept out"] = held_out
+    for frames, (before, after) in pairs.items():
+        if not after <= before:
+            found.append(
+                f"the fit ended worse than it began on {frames}: {before:.2f} -> {after:.2f} px; look at the page before you use it"
+            )
+    return found
 
 
 def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray, fit: ContactFit, summary: dict) -> Path:
@@ -72,6 +91,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
     chosen = solved[np.argsort(fit.before_px[solved])[[len(solved) // 2, -1]]] if len(solved) else solved
     page = Page(f"Contact of {summary['sensor']}", "twin calibrate contact", topic="TacTip twin: contact calibration", lead=_lead(summary))
     page.notice("Not trusted, as neither story fits them", [", ".join(summary["distrusted"])] if summary["distrusted"] else [], tone="bad")
+    page.notice("Warnings", summary["warnings"], tone="bad")
     page.notice("Noted", summary["problems"])
     _parameters_section(page, summary)
     page.section("Frames")

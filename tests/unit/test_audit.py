@@ -13,6 +13,7 @@ from training.pins import PinTable
 from training.studies.label_audit import NAMES, LabelAudit, summary_of, write_audit
 from training.targets import Targets
 from twin.pins import nominal_reference
+from twin.rig.labels import read_executed
 from twin.types import Form
 
 FRAMES = 600
@@ -106,4 +107,7 @@ def test_of_too_few_frames_no_corrected_labels_are_written(planted, tmp_path):
         page = (out / "audit.html").read_text()
         assert all(path.is_file() for path in written) and json.loads((out / "audit.json").read_text())["frames"] == count
         assert (out / "labels_corrected.csv").exists() == (count == 600)
+        if count == 600:  # training reads them
+            problems: list[str] = []
+            assert len(read_executed(out, data.pins.image_name.tolist(), problems)) == count and not problems
         assert ("too few" in said) == ("too few" in page) == (count == 30)

@@ -105,3 +105,29 @@ def test_what_could_not_be_let_go_of_is_printed_after_ctrl_c(monkeypatch, tmp_pa
     command = ["collect", "--camera", "twin", "--arm", "simulated", "--sensor", "mg400-331", "--out", str(tmp_path)]
     ended = CliRunner().invoke(command_line(), command)
     assert ended.exit_code == 130 and "twin: note: stop failed: press its emergency stop" in ended.stderr
+
+
+TRAIN = ["train", "--model", "gnn", "--sensor", "mg400-127", "--data", "nowhere", "--out", "nowhere/run"]
+STUDY = ["study", "tac-vgnn", "--sensor", "mg400-127", "--data", "nowhere", "--out", "nowhere/study"]
+OUT_OF_RANGE = [
+    *([*TRAIN, option, value] for option, values in {
+        "--seed": ("-1", "4294967296"), "--split": ("-2", "4294967296"), "--max-minutes": ("nan", "-1", "inf"),
+        "--threads": ("0", "-3", "100000"), "--target": ("pose_2,pose_2", ",", ""),
+    }.items() for value in values),
+    *([*STUDY, option, value] for option, values in {
+        "--seeds": ("-1", "x", "1.5"), "--batches": ("0", "-1", "x"), "--max-minutes": ("nan",), "--threads": ("0",),
+    }.items() for value in values),
+    ["study", "servo", "--model", "mg400-127", "--out", "nowhere", "--objects", ","],
+    ["study", "servo", "--model", "mg400-127", "--out", "nowhere", "--objects", "can,can"],
+    ["study", "sim-to-real", "--sensor", "mg400-127", "--frames", "nowhere", "--out", "nowhere", "--sim", "nowhere"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", OUT_OF_RANGE, ids=lambda command: " ".join((command[0], *command[-2:])))
+def test_an_option_out_of_range_is_a_usage_error_of_one_line_before_any_work(command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    ended = CliRunner().invoke(command_line(), command)
+    assert ended.exit_code == 2
+    last = ended.output.strip().splitlines()[-1]
+    assert last.startswith("Error: ") and command[-2] in last
+    assert not list(tmp_path.iterdir())

@@ -22,6 +22,7 @@ from twin.fit.response import fit_blur, fit_focus, fit_noise, fit_response, shar
 from twin.fit.rim import fit_rim
 from twin.fit.sensor_file import write_sensor
 from twin.fit.surroundings import fit_surroundings
+from twin.frames import distinct_stems
 from twin.frames.images import read_image, write_image
 from twin.judge.pictures.aligned import Aligned, read_frames, revised
 from twin.judge.pictures.images import compare_images, difference_picture
@@ -316,10 +317,9 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
 def _write_pictures(folder: Path, found: Calibration) -> list[tuple[str, dict[str, Path]]]:
     """Write four pictures of each frame (see ``KINDS``); the frame's name, and the pictures' paths by kind."""
     folder.mkdir(parents=True, exist_ok=True)
-    rows, stems = [], [Path(frame.name).stem for frame in found.frames]
-    for frame, before, after in zip(found.frames, found.first, found.last, strict=True):
+    rows, stems = [], distinct_stems([frame.name for frame in found.frames])
+    for stem, frame, before, after in zip(stems, found.frames, found.first, found.last, strict=True):
         images = {"real": frame.image, "before": before, "after": after, "residual": difference_picture(frame.image, after)}
-        stem = Path(frame.name).stem if stems.count(Path(frame.name).stem) == 1 else Path(frame.name).name
         rows.append((frame.name, {kind: write_image(folder / f"{stem}-{kind}.png", image) for kind, image in images.items()}))
     return rows
 

@@ -5,8 +5,8 @@ Understands the folder formats of the sensor's users: ``frames_bw/`` with ``init
 read.
 """
 
-from twin.frames.folders import natural_key
+from twin.frames.folders import distinct_stems, natural_key
 from twin.frames.images import read_image
 from twin.frames.recording import Recording, evenly_read, open_recording
 
-__all__ = ["Recording", "evenly_read", "natural_key", "open_recording", "read_image"]
+__all__ = ["Recording", "distinct_stems", "evenly_read", "natural_key", "open_recording", "read_image"]

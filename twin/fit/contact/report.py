@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from twin.fit.contact.fit import INDEPENDENT, ContactFit
 from twin.fit.contact.simulate import Setup
+from twin.frames import distinct_stems
 from twin.judge.labelled.model import MeasuredFrames
 from twin.report.charts import new_figure, write_chart
 from twin.report.numbers import number
@@ -52,7 +53,7 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
         "executed_share": fit.share,
         "fitted_px": {"before": float(np.nanmean(fit.before_px)), "after": float(np.nanmean(fit.after_px)), "frames": len(measured)},
         "held_out_px": {"before": held_out[0], "after": held_out[1], "frames": held_frames} if held_out else {},
-        "warnings": _warnings(fit, held_out, held_frames),
+        "warnings": warnings_of(fit, held_out, held_frames),
         "distrusted": [frame["image_name"] for frame in frames if frame["trust"] < TRUSTED],
         "frames": frames,
         "independent_numbers_a_frame": INDEPENDENT,
@@ -60,7 +61,7 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
     }
 
 
-def _warnings(fit: ContactFit, held_out: tuple | None, held_frames: int) -> list[str]:
+def warnings_of(fit: ContactFit, held_out: tuple | None, held_frames: int) -> list[str]:
     """What is worse than before the fit, or not known; empty if nothing is."""
     found = []
     if not held_out:
@@ -107,8 +108,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
         caption="Mean pin error of each frame; a dash: its contact failed.",
     )
     page.section("Real pins to simulated ones")
-    for k in chosen:
-        name = Path(measured.names[k]).stem
+    for k, name in zip(chosen, distinct_stems([measured.names[k] for k in chosen]), strict=True):
         chart = write_chart(folder / f"{name}.png", partial(_frame_figure, measured, moved, fit, int(k)))
         page.figures(Picture(chart, f"Pin errors of {name} before and after the calibration", measured.names[k]))
     page.download(figures, "all figures of this page")

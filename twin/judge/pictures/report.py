@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from scenes.sensor import SensorSpec
+from twin.frames import distinct_stems
 from twin.frames.images import write_image
 from twin.judge.pictures.compare import Pair, PoseAligned
 from twin.judge.pictures.images import difference_picture
@@ -34,8 +35,7 @@ def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
     """Write real, rendered and difference of every pair; the page's rows."""
     folder.mkdir(exist_ok=True)
     rows = []
-    for pair in pairs:
-        stem = Path(pair.real.frame.name).stem
+    for pair, stem in zip(pairs, distinct_stems([pair.real.frame.name for pair in pairs]), strict=True):
         real = pair.real.frame.image if pair.image.ndim == pair.real.frame.image.ndim else pair.real.gray
         row = _frame_row(pair, kind)
         images = {"real": real, kind: pair.image, f"{kind}-difference": difference_picture(real, pair.image)}

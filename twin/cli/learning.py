@@ -151,12 +151,13 @@ Depth and angle of simulated contacts are relative to the touched surface, whate
 the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
 
 A random fifth of the rows is kept out of training for 'twin evaluate'. Of simulated data it is a fifth of the contacts, with all
-their states. --split gives the seed of this choice; with --split -1 all rows are trained on.
+their states. --split gives the seed of this choice; with --split -1 all rows are trained on. The choice goes by the frames' names: the
+order of the table does not matter.
 
 \b
 Writes to --out: config.json (resolved, with the sensor and the parameters of the
 pipeline), curves.csv, weights.pt, and checkpoint.pt while it runs. The same command
-continues a run that was interrupted.
+continues a run that was interrupted, if frames and labels are still the same.
 """
 
 
@@ -214,7 +215,8 @@ def train(
 HELP_EVALUATE = """Judge a trained model on a labelled recording.
 
 \b
---rows validation  the fifth of the run's own recording that was kept out of its training
+--rows validation  the fifth of the run's own recording that was kept out of its training,
+                   by the frames' names
 --rows all         every row, for a recording that the model has not seen
 
 \b
@@ -252,7 +254,7 @@ def evaluate(
 HELP_PREDICT = """Tell the pose in every frame, with its 90 % interval.
 
 The model contains its sensor and pipeline, and a frame of another sensor is refused. If a recording has a frame without contact
-(init_0.png), the pins are counted from that frame.
+(init_0.png), the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
 """
 
 

@@ -5,6 +5,7 @@ precision. Those of a Gaussian process are not, because its terms nearly cancel.
 do without: see ``Model.pack``.
 """
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
+from safetensors.numpy import load, save
 
 from scenes.sensor import SensorSpec
+from training.identity import ASIDE
 from training.models import model_named
 from training.recipes import TrainingError
 from training.run_files import CONFIG, TENSORS, read_config, read_tensors
@@ -26,6 +28,7 @@ SHIPPED = Path(__file__).parent / "weights"
 LARGE = 1000  # numbers; a larger array is kept in half precision
 NETWORKS = "networks"  # the networks' weights, in ``weights.pt``
 BESIDE = "beside"  # the arrays of the Gaussian process beside the networks, in ``weights.pt``
+SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; the shipped copies were made before there was one
 NOT_PACKED = ("kernels", "kernel_labels", "parameters")  # entries of ``weights.pt`` that a small copy leaves out
 
 
@@ -57,8 +60,9 @@ def pack(run: Path, out: Path) -> int:
     small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
     small["reference_px"] = content["reference_px"].numpy()  # whole: the graph is made from it
     out.mkdir(parents=True, exist_ok=True)
-    write_bytes(out / WEIGHTS, save({key: np.ascontiguousarray(value) for key, value in small.items()}))
-    about = {key: value for key, value in config.items() if key not in ("data", "problems")}
+    weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})
+    write_bytes(out / WEIGHTS, weights)
+    about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
     write_text(out / CONFIG, json.dumps(about) + "\n")
     return (out / WEIGHTS).stat().st_size
 
@@ -71,8 +75,11 @@ def unpack(config: dict, path: Path) -> dict:
     ValueError
         The file is damaged.
     """
+    weights = path.read_bytes()
+    if SHA256 in config and hashlib.sha256(weights).hexdigest() != config[SHA256]:
+        raise ValueError(f"{path.name}: changed since it was written")  # the format has no checksums
     try:
-        arrays = load_file(path)
+        arrays = load(weights)
     except SafetensorError as error:
         raise ValueError(f"{path.name}: {error}") from error
     content: dict = {"kernels": [], "kernel_labels": [], "aside": {}, NETWORKS: {}}

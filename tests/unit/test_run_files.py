@@ -104,3 +104,14 @@ def test_tensors_come_back_as_they_were_written(tmp_path):
     write_tensors(tmp_path / "x.pt", content)
     found = read_tensors(tmp_path / "x.pt")
     assert torch.equal(found["a"], content["a"]) and torch.equal(found["b"][1]["c"], torch.eye(2)) and found["d"] == "text"
+
+
+def test_a_changed_byte_in_a_small_copy_is_refused(data, tmp_path):
+    train_run(config_of("vgnn", epochs=1, batch=32, members=1, kernel=False), data, tmp_path / "run")
+    pack(tmp_path / "run", tmp_path / "small")
+    assert PoseEstimator.load(tmp_path / "small").config["rows"]["kept_out"]
+    weights = tmp_path / "small" / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-100] ^= 1
+    weights.write_bytes(content)
+    refused(lambda: PoseEstimator.load(tmp_path / "small"), weights)

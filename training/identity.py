@@ -7,6 +7,7 @@ import numpy as np
 from training.dataset import Dataset
 from training.models.part import Model
 from training.recipes import TrainingError
+from training.targets import TARGET_COLUMNS
 from twin.store import inputs_digest
 
 DIGESTS = {  # what a run's configuration tells of its data by a digest, and what a message calls it where it differs
@@ -15,6 +16,8 @@ DIGESTS = {  # what a run's configuration tells of its data by a digest, and wha
     "frames": "other frames under the same names",
 }
 ASIDE = ("problems", "data")  # keys of a run's configuration that its result does not depend on
+COUNTED = "parameters"  # key that only a finished run's configuration has: how many its networks have
+EXACT = 9  # decimals of labels that count, mm and deg: the last bits of a sum may differ between machines
 NAMED = 3  # frames, or settings, that a message names
 
 
@@ -24,7 +27,7 @@ def identity_of(data: Dataset, model: Model) -> dict[str, str]:
     targets = ordered.targets
     return {
         "names": inputs_digest(ordered.pins.image_name.tolist(), ordered.group),
-        "labels": inputs_digest(targets.names, targets.raw, targets.corrected, targets.executed, targets.move),
+        "labels": inputs_digest(targets.names, *(np.round(getattr(targets, key), EXACT) + 0.0 for key in TARGET_COLUMNS)),
         "frames": inputs_digest(model.seen(ordered)),
     }
 
@@ -59,12 +62,12 @@ def changed_since(config: Mapping, data: Dataset, model: Model) -> list[str]:
             "can't be told, if the table was sorted anew, or frames or labels have changed since; train again to know"
         ]
     now = identity_of(data, model)
-    return [f"the run learnt from {DIGESTS[key]}: something has changed since" for key in DIGESTS if now[key] != rows[key]]
+    return [f"the run learnt from {DIGESTS[key]}: something has changed since" for key in DIGESTS if now[key] != rows.get(key)]
 
 
 def difference(wanted: Mapping, found: Mapping) -> str:
     """In which data and settings two configurations of runs differ, in words; "" where they don't."""
-    keys = [key for key in wanted if key not in ASIDE and wanted[key] != found.get(key)]
+    keys = [key for key in {**wanted, **found} if key not in (*ASIDE, COUNTED) and wanted.get(key) != found.get(key)]
     said: list[str] = []
     if "rows" in keys:
         said += _rows_differ(wanted["rows"], found.get("rows"))

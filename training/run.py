@@ -301,7 +301,7 @@ def _opened(out: Path, resolved: dict) -> dict | None:
         return None
     state = read_tensors(path, BEGIN_ANEW)
     try:
-        before = json.loads(state["identity"])
+        before = dict(json.loads(state["identity"]))
     except (KeyError, TypeError, ValueError) as error:
         raise damaged(path, "it does not say of which run it is", BEGIN_ANEW) from error
     _require_same(out, resolved, before, "begun and not finished")

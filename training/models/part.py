@@ -24,6 +24,7 @@ from twin.pins import Pipeline
 from twin.pins.reference import Reference
 from twin.types import Frame
 
+SEEN_DECIMALS = 3  # of pins (px) and areas (px^2) that tell frames apart: the last bits of a centroid may differ between machines
 Learnt = Mapping[str, Mapping[str, np.ndarray]]  # groups of named arrays that a model learnt before its networks did
 Weights = dict[str, torch.Tensor]  # a network's state
 
@@ -277,7 +278,8 @@ class PinModel(Model):
     def seen(self, data: Dataset) -> object:
         """See ``Model``: the pins, and where they are at rest."""
         pins = data.pins
-        return [pins.nodes_px, pins.area_px2, pins.lost, pins.reference.pins_px, pins.measured]
+        places = [np.round(px, SEEN_DECIMALS) + 0.0 for px in (pins.nodes_px, pins.area_px2, pins.reference.pins_px)]
+        return [*places, pins.lost, pins.measured]
 
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:
         """See ``Model``."""

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from scenes.load import explained
 from scenes.sensor import SensorSpec
+from training.models import model_named
 from training.recipes import TrainingError
 from twin.store import write_with
 from twin.types import Form
@@ -61,6 +62,10 @@ def read_config(run: Path) -> dict[str, Any]:
         _Config.model_validate(config)
     except ValidationError as error:
         raise damaged(path, explained(error, _Config)) from error
+    try:
+        model_named(config["model"])
+    except TrainingError as error:
+        raise damaged(path, str(error)) from error
     return config
 
 

@@ -27,3 +27,7 @@ class StoreError(TwinError):
 
 class DatasetError(TwinError):
     """A data set can't be made or continued."""
+
+
+class WorkersError(TwinError):
+    """Processes that share work are lost."""

@@ -1,7 +1,6 @@
 """What is wrong now: a part of what the test of an entry reports, and the names of the entries. Each mend removes its lines."""
 
 WRONG: dict[str, tuple[str, ...]] = {
-    "did not end|took|MemoryError": ("robustness, outputs: none given",),
     "lines of error": (
         "audit, outputs: a full disk",
         "train, outputs: a full disk",
@@ -17,10 +16,6 @@ WRONG: dict[str, tuple[str, ...]] = {
         "study tac-vgnn, outputs: files of the user's own",
         "tune, outputs: its own specification",
     ),
-    "traceback|left ": (
-        "robustness, ends: SIGTERM",
-        "robustness, ends: SIGKILL",
-    ),
     "traceback: FileExistsError": (
         "train, outputs: a file",
         "train, outputs: a named pipe",
@@ -35,7 +30,6 @@ WRONG: dict[str, tuple[str, ...]] = {
         "calibrate contact, outputs: where nothing can be made",
         "live, outputs: where nothing can be made",
     ),
-    "traceback: KeyboardInterrupt": ("robustness, ends: Ctrl-C",),
     "traceback: NotADirectoryError": (
         "train, outputs: below a file",
         "calibrate optics, outputs: a file",
@@ -56,7 +50,6 @@ WRONG: dict[str, tuple[str, ...]] = {
         "calibrate contact, outputs: a name too long",
         "live, outputs: a name too long",
     ),
-    "traceback: UnicodeEncodeError": ("predict, names: an umlaut in an ASCII locale",),
 }
-TOGETHER = ("train, two at once", "preprocess, two at once")  # both run in one folder and write over each other
+TOGETHER: tuple[str, ...] = ("train, two at once", "preprocess, two at once")  # both run in one folder and write over each other
 KNOWN = {name: wrong for wrong, names in WRONG.items() for name in names} | dict.fromkeys(TOGETHER, "both ended well")

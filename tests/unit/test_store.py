@@ -7,12 +7,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from scenes import load_sensor
@@ -42,7 +40,6 @@ from twin.store import (
     write_text,
 )
 from twin.store.fingerprint import PACKAGES, ROOT
-from twin.workers import outcomes
 
 SOLVER = "twin/mechanics/solver.py"
 KEEPERS = (  # the module of every function whose results are kept between runs
@@ -334,22 +331,3 @@ def test_frames_of_the_same_stem_do_not_share_a_fitted_skin(tmp_path, monkeypatc
     raw = [("frame.png", image, np.zeros((3, 2))), ("frame.jpg", image, np.ones((3, 2)))]
     frames = _Log(tmp_path, sensor, raw).aligned(sensor, raw, lambda *_: None)
     assert [float(frame.state.base_mm.mean()) for frame in frames] == [0.0, 1.0]
-
-
-def listening(index_text: str, index: int) -> list[str]:
-    """Addresses on which the worker that runs this, its parent and its parent's other children listen."""
-    time.sleep(0.2)
-    above = psutil.Process().parents()
-    root = next(process for process in above if process.pid == int(index_text))
-    found = []
-    for process in (root, *root.children(recursive=True)):
-        found += [c.laddr.ip for c in process.net_connections(kind="inet") if c.status == psutil.CONN_LISTEN]
-    return found
-
-
-def test_processes_that_share_work_listen_on_this_machine_alone():
-    own = {c.laddr for c in psutil.Process().net_connections(kind="inet") if c.status == psutil.CONN_LISTEN}
-    (found,) = list(outcomes(listening, str(os.getpid()), [0], workers=2, scheduler=""))
-    assert found, "Dask listens somewhere"
-    strangers = {address.ip for address in own}
-    assert set(found) - strangers <= {"127.0.0.1", "::1"}

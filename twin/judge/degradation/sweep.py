@@ -1,23 +1,21 @@
 """Every case at every severity: cells that are computed in parallel, kept one by one, and never computed twice."""
 
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from scenes import load_object
-from twin.errors import TwinError
 from twin.judge.degradation.condition import Case, Condition
 from twin.judge.degradation.measures import judge_shot
 from twin.judge.degradation.shots import DegradedShot, RealSource, RenderedSource
 from twin.pins import DetectorSpec, Found, make_detector
 from twin.store import Item, find_json, inputs_digest, keep_json, write_bytes
 from twin.types import Frame
+from twin.workers import in_processes
 
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 CELLS = "cells"
@@ -93,44 +91,22 @@ def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, i
     open_cells = {cell.file: cell for cell in cells if find_json(folder / CELLS, cell.item) is None}
     total = len({cell.file for cell in cells})
     progress(total - len(open_cells), total)
-    if open_cells:
-        _compute(plan, folder, list(open_cells.values()), jobs, lambda done: progress(total - len(open_cells) + done, total))
+    for done, _ in enumerate(in_processes(_begin, (plan, folder), list(open_cells.values()), processes=jobs)):
+        progress(total - len(open_cells) + done + 1, total)
     return [
         row | {"case": cell.case.name, "severity": cell.severity} for cell in cells for row in find_json(folder / CELLS, cell.item) or []
     ]
 
 
-def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress: Callable[[int], None]) -> None:
-    if jobs == 1:
-        _begin(plan, folder)
-        for done, cell in enumerate(cells):
-            _run(cell)
-            progress(done + 1)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin, initargs=(plan, folder)) as pool:
-        running = [pool.submit(_run, cell) for cell in cells]
-        try:
-            for done, future in enumerate(as_completed(running)):
-                future.result()
-                progress(done + 1)
-        except BrokenProcessPool as error:
-            raise TwinError("a process of the sweep ended before its time, perhaps because memory ran out; go on with --jobs 1") from error
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-_WORK: dict = {}  # what `_begin` was given; each process builds it once
-
-
-def _begin(plan: Plan, folder: Path) -> None:
+def _begin(plan: Plan, folder: Path) -> Callable[[Cell], None]:
+    """What computes and keeps a cell."""
     cv2.setNumThreads(1)
-    _WORK.update(plan=plan, folder=folder, models=plan.models() if plan.models else {})
+    return partial(_run, plan, folder, plan.models() if plan.models else {})
 
 
-def _run(cell: Cell) -> None:
-    plan, folder = _WORK["plan"], _WORK["folder"]
-    rows, worst = [], None
+def _run(plan: Plan, folder: Path, models: dict[str, Estimate], cell: Cell) -> None:
+    rows: list[dict] = []
+    worst: tuple[float, DegradedShot, Found] | None = None
     detectors = [make_detector(plan.source.spec, cell.case.on_setting(spec, cell.severity)) for spec in plan.detectors]
     for shot in plan.source.shoot(cell.case, cell.severity):
         for place, detector in enumerate(detectors):
@@ -138,7 +114,7 @@ def _run(cell: Cell) -> None:
             rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | judge_shot(detector, found, shot))
             if place == 0 and (worst is None or rows[-1]["recall"] < worst[0]):
                 worst = rows[-1]["recall"], shot, found
-        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in _WORK["models"].items()]
+        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in models.items()]
     if worst is not None:
         picture = cv2.imencode(".jpg", overlay(worst[1], worst[2]))[1].tobytes()
         write_bytes(folder / "pictures" / f"{cell.file}.jpg", picture)

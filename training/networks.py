@@ -5,6 +5,7 @@ from torch import nn
 
 from training.models.part import Inputs
 from training.recipes import TrainingError
+from twin.errors import OptionError
 
 
 def parameter_count(network: nn.Module) -> int:
@@ -26,7 +27,7 @@ def choose_device(name: str) -> str:
         For another name, or ``cuda`` where PyTorch finds none.
     """
     if name not in ("auto", "cpu", "cuda"):
-        raise TrainingError(f"--device must be auto, cpu or cuda, got {name!r}")
+        raise OptionError(f"--device must be auto, cpu or cuda, got {name!r}")
     if name == "cuda" and not torch.cuda.is_available():
         raise TrainingError("--device cuda: PyTorch finds no GPU here; give --device cpu, or install a PyTorch built for your GPU")
     return "cuda" if name != "cpu" and torch.cuda.is_available() else "cpu"

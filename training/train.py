@@ -11,10 +11,10 @@ from training.dataset import joined, load_dataset
 from training.loop import epoch_step
 from training.models import recipe_of
 from training.networks import choose_device
-from training.recipes import TrainingError
 from training.run import RunConfig, train_run
 from training.run_files import CONFIG, TENSORS
 from training.targets import PRESETS
+from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.types import Form
 
@@ -117,7 +117,7 @@ def train_model(
         The recordings have no such labels, or can't be joined.
     """
     if labels not in ("corrected", "raw"):
-        raise TrainingError(f"--labels must be corrected or raw, got {labels!r}")
+        raise OptionError(f"--labels must be corrected or raw, got {labels!r}")
     recipe = recipe_of(model, epochs=epochs, batch=batch, members=members, kernel=kernel)
     if threads:
         torch.set_num_threads(threads)

@@ -5,6 +5,10 @@ class TwinError(Exception):
     """Base of the errors that are raised on purpose. The message says what was expected, what came, and what to do."""
 
 
+class OptionError(TwinError):
+    """An option's value, or options together, can't be meant, whatever the files hold. The message names the option."""
+
+
 class FrameError(TwinError):
     """A frame, video or recording can't be read, or does not fit the sensor."""
 

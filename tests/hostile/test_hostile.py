@@ -145,7 +145,7 @@ def how_it_ended(entry: Entry, ended: Ended) -> list[str]:
                 found.append(f"an error of {len(errors[0])} characters: {errors[0][:60]!r}")
             if "pydantic.dev" in said or "weights_only=False" in said or "allow_pickle=True" in said:
                 found.append("quotes a library's advice")
-        if ended.exit == USAGE and not (lines and lines[-1].startswith("Error: ") or "BAD" in ended.stdout):
+        if ended.exit == USAGE and not (lines and lines[-1].startswith(("Error: ", ERROR))):
             found.append("usage without a line of error")
         if entry.end[0] and len(lines) > 2:
             found.append(f"{len(lines)} lines at its end")

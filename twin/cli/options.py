@@ -1,16 +1,14 @@
-"""What several commands share: their options, what they print of a result, and how a command that moves an arm may be ended."""
+"""What several commands share: their options, and what they print of a result."""
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, Protocol, TypeVar
 
 import typer
 
-from twin.cli import print_notes
-from twin.errors import TwinError
+from twin.errors import OptionError, TwinError
 from twin.types import Form
 
 Given = TypeVar("Given", str, Path)
@@ -82,7 +80,7 @@ FIRST, NONE = "first", "none"
 def _even(value: int) -> int:
     """The number, if it is even."""
     if value % 2:
-        raise TwinError(f"--across {value}: give an even number")
+        raise OptionError(f"--across {value}: give an even number")
     return value
 
 
@@ -143,19 +141,3 @@ def tell(result: Result) -> None:
     """Print a result and the files that were written."""
     say(result.lines())
     say(f"wrote {path}" for path in result.written)
-
-
-@contextmanager
-def arm_let_go() -> Iterator[None]:
-    """Context in which SIGTERM and a closed terminal end the command as Ctrl-C does, so that the arm is let go of.
-
-    If letting go failed, what failed is printed.
-    """
-    from hardware.rig import signals_as_ctrl_c
-
-    with signals_as_ctrl_c():
-        try:
-            yield
-        except KeyboardInterrupt as interrupt:
-            print_notes(interrupt)  # here, because typer ends the program without printing them
-            raise

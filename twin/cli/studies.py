@@ -84,7 +84,8 @@ UNSEEN = "cylinder,edge"
 HELP_STUDY_OBJECTS = """Train on several objects, and judge on others.
 
 \b
-  twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod --unseen cylinder,edge --out out/objects
+  twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod \\
+      --unseen cylinder,edge --out out/objects
 
 Two models learn from the same number of contacts that are simulated in the twin (pins alone, every state on their way). 'mixed' learns
 from --count contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other
@@ -100,8 +101,9 @@ The same command continues an interrupted study. The run that learnt several obj
   twin servo --object can --model out/objects/mixed --out out/can
 
 \b
-Writes to --out: mixed/ and one named after the first object, each a RUN; sim/ and tests/, a data set for each object
-(as 'twin dataset' writes them); objects.csv, index.html.
+Writes to --out: mixed/ and one named after the first object, each a RUN; sim/
+and tests/, a data set for each object (as 'twin dataset' writes them);
+objects.csv, index.html.
 """
 
 
@@ -145,7 +147,8 @@ def study_objects(
 HELP_STUDY_SIM_TO_REAL = """Train in the twin or on real frames, test on real ones.
 
 \b
-  twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 --seed 0 --out out/sim-to-real
+  twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 \\
+      --seed 0 --out out/sim-to-real
 
 --experiment says how the arm moved in the recording and what is learnt; --contacts is the experiment that is simulated.
 
@@ -159,21 +162,22 @@ these frames first ('twin calibrate contact'; about an hour). All models are jud
                        intervals are calibrated on the labelled frames
   simulated and real   the same, averaged with a Gaussian process of the pins
                        of both simulated contacts and labelled frames
-  real                 vgnn and a quadratic regression, trained on as many real
-                       frames, on 500 and on all
-  --ablate             also models trained on simulated contacts with one change
-                       each: without the learnt difference of the pins, with a
-                       fifth of the contacts, a coarse mesh, one friction, any
-                       friction, no moves, drawn tolerances of skin and gel, and
-                       without calibration; this simulates six more sets of
-                       contacts
+  real                 vgnn and a quadratic regression, trained on as many
+                       real frames, on 500 and on all
+  --ablate             also models trained on simulated contacts with one
+                       change each: without the learnt difference of the pins,
+                       with a fifth of the contacts, a coarse mesh, one
+                       friction, any friction, no moves, drawn tolerances of
+                       skin and gel, and without calibration; this simulates
+                       six more sets of contacts
 
 The contacts are simulated in --out/sim, without pictures. With --sim finished data sets of 'twin dataset' or 'twin study objects'
 are used instead (give it once for each). If a data set has pictures, the pins are those that the pipeline finds in them. The same
 command continues an interrupted study.
 
 \b
-Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv, index.html.
+Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv,
+index.html.
 """
 
 
@@ -232,7 +236,8 @@ HELP_STUDY_TAC_VGNN = """Repeat the Tac-VGNN paper's comparison on a recording.
 It compares graphs, models and training efficiency, and shows how the Voronoi areas tell the depth of a contact.
 
 \b
-  twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study --max-minutes 120
+  twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study \\
+      --max-minutes 120
 
 The models (--models) are gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and this project's vgnn. vgnn-without-graph,
 vgnn-without-modes and vgnn-without-kernel show what each part of vgnn contributes.
@@ -242,7 +247,8 @@ writes it. The same command continues an interrupted study, so a study may be sp
 evenly among the runs that are still to do. A run that this time ended is reported as ended early.
 
 \b
-Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv, curves.png, efficiency.png, contacts.png, index.html, runs/.
+Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv,
+curves.png, efficiency.png, contacts.png, index.html, runs/.
 """
 
 

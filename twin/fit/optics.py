@@ -14,7 +14,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc
-from twin.errors import FrameError
+from twin.errors import FrameError, OptionError
 from twin.fit.camera_pose import fit_camera
 from twin.fit.caps import fit_caps
 from twin.fit.photometry import fit_photometry
@@ -356,7 +356,7 @@ def folder_beside(out: Path, kind: str) -> Path:
         ``out`` is no name of a ``.toml`` file.
     """
     if out.suffix != ".toml":
-        raise FrameError(f"--out {out}: give the name of a .toml file")
+        raise OptionError(f"--out {out}: give the name of a .toml file")
     folder = out.with_name(f"{out.stem}-{kind}")
     folder.mkdir(parents=True, exist_ok=True)
     return folder

@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes.files import require_regular
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError
+from twin.errors import FrameError, OptionError
 from twin.frames import open_recording
 from twin.frames.forms import frame_size
 from twin.pins.batch import recording_reference
@@ -81,7 +81,7 @@ def write_graphs_of(
         No frame has a graph, the file is no ``pins.npz`` of this sensor, or ``legacy`` is asked for where it does not apply.
     """
     if legacy and (kind != "voronoi" or path.suffix == PINS):
-        raise FrameError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
+        raise OptionError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
     if path.suffix == PINS:
         found, nodes_px = read_pins(path, sensor.pins.count)
         names = list(found)

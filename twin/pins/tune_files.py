@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scenes import SensorSpec
-from twin.errors import FrameError
+from twin.errors import OptionError
 from twin.frames import evenly_read, open_recording
 from twin.pins.detector_spec import Evidence, Method, write_detector
 from twin.pins.tune import Tuned, tune
@@ -81,7 +81,7 @@ def tune_on_frames(
         No frame shows the layout, or ``out`` is no name of a ``.toml`` file.
     """
     if out is not None and out.suffix != ".toml":
-        raise FrameError(f"--out {out}: give the name of a .toml file")
+        raise OptionError(f"--out {out}: give the name of a .toml file")
     recording = open_recording(path, sensor, form)
     frames = evenly_read(recording, limit)
     with stage(progress, "tuning") as step:

@@ -11,10 +11,10 @@ from scenes import SensorSpec
 from training.dataset import Dataset, load_dataset
 from training.models import model_named
 from training.networks import choose_device
-from training.recipes import TrainingError
 from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, recorded_contacts, twin_contacts
 from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
 from training.studies.tac_vgnn.page import draw_contacts, draw_curves, draw_efficiency, write_page
+from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.types import Form
@@ -74,11 +74,11 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.labels not in ("corrected", "raw"):
-            raise TrainingError(f"--labels must be corrected or raw, got {self.labels!r}")
+            raise OptionError(f"--labels must be corrected or raw, got {self.labels!r}")
         if not self.models or not self.seeds:
-            raise TrainingError("nothing to compare: give at least one of --models and of --seeds")
+            raise OptionError("nothing to compare: give at least one of --models and of --seeds")
         if any(batch < 1 for batch in self.batches):
-            raise TrainingError(f"--batches {','.join(map(str, self.batches))}: a batch has at least 1 frame")
+            raise OptionError(f"--batches {','.join(map(str, self.batches))}: a batch has at least 1 frame")
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""

@@ -11,7 +11,7 @@ from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError
+from twin.errors import OptionError
 from twin.fit.contact.fit import fit_contact, held_out_px, simulate
 from twin.fit.contact.parameters import PARAMETERS, Parameter
 from twin.fit.contact.report import summary_of, write_calibration
@@ -150,7 +150,7 @@ def calibrate_to_file(
     """
     names = [parameter.name for parameter in PARAMETERS]
     if unknown := set(hold) - set(names):
-        raise FrameError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
+        raise OptionError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = folder_beside(out, "contact")
     parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
     with stage(progress, "contacts") as step:

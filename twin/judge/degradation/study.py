@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError, TwinError
+from twin.errors import FrameError, OptionError, TwinError
 from twin.frames import evenly_read, open_recording
 from twin.judge.degradation.condition import Case
 from twin.judge.degradation.envelope import Envelope, judge_sweep
@@ -141,12 +141,12 @@ def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
     """
     for name in names:
         if name not in METHODS and Path(name).suffix != ".toml":
-            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
+            raise OptionError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
     called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
     if len(set(called)) < len(called):
-        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
+        raise OptionError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
     if len({*called, *models}) < len(called) + len(models):
-        raise TwinError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
+        raise OptionError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
 
 
 def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress: Step) -> tuple[DetectorSpec, ...]:

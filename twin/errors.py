@@ -1,4 +1,7 @@
-"""Errors that a user can act on; the command line prints them as one line."""
+"""Errors and warnings that a user can act on; the command line prints each as one line."""
+
+import warnings
+from functools import cache
 
 
 class TwinError(Exception):
@@ -35,3 +38,9 @@ class DatasetError(TwinError):
 
 class WorkersError(TwinError):
     """Processes that share work are lost."""
+
+
+@cache
+def warn_once(message: str) -> None:
+    """Give a ``RuntimeWarning``, each message once in a process."""
+    warnings.warn(message, RuntimeWarning, stacklevel=3)

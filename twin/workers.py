@@ -6,6 +6,7 @@ import pickle
 import signal
 import threading
 import traceback
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -14,7 +15,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from twin.errors import DatasetError, TwinError, WorkersError
+from twin.errors import DatasetError, TwinError, WorkersError, warn_once
 from twin.store import fingerprint
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Seq
     """Yield ``begin(*given)(task)`` for each task, in the order in which the calls end.
 
     The processes end with this one, however it ends. Ctrl-C is left to this process, which ends them at once. A process that is lost
-    is replaced, and its task is begun again after the others.
+    is replaced, and its task is begun again after the others. A warning of several processes is given once, by this one.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Seq
             ready = wait([process.pipe for process in busy])
             for process in [process for process in busy if process.pipe in ready]:
                 try:
-                    made, error, where = process.pipe.recv()
+                    made, error, where, told = process.pipe.recv()
                 except (EOFError, OSError):
                     busy.remove(process)
                     process.end()
@@ -84,6 +85,8 @@ def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Seq
                     if lost[process.number] < TRIES:
                         waiting.append(process.number)
                     continue
+                for message in told:
+                    warn_once(message)
                 if error is not None:
                     raise error from RuntimeError(f"in a process of its own:\n{where}")
                 if waiting:
@@ -91,7 +94,7 @@ def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Seq
                 else:
                     busy.remove(process)
                     process.end()
-                yield made
+                yield pickle.loads(made)
     finally:
         for process in busy:
             process.end()
@@ -147,20 +150,21 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
 
 
 def _serve(pipe: Connection, pickled: bytes) -> None:
-    """Do tasks in a process of its own: for each, send what was made, or the error and where it arose."""
+    """Do tasks in a process of its own: for each, send what was made, or the error and where it arose, and the warnings."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     work: Callable[[Any], Any] | None = None
     while True:
         task = pipe.recv()
-        try:
-            if work is None:
-                begin, given = pickle.loads(pickled)
-                work = begin(*given)
-            answer = pickle.dumps((work(task), None, ""))
-        except Exception as error:
-            answer = pickle.dumps((None, _that_can_be_sent(error), traceback.format_exc()))
-        pipe.send_bytes(answer)
+        with warnings.catch_warnings(record=True) as caught:
+            try:
+                if work is None:
+                    begin, given = pickle.loads(pickled)
+                    work = begin(*given)
+                made, error, where = pickle.dumps(work(task)), None, ""
+            except Exception as arisen:
+                made, error, where = pickle.dumps(None), _that_can_be_sent(arisen), traceback.format_exc()
+        pipe.send((made, error, where, [str(each.message) for each in caught]))
 
 
 def _end_with_parent() -> None:

@@ -28,6 +28,7 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "progress",
     "store",
     "workers",
+    "compiled",
     "geometry",
     "objects",
     "report",
@@ -120,6 +121,12 @@ def test_only_the_optics_name_mitsuba():
                 continue
             named = {name.split(".")[0] for name in imports_of(path)} & {"mitsuba", "drjit"}
             assert not named, f"{path.relative_to(ROOT)} imports {named}"
+
+
+def test_one_module_names_numba():
+    """It says what happens where compiled code can't be kept, for all of them."""
+    modules = [path for package in MAY_IMPORT for path in sources(package)]
+    assert {path for path in modules if "numba" in {name.split(".")[0] for name in imports_of(path)}} == {ROOT / "twin" / "compiled.py"}
 
 
 RENAMING = {"replace", "rename", "renames"}  # functions of os

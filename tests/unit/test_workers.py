@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from contextlib import suppress
 from pathlib import Path
 
@@ -40,6 +41,16 @@ def failing(where):
         raise FrameError(where)
 
     return fail() if where == "begin" else fail
+
+
+def warning():
+    """Warns at every task."""
+
+    def warn(task):
+        warnings.warn("the disk is slow", RuntimeWarning, stacklevel=1)
+        return os.getpid()
+
+    return warn
 
 
 def dying(folder, always=""):
@@ -90,6 +101,12 @@ def test_every_task_is_done_once_by_this_process_or_by_others():
 def test_an_error_of_a_task_is_the_callers(where):
     with pytest.raises(FrameError, match=where):
         list(in_processes(failing, (where,), [1, 2], processes=2))
+
+
+def test_a_warning_of_all_processes_is_given_once():
+    with pytest.warns(RuntimeWarning, match="the disk is slow") as told:
+        assert os.getpid() not in list(in_processes(warning, (), [1, 2, 3, 4], processes=2))
+    assert len(told) == 1
 
 
 def test_a_lost_process_is_replaced(tmp_path):

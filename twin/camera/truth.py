@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from scenes.sensor import SensorSpec, ViewSpec
 from twin.camera.projection import pixel_rays, project
+from twin.compiled import compiled
 from twin.frames.forms import frame_size, from_raw
 from twin.types import BoolArray, FloatArray, Form, PinState
 
@@ -48,7 +48,7 @@ def occluded(view: ViewSpec, cap_radius_mm: float, state: PinState) -> BoolArray
     return _meets_another(window_mm, state.base_mm, state.caps_mm, cap_radius_mm)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _meets_another(eyes: FloatArray, base: FloatArray, caps: FloatArray, radius: float) -> BoolArray:
     """(N,) bool: the segment from ``eyes`` to ``caps``, (N, 3) each, comes nearer than ``radius`` to another pin's axis."""
     hidden = np.zeros(len(caps), np.bool_)
@@ -60,7 +60,7 @@ def _meets_another(eyes: FloatArray, base: FloatArray, caps: FloatArray, radius:
     return hidden
 
 
-@numba.njit(cache=True)
+@compiled()
 def segment_distance(p0: FloatArray, p1: FloatArray, q0: FloatArray, q1: FloatArray) -> float:
     """Distance of the segment p0-p1 to the segment q0-q1, (3,) each (Ericson 2004, 5.1.9)."""
     a = b = c = e = f = 0.0

@@ -6,6 +6,7 @@ Each module of this package holds the commands of one kind of work. A command im
 
 import io
 import sys
+import warnings
 from importlib import import_module
 from typing import Annotated, Any, NoReturn
 
@@ -66,11 +67,12 @@ def main() -> None:
     """Run the command line.
 
     An error that a user can act on is printed as one line on stderr. The exit code is then 2 if the command line itself is wrong,
-    and 1 otherwise. Ctrl-C is one line, too, and exit code 130.
+    and 1 otherwise. Ctrl-C is one line, too, and exit code 130. A warning is one line without the place in the source.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # where the terminal's encoding lacks a letter, it is printed by its number
+    warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
     try:
         command_line()(prog_name="twin")
     except KeyboardInterrupt as interrupt:  # before a command runs

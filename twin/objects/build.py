@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-import numba
 import numpy as np
 
 from scenes.object import CylinderShape, EdgeShape, MeshShape, ObjectSpec, PlaneShape, PrismShape, SphereShape
+from twin.compiled import compiled
 from twin.objects.analytic import Cylinder, Edge, Plane, Prism, Sphere
 from twin.objects.level_set import Probe, Probed, Wrapped, unit_normals
 from twin.objects.mesh_field import load_mesh_field
@@ -87,7 +87,7 @@ class WireMesh(Probed):
         return distance, slope, hessian
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _lay_wires(
     distance: FloatArray,
     slope: FloatArray,

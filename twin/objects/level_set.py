@@ -3,9 +3,9 @@
 from abc import ABC, abstractmethod
 from typing import TypeAlias
 
-import numba
 import numpy as np
 
+from twin.compiled import compiled
 from twin.types import FloatArray
 
 Probe: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
@@ -45,7 +45,7 @@ def rows(points_mm: FloatArray) -> FloatArray:
     return np.ascontiguousarray(points_mm, dtype=np.float64)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def unit_normals(slope: FloatArray, hessian: FloatArray) -> None:
     """Turn, in place, a field's slope g (k, 3) into the unit normal n and its second derivative H (k, 3, 3) into P H P / |g|, P = I - n n.
 

@@ -5,10 +5,10 @@ tree (node i has children 2 i and 2 i + 1) over leaves of equally many triangles
 nearest face, edge or corner (Baerentzen & Aanaes, "Signed distance computation using the angle weighted pseudonormal", 2005).
 """
 
-import numba
 import numpy as np
 import trimesh
 
+from twin.compiled import compiled
 from twin.objects.level_set import Triple
 from twin.types import FloatArray, IntArray
 
@@ -93,18 +93,18 @@ def _boxes(triangles: FloatArray, leaves: int) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _dot(p: Triple, q: Triple) -> float:
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _minus(p: Triple, q: Triple, s: float, u: Triple, t: float, v: Triple) -> Triple:
     """p - q - s u - t v"""
     return p[0] - q[0] - s * u[0] - t * v[0], p[1] - q[1] - s * u[1] - t * v[1], p[2] - q[2] - s * u[2] - t * v[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _from_triangle(p: Triple, corners: FloatArray, k: int) -> tuple[Triple, int]:
     """The way from triangle k's nearest point to p, and where that is: 0 face, 1-3 corner, 4-6 edge (Ericson 2005, section 5.1.5)."""
     a = (corners[k, 0, 0], corners[k, 0, 1], corners[k, 0, 2])
@@ -135,7 +135,7 @@ def _from_triangle(p: Triple, corners: FloatArray, k: int) -> tuple[Triple, int]
     return _minus(p, a, vb / (va + vb + vc), ab, vc / (va + vb + vc), ac), 0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _from_box(p: Triple, low: FloatArray, high: FloatArray, k: int) -> float:
     """Squared distance of p to box k."""
     x = max(low[k, 0] - p[0], p[0] - high[k, 0], 0.0)
@@ -144,7 +144,7 @@ def _from_box(p: Triple, low: FloatArray, high: FloatArray, k: int) -> float:
     return x * x + y * y + z * z
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _search(triangles: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray, points: FloatArray) -> FloatArray:
     leaves = len(low) // 2
     leaf = len(triangles) // leaves

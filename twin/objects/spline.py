@@ -5,9 +5,9 @@ Loops over tuples and plain numbers: slices of arrays would cost more than the s
 
 from typing import TypeAlias
 
-import numba
 import numpy as np
 
+from twin.compiled import compiled
 from twin.types import FloatArray
 
 Four: TypeAlias = tuple[float, float, float, float]
@@ -16,32 +16,32 @@ _SUMS = {"contract", "reassoc"}
 """What the compiler may do with sums: reorder them and fuse products. This nearly halves the time, and NaN stays NaN."""
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _cell(at: float, count: int) -> tuple[int, float]:
     """Node below ``at`` (in nodes) that has a neighbour before it and two behind, and the way from it."""
     cell = min(max(int(np.floor(at)), 1), count - 3)
     return cell, at - cell
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _weights(t: float) -> Four:
     """Shares of the four nodes around a place ``t`` after the second."""
     s = 1 - t
     return s**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * s**2 + 3 * s**3) / 6, t**3 / 6
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _slopes(t: float) -> Four:
     s = 1 - t
     return -(s**2) / 2, (3 * t - 4) * t / 2, (4 - 3 * s) * s / 2, t**2 / 2
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _bends(t: float) -> Four:
     return 1 - t, 3 * t - 2, 1 - 3 * t, t
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _line(weights: Four, values: FloatArray, i: int, j: int, k: int) -> float:
     """Weighted sum over four nodes along the last axis."""
     return (
@@ -52,14 +52,14 @@ def _line(weights: Four, values: FloatArray, i: int, j: int, k: int) -> float:
     )
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _step_in(point: float, low: float, spacing: float, count: int) -> tuple[float, float]:
     """Where a coordinate lies in the grid, in nodes, and how far it lies outside of it, in mm."""
     inside = min(max(point, low + 2 * spacing), low + (count - 3) * spacing)
     return (inside - low) / spacing, point - inside
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _place(
     points: FloatArray, k: int, corner: FloatArray, spacing: float, counts: tuple[int, ...]
 ) -> tuple[tuple[int, float], tuple[int, float], tuple[int, float], tuple[float, float, float]]:
@@ -70,7 +70,7 @@ def _place(
     return _cell(x, counts[0]), _cell(y, counts[1]), _cell(z, counts[2]), (away_x, away_y, away_z)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def spline_value(coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray) -> FloatArray:
     """Values (k,) at points (k, 3); outside the grid the distance to it is added."""
     value = np.empty(len(points))
@@ -86,7 +86,7 @@ def spline_value(coefficients: FloatArray, corner: FloatArray, spacing: float, p
     return value
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def spline_probe(
     coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -122,7 +122,7 @@ def spline_probe(
     return value, slope, hessian
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _add_gap(slope: FloatArray, hessian: FloatArray, away: tuple[float, float, float]) -> float:
     """Beyond the grid the spline is constant along ``away``'s axes, and the distance to the grid, returned, grows along them."""
     gap = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)

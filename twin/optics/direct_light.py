@@ -5,10 +5,10 @@ The ray equation is that of ``twin.camera.projection``.
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 
 from scenes.sensor import GelSpec, LensSpec
+from twin.compiled import compiled
 from twin.optics.lights import Patch
 from twin.optics.window import NEWTON_STEPS, fresnel
 from twin.types import FloatArray
@@ -18,7 +18,7 @@ RING_PLACES = 24
 ON_AXIS_MM = 1e-4
 """A point that is closer to the vertical through the light than this is lit straight along it."""
 
-_reflectance = numba.njit(cache=True, error_model="numpy")(fresnel)
+_reflectance = compiled(error_model="numpy")(fresnel)
 
 
 class DirectLight:
@@ -66,7 +66,7 @@ class DirectLight:
         return _ways(points_mm, np.asarray(place_mm, float), self._window)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _irradiance(
     points: FloatArray, normals: FloatArray, bump: float, places: FloatArray, powers: FloatArray, window: FloatArray, absorption: FloatArray
 ) -> FloatArray:
@@ -84,7 +84,7 @@ def _irradiance(
     return result
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _ways(points: FloatArray, place: FloatArray, window: FloatArray) -> tuple[FloatArray, FloatArray]:
     toward, lengths = np.empty((len(points), 3)), np.empty(len(points))
     for i in range(len(points)):
@@ -92,7 +92,7 @@ def _ways(points: FloatArray, place: FloatArray, window: FloatArray) -> tuple[Fl
     return toward, lengths
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _way(point: FloatArray, place: FloatArray, window: FloatArray) -> tuple[float, float, float, float, float]:
     """The refracted way from a point in the gel to a place in the air: direction in the gel, length there, and the solid
     angle at the point per area at the place (facing +z) times transmittance, ``d omega = sin d(theta) d(phi)``."""

@@ -4,11 +4,11 @@ Polygons are drawn with exact coverage, triangles with smooth shading. Places ar
 centres; images are (H, W, C) and are drawn into.
 """
 
-import numba
 import numpy as np
 
 from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.camera.projection import project
+from twin.compiled import compiled
 from twin.optics.surfaces import CAP_BEVEL, cap_outlines
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -78,7 +78,7 @@ def _hull(*discs: FloatArray) -> FloatArray:
     return hull
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def draw_polygons(image: FloatArray, polygons: FloatArray, light: FloatArray, inner: BoolArray) -> None:
     """Paint closed polygons (P, K, 2) of one light (P, C) each over the image, in the order given.
 
@@ -103,7 +103,7 @@ def draw_polygons(image: FloatArray, polygons: FloatArray, light: FloatArray, in
                         image[y, x, c] += share * (light[p, c] - (light[p - 1, c] if inner[p] else image[y, x, c]))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _cover(polygon: FloatArray, x0: int, y0: int, width: int, height: int) -> FloatArray:
     """Covered share of the pixels of a box from (x0, y0), two columns wider than asked for.
 
@@ -131,7 +131,7 @@ def _cover(polygon: FloatArray, x0: int, y0: int, width: int, height: int) -> Fl
     return cover
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _add_edge(row: FloatArray, start: float, end: float, rise: float) -> None:
     """Add to a row of differences an edge that crosses it from x = start to end while it rises by ``rise``."""
     left, right = min(start, end), max(start, end)
@@ -150,7 +150,7 @@ def _add_edge(row: FloatArray, start: float, end: float, rise: float) -> None:
         row[x + 1] += part * beyond
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def draw_triangles(image: FloatArray, corners: FloatArray, light: FloatArray, faces: IntArray) -> None:
     """Fill triangles ``faces (m, 3)`` over corners (v, 2), lights (v, C) interpolated linearly, where pixel centres lie inside."""
     height, width, channels = image.shape
@@ -184,7 +184,7 @@ def draw_triangles(image: FloatArray, corners: FloatArray, light: FloatArray, fa
                     image[y, x, c] = at[c] + step * (x - x0)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _inside(slope: float, at_zero: float, low: float, high: float) -> tuple[float, float]:
     """The part of [low, high] where ``at_zero + slope x >= 0``."""
     if slope > 0:

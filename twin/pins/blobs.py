@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 
 from scenes.sensor import BlobSpec
+from twin.compiled import compiled
 
 GROWTH_PX = 4
 """A component is grown by at most this much beyond its bounding box, px."""
@@ -139,7 +139,7 @@ def _smoothed(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
     return smooth
 
 
-@njit(cache=True)
+@compiled()
 def _centroids(gray: np.ndarray, labels: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, count: int) -> np.ndarray:
     """Sums (count, 7) over the pixels of each label: weight, weight x, weight y, bright pixels, weight xx, weight xy, weight yy.
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.optimize import linear_sum_assignment
 
+from twin.compiled import compiled
 from twin.pins.reference import Reference
 
 RIDGE = 0.25
@@ -167,7 +167,7 @@ def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np
     return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)
 
 
-@njit(cache=True)
+@compiled()
 def predict(
     i: int, rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray
 ) -> tuple[float, float, int]:
@@ -229,7 +229,7 @@ def predict(
     return (c00 * bx0 + c01 * bx1 + c02 * bx2) / det, (c00 * by0 + c01 * by1 + c02 * by2) / det, count
 
 
-@njit(cache=True)
+@compiled()
 def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Each pin's position (N, 2) as its neighbours predict it; NaN where no neighbour counts."""
     out = np.empty_like(rest)
@@ -240,7 +240,7 @@ def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, m
     return out
 
 
-@njit(cache=True)
+@compiled()
 def _buckets(px: np.ndarray, cell: float) -> Buckets:
     """Blobs by square cell: (first blob of each cell, next blob in the same cell, x0, y0, columns, rows)."""
     x0, y0 = px[:, 0].min(), px[:, 1].min()
@@ -255,7 +255,7 @@ def _buckets(px: np.ndarray, cell: float) -> Buckets:
     return head, following, x0, y0, columns, rows
 
 
-@njit(cache=True)
+@compiled()
 def _nearest(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray, buckets: Buckets, cell: float) -> tuple[int, float]:
     """Nearest free blob within ``reach`` of (x, y): (index or -1, squared distance)."""
     head, following, x0, y0, columns, rows = buckets
@@ -272,7 +272,7 @@ def _nearest(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray
     return best, best_d2
 
 
-@njit(cache=True)
+@compiled()
 def _grow(
     rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, start: np.ndarray, buckets: Buckets, cell: float
 ) -> np.ndarray:
@@ -331,7 +331,7 @@ def _grow(
     return blob
 
 
-@njit(cache=True)
+@compiled()
 def _ring_turns(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.ndarray, winding: int) -> tuple[np.ndarray, int]:
     """Turn of each ring (R,) as a unit complex number (0: unknown) after its labels are shifted back by ``winding``; number known."""
     turns = np.zeros(len(ring_ends) - 1, np.complex128)
@@ -357,7 +357,7 @@ def _ring_turns(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: n
     return turns, known
 
 
-@njit(cache=True)
+@compiled()
 def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.ndarray) -> np.ndarray:
     """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
 
@@ -378,7 +378,7 @@ def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.n
     return out
 
 
-@njit(cache=True)
+@compiled()
 def _trust(
     rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, blob: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -399,7 +399,7 @@ def _trust(
     return moved, weight
 
 
-@njit(cache=True)
+@compiled()
 def _candidates(
     predicted: np.ndarray,
     neighbours: np.ndarray,

@@ -13,8 +13,9 @@ additive, so the cells tile the region to rounding, whatever its shape.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.spatial import ConvexHull, Delaunay, QhullError
+
+from twin.compiled import compiled
 
 # The outline is enlarged by this about its centroid: half way to the release's further sites, which stand at 1.1.
 BOUNDARY_SCALE = 1.05
@@ -51,7 +52,7 @@ def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
     return None if len(mesh.coplanar) else mesh.simplices
 
 
-@njit(cache=True)
+@compiled()
 def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
     """(E, 2) both directions of each triangle side of a triangulation of ``n`` nodes, sorted."""
     start = np.zeros(n + 1, np.int64)
@@ -80,7 +81,7 @@ def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
     return edges[:count]
 
 
-@njit(cache=True)
+@compiled()
 def polygon_area(polygon: np.ndarray, count: int) -> float:
     """Signed area (shoelace) of the first ``count`` vertices, about the first one: far from the origin digits would cancel."""
     total = 0.0
@@ -90,7 +91,7 @@ def polygon_area(polygon: np.ndarray, count: int) -> float:
     return 0.5 * total
 
 
-@njit(cache=True)
+@compiled()
 def _cut(polygon: np.ndarray, count: int, a: float, b: float, c: float, out: np.ndarray) -> int:
     """The part of a polygon with a x + b y <= c (Sutherland and Hodgman 1974); returns its vertex count."""
     kept = 0
@@ -112,7 +113,7 @@ def _cut(polygon: np.ndarray, count: int, a: float, b: float, c: float, out: np.
     return kept
 
 
-@njit(cache=True)
+@compiled()
 def _cell(
     i: int, nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, count: int, here: np.ndarray, there: np.ndarray
 ) -> tuple[int, np.ndarray, np.ndarray]:
@@ -128,7 +129,7 @@ def _cell(
     return count, here, there
 
 
-@njit(cache=True)
+@compiled()
 def _inner_radius2(region: np.ndarray, x0: float, y0: float) -> float:
     """Squared distance of a point from the nearest of a polygon's sides."""
     least = np.inf
@@ -141,7 +142,7 @@ def _inner_radius2(region: np.ndarray, x0: float, y0: float) -> float:
     return least
 
 
-@njit(cache=True)
+@compiled()
 def _cells(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Area of every cell and its vertices, end to end.
 

@@ -7,16 +7,14 @@ another folder, or ``off`` for none.
 
 import os
 import re
-import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import platformdirs
 
-from twin.errors import StoreError
+from twin.errors import StoreError, warn_once
 from twin.store.atomic import write_npz
 from twin.store.fingerprint import Maker, UnknownCodeError, fingerprint
 from twin.store.made import inputs_digest
@@ -60,7 +58,7 @@ def cached_arrays(
     try:
         path = folder / f"{kind}-{inputs_digest(digest, fingerprint(*(code or (compute,))))}.npz"
     except UnknownCodeError as error:
-        _warn(str(error))
+        warn_once(str(error))
         return _arrays(compute)
     found = _read(path)
     if found is None:
@@ -91,7 +89,7 @@ def _read(path: Path) -> dict[str, np.ndarray] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except Exception as error:  # damaged bytes raise whatever zipfile and numpy run into; the file is written anew
-        _warn(f"{path}: not a readable cache entry ({error}); computed again")
+        warn_once(f"{path}: not a readable cache entry ({error}); computed again")
         return None
     with suppress(OSError):
         os.utime(path)  # used now
@@ -107,7 +105,7 @@ def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
     except (OSError, StoreError) as error:
         reason = error.__cause__ if isinstance(error, StoreError) else error
         why = getattr(reason, "strerror", None) or reason
-        _warn(f"{path.parent}: results can't be kept ({why}); set {_VARIABLE} to a writable folder, or to off")
+        warn_once(f"{path.parent}: results can't be kept ({why}); set {_VARIABLE} to a writable folder, or to off")
 
 
 def _make_room(folder: Path) -> None:
@@ -124,9 +122,3 @@ def _make_room(folder: Path) -> None:
             return
         path.unlink(missing_ok=True)
         total -= size
-
-
-@cache
-def _warn(message: str) -> None:
-    """Each message once in a process."""
-    warnings.warn(message, RuntimeWarning, stacklevel=4)

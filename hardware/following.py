@@ -235,5 +235,5 @@ def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, 
         "notes": followed.notes,
     }
     measures = out / "measures.json"
-    measures.write_text(json.dumps(plain(content), indent=1) + "\n")
+    measures.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
     return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]

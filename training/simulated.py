@@ -107,7 +107,7 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     config = config_of(folder)
     truth, _, _ = _truth(folder)
     row_of = _row_of(truth)
-    with (folder / DRAWS).open(newline="") as file:
+    with (folder / DRAWS).open(newline="", encoding="utf-8") as file:
         draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
     rows = np.array([row_of.get(name, -1) for name in names.tolist()], int)
     arrays = _arrays(truth, ("pose", "move", "executed", "force_n", "path_id"))

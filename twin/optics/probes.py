@@ -127,7 +127,7 @@ def _run(backend: str, library: Path) -> Verdict:
 
 def _read(store: Path) -> dict:
     try:
-        known = json.loads(store.read_text())
+        known = json.loads(store.read_text(encoding="utf-8"))
         return known if isinstance(known, dict) else {}
     except (OSError, ValueError):
         return {}

@@ -70,8 +70,11 @@ def write_bytes(path: Path, data: bytes) -> Path:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write text as UTF-8, its line ends as they are; errors as of ``write_with``."""
-    return write_bytes(path, text.encode())
+    """Write text as UTF-8, its line ends as they are; errors as of ``write_with``.
+
+    Names of files that the locale can't decode are written with the bytes that they have on the disk.
+    """
+    return write_bytes(path, text.encode(errors="surrogateescape"))
 
 
 @contextmanager

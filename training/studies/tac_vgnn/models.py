@@ -139,7 +139,7 @@ def error_columns(data: Dataset) -> list[str]:
 
 def read_curves(folder: Path) -> list[dict[str, float]]:
     """The learning curve of a run: a dict of numbers for each epoch, one network after the other."""
-    with (folder / "curves.csv").open(newline="") as file:
+    with (folder / "curves.csv").open(newline="", encoding="utf-8") as file:
         return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
 
@@ -185,7 +185,7 @@ class PeakMemory:
     def _now(self) -> float:
         if self.device == "cuda":
             return torch.cuda.memory_allocated() / MIB
-        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / MIB
+        return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * 4096 / MIB
 
 
 def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, device: str = "cpu") -> dict[str, Any]:

@@ -69,9 +69,8 @@ def main() -> None:
     An error that a user can act on is printed as one line on stderr. The exit code is then 2 if the command line itself is wrong,
     and 1 otherwise. Ctrl-C is one line, too, and exit code 130. A warning is one line without the place in the source.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # where the terminal's encoding lacks a letter, it is printed by its number
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed by its number, as on stderr
     warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
     try:
         command_line()(prog_name="twin")

@@ -5,6 +5,7 @@ Each module of this package holds the commands of one kind of work. A command im
 """
 
 import io
+import logging
 import sys
 import warnings
 from importlib import import_module
@@ -72,6 +73,7 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed by its number, as on stderr
     warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where the home can't be written it is slower, and says so in four lines
     try:
         command_line()(prog_name="twin")
     except KeyboardInterrupt as interrupt:  # before a command runs

@@ -218,7 +218,7 @@ def outcomes(make: Callable[[str, int], Made], text: str, todo: list[int], *, wo
 
 def require_scheduler(address: str) -> None:
     """Raise ``DatasetError`` where no Dask scheduler answers, before anything is written for its workers."""
-    with _client(1, address):
+    with _client(address):
         pass
 
 

@@ -18,7 +18,9 @@ from hostile_known import KNOWN
 
 SLOW_MACHINE = 4.0  # times the seconds of an entry, where other work shares the machine
 HANGS_S = 10.0  # for entries that are known not to end, which are not waited for longer
-PROGRESS = re.compile(r"[━╸╺⠀-⣿]|\d/\d+ .*(\d:\d\d:\d\d|-:--:--)")  # what only progress bars print
+PROGRESS = re.compile(  # what only progress prints: bars, or a line every ten seconds
+    r"[━╸╺⠀-⣿]|\d/\d+ .*(\d:\d\d:\d\d|-:--:--)|^(?!twin: )(at work|.+: (begun|\d+%|\d+ of \d+)(, .*)?)$"
+)
 ERROR = "twin: error: "
 VARYING = re.compile(r"\d+\.?\d* ms\b")
 

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
+from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from twin.errors import DatasetError, TwinError, WorkersError, warn_once
@@ -119,8 +120,13 @@ class _Process:
         self.pipe, theirs = context.Pipe()
         self.number = -1
         self._process = context.Process(target=_serve, args=(theirs, pickled), daemon=True)
-        with _deaf_to_ctrl_c():
-            self._process.start()
+        try:
+            with _deaf_to_ctrl_c():
+                self._process.start()
+        except BaseException:
+            if self._process.pid is not None:
+                self.end()
+            raise
         theirs.close()
 
     def give(self, number: int, task: object) -> None:
@@ -138,15 +144,21 @@ class _Process:
 
 @contextmanager
 def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Context in which this thread does not hear SIGINT, nor do the processes that it starts, for as long as they live."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Context that SIGINT does not interrupt: it is heard at the end. Processes that are started in it never hear it."""
+    heard: list[tuple[int, FrameType | None]] = []
+    before = None
+    if threading.current_thread() is threading.main_thread():  # another thread may take the signal, and this one then raises it
+        before = signal.signal(signal.SIGINT, lambda number, frame: heard.append((number, frame)))
+    masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if hasattr(signal, "pthread_sigmask") else None  # not on Windows
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if masked is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+    if heard and callable(before):
+        before(*heard[0])
 
 
 def _serve(pipe: Connection, pickled: bytes) -> None:
@@ -155,7 +167,10 @@ def _serve(pipe: Connection, pickled: bytes) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     work: Callable[[Any], Any] | None = None
     while True:
-        task = pipe.recv()
+        try:
+            task = pipe.recv()
+        except (EOFError, OSError):  # the process that started this one has ended
+            return
         with warnings.catch_warnings(record=True) as caught:
             try:
                 if work is None:
@@ -164,7 +179,10 @@ def _serve(pipe: Connection, pickled: bytes) -> None:
                 made, error, where = pickle.dumps(work(task)), None, ""
             except Exception as arisen:
                 made, error, where = pickle.dumps(None), _that_can_be_sent(arisen), traceback.format_exc()
-        pipe.send((made, error, where, [str(each.message) for each in caught]))
+        try:
+            pipe.send((made, error, where, [str(each.message) for each in caught]))
+        except OSError:
+            return
 
 
 def _end_with_parent() -> None:

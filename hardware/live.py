@@ -17,7 +17,7 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.recorded import SequentialSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
-from hardware.rig import FIRST, NONE, counting_from_first, given_frame
+from hardware.rig import counting_from_first, given_frame
 from hardware.session import SessionSource, SessionWriter
 from hardware.step import Estimate, Estimator, SensorModel
 from hardware.timing import Spread, Timing
@@ -26,7 +26,7 @@ from hardware.view.rerun import RerunView
 from hardware.view.server import BrowserView
 from twin.errors import FrameError, OptionError
 from twin.pins import Pipeline
-from twin.types import Frame
+from twin.types import FIRST, NONE, Frame
 
 # Newest times of each kind that the figures are computed from.
 KEPT_TIMES = 10_000

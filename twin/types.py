@@ -18,6 +18,11 @@ FINE = 20
 """Elements across the skin for calibrations and data sets. In the deepest contacts the outer pins then move as with 32 elements, to 1 %."""
 
 
+# What may stand in place of the file of a frame without contact (the option --at-rest): the first frame that is read, or no frame, so that
+# pins are counted from the specification's layout.
+FIRST, NONE = "first", "none"
+
+
 class Form(StrEnum):
     """A sensor's frames come in two forms."""
 

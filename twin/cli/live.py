@@ -13,8 +13,6 @@ import typer
 
 from twin.cli import app
 from twin.cli.options import (
-    FIRST,
-    NONE,
     SHIPPED_MODEL,
     ArmOption,
     AtRest,
@@ -31,6 +29,7 @@ from twin.cli.options import (
     tell,
     writable_folder,
 )
+from twin.types import FIRST, NONE
 
 HELP_LIVE = """Show a model's estimates on a camera's frames.
 

@@ -73,8 +73,6 @@ AtRest = Annotated[
         "or none (the specification's layout)",
     ),
 ]
-# What --at-rest takes besides a file (the constants of hardware.rig, which would load the devices).
-FIRST, NONE = "first", "none"
 
 
 def _even(value: int) -> int:

@@ -20,7 +20,7 @@ SLIGHT_BLUR_PX = 0.6
 @pytest.fixture(scope="module")
 def real(real_dir):
     spec = load_sensor("ur5-331")
-    disc = lens_disc(spec)
+    disc = lens_disc(spec.view, spec.housing)
     found = read_real(real_dir / "ur5-331-raw", spec, disc)
     assert not found.refused
     return disc, found.frames

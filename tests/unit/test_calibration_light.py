@@ -184,7 +184,7 @@ def test_noise_is_recovered(known, light, frame):
     real = replace(frame, image=expose(light, loud.capture, np.random.default_rng(5)))
     found = fit_noise(known, [real], [light])
     again = expose(light, found.capture, np.random.default_rng(6))
-    bare = bare_skin(again.shape, frame.pins_px, lens_disc(known))
+    bare = bare_skin(again.shape, frame.pins_px, lens_disc(known.view, known.housing))
     assert noise_sd(gray_levels(again), bare) == pytest.approx(noise_sd(gray_levels(real.image), bare), rel=0.05)
 
 

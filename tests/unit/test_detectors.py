@@ -24,7 +24,7 @@ def spec():
 @pytest.fixture(scope="module")
 def foreign(spec):
     """Frames of a sensor like ours whose camera nobody knows: larger, displaced, turned, brighter ring around; and their pins."""
-    flat = flat_layout(spec)
+    flat = flat_layout(spec.geometry)
     turn = np.radians(8.0)
     turning = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     center, frames, truths = np.array([300.0, 255.0]), [], []
@@ -88,7 +88,7 @@ def test_frames_without_a_layout_are_refused(spec):
     black = Frame(np.zeros((480, 640), np.uint8), Form.RAW)
     with pytest.raises(FrameError, match="none of 1 frames shows 127 pins"):
         tune([black], spec)
-    assert see_layout(black.image, flat_layout(spec), spec.pins.rings, binary=False) is None
+    assert see_layout(black.image, flat_layout(spec.geometry), spec.pins.rings, binary=False) is None
 
 
 def test_recordings_are_tuned_without_a_crop(spec):

@@ -98,6 +98,6 @@ def test_frames_that_differ_in_shape_are_refused(disc):
 
 def test_the_lens_disc_holds_all_pins():
     spec = load_sensor("ur5-331")
-    disc = lens_disc(spec)
+    disc = lens_disc(spec.view, spec.housing)
     assert disc.radius_px > spec.pipeline.raw.mask_radius_px
     assert disc.inside.sum() == pytest.approx(np.pi * disc.radius_px**2, rel=0.01)

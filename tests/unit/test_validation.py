@@ -75,7 +75,7 @@ def test_a_wrong_executed_flag_shows(recorded, found):
 
 def test_page_and_table_hold_every_frame(found, recorded, tmp_path):
     _, config, _ = recorded
-    page, table, _ = write_validation(tmp_path, found, config.sensor, summary_of(found, config.sensor))
+    page, table, _ = write_validation(tmp_path, found, config.sensor.description, summary_of(found, config.sensor.name))
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["image_name"] for row in rows] == found.measured.names

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenes import SensorSpec
+from scenes.sensor import RecordingSpec
 from training.estimator import PoseEstimator, digest_of
 from twin.camera.capture import record
 from twin.judge.degradation.envelope import Envelope
@@ -93,7 +94,7 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
 
 def load_models(runs: tuple[Path, ...], sensor: SensorSpec) -> dict[str, Callable[[Frame], Estimates]]:
     """Models by name, as a sweep calls them: raw frames are recorded first where the model was trained on recordings."""
-    return {each.name: partial(_estimates, _checked(each, sensor), sensor) for each in runs}
+    return {each.name: partial(_estimates, _checked(each, sensor), sensor.recording) for each in runs}
 
 
 def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
@@ -102,8 +103,8 @@ def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
     return estimator
 
 
-def _estimates(estimator: PoseEstimator, sensor: SensorSpec, frame: Frame) -> Estimates:
-    if frame.form == Form.RAW and estimator.form == Form.RECORDING and sensor.recording is not None:
-        frame = replace(frame, image=record(frame.image, sensor.recording), form=Form.RECORDING)
+def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Estimates:
+    if frame.form == Form.RAW and estimator.form == Form.RECORDING and recording is not None:
+        frame = replace(frame, image=record(frame.image, recording), form=Form.RECORDING)
     found = estimator(frame)
     return found.value, found.units, found.valid

@@ -88,5 +88,5 @@ def validate_contacts(
     model = ContactModel(sensor, experiment, touched or load_object(experiment.object), measured.form, across=across)
     with stage(progress, "contacts") as step:
         found = compare(model, measured, friction_frames=friction_frames, progress=step)
-    summary = summary_of(found, sensor)
-    return Validation(found, summary, sensor, write_validation(out, found, sensor, summary))
+    summary = summary_of(found, sensor.name)
+    return Validation(found, summary, sensor, write_validation(out, found, sensor.description, summary))

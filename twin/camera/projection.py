@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import CameraSpec, SensorSpec, ViewSpec
+from scenes.sensor import CameraSpec, HousingSpec, ViewSpec
 from twin.types import FloatArray
 
 NEWTON_STEPS = 12
@@ -167,14 +167,14 @@ def round_disc(size_px: tuple[int, int], center_px: np.ndarray, radius_px: float
     return Disc(np.asarray(center_px, float), float(radius_px), inside)
 
 
-def lens_disc(spec: SensorSpec) -> Disc:
-    """The housing's aperture as the specification's camera sees it: centre and mean radius of its projected rim."""
-    turn, housing = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False), spec.housing
+def lens_disc(view: ViewSpec, housing: HousingSpec) -> Disc:
+    """The housing's aperture as the camera sees it: centre and mean radius of its projected rim."""
+    turn = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
     rim = np.column_stack([housing.aperture_radius_mm * np.cos(turn), housing.aperture_radius_mm * np.sin(turn), np.zeros(CORNERS)])
-    rim_px = project(spec.view, rim + [*housing.center_mm, housing.z_mm])
+    rim_px = project(view, rim + [*housing.center_mm, housing.z_mm])
     center = rim_px.mean(axis=0)
     radius = float(np.linalg.norm(rim_px - center, axis=1).mean())
-    return round_disc((spec.camera.width_px, spec.camera.height_px), center, radius)
+    return round_disc((view.camera.width_px, view.camera.height_px), center, radius)
 
 
 def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:

@@ -152,7 +152,7 @@ def _seen_reflections(spec: SensorSpec, still: Still) -> _Reflections | None:
     lens = spec.lens
     z_mm = float(np.clip(spec.leds.z_mm, lens.back_mm - BEHIND_MM[1], lens.back_mm - BEHIND_MM[0]))
     straight_mm = 2 * lens.back_mm - z_mm + spec.camera.distance_mm
-    disc = lens_disc(spec)
+    disc = lens_disc(spec.view, spec.housing)
     hearts = {k: at for k in lit_leds(spec.leds) if (at := _heart_px(still, disc, spec.leds.azimuth_deg[k])) is not None}
     if not hearts:
         return None

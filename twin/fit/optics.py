@@ -204,7 +204,7 @@ def fit_optics(
     log = _Log(work, spec, raw)
     with bar("fit the skin to the pins") as step:
         frames = log.aligned(spec, raw, step)
-    inside, studio = lens_disc(spec).inside, _Studio(bar)
+    inside, studio = lens_disc(spec.view, spec.housing).inside, _Studio(bar)
     first = studio.shots(spec, frames, "render the start")
     for number, fit in enumerate(_stages(frames, inside, studio, bar)):
         spec = log.stage(f"{number:02d}-{fit.__name__}", fit, spec)

@@ -197,7 +197,7 @@ def apparent_mm(z_mm: np.ndarray, pupil_mm: float, lens: LensSpec, gel_index: fl
 
 def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], rounds: int = 3) -> SensorSpec:
     """The specification with its noise scaled until bare skin is as rough in renders as in the real frames."""
-    disc, scale = lens_disc(spec), 1.0
+    disc, scale = lens_disc(spec.view, spec.housing), 1.0
     bare = [bare_skin(f.image.shape, f.pins_px, disc) for f in frames]
 
     def roughness(images: Iterable[np.ndarray]) -> float:

@@ -75,7 +75,7 @@ def fit_disc_edge(spec: SensorSpec, still: Still) -> SensorSpec:
         There is no bright ring around a darker disc.
     """
     light = to_light(still.gray, spec.response)
-    disc = lens_disc(spec)
+    disc = lens_disc(spec.view, spec.housing)
     for reach in REACHES:
         edge_px = _edge_places(light, disc.center_px, disc.radius_px, reach, spec.name)
         x, y, radius = _circle_through(edge_px, [*disc.center_px, disc.radius_px], EDGE_PX)
@@ -183,7 +183,7 @@ def _thinned(spec: SensorSpec, still: Still) -> _Wall:
     """What is compared of the still picture."""
     ring, few = spec.housing, (slice(None, None, EVERY),) * 2
     at_mm = still.tangents[few] * (ring.z_mm + spec.camera.distance_mm)
-    margin_mm = RIM_PX * ring.aperture_radius_mm / lens_disc(spec).radius_px
+    margin_mm = RIM_PX * ring.aperture_radius_mm / lens_disc(spec.view, spec.housing).radius_px
     beyond_mm = np.linalg.norm(at_mm - ring.center_mm, axis=-1) - ring.aperture_radius_mm
     return _Wall(
         at_mm=at_mm,

@@ -104,7 +104,7 @@ def _window_view(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np
     spacing = pin_spacing_px(pins_px[0])
     clear = np.array([clear_of_pins(gray.shape[1:], pins, CLEAR_SHARE * spacing) for pins in pins_px])
     y, x = np.mgrid[: gray.shape[1], : gray.shape[2]]
-    disc, response, lens = lens_disc(spec), spec.response, spec.lens
+    disc, response, lens = lens_disc(spec.view, spec.housing), spec.response, spec.lens
     u2 = np.sum(still.tangents**2, axis=-1, keepdims=True)
     in_window = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)  # tangent there, relative to that in air
     place_mm = still.tangents * (lens.back_mm + spec.camera.distance_mm + lens.thickness_mm * in_window)

@@ -4,6 +4,7 @@ No contact changes this layer. It is computed once, without noise.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -37,25 +38,27 @@ def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tupl
         Share of the gel's light that is hidden: the film gets ``light + (1 - cover) * gel``.
     """
     table = ray_table(spec.camera, window_px) @ sensor_to_camera(spec.camera)[:3, :3]
-    at_corners = np.concatenate([part.reshape(*part.shape[:2], -1) for part in _seen(spec, table)], axis=2)
+    seen = partial(_seen, spec.view, spec.leds, spec.housing, spec.appearance.specks)
+    at_corners = np.concatenate([part.reshape(*part.shape[:2], -1) for part in seen(table)], axis=2)
     around = np.stack([at_corners[:-1, :-1], at_corners[:-1, 1:], at_corners[1:, :-1], at_corners[1:, 1:]])
     both = around.mean(axis=0)
     uneven = (np.ptp(around, axis=0) > EVEN * np.maximum(both, SMALL)).any(axis=2)
     rows, columns = np.nonzero(cv2.dilate(uneven.astype(np.uint8), np.ones((3, 3), np.uint8)))
     corners = np.stack([[table[rows + j, columns + i] for i in (0, 1)] for j in (0, 1)])
-    light, hidden = _seen(spec, subpixel_rays(corners, ACROSS))
+    light, hidden = seen(subpixel_rays(corners, ACROSS))
     both[rows, columns] = np.concatenate([light, hidden[..., None]], axis=2).mean(axis=1)
     return both[..., :3].astype(np.float32), both[..., 3].astype(np.float32)
 
 
-def _seen(spec: SensorSpec, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _seen(
+    view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, specks: Sequence[SpeckSpec], rays: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Light (..., 3) and cover (...) along rays (..., 3) from the pupil, sensor frame, of any length."""
-    camera, ring = spec.camera, spec.housing
     tangents = rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)
-    at_ring = tangents * (ring.z_mm + camera.distance_mm)
+    at_ring = tangents * (ring.z_mm + view.camera.distance_mm)
     wall = np.linalg.norm(at_ring - ring.center_mm, axis=-1) >= ring.aperture_radius_mm
-    light = np.where(wall[..., None], housing_light(spec.leds, ring, at_ring), reflections(spec.view, spec.leds, ring, tangents))
-    hidden, shine = _specks(spec.view, spec.appearance.specks, tangents)
+    light = np.where(wall[..., None], housing_light(leds, ring, at_ring), reflections(view, leds, ring, tangents))
+    hidden, shine = _specks(view, specks, tangents)
     light = np.where(wall[..., None], light, light + shine) + rim_light(ring, at_ring)
     return light, np.where(wall, 1.0, hidden)
 

@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenes.sensor import SensorSpec
+from scenes.sensor import GeometrySpec
 from twin.geometry.pins import rest_pins
 from twin.pins.matching import Match, match
 from twin.pins.reference import Reference, make_reference
@@ -62,9 +62,9 @@ class Sighting:
     score: float
 
 
-def flat_layout(spec: SensorSpec) -> np.ndarray:
+def flat_layout(geometry: GeometrySpec) -> np.ndarray:
     """Pins (N, 2) of the layout laid flat, the outermost at distance 1. It depends on neither the dome nor the camera."""
-    axis = rest_pins(spec.geometry).axis
+    axis = rest_pins(geometry).axis
     polar = np.arccos(np.clip(np.abs(axis[:, 2]), -1, 1))
     rho = np.linalg.norm(axis[:, :2], axis=1, keepdims=True)
     outward = -axis[:, :2] / np.maximum(rho, 1e-12)

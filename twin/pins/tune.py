@@ -92,7 +92,7 @@ def tune(frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, pr
     frames = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(TUNED_ON, len(frames))).round().astype(int))]
     form = frames[0].form
     binary = form == Form.RECORDING
-    seen = _sightings(frames, flat_layout(sensor), sensor.pins, binary, progress)
+    seen = _sightings(frames, flat_layout(sensor.geometry), sensor.pins, binary, progress)
     reference = rest_of(seen, sensor.pins.rings)
     start = _start(frames[0], reference, seen, method, form, sensor.pins.layout)
     tried, judged = list(_settings(start, reference, seen, binary)), frames

@@ -45,7 +45,7 @@ class View:
     @classmethod
     def of(cls, spec: SensorSpec, caps_px: np.ndarray) -> "View":
         """The view of a sensor whose caps are at ``caps_px`` (N, 2), raw-frame px."""
-        disc = lens_disc(spec)
+        disc = lens_disc(spec.view, spec.housing)
         caps_mm = rest_pins(spec.geometry).caps_mm
         apart = [cKDTree(points).query(points, k=2)[0][:, 1] for points in (project(spec.view, caps_mm), caps_mm)]
         return cls(spec, disc.center_px, disc.radius_px, float(np.median(apart[0] / apart[1])), caps_px)

@@ -46,7 +46,7 @@ def read_frames(folder: Path, spec: SensorSpec, limit: int, progress: Step) -> l
         No frame can be used, or one does not fit the camera: it has another size, or is in colour where the camera is mono
         (or the other way round). Names the first and why.
     """
-    real = read_real(folder, spec, lens_disc(spec), limit=limit, progress=progress)
+    real = read_real(folder, spec, lens_disc(spec.view, spec.housing), limit=limit, progress=progress)
     for found in real.frames:
         require_cameras_own(found.frame.image, found.frame.name, spec.camera)
     return [(found.frame.name, found.frame.image, found.pins_px) for found in real.frames]

@@ -83,7 +83,7 @@ def run_realism(
     RenderError
         Nothing can be rendered here.
     """
-    disc, bar = lens_disc(spec), partial(stage, progress)
+    disc, bar = lens_disc(spec.view, spec.housing), partial(stage, progress)
     with bar("read the real frames, find their pins") as step:
         real = read_real(folder, spec, disc, limit=limit, progress=step)
     with bar("fit the skin to the pins, render") as step:

@@ -195,7 +195,7 @@ def write_page(
         "would say.",
     )
     _image_table(page, metrics["pin_aligned"])
-    page.text(_detector_text(spec, metrics))
+    page.text(_detector_text(spec.pins.count, metrics))
     _statistics_section(page, metrics["statistics"], plots, found)
     if metrics["pose_aligned"]:
         error = metrics["pose_aligned"]["pin_error_px"]
@@ -226,12 +226,12 @@ def _image_table(page: Page, summary: dict) -> None:
     page.table([{"of": said} | {c.key: summary[c.key][part] for c in columns[1:]} for part, said in parts.items()], columns)
 
 
-def _detector_text(spec: SensorSpec, metrics: dict) -> str:
+def _detector_text(count: int, metrics: dict) -> str:
     def percent(share: float) -> str:
         return number(100 * share, decimals=1)
 
     said = (
-        f"The detector, with the parameters of the real frames, finds exactly all {spec.pins.count} pins in "
+        f"The detector, with the parameters of the real frames, finds exactly all {count} pins in "
         f"{percent(metrics['pin_aligned']['exact_fraction'])} % of the renders."
     )
     test = metrics["two_sample"]

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from scenes.sensor import CameraSpec, SensorSpec
+from twin.camera.projection import lens_disc
 from twin.judge.degradation.condition import Condition, OnSection, View, altered
 
 # Direction of a shift in the picture (unit vector, 30 deg from x towards y).
@@ -30,7 +31,7 @@ def distorted(spec: SensorSpec, value: float, rng: np.random.Generator) -> Senso
     """Another lens: barrel distortion that draws the disc's rim in by a share of its radius."""
     if not value:
         return spec
-    rim = View.of(spec, np.zeros((0, 2))).radius_px / spec.camera.fx_px
+    rim = lens_disc(spec.view, spec.housing).radius_px / spec.camera.fx_px
     return altered(spec, camera={"k1": spec.camera.k1 - value / rim**2})
 
 

@@ -23,21 +23,19 @@ TEAR_LIGHT = 0.7
 LEAST_FACING = 0.3
 
 
-def cap_levels(spec: SensorSpec) -> np.ndarray:
-    """Level (N,) of each cap relative to ``cap_albedo``: measured, or as the print's random pattern has it."""
-    albedo = np.array(spec.appearance.cap_albedo)
+def cap_levels(appearance: AppearanceSpec, count: int) -> np.ndarray:
+    """Reflectance (count,) of each cap relative to ``cap_albedo``: the measured one, else that of the print's random pattern."""
+    if appearance.cap_levels:
+        return np.array(appearance.cap_levels)
+    albedo = np.array(appearance.cap_albedo)
     k = int(albedo.argmax())
-    return (
-        np.array(spec.appearance.cap_levels)
-        if spec.appearance.cap_levels
-        else np.maximum(cap_albedo(spec.appearance, spec.pins.count)[:, k] / albedo[k], GONE)
-    )
+    return np.maximum(cap_albedo(appearance, count)[:, k] / albedo[k], GONE)
 
 
 def missing(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     if not value:
         return spec
-    levels = np.where(chosen(spec.pins.count, value, rng), GONE, cap_levels(spec))
+    levels = np.where(chosen(spec.pins.count, value, rng), GONE, cap_levels(spec.appearance, spec.pins.count))
     return altered(spec, appearance={"cap_levels": tuple(levels.tolist())})
 
 
@@ -66,7 +64,7 @@ def faded(appearance: AppearanceSpec, value: float, rng: np.random.Generator) ->
 def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     if not value:
         return spec
-    levels = cap_levels(spec) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count)))
+    levels = cap_levels(spec.appearance, spec.pins.count) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count)))
     return altered(spec, appearance={"cap_levels": tuple(levels.tolist())})
 
 

@@ -1,4 +1,4 @@
-"""Simulated data sets: read like recordings where they have no pictures, and what is known of their contacts beyond the table."""
+"""Simulated data sets: reading those without pictures, and what is known of their contacts besides the table of labels."""
 
 import csv
 from collections.abc import Sequence
@@ -42,12 +42,12 @@ def is_pins_only(folder: Path) -> bool:
 
 
 def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str, np.ndarray]]:
-    """A data set without pictures: its table, and its arrays ``pins_px`` and ``rest_px`` (M, N, 2) and ``visible`` (M, N).
+    """Read a data set without pictures: its table, and its arrays ``pins_px`` and ``rest_px`` (M, N, 2) and ``visible`` (M, N).
 
     Raises
     ------
     FrameError
-        It is another sensor's, or its table and truth don't belong together.
+        The data set was simulated for another sensor, or its table and its truth have different numbers of rows.
     """
     truth, sensor, form = _truth(folder)
     if sensor != spec.name:
@@ -86,23 +86,23 @@ def config_of(folder: Path) -> GenerationConfig:
 
 
 def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
-    """Depth and angle of the surface that was touched, whatever its shape, as labels: see ``twin.rig.touch.surface_labels``.
+    """Depth and angle of the touched surface, of any shape, as labels: see ``twin.rig.touch.surface_labels``.
 
-    Where the object stood is where the arm was sent, by the rig's numbers that were drawn for each contact, less what the object
-    gave way, so that the flat plate's are the table's own, with moves that were not executed taken out.
+    The object's place follows from the pose that the arm was sent to and the rig's parameters that were drawn for the contact. What
+    the object gave way is subtracted. Therefore the labels of a flat plate are those of the table, less moves that were not executed.
 
     Parameters
     ----------
     folder : Path
-        Of a simulated data set, with or without pictures.
+        A simulated data set, with or without pictures.
     names : (M,) str
-        Frames of it.
+        Names of frames.
 
     Returns
     -------
     dict of str to (M,) float
-        mm and deg by the table's columns, NaN for frames that it does not name; empty where depth and one angle do not tell how a
-        surface is touched.
+        Labels in mm and deg by the name of the table's column; NaN for frames that are not in the table. The dict is empty if depth
+        and one angle do not describe how the surface is touched.
     """
     config = config_of(folder)
     truth, _, _ = _truth(folder)
@@ -161,6 +161,6 @@ def _arrays(truth: zarr.Group, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _rigged(sensor: SensorSpec, drawn: dict[str, str]) -> SensorSpec:
-    """The sensor with the rig that was drawn for a contact."""
+    """The sensor with the rig's parameters that were drawn for a contact."""
     rig = {key.removeprefix("rig."): float(value) for key, value in drawn.items() if key.startswith("rig.")}
     return sensor.model_copy(update={"rig": rig_of(sensor).model_copy(update=rig)})

@@ -1,14 +1,13 @@
-"""Whether the labels of a flat-surface recording agree with its pins.
+"""Audit of a flat-surface recording: do its labels agree with its pins?
 
-The pins follow from what happened: depth d, angle a, and both shears s, t. That map is smooth, so it can be fitted to the
-recording itself (polynomials of the four to the leading modes of the displacement), and every frame can be asked which
-story it fits best:
+The pins are a smooth function of depth d, angle a, and the shears s and t. Polynomials of these four are fitted to the leading modes
+of the recording's own displacements. Then each frame is compared with several explanations ("stories") of what the arm did:
 
 - executed: ``(pose_2, pose_6, move_1, move_6)``
-- not executed, as the shear move had not been done when the frame was taken: ``(pose_2, pose_6 - move_6, 0, 0)``
-- sign errors: the same with the angle's or the shear's sign turned.
+- not executed, if the frame was taken before the shear move: ``(pose_2, pose_6 - move_6, 0, 0)``
+- sign errors: executed, with the opposite sign of the angle or of the shear.
 
-Fit and choice take turns until no frame changes sides. Nothing but pins and ``targets.csv`` is read.
+Fitting the polynomials and choosing each frame's story alternate until no choice changes. Only pins and ``targets.csv`` are read.
 """
 
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ STORIES = ("executed", "not executed", "angle's sign", "shear's sign")
 
 @dataclass(frozen=True)
 class Audit:
-    """What the pins say about M rows of labels.
+    """Findings about M rows of labels.
 
     Attributes
     ----------
@@ -42,11 +41,11 @@ class Audit:
     chi2 : (M, 4) float
         Misfit of each frame to each of ``STORIES``; NaN for frames without contact.
     no_contact, odd, wrong_sign : (M,) bool
-        No pin has moved; the frame fits no story; a sign error fits far better than the label.
+        Frames in which no pin has moved; frames that fit no story; frames that a sign error fits far better than the label.
     twins : (M,) int
-        The first frame with the very same pins; its own index where there is none.
+        Index of the first frame with exactly the same pins; the frame's own index if there is none before it.
     depth_per_move : float
-        mm of depth that go with each mm of ``move_1`` where it was not executed: the plate's tilt.
+        Change of depth in mm for each mm of ``move_1`` over frames whose move was not executed. It shows the plate's tilt.
     drift : dict
         Part of the row number's variance (R^2) that the pins tell beyond the labels, and the drift in px from the first to the last row.
     untold : str
@@ -110,7 +109,7 @@ def audit_labels(pins: PinTable, depth_mm: np.ndarray, angle_deg: np.ndarray, sh
         done = now
     tilt = _depth_per_move(terms[1], modes, weight, precision, stories[1], shear_mm, used & ~done, scale[0])
     usual = np.median(best[~no_contact])
-    # The fitted map is only nearly right, so misfits are larger than noise alone makes them: the usual misfit is their unit here.
+    # The polynomials are an approximation, so the misfits are larger than noise alone would make them. Their unit is the usual misfit.
     odds = np.clip((chi2[:, 1] - chi2[:, 0]) / (2 * max(usual / modes.shape[1], 1.0)), -50, 50)
     chi2[no_contact] = np.nan
     return Audit(
@@ -163,7 +162,7 @@ def _depth_per_move(
     rows: np.ndarray,
     depth_scale: float,
 ) -> float:
-    """Slope (mm per mm) on the move of the depth that the pins show beyond the label, over frames whose move was not executed.
+    """Slope in mm per mm of the depth that the pins show beyond the label, by the move, over frames whose move was not executed.
 
     Parameters
     ----------
@@ -172,9 +171,9 @@ def _depth_per_move(
     modes : (M, D) float
         Amplitudes of the displacement's modes.
     weight : (P, D) float
-        The fitted map from polynomials to modes.
+        Coefficients of the fit, from polynomials to modes.
     precision : (D, D) float
-        Inverse covariance of what the map misses.
+        Inverse covariance of the fit's residuals.
     story : (M, 4) float
         The scaled labels of the story.
     shear_mm : (M,) float
@@ -182,7 +181,7 @@ def _depth_per_move(
     rows : (M,) bool
         Frames whose move was not executed.
     depth_scale : float
-        mm of depth that 1 stands for in ``story``.
+        Depth in mm that the value 1 stands for in ``story``.
     """
     if rows.sum() < 20 or np.ptp(shear_mm[rows]) < 1:
         return 0.0
@@ -202,7 +201,7 @@ def _twins(nodes_px: np.ndarray) -> np.ndarray:
 
 
 def _drift(pins: PinTable, terms: np.ndarray, used: np.ndarray) -> dict:
-    """Drift of the outmost pins' middle and spread along the table, after what the labels explain has been taken out."""
+    """Drift of the outermost pins' mean place and spread over the rows of the table, after what the labels explain is subtracted."""
     rim = pins.nodes_px[:, pins.reference.outmost]
     middle = rim.mean(axis=1)
     spread = np.linalg.norm(rim - middle[:, None], axis=2).mean(axis=1)

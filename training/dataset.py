@@ -16,8 +16,10 @@ from twin.progress import Step
 from twin.rig.labels import label_slope, plate_slope
 from twin.types import Form
 
-HELD_OUT = 5  # one row in so many is held out for validation
-GROUP_COLUMN = "path_id"  # column of a simulated data set's table that numbers the contacts
+# One row in this many is held out for validation.
+HELD_OUT = 5
+# Column of a simulated data set's table that holds the number of the contact.
+GROUP_COLUMN = "path_id"
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,12 @@ class Dataset:
     targets : Targets
         M rows of labels, raw and corrected.
     folders : tuple of Path
-        Folders that it was read from.
+        Folders that the data set was read from.
     group : (M,) array or None
-        Rows of one value belong together (the states of one simulated contact): they are never split.
+        Rows with the same value form a group (the states of one simulated contact). A group is never divided between training and
+        validation.
     problems : list of str
-        What is odd about the recording, and what was left out because of it; one line each.
+        One line for each irregularity of the recording, and what was left out because of it.
     """
 
     pins: PinTable
@@ -49,7 +52,7 @@ class Dataset:
 
     @property
     def folder(self) -> Path:
-        """The one folder that it was read from, for callers that read its pictures.
+        """The only folder that the data set was read from, for callers that read its pictures.
 
         Raises
         ------
@@ -61,7 +64,7 @@ class Dataset:
         return self.folders[0]
 
     def rows(self, index: np.ndarray) -> "Dataset":
-        """The same data set with only some rows."""
+        """The data set of the rows with these indices."""
         group = None if self.group is None else self.group[index]
         return replace(self, pins=self.pins.rows(index), targets=self.targets.rows(index), group=group)
 
@@ -83,7 +86,7 @@ class Dataset:
         return replace(ordered, group=np.argsort(np.argsort(first))[of_row.ravel()])
 
     def beside(self, pins: "list[PinTable]") -> "Dataset":
-        """This data set once with its own pins and once more with each of ``pins``; all copies of a row belong together."""
+        """This data set, followed by copies with each of ``pins`` instead of its own. All copies of a row form a group."""
         copies = np.tile(np.arange(len(self)), 1 + len(pins))
         every = self.rows(copies)
         tables = {key: np.concatenate([getattr(table, key) for table in (self.pins, *pins)]) for key in PIN_COLUMNS}
@@ -105,7 +108,7 @@ def load_dataset(
     folder : path
         Anything ``open_recording`` takes that has a table of labels, or a simulated data set without pictures.
     columns : str or tuple of str
-        A name of ``training.targets.PRESETS``, or the table's columns themselves.
+        Key of ``training.targets.PRESETS``, or names of columns of the table.
     progress : callable, optional
         Called with (done, total) while the pipeline runs.
 
@@ -116,7 +119,7 @@ def load_dataset(
 
     Notes
     -----
-    The corrected labels of a simulated data set are depth and angle of the surface that was touched: see ``touched_labels``.
+    The corrected labels of a simulated data set are depth and angle of the touched surface: see ``touched_labels``.
     """
     problems: list[str] = []
     simulated = is_simulated(Path(folder))
@@ -146,10 +149,10 @@ def load_dataset(
 
 
 def joined(parts: list[Dataset]) -> Dataset:
-    """Several data sets of one sensor as one; rows that form a group in one of them form the same group in the whole.
+    """Join several data sets of one sensor. Rows that form a group in one of them form a group in the result.
 
-    They are put in the order of their folders' names, so that the order in which they are given does not matter. Displacements are
-    counted from the no-contact layout of the first one.
+    The data sets are joined in the order of their folders' names, whatever the order in which they are given. Displacements are counted
+    from the first one's layout without contact.
 
     Raises
     ------
@@ -179,7 +182,7 @@ def joined(parts: list[Dataset]) -> Dataset:
     pins = replace(first.pins.with_columns(columns), measured=all(table.measured for table in tables))
     targets = joined_targets([part.targets for part in parts])
     groups: list[np.ndarray] = []
-    taken = 0  # numbers of groups that the parts before have used
+    taken = 0  # number of groups in the parts before
     for part in parts:
         own = np.arange(len(part)) if part.group is None else np.unique(part.group, return_inverse=True)[1]
         groups.append(taken + own)
@@ -196,7 +199,7 @@ def _told_apart(folders: list[Path]) -> list[str]:
 
 
 def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Training and validation rows: a random fifth is held out. The rows of recordings are sorted by label, so no block of rows would do.
+    """Training and validation rows: a random fifth of the rows is held out.
 
     Rows are chosen by their number, so number them in the order of their names (``Dataset.in_order``). With ``group`` (count,) a fifth of
     the groups is held out, with all their rows.
@@ -218,10 +221,10 @@ def simulated_table(
     *,
     progress: Step | None = None,
 ) -> PinTable:
-    """The table that a perfect pipeline would make of simulated frames, from their known pins; hidden caps count as lost.
+    """The pin table that a perfect pipeline would make of simulated frames. The pins are known; hidden caps count as lost.
 
-    Each contact may have a sensor of its own (longer pins, a thinner skin). Its displacements are counted from this sensor's pins at rest,
-    as those of a real sensor are counted from its own no-contact frame.
+    Each contact may have another sensor (longer pins, a thinner skin). Its displacements are counted from that sensor's pins at rest, as
+    those of a real sensor are counted from its own frame without contact.
     """
     reference = nominal_reference(spec, recording.form)
     nodes = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])

@@ -1,4 +1,4 @@
-"""What holds for every network: its size, its device, its outputs for many rows."""
+"""Functions for all networks: their size, their device, their outputs for many rows."""
 
 import torch
 from torch import nn
@@ -9,12 +9,12 @@ from twin.errors import OptionError
 
 
 def parameter_count(network: nn.Module) -> int:
-    """Trainable numbers."""
+    """Number of trainable parameters."""
     return sum(p.numel() for p in network.parameters())
 
 
 def device_of(network: nn.Module) -> torch.device:
-    """Where a network's numbers lie."""
+    """The device that holds a network's parameters."""
     return next(network.parameters()).device
 
 
@@ -24,7 +24,7 @@ def choose_device(name: str) -> str:
     Raises
     ------
     TrainingError
-        For another name, or ``cuda`` where PyTorch finds none.
+        The name is another one, or it is ``cuda`` and PyTorch finds no GPU.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise OptionError(f"--device must be auto, cpu or cuda, got {name!r}")

@@ -1,8 +1,8 @@
-"""Small copies of runs, small enough to go with the package: ``config.json`` and ``weights.safetensors``.
+"""Copies of runs that are small enough to be shipped with the package: ``config.json`` and ``weights.safetensors``.
 
-The arrays are in the safetensors format (https://github.com/huggingface/safetensors), which holds no code. Large arrays are kept in half
-precision. Those of a Gaussian process are not, because its terms nearly cancel. Each model decides itself which weights a small copy can
-do without: see ``Model.pack``.
+The arrays are in the safetensors format (https://github.com/huggingface/safetensors), which holds no code. Large arrays are stored in
+half precision, except those of a Gaussian process, because its terms nearly cancel. Each model decides which weights its small copy
+leaves out: see ``Model.pack``.
 """
 
 import hashlib
@@ -33,12 +33,12 @@ NOT_PACKED = ("kernels", "kernel_labels", "parameters")  # entries of ``weights.
 
 
 def shipped_names() -> list[str]:
-    """Sensors whose weights go with the package."""
+    """Names of the sensors whose weights are shipped with the package."""
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
 
 
 def pack(run: Path, out: Path) -> int:
-    """Write the small copy of a finished run without Gaussian processes beside its networks; returns its size in bytes.
+    """Write the small copy of a finished run that has no Gaussian processes of its modes, and return its size in bytes.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def pack(run: Path, out: Path) -> int:
     arrays = _flat(kept)
     whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith(f"{BESIDE}.")}
     small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
-    small["reference_px"] = content["reference_px"].numpy()  # whole: the graph is made from it
+    small["reference_px"] = content["reference_px"].numpy()  # in full precision, because the graph is made from it
     out.mkdir(parents=True, exist_ok=True)
     weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})
     write_bytes(out / WEIGHTS, weights)

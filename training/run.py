@@ -1,4 +1,4 @@
-"""Training runs: a folder with the configuration, the learning curves, the weights, and what continuing after a kill needs.
+"""Training runs. A run's folder holds the following files, so that training can be continued after it was killed:
 
 - ``config.json``: the resolved configuration (model, recipe, sensor, pipeline, labels), and what the run learnt from: the names of the
   frames that it kept out, and digests of names, labels and frames.
@@ -42,7 +42,7 @@ EXTRA_WEIGHT = 0.3  # of a helper label in the loss, beside 1 of a label that is
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What a run is told.
+    """Settings of a run.
 
     Attributes
     ----------
@@ -95,16 +95,16 @@ def train_run(
     Parameters
     ----------
     progress : callable, optional
-        Called with (epochs done, epochs in all, the curve's last row) over all networks.
+        Called with (epochs done, epochs of all networks, last row of the learning curve).
     max_minutes : float, optional
-        Stop after the epoch in which this time has passed. The weights so far are written all the same.
+        Stop after the epoch in which this time has passed. The weights so far are written.
     device : {"cpu", "cuda"}
-        Where the networks learn; what is kept runs anywhere.
+        Device for training. The written weights can be used on any device.
 
     Returns
     -------
     bool
-        Whether training came to its end.
+        Whether training is finished.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def train_run(
 
 
 def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
-    """Whether a folder holds this very run, and it is finished.
+    """Whether a folder holds this run (the same settings, data and code) and it is finished.
 
     Raises
     ------
@@ -232,13 +232,13 @@ def _member(
     network.to(device)
     weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
     executed = torch.from_numpy(data.targets.executed.astype(np.float32))
-    learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # frames are watched as they are, in view 0 only
+    learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
     rows = Rows(prepared.inputs, scaled.repeat(views, 1), weight, executed.repeat(views), torch.from_numpy(learnt), torch.from_numpy(held))
     return Loop(network, config.recipe, rows, seed, model.penalty)
 
 
 def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The tenth of the training rows that a network watches, and the rows that it learns from; ``group`` as in ``Dataset``."""
+    """Held-out rows (a tenth) and training rows of a network, from the rows ``train``; ``group`` as in ``Dataset``."""
     parts = train if group is None else np.unique(group[train])
     held = np.random.default_rng([seed, 1]).permutation(parts)[member % FOLDS :: FOLDS]
     if group is not None:

@@ -1,4 +1,4 @@
-"""A trained model from labelled recordings: the data sets read, joined and learnt in one call."""
+"""Training of a model in one call: labelled recordings are read, joined and learnt from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,15 +32,15 @@ class Trained:
     out : Path
         The run's folder.
     finished : bool
-        Whether training came to its end; if not, the same call continues it.
+        Whether training is finished; if not, the same call continues it.
     frames : int
         Number of usable frames.
     names : tuple of str
         The label columns.
     labels : str
-        Whether they are corrected or raw.
-    problems : list of str
-        What is odd about the recordings.
+        Kind of labels: corrected or raw.
+        problems : list of str
+            Irregularities of the recordings.
     """
 
     out: Path
@@ -56,7 +56,7 @@ class Trained:
         return [self.out / name for name in FILES]
 
     def lines(self) -> list[str]:
-        """Lines for people."""
+        """The result as lines of text."""
         lines = [f"note: {problem}" for problem in self.problems]
         lines.append(f"{self.frames} usable frames; labels {', '.join(self.names)} ({self.labels})")
         if not self.finished:
@@ -91,20 +91,20 @@ def train_model(
     model : str
         As ``recipe_of`` takes it.
     recordings : sequence of Path
-        Several are joined.
+        Several recordings are joined to one data set.
     target : str
         A preset's name, or label columns separated by commas.
     labels : {"corrected", "raw"}
     seed : int
-        Of weights and order.
-    split : int or None
-        Seed of the fifth that is kept out of training; None: train on all.
+        Seed of the weights and of the order of rows.
+        split : int or None
+            Seed of the random fifth of the rows that is kept out of training; None: train on all rows.
     epochs, batch, members, kernel : optional
         Values that replace the recipe's own.
     max_minutes : float, optional
         Stop after the epoch in which this time has passed.
     threads : int, optional
-        Of the CPU.
+        Number of CPU threads.
     device : {"auto", "cpu", "cuda"}
     form : Form, optional
         Form of the frames; recognised by size and content by default.

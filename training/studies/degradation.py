@@ -66,13 +66,13 @@ class Result:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """For people: by pipeline, the narrowest first."""
+        """The result as lines of text, sorted by pipeline; the condition with the narrowest envelope comes first."""
         found = sorted(self.envelopes, key=lambda each: (each.pipeline, each.width))
         return [f"{e.pipeline:10} {e.case.name:18} {e.label}{f' ({e.measure})' if e.measure else ''}" for e in found]
 
 
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
-    """Sweep every condition from nothing to severe, judge pipelines and models on every frame, and write what was found.
+    """Sweep every condition from severity 0 to 1, judge pipelines and models on every frame, and write the result.
 
     The folder ``out`` must exist. Results of an earlier call there are used again if their inputs have not changed.
 

@@ -1,4 +1,4 @@
-"""Use of trained models on recordings: the pose in every frame, and how good a model is on labelled frames."""
+"""Use of trained models on recordings: estimates of the pose in every frame, and a model's errors on labelled frames."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -15,13 +15,15 @@ from twin.frames import Recording, open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 
-ROWS = ("validation", "all")  # which rows can be judged
-LABELS = ("corrected", "raw")  # which labels can be the truth
+# Choices of the rows to judge.
+ROWS = ("validation", "all")
+# Choices of the labels that count as truth.
+LABELS = ("corrected", "raw")
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Estimates of a recording's frames. Iterate over it: each estimate is made when it is asked for.
+    """Estimates of a recording's frames, as an iterable. Each estimate is made when the iteration reaches its frame.
 
     Attributes
     ----------
@@ -65,9 +67,9 @@ class Predictions:
 
 
 def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
-    """Poses in the frames at a path, by a trained model.
+    """Estimate the poses in the frames at a path by a trained model.
 
-    Where the model counts pins from rest and the recording has a frame without contact, they are counted from that frame.
+    If the model uses displacements from rest and the recording has a frame without contact, displacements are counted from that frame.
 
     Parameters
     ----------
@@ -95,26 +97,26 @@ def _said(made: PoseEstimate) -> str:
         return f"not valid: {made.reason}"
     rows = zip(made.names, made.units, made.value, made.low, made.high, strict=True)
     pose = ", ".join(f"{name} {value:.3f} {unit} [{low:.3f}, {high:.3f}]" for name, unit, value, low, high in rows)
-    moved = "" if made.executed != made.executed else f", move executed {made.executed:.2f}"  # NaN: the model doesn't tell
+    moved = "" if made.executed != made.executed else f", move executed {made.executed:.2f}"  # NaN: the model does not estimate it
     return f"{pose}{moved} ({made.ms:.1f} ms)"
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good a model is.
+    """Evaluation of a model.
 
     Attributes
     ----------
     metrics : dict
-        As ``metrics.json`` holds them.
-    changes : list of dict
-        Errors on changed images; empty where they were not asked for.
-    units : dict of str to str
-        Of each label.
-    frames : int
-        Number of judged frames.
-    problems : list of str
-        What is odd about the recordings.
+        Content of ``metrics.json``.
+        changes : list of dict
+            Errors on changed images; empty if they were not asked for.
+        units : dict of str to str
+            Unit of each label.
+        frames : int
+            Number of judged frames.
+        problems : list of str
+            Irregularities of the recordings.
     written : list of Path
     """
 
@@ -126,7 +128,7 @@ class Evaluation:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """Lines for people."""
+        """The result as lines of text."""
         lines = [f"note: {problem}" for problem in self.problems]
         for name, unit in self.units.items():
             raw, corrected = self.metrics["raw"][name], self.metrics["corrected"][name]
@@ -154,18 +156,18 @@ def evaluate_run(
     robustness: bool = False,
     progress: Progress = silent,
 ) -> Evaluation:
-    """Judge a trained model, and write what was found to an existing folder.
+    """Judge a trained model, and write the result to an existing folder.
 
     Parameters
     ----------
     run : path
         As ``PoseEstimator.load`` takes it.
     recordings : sequence of Path
-        Labelled recordings; for ``validation`` exactly those that the run was trained on.
+        Labelled recordings; for ``rows="validation"`` exactly those that the run was trained on.
     rows : {"validation", "all"}
-        The rows that were kept out of the run's training, or every row.
+        Judge the rows that were kept out of the run's training, or all rows.
     labels : {"corrected", "raw"}
-        Which labels are the truth in ``predictions.csv`` and ``errors.png``.
+        Labels that count as truth in ``predictions.csv`` and ``errors.png``.
     robustness : bool
         Also judge changed images.
 

@@ -1,4 +1,4 @@
-"""Whether a recording's labels agree with its pins: the audit of a recording, written as tables, numbers, a picture and a page."""
+"""Audit of a recording: do its labels agree with its pins? The result are tables, numbers, a picture and a page."""
 
 import csv
 import io
@@ -21,23 +21,29 @@ from twin.report.table import Column
 from twin.store import made_by, write_json, write_text
 from twin.types import Form
 
-TARGET = "surface-2d-shear"  # the preset of labels that an audit needs
-NAMES = PRESETS[TARGET]  # depth (mm), angle (deg), shear (mm) and shear (deg), as columns of the table
-LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")  # findings that are lists of frames
-SAID = 3  # frames of each list that are named on the terminal
-NAMED = 8  # frames of each list that are named on the page; audit.json names all
-LARGE_MOVE = 1.0  # mm or deg; whether a smaller move was executed changes the labels too little to count
+# Preset of the labels that an audit needs.
+TARGET = "surface-2d-shear"
+# Columns of depth (mm), angle (deg), shear (mm) and shear (deg).
+NAMES = PRESETS[TARGET]
+# Findings that are lists of frames.
+LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")
+# Number of frames of each list that are named on the terminal.
+SAID = 3
+# Number of frames of each list that are named on the page; audit.json names all.
+NAMED = 8
+# Move in mm or deg above which a move is large. Some figures are of large moves alone, because a small move hardly changes the pins.
+LARGE_MOVE = 1.0
 
 
 @dataclass(frozen=True)
 class LabelAudit:
-    """What an audit found, and its files.
+    """The result of an audit, and its files.
 
     Attributes
     ----------
     audit : Audit
     summary : dict
-        As ``audit.json`` holds it.
+        Content of ``audit.json``.
     frames : int
     written : list of Path
     """
@@ -69,7 +75,7 @@ class LabelAudit:
 
 
 def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
-    """Audit the labels of a flat-surface recording, and write what was found to an existing folder.
+    """Audit the labels of a flat-surface recording, and write the result to an existing folder.
 
     A recording of too few frames is not judged: the result says so (``Audit.untold``), and no corrected labels are written.
 
@@ -157,7 +163,7 @@ def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[
 
 
 def _findings(summary: dict) -> list[dict]:
-    """The findings that are numbers, one in each row; the names in a group begin with the group's name."""
+    """The findings that are numbers, one in each row. A finding within a group is named with the group's name first."""
     rows = []
     for key, value in summary.items():
         if key in LISTS or key in ("reader", "not_told"):

@@ -23,7 +23,7 @@ class Realism:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result as lines of text."""
         metrics, found = self.metrics, self.metrics["statistics"]
         lines = [f"refused {refused['image_name']}: {refused['reason']}" for refused in metrics["refused"]]
         lines.append(_image_line("pin-aligned", metrics["frames"], metrics["pin_aligned"]))
@@ -59,7 +59,7 @@ def compare_with_renders(
     test: bool = True,
     progress: Progress = silent,
 ) -> Realism:
-    """Compare a folder of real raw frames with their renders, and write what was found to an existing folder.
+    """Compare a folder of real raw frames with their renders, and write the result to an existing folder.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the convolutional networks see of frames: small grey images."""
+"""Inputs of the convolutional networks: small grey images of the frames."""
 
 from collections.abc import Callable
 
@@ -34,12 +34,12 @@ class ImageInputs:
 
 
 def small_image(image: np.ndarray) -> np.ndarray:
-    """A frame as the convolutional networks see it: (128, 128) uint8."""
+    """The small grey image of a frame, (128, 128) uint8."""
     return cv2.resize(gray_levels(image), (INPUT_PX, INPUT_PX), interpolation=cv2.INTER_AREA)
 
 
 def image_inputs(dataset: Dataset, progress: Callable | None = None) -> ImageInputs:
-    """The frames of a data set, small, in its order."""
+    """Small images of a data set's frames, in the order of its rows."""
 
     recording = open_recording(dataset.folder, dataset.pins.sensor, dataset.pins.form)
 

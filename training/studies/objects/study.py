@@ -44,7 +44,7 @@ class Result:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """A line for each model and object, and the verdicts; for people."""
+        """The result as lines of text: one for each model and object, then the verdicts."""
         lines = []
         for row in self.rows:
             errors = ", ".join(f"{name} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name in self.names)
@@ -55,8 +55,7 @@ class Result:
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     """Simulate contacts of all objects, train both models, and judge them on contacts of every object.
 
-    Writes data sets, runs, ``objects.csv`` and ``index.html`` to ``out``. What lies there from an earlier call with the same plan is not
-    made again.
+    Writes data sets, runs, ``objects.csv`` and ``index.html`` to ``out``. Results of an earlier call with the same plan are used again.
 
     Raises
     ------

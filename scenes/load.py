@@ -1,4 +1,4 @@
-"""Reading specification files: where they lie, and errors that help."""
+"""Reading specification files: finding them, and errors that name the key and the remedy."""
 
 import difflib
 import hashlib
@@ -19,12 +19,13 @@ from scenes.tables import fill_in_tables
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
-MOST_PROBLEMS = 5  # that a message names; the others are counted
+# Most problems that a message names; of further ones it states the number.
+MOST_PROBLEMS = 5
 Spec = TypeVar("Spec", bound=BaseModel)
 
 
 def user_spec_dir() -> Path:
-    """Where a user's own ``sensors/*.toml``, ``objects/``, ``experiments/``, ``randomisations/`` and ``servos/`` lie.
+    """Folder of a user's own specifications: ``sensors/*.toml``, ``objects/``, ``experiments/``, ``randomisations/``, ``servos/``.
 
     ``TACTIP_SPECS`` if set, else ``$XDG_CONFIG_HOME/tactip-twin`` (``~/.config``).
     """
@@ -34,22 +35,22 @@ def user_spec_dir() -> Path:
 
 
 def list_sensors() -> dict[str, Path]:
-    """Sensor names and their files; a user's own file of the same name wins."""
+    """Sensor names and their files. A user's own file takes precedence over a shipped one of the same name."""
     return _list("sensors")
 
 
 def list_objects() -> dict[str, Path]:
-    """Object names and their files; a user's own file of the same name wins."""
+    """Object names and their files. A user's own file takes precedence over a shipped one of the same name."""
     return _list("objects")
 
 
 def list_experiments() -> dict[str, Path]:
-    """Experiment names and their files; a user's own file of the same name wins."""
+    """Experiment names and their files. A user's own file takes precedence over a shipped one of the same name."""
     return _list("experiments")
 
 
 def list_randomisations() -> dict[str, Path]:
-    """Names of randomisations and their files; a user's own file of the same name wins."""
+    """Names of randomisations and their files. A user's own file takes precedence over a shipped one of the same name."""
     return _list("randomisations")
 
 
@@ -59,7 +60,7 @@ def load_sensor(name_or_path: str | Path) -> SensorSpec:
     Raises
     ------
     SpecError
-        If there is no such sensor, or its file is wrong: names file, key and remedy.
+        There is no such sensor, or its file is not valid. The message names the file, the key and the remedy.
     """
     return read_section(_find(name_or_path, "sensors"), SensorSpec)
 
@@ -70,7 +71,7 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
     Raises
     ------
     SpecError
-        If there is no such object, or its file is wrong: names file, key and remedy.
+        There is no such object, or its file is not valid. The message names the file, the key and the remedy.
     """
     path = Path(name_or_path)
     if path.suffix.lower() in MESH_SUFFIXES:
@@ -110,7 +111,7 @@ def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
     Raises
     ------
     SpecError
-        If there is no such experiment, or its file is wrong: names file, key and remedy.
+        There is no such experiment, or its file is not valid. The message names the file, the key and the remedy.
     """
     return read_section(_find(name_or_path, "experiments"), ExperimentSpec)
 
@@ -121,7 +122,7 @@ def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
     Raises
     ------
     SpecError
-        If there is no such randomisation, or its file is wrong: names file, key and remedy.
+        There is no such randomisation, or its file is not valid. The message names the file, the key and the remedy.
     """
     return read_section(_find(name_or_path, "randomisations"), RandomisationSpec)
 

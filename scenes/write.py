@@ -1,4 +1,4 @@
-"""The text of a sensor's specification: a TOML file that a person can read and edit, its long arrays as tables beside it."""
+"""The text of a sensor's specification: a TOML file that a person can read and edit, and tables of its long arrays."""
 
 import tomlkit
 
@@ -10,7 +10,7 @@ ROW = 12
 
 
 def sensor_files(spec: SensorSpec, stem: str, comment: str = "") -> dict[str, str]:
-    """The files of a specification. Values that are the defaults are left out; the sensor's name is the file's.
+    """The files of a specification. Default values are left out, and so is the sensor's name, because the file is named after it.
 
     Parameters
     ----------
@@ -18,7 +18,7 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "") -> dict[str, st
     stem : str
         Name of the TOML file without its suffix. Tables are named after it.
     comment : str
-        Lines that stand above everything.
+        Lines of comment at the beginning.
 
     Returns
     -------
@@ -36,7 +36,7 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "") -> dict[str, st
 
 
 def _item(value: object) -> object:
-    """A value as tomlkit writes it: sections as tables, references to tables and lists of sections inline, lists in even lines."""
+    """A value in the form that tomlkit writes: sections as tables, references and lists of sections inline, lists in lines."""
     if isinstance(value, dict) and set(value) == {"csv", "shape"}:
         reference = tomlkit.inline_table()
         reference.update(value)
@@ -70,5 +70,5 @@ def _item(value: object) -> object:
 
 
 def _numbers(value: object) -> int:
-    """How many numbers a value holds."""
+    """Number of numbers in a value."""
     return sum(map(_numbers, value)) if isinstance(value, list | tuple) else 1

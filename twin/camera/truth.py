@@ -1,4 +1,4 @@
-"""Exact ground truth of a rendered contact: where every cap is, in space and in the frame."""
+"""Exact ground truth of a rendered contact: the place of every cap in space and in the frame."""
 
 from dataclasses import dataclass
 
@@ -20,9 +20,9 @@ class CapTruth:
     caps_mm : (N, 3) float
         Cap centres, sensor frame.
     caps_px, rest_px : (N, 2) float
-        Their projections in px of the frame, now and at rest.
-    visible : (N,) bool
-        Inside the frame, and the line of sight to the cap's centre meets no other pin.
+        Projections of the cap centres in px of the frame, in the contact and at rest.
+        visible : (N,) bool
+            The cap's centre is inside the frame, and the line of sight to it meets no other pin.
     """
 
     caps_mm: FloatArray
@@ -42,7 +42,7 @@ def cap_truth(spec: SensorSpec, rest: PinState, state: PinState, form: Form) -> 
 def occluded(view: ViewSpec, cap_radius_mm: float, state: PinState) -> BoolArray:
     """(N,) bool: the ray in the gel from the window to the cap's centre passes through another pin.
 
-    Pins count as capsules of the cap's radius around the axis from foot to cap.
+    Each pin is approximated by a capsule of the cap's radius around the axis from foot to cap.
     """
     window_mm, _ = pixel_rays(view, project(view, state.caps_mm))
     return _meets_another(window_mm, state.base_mm, state.caps_mm, cap_radius_mm)

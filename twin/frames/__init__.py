@@ -1,8 +1,7 @@
 """Recorded frames from disk: a picture, a folder, a video, or a recording with its table and metadata.
 
-Understands the folder formats of the sensor's users: ``frames_bw/`` with ``init_0.png``, ``images/``, and ``sensor_images/`` or
-``processed_images/``, each with ``targets.csv`` and JSON metadata. Whatever is odd in them is listed, and what is readable is
-read.
+It reads the folder formats of the sensor's users: ``frames_bw/`` with ``init_0.png``, ``images/``, and ``sensor_images/`` or
+``processed_images/``, each with ``targets.csv`` and JSON metadata. Irregularities are listed; everything that can be read is read.
 """
 
 from twin.frames.folders import distinct_stems, natural_key

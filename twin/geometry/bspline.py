@@ -1,7 +1,7 @@
 """B-splines, the basis of the skin and the gel.
 
-A quadratic basis of m elements has m + 2 functions and is C1, a linear one m + 1 and C0; both
-interpolate their first and last coefficient (open knot vector; Piegl & Tiller, "The NURBS Book", ch. 2).
+A quadratic basis of m elements has m + 2 functions and is C1; a linear basis has m + 1 functions and is C0. At both ends a spline
+equals its first and last coefficient (open knot vector; Piegl & Tiller, "The NURBS Book", ch. 2).
 """
 
 from dataclasses import dataclass
@@ -35,12 +35,12 @@ class Basis:
 
     @property
     def greville(self) -> FloatArray:
-        """(count,) Greville points, means of ``degree`` neighbouring knots: a linear function's coefficients are its values there."""
+        """(count,) Greville points: the means of ``degree`` neighbouring knots. A linear function's coefficients are its values there."""
         knots = self._knots
         return np.array([knots[i + 1 : i + 1 + self.degree].mean() for i in range(self.count)])
 
     def values(self, at: FloatArray, *, derivative: int = 0) -> FloatArray:
-        """(k, count) values, or a derivative's, of all functions at points (k,)."""
+        """(k, count) values of all functions, or of a derivative of them, at points (k,)."""
         splines = BSpline(self._knots, np.eye(self.count), self.degree)
         return (splines.derivative(derivative) if derivative else splines)(np.clip(at, self.breaks[0], self.breaks[-1]))
 

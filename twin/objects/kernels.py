@@ -11,7 +11,7 @@ from twin.objects.level_set import Probe, Triple
 from twin.types import FloatArray
 
 _CREASE_MM = 1e-3
-"""A surface with a smaller radius of curvature counts as a crease, which has no Hessian."""
+"""Radius of curvature below which a surface counts as a crease. The Hessian of a crease is set to 0."""
 
 
 @compiled(error_model="numpy")
@@ -21,7 +21,7 @@ def _results(count: int) -> Probe:
 
 @compiled(error_model="numpy")
 def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple, radius: float) -> None:
-    """Point k's normal n and (I - n n - a a) / radius; plain numbers, since slices of arrays cost more than the sums."""
+    """Write point k's normal n and Hessian (I - n n - a a) / radius. Plain numbers are used, because slices of arrays would be slower."""
     normal[k, 0], normal[k, 1], normal[k, 2] = n
     if radius > _CREASE_MM:
         r = 1 / radius
@@ -59,7 +59,7 @@ def round_solid(points: FloatArray, radius: float, along_y: float) -> Probe:
 def edge(points: FloatArray, fillet: float) -> Probe:
     distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
-        # how far the point lies in front of the faces moved in by the fillet
+        # distances of the point in front of the faces, which are moved inwards by the fillet
         x, z = fillet - points[k, 0], fillet - points[k, 2]
         if x > 0 and z > 0:
             away = np.sqrt(x * x + z * z)
@@ -80,9 +80,10 @@ def _sector(x: float, z: float, sides: int) -> int:
 
 @compiled(error_model="numpy")
 def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper: float) -> Probe:
-    """A point is folded into the sector of its nearest face, into coordinates out, along the face, y.
+    """Prism. Each point is rotated into the sector of its nearest face, with the coordinates: outwards, along the face, y.
 
-    There the nearest point of the polyhedron moved in by the fillet lies on that face or on the edge between two faces.
+    In this sector the nearest point of the polyhedron, whose faces are moved inwards by the fillet, is on that face or on the edge
+    between two faces.
     """
     distance, normal, hessian = _results(len(points))
     lean_out, lean_y = np.cos(taper), np.sin(taper)

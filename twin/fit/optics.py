@@ -1,7 +1,7 @@
-"""A whole calibration of camera and light: from a folder of frames to a specification and a page.
+"""Calibration of camera and light by a folder of frames. The result are a specification and a page.
 
-The calibration runs in stages. Each stage's result is kept, so that an interrupted run goes on where it was. The page shows renders
-before and after the fit, what is left, and what changed.
+The calibration has stages. The result of each stage is stored, so that an interrupted run can be continued. The page shows renders before
+and after the fit, the remaining differences, and the changed values.
 """
 
 from collections.abc import Callable
@@ -37,15 +37,15 @@ from twin.store import Item, inputs_digest, kept_arrays, kept_json
 from twin.types import Form, Frame
 
 FRAMES = 6
-"""Number of frames that are fitted, evenly spread over the folder."""
+"""Number of frames that are fitted, spread evenly over the folder."""
 SAMPLES = 16
-"""Samples a pixel of the renders."""
+"""Samples per pixel of the renders."""
 CAP_ROUNDS = 2
-"""Rounds of fitting caps and response in turn."""
+"""Rounds of fitting caps and response alternately."""
 HAZE_SIGMA_PX = 40.0
-"""Width of the haze to start from, px, where the specification has none."""
+"""Width of the haze, px, at the start of the fit if the specification has no haze."""
 LONGEST = 12
-"""The page shows lists of at most this many numbers; it tells the length of longer ones."""
+"""Most numbers of a list that the page shows. Of longer lists it shows only the length."""
 KINDS = {"real": "real", "before": "before", "after": "after", "residual": "what is left, twice amplified about middle gray"}
 """Kinds of pictures of a frame on the page, with their captions."""
 JUDGED = {"psnr_db": "PSNR, dB,", "ssim": "SSIM"}
@@ -55,9 +55,9 @@ ALWAYS = (
     "LED power, exposure and reflectance: only their product is seen; the caps' brightest channel is taken as white resin",
     "the window's thickness and index, and the skin's thickness: held",
 )
-"""What no set of frames determines."""
+"""Parameters that no set of frames determines."""
 Stage = Callable[[SensorSpec], SensorSpec]
-"""One stage of the fit: from a specification to a better one."""
+"""One stage of the fit: a function from a specification to a better one."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +69,13 @@ class Calibration:
     spec : SensorSpec
         The fitted specification.
     before, after : dict of str to float
-        Image figures over the disc, mean of the frames: ``psnr_db``, ``ssim`` (colour) and so on.
-    notes : list of str
-        What the frames do not determine, and what was left out.
-    frames : list of Aligned
-        Frames to which it was fitted.
+        Image figures over the disc, mean over the frames: ``psnr_db``, ``ssim`` (colour) and others.
+        notes : list of str
+            Parameters that the frames do not determine, and what was left out.
+        frames : list of Aligned
+            The frames of the fit.
     first, last : list of (H, W[, 3]) uint8
-        Renders under the specification at the start and at the end.
+        Renders with the specification at the start and at the end.
     """
 
     spec: SensorSpec
@@ -98,13 +98,13 @@ class Calibration:
 
 @dataclass(frozen=True)
 class OpticsCalibration:
-    """A fitted specification and the files of it, the ``.toml`` file first."""
+    """A fitted specification and its files, the ``.toml`` file first."""
 
     found: Calibration
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """For people: what the frames could not tell, and how near the twin came."""
+        """The result as lines of text: what the frames did not determine, and the image figures before and after."""
         before, after = self.found.before, self.found.after
         return [
             *(f"note: {note}" for note in self.found.notes),
@@ -114,7 +114,7 @@ class OpticsCalibration:
 
 
 class _Studio:
-    """Renders the states of frames under changing specifications."""
+    """Renders the states of frames with different specifications."""
 
     def __init__(self, bar: Bar, samples: int = SAMPLES) -> None:
         self._bar, self._samples = bar, samples
@@ -138,23 +138,24 @@ def calibrate_optics(
 ) -> OpticsCalibration:
     """Fit camera and light of a specification to a folder of raw frames, and write it.
 
-    Beside the specification a folder ``NAME-calibration`` holds the page and the stages' results: an interrupted run goes on there.
+    The folder ``NAME-calibration`` beside the specification holds the page and the results of the stages, so that an interrupted run can
+    be continued.
 
     Parameters
     ----------
     sensor : SensorSpec
-        Where the fit starts.
-    out : Path
-        The ``.toml`` file to write.
-    limit, no_contact
-        As ``fit_optics`` takes them.
+        The specification at the start of the fit.
+        out : Path
+            The ``.toml`` file to write.
+        limit, no_contact
+            As in ``fit_optics``.
 
     Raises
     ------
     FrameError
-        No frame can be used, or ``out`` is no name of a ``.toml`` file.
+        No frame can be used, or ``out`` is not the name of a ``.toml`` file.
     RenderError
-        Nothing can be rendered, or differentiated, here.
+        The renderer, or its differentiation, does not work on this machine.
     """
     folder = folder_beside(out, "calibration")
     found = fit_optics(frames, sensor, folder, limit=limit, no_contact=no_contact, progress=progress)
@@ -179,11 +180,11 @@ def fit_optics(
     folder : Path
         Folder of raw frames.
     spec : SensorSpec
-        Where the fit starts: geometry and camera of the same kind of sensor.
-    work : Path
-        Folder for the stages' results. A second run with the same frames, start and code goes on from there.
-    limit : int
-        Number of frames to fit.
+        The specification at the start of the fit: geometry and camera of the same type of sensor.
+        work : Path
+            Folder for the results of the stages. A second run with the same frames, start and code continues from them.
+        limit : int
+            Number of frames to fit.
     no_contact : Path, optional
         A raw frame without contact, to which the camera is fitted first.
     progress : Progress
@@ -193,7 +194,7 @@ def fit_optics(
     FrameError
         No frame can be used, or their sizes differ.
     RenderError
-        Nothing can be rendered, or differentiated, here.
+        The renderer, or its differentiation, does not work on this machine.
     """
     notes, bar = list(ALWAYS), partial(stage, progress)
     if no_contact is not None:
@@ -214,7 +215,7 @@ def fit_optics(
 
 
 def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar) -> list[Stage]:
-    """The stages of a fit to frames, in their order; ``inside`` (H, W) bool: the lens disc. A stage's name names its kept result."""
+    """The stages of a fit to frames, in their order; ``inside`` (H, W) bool is the lens disc. A stage's stored result has its name."""
 
     def surroundings(spec: SensorSpec) -> SensorSpec:
         with bar("fit the ring, the reflections, the specks") as step:
@@ -246,7 +247,7 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
 
 
 def _mean_figures(frames: list[Aligned], shots: list[np.ndarray], inside: np.ndarray) -> dict[str, float]:
-    """Image figures of renders against the frames over the lens disc (H, W) bool, mean of the frames."""
+    """Image figures of renders compared with the frames over the lens disc (H, W) bool, mean over the frames."""
     figures = [compare_images(frame.image, image, inside) for frame, image in zip(frames, shots, strict=True)]
     return {name: float(np.mean([getattr(each, name) for each in figures])) for name in vars(figures[0])}
 
@@ -263,19 +264,19 @@ def _pins_at_rest(path: Path, spec: SensorSpec) -> np.ndarray:
 
 
 class _Log:
-    """Results of the stages on disk, each under the digest of what it was made of."""
+    """Results of the stages on disk, each named with the digest of its inputs."""
 
     def __init__(self, work: Path, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
         self._folder, self._inputs = work, inputs_digest(spec, raw)
 
     def aligned(self, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]], progress: Step) -> list[Aligned]:
-        """Frames with their fitted skin, from disk where it is there. ``raw``: names, images, and pins (N, 2) px."""
+        """Frames with their fitted skin, read from disk if it was stored. ``raw`` holds names, images, and pins (N, 2) px."""
         fit: SkinFit | None = None
         frames = []
 
         def fitted(pins_px: np.ndarray) -> dict[str, np.ndarray]:
             nonlocal fit
-            fit = fit or SkinFit(spec)  # it takes seconds to build, and is not needed where all frames are there
+            fit = fit or SkinFit(spec)  # takes seconds to build, and is not needed if all frames were stored
             return vars(fit(pins_px))
 
         for done, (name, image, pins_px) in enumerate(raw):
@@ -286,13 +287,13 @@ class _Log:
         return frames
 
     def stage(self, name: str, run: Stage, spec: SensorSpec) -> SensorSpec:
-        """The stage's result, from disk where it is there."""
+        """The result of a stage, read from disk if it was stored."""
         item = Item(name, (__name__,), [self._inputs, spec])
         return SensorSpec.model_validate(kept_json(self._folder, item, lambda: run(spec).model_dump(mode="json")))
 
 
 def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) -> Path:
-    """Write ``index.html`` and its pictures into ``out``; the page's path."""
+    """Write ``index.html`` and its pictures to the folder ``out``, and return the page's path."""
     rows = _write_pictures(out / "pictures", found)
     lead = (
         f"{len(rows)} frames of {source}. Figures are over the lens disc, of renders without noise, the skin fitted to each frame's pins."
@@ -315,7 +316,7 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
 
 
 def _write_pictures(folder: Path, found: Calibration) -> list[tuple[str, dict[str, Path]]]:
-    """Write four pictures of each frame (see ``KINDS``); the frame's name, and the pictures' paths by kind."""
+    """Write four pictures of each frame (see ``KINDS``). Returns the frame's name, and the pictures' paths by kind."""
     folder.mkdir(parents=True, exist_ok=True)
     rows, stems = [], distinct_stems([frame.name for frame in found.frames])
     for stem, frame, before, after in zip(stems, found.frames, found.first, found.last, strict=True):
@@ -325,7 +326,7 @@ def _write_pictures(folder: Path, found: Calibration) -> list[tuple[str, dict[st
 
 
 def _changes(before: SensorSpec, after: SensorSpec) -> list[dict]:
-    """Every value that differs: ``name`` as section.key, ``before`` and ``after`` as text."""
+    """All values that differ: ``name`` is section.key, ``before`` and ``after`` are texts."""
     old, new = before.model_dump(), after.model_dump()
     found = []
     for section, values in new.items():
@@ -348,7 +349,7 @@ def _shown(value: object) -> str:
 
 
 def folder_beside(out: Path, kind: str) -> Path:
-    """The folder for what belongs to a specification that is to be written; made if missing.
+    """The folder for further files of a specification that will be written; made if missing.
 
     Raises
     ------

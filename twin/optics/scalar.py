@@ -64,7 +64,7 @@ class ScalarView:
         return np.stack([map_coordinates(channel, at[:, ::-1].T, order=3, mode="nearest") for channel in np.moveaxis(image, 2, 0)], axis=1)
 
     def _places(self, state: PinState) -> FloatArray:
-        """Place (H W, 2) in the pinhole image that each pixel of the window shows: the point of its ray at the depth of the nearest caps."""
+        """Place (H W, 2) in the pinhole image that each pixel of the window shows: its ray's point at the depth of nearby caps."""
         caps_mm = state.caps_mm
         x0, y0, x1, y1 = self._window_px
         coarse = [np.arange(lo, hi + COARSE, COARSE) for lo, hi in ((x0, x1), (y0, y1))]

@@ -54,8 +54,8 @@ class Window:
             length : mi.Float
                 Length of the ray in the gel, mm.
             factor : mi.Float
-                Solid angle at the point per area of the light, times transmittance and n^2. The product with the light's radiance in air and
-                the cosine at the point is the irradiance per area of the light. Zero for light from behind.
+                Solid angle at the point per area of the light, times transmittance and n^2. Times the light's radiance in air and the
+                cosine at the point, it is the irradiance per area of the light. Light from behind has the factor zero.
         """
         across = mi.Vector2f(light.x - point.x, light.y - point.y)
         rho2 = dr.squared_norm(across)

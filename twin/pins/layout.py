@@ -1,4 +1,4 @@
-"""Where a layout of pins lies in a frame, from its count and rings alone."""
+"""Search for a layout of pins in a frame, given only the layout's rings and their spacing."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,26 +14,28 @@ from twin.geometry.pins import rest_pins
 from twin.pins.matching import Match, match
 from twin.pins.reference import Reference, make_reference
 
-# Thresholds that are tried: gray levels above the local mean, and the side over which that mean is taken, as a share of the frame's
-# smaller side.
+# Adaptive thresholds that are tried: gray levels above the local mean, and side of the block over which that mean is taken, as a share
+# of the frame's smaller side.
 OFFSETS, BLOCKS = (3.0, 6.0, 12.0, 20.0, 32.0), (1 / 40, 1 / 20, 1 / 10)
-# Least area of a blob, px^2; least share of its bounding box that it fills; largest ratio of that box's sides.
+# Least area of a blob, px^2; least share of its bounding box that a blob fills; largest ratio of that box's sides.
 LEAST_AREA_PX2, LEAST_FILL, MOST_ASPECT = 4.0, 0.4, 3.0
-# Blobs nearer to each other than this many median distances of nearest neighbours belong together.
+# Distance, in median distances of nearest neighbours, below which two blobs belong to the same cluster.
 LINK = 1.7
-# Largest ratio of a blob's area to the median, either way.
+# Largest ratio of a blob's area to the median area, and of the median area to a blob's.
 AREA_RATIO = 3.5
-# Fewer blobs than this share of the pins are no layout.
+# Least number of blobs of a layout, as a share of the pins.
 ENOUGH = 0.5
-# Sets of blobs that are tried, those nearest to the number of pins first.
+# Number of sets of blobs that are tried. Those whose number is nearest to the number of pins come first.
 CANDIDATES = 3
-# Turns that are tried. A layout is the same after 60 deg.
+# Turns that are tried. A turn by 60 deg does not change a layout.
 TURNS_DEG = (0.0, -6.0, 6.0, -12.0, 12.0, -18.0, 18.0, -24.0, 24.0, 30.0)
-# Sizes that are tried, relative to that of the circle around the blobs.
+# Sizes of the layout that are tried, relative to the smallest circle around the blobs.
 SCALES = (1.0, 0.96, 1.05)
-# Score for each pin below which no other size is tried, and above which a fit, and a sighting, is good enough.
+# Limits of the score divided by the number of pins: below the first no other size is tried, above the second no other size or turn,
+# above the third no other set of blobs.
 HOPELESS, FITTED, SETTLED = 0.4, 0.93, 0.95
-# Blobs at the very rim are left out (glints stand there): those farther away than this quantile of the distances, by this ratio.
+# Blobs at the very rim may be glints. A second search leaves out blobs whose distance from the middle exceeds this quantile of all
+# distances by this ratio.
 RIM_QUANTILE, RIM_RATIO = 0.95, 1.08
 
 
@@ -44,15 +46,15 @@ class Sighting:
     Attributes
     ----------
     pins_px : (N, 2) float
-        Specification's order, NaN where lost.
-    predicted_px : (N, 2) float
-        Of every pin, by its neighbours.
+        Places of the pins in the specification's order, NaN if lost.
+        predicted_px : (N, 2) float
+            Place of every pin as predicted from its neighbours.
     area_px2 : float
         Median area of the blobs.
     contrast : float
-        Median of the blobs' mean level above their surroundings, gray levels.
+        Median level of the blobs minus that of their surroundings, gray levels.
     score : float
-        The matching's.
+        Score of the matching.
     """
 
     pins_px: np.ndarray
@@ -63,7 +65,7 @@ class Sighting:
 
 
 def flat_layout(geometry: GeometrySpec) -> np.ndarray:
-    """Pins (N, 2) of the layout laid flat, the outermost at distance 1. It depends on neither the dome nor the camera."""
+    """Pins (N, 2) of the layout in a plane, with the outermost at distance 1. The result is independent of camera and dome radius."""
     axis = rest_pins(geometry).axis
     polar = np.arccos(np.clip(np.abs(axis[:, 2]), -1, 1))
     rho = np.linalg.norm(axis[:, :2], axis=1, keepdims=True)
@@ -72,16 +74,16 @@ def flat_layout(geometry: GeometrySpec) -> np.ndarray:
 
 
 def see_layout(gray: np.ndarray, flat: np.ndarray, rings: int, *, binary: bool) -> Sighting | None:
-    """The layout in a gray frame, wherever it lies and however large it is; None where nothing resembles it.
+    """Find the layout in a gray frame at any place and of any size; None if nothing resembles it.
 
     Parameters
     ----------
     gray : (H, W) uint8
     flat : (N, 2) float
-        As ``flat_layout`` gives it.
+        The layout as ``flat_layout`` gives it.
     rings : int
     binary : bool
-        The frame is thresholded.
+        Whether the frame is thresholded.
     """
     best = None
     for px, area, contrast in _candidates(gray, len(flat), binary)[:CANDIDATES]:
@@ -95,7 +97,7 @@ def see_layout(gray: np.ndarray, flat: np.ndarray, rings: int, *, binary: bool) 
 
 
 def _candidates(gray: np.ndarray, count: int, binary: bool) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Clusters of blobs of like area, those whose number is nearest to the pins' first: places (K, 2), areas (K,), contrast."""
+    """Clusters of blobs of similar area: places (K, 2), areas (K,), contrast. They are sorted by how near K is to the number of pins."""
     found = []
     for bright in _bright(gray, binary):
         _, labels, stats, centroids = cv2.connectedComponentsWithStats(bright, connectivity=8)
@@ -116,7 +118,7 @@ def _candidates(gray: np.ndarray, count: int, binary: bool) -> list[tuple[np.nda
 
 
 def _bright(gray: np.ndarray, binary: bool) -> Iterator[np.ndarray]:
-    """Thresholded frames (H, W) uint8 of 0 and 255; one for a frame that is thresholded already."""
+    """Thresholded frames (H, W) uint8 of 0 and 255; only one if the frame is already thresholded."""
     if binary:
         yield cv2.threshold(gray, 127, 255, cv2.THRESH_BINARY)[1]
         return
@@ -128,9 +130,9 @@ def _bright(gray: np.ndarray, binary: bool) -> Iterator[np.ndarray]:
 
 
 def _largest_cluster(px: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """Indices of the largest set of blobs that hang together and are of like area."""
+    """Indices of the blobs in the largest connected cluster that have a similar area."""
     chosen = np.arange(len(px))
-    for _ in range(2):  # the second time by the cluster's own area and spacing
+    for _ in range(2):  # the second round uses the area and the spacing of the first round's cluster
         tree = cKDTree(px[chosen])
         distance, _ = tree.query(px[chosen], k=min(2, len(chosen)))
         if distance.ndim < 2:
@@ -147,7 +149,7 @@ def _largest_cluster(px: np.ndarray, area: np.ndarray) -> np.ndarray:
 
 
 def _outermost_first(px: np.ndarray) -> Iterator[np.ndarray]:
-    """Masks (K,): all blobs, then all but those at the very rim, where glints stand."""
+    """Masks (K,): all blobs, then all blobs except those at the very rim, which may be glints."""
     everything = np.ones(len(px), bool)
     yield everything
     away = np.linalg.norm(px - np.median(px, axis=0), axis=1)
@@ -155,7 +157,7 @@ def _outermost_first(px: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _fit(flat: np.ndarray, rings: int, px: np.ndarray, area: np.ndarray, contrast: float) -> Sighting | None:
-    """The layout fitted to blobs by size and turn, and matched; None where too few blobs fit."""
+    """Fit size and turn of the layout to blobs, and match it to them; None if too few blobs fit."""
     if len(px) < ENOUGH * len(flat):
         return None
     (x, y), radius = cv2.minEnclosingCircle(px.astype(np.float32))
@@ -175,7 +177,7 @@ def _fit(flat: np.ndarray, rings: int, px: np.ndarray, area: np.ndarray, contras
 
 
 def _sighting(found: Match, px: np.ndarray, area: np.ndarray, contrast: float) -> Sighting:
-    """What a labelling of blobs says of the layout."""
+    """The sighting that follows from a labelling of blobs."""
     paired = found.blob >= 0
     pins_px = np.full((len(found.blob), 2), np.nan)
     pins_px[paired] = px[found.blob[paired]]
@@ -183,6 +185,6 @@ def _sighting(found: Match, px: np.ndarray, area: np.ndarray, contrast: float) -
 
 
 def rest_of(sightings: list[Sighting], rings: int) -> Reference:
-    """The layout as most frames show it: the median of each pin's places. A predicted place stands for one that was not seen."""
+    """The layout at rest: the median of each pin's places in all sightings. If a pin was not seen, its predicted place is used."""
     seen = np.stack([np.where(np.isfinite(s.pins_px), s.pins_px, s.predicted_px) for s in sightings])
     return make_reference(np.nanmedian(seen, axis=0), rings)

@@ -1,4 +1,4 @@
-"""Parameters of a detector, found from frames and the pins' layout alone."""
+"""Tuning: the parameters of a detector are found from frames and the pins' layout alone."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,33 +17,36 @@ from twin.pins.reference import Reference
 from twin.progress import Step
 from twin.types import Form, Frame
 
-# Frames that are tuned on, evenly spread: with more the parameters hardly change.
+# Number of frames that are used, spread evenly. With more frames the parameters hardly change.
 TUNED_ON = 12
-# Methods that take about a second a frame, and the number of frames for them.
+# Methods that take about a second for a frame, and number of frames that are used for them.
 SLOW, SLOW_TUNED_ON = ("log", "dog", "doh"), 3
-# Distance of the mask's edge from the outermost pins seen, in spacings at the rim.
+# Distance of the mask's edge from the outermost pins, in spacings at the rim.
 MASK_SPACINGS = 0.85
-# Sides of adaptive thresholds that are tried, in median spacings; of the published recorder's threshold; erosions, px.
+# Values that are tried: sides of the block of an adaptive threshold, in median spacings; the same for the published recorder's
+# threshold; erosions, px.
 BLOCK_PITCHES, RECORDER_BLOCKS_PITCHES, EROSIONS_PX = (2.0, 3.0, 4.5), (2.0, 4.5), (1, 2)
-# Thresholds that are tried, as shares of the caps' contrast; and the least contrast that is assumed, gray levels.
+# Thresholds that are tried, as shares of the caps' contrast; least contrast that is assumed, gray levels.
 STRICTNESS, LEAST_CONTRAST = (0.04, 0.07, 0.1, 0.15, 0.22, 0.3, 0.4, 0.55), 4.0
-# Fixed thresholds that are tried, gray levels: on thresholded frames, and on raw ones.
+# Fixed thresholds that are tried, gray levels: on thresholded frames, and on raw frames.
 BINARY_LEVELS, RAW_LEVELS = (60.0, 80.0, 100.0, 127.0, 150.0, 175.0), tuple(float(level) for level in np.linspace(20, 220, 21))
-# One frame in this many shows which settings are hopeless: those whose exact rate and found share, added, are worse by HOPELESS.
+# First, all settings are tried on one frame in GLANCE. Settings whose sum of exact rate and found share is smaller than the best one by
+# more than HOPELESS are not tried on the other frames.
 GLANCE, HOPELESS = 4, 0.3
-# Thresholds whose rate is lower by no more than this belong to the plateau.
+# Largest difference from the best rate of a threshold that belongs to the plateau.
 NEAR = 0.02
 # Least area of a pin's blob, as a share of the caps' median area.
 LEAST_AREA = 0.2
 # Smallest and largest radius of a cap, relative to the median one.
 CAP_RADII = (0.6, 1.4)
-# Sightings whose score is less than this share of the best one's do not count.
+# Least score of a sighting that is used, relative to the best one's.
 LIKE_THE_BEST = 0.9
-# The recorder's threshold before it is tuned: side, px, and offset, gray levels.
+# The recorder's threshold before it is tuned: side of the block, px, and offset, gray levels.
 RECORDER_BLOCK_PX, RECORDER_OFFSET = 61, -5.0
 # Standard normal quantile of a two-sided 90 % interval.
 Z_90 = 1.645
-# A tuning is sure if the lower end of its exact rate is at least the first, and its threshold may move by the second, gray levels.
+# A tuning is sure if the lower end of the interval of its exact rate is at least SURE_LOW_RATE, and its threshold may change by
+# SURE_SLACK gray levels.
 SURE_LOW_RATE, SURE_SLACK = 0.8, 1.0
 # Exact rate from which on a tuning that is not sure is fairly sure.
 FAIR_RATE = 0.5
@@ -53,7 +56,7 @@ Rate = tuple[float, float]
 
 
 class RateRow(TypedDict):
-    """A setting that was tried, and how it did."""
+    """A setting that was tried, and its result."""
 
     block_px: int
     threshold: float
@@ -63,13 +66,13 @@ class RateRow(TypedDict):
 
 @dataclass(frozen=True)
 class Tuned:
-    """What a tuning found.
+    """The result of a tuning.
 
     Attributes
     ----------
     detector : DetectorSpec
     rates : list of RateRow
-        Every setting tried.
+        All settings that were tried.
     notes : list of str
         Reasons to doubt the result, and what to do.
     """
@@ -115,7 +118,7 @@ def tune(frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, pr
 
 
 def _sightings(frames: list[Frame], flat: np.ndarray, pins: PinsSpec, binary: bool, progress: Step | None) -> list[Sighting]:
-    """The layout in the frames that show it clearly; ``flat`` (N, 2) as ``flat_layout`` gives it.
+    """The sightings of the layout in the frames that show it clearly; ``flat`` (N, 2) as ``flat_layout`` gives it.
 
     Raises
     ------
@@ -140,7 +143,7 @@ def _sightings(frames: list[Frame], flat: np.ndarray, pins: PinsSpec, binary: bo
 def _start(
     frame: Frame, reference: Reference, seen: list[Sighting], method: Method, form: Form, layout: Literal["rings", "hexagon"]
 ) -> DetectorSpec:
-    """Mask and caps' size; no threshold yet."""
+    """A detector with the mask and the caps' size, before a threshold is chosen."""
     rim = reference.pins_px[reference.outmost]
     center = (rim.max(axis=0) + rim.min(axis=0)) / 2
     reach = max(np.nanmax(np.linalg.norm(s.pins_px - center, axis=1)) for s in seen)
@@ -165,7 +168,7 @@ def _start(
 
 
 def _recorder(shape: tuple[int, ...], blob: BlobSpec, layout: Literal["rings", "hexagon"]) -> RecordingSpec:
-    """The published recorder with a square crop that puts the mask where the published method looks."""
+    """The published recorder, with a square crop in which the mask is at the place that the published method uses."""
     release = LEGACY[layout]
     half = release.size_px // 2
     side = 2 * blob.mask_radius_px * half / (half - release.mask_margin_px)
@@ -183,7 +186,7 @@ def _recorder(shape: tuple[int, ...], blob: BlobSpec, layout: Literal["rings", "
 
 
 def _settings(start: DetectorSpec, reference: Reference, seen: list[Sighting], binary: bool) -> Iterator[DetectorSpec]:
-    """Every setting to try: thresholds in the caps' contrast, blocks in pitches."""
+    """All settings to try. Thresholds are in units of the caps' contrast, blocks in units of the pitch."""
     contrast = max(float(np.median([s.contrast for s in seen])), LEAST_CONTRAST)
     pitch = float(np.median(reference.spacing_px))
     levels = [round(share * contrast, 1) for share in STRICTNESS]
@@ -213,29 +216,29 @@ def _with_blob(detector: DetectorSpec, **values: Any) -> DetectorSpec:
 
 
 def _rate(detect: Callable[[Frame], Found], frames: list[Frame], count: int) -> Rate:
-    """Share of frames with exactly all pins, and mean share of pins found; a blob too many counts as a pin lost."""
+    """Share of frames with exactly all pins, and mean share of found pins. An additional blob counts as a lost pin."""
     found = np.array([len(detect(frame).claims_px) for frame in frames])
     return float(np.mean(found == count)), float(np.mean(1 - np.minimum(np.abs(found - count) / count, 1)))
 
 
 def _block(detector: DetectorSpec) -> int:
-    """Side of the adaptive threshold, px: the recorder's where there is one."""
+    """Side of the adaptive threshold's block, px; the recorder's if there is one."""
     return detector.recording.threshold_block_px if detector.recording is not None else detector.blob.threshold_block_px
 
 
 def _threshold(detector: DetectorSpec) -> float:
-    """Threshold, gray levels: the recorder's where there is one."""
+    """Threshold, gray levels; the recorder's if there is one."""
     return detector.recording.threshold_offset if detector.recording is not None else detector.blob.threshold
 
 
 def _series(tried: list[DetectorSpec], k: int) -> list[int]:
-    """Settings that differ from the k-th in nothing but the threshold, in its order."""
+    """Indices of the settings that differ from the k-th only in the threshold, in the order of the threshold."""
     same = [j for j, d in enumerate(tried) if _block(d) == _block(tried[k]) and d.blob.erosion_px == tried[k].blob.erosion_px]
     return sorted(same, key=lambda j: _threshold(tried[j]))
 
 
 def _plateau(tried: list[DetectorSpec], rates: list[Rate], k: int) -> list[int]:
-    """The k-th setting and those with neighbouring thresholds that do nearly as well."""
+    """Indices of the k-th setting and of those with neighbouring thresholds whose rates are nearly as good."""
     series = _series(tried, k)
     at = series.index(k)
     low = high = at
@@ -248,7 +251,7 @@ def _plateau(tried: list[DetectorSpec], rates: list[Rate], k: int) -> list[int]:
 
 
 def _middle_of_plateau(tried: list[DetectorSpec], rates: list[Rate]) -> int:
-    """The best setting, as far as possible from the thresholds that fail: in the middle of the widest plateau."""
+    """Index of the best setting in the middle of the widest plateau, which is as far as possible from thresholds that fail."""
     score = np.array([exact + share for exact, share in rates])
     best = np.flatnonzero(score >= score.max() - 1e-9)
     widest = max((_plateau(tried, rates, int(k)) for k in best), key=lambda p: abs(_threshold(tried[p[-1]]) - _threshold(tried[p[0]])))
@@ -259,7 +262,7 @@ def _middle_of_plateau(tried: list[DetectorSpec], rates: list[Rate]) -> int:
 def _evidence(
     tried: list[DetectorSpec], rates: list[Rate], best: int, frames: list[Frame], reference: Reference, start: DetectorSpec
 ) -> Evidence:
-    """How sure the best setting is: its rate with a 90 % interval (Wilson 1927), and how far threshold and mask are from failing."""
+    """Evidence for the best setting: its rate with a 90 % interval (Wilson 1927), and the slack of threshold and mask."""
     exact, n = rates[best][0], len(frames)
     spread = Z_90 * np.sqrt(exact * (1 - exact) / n + Z_90**2 / (4 * n * n))
     low = max((exact + Z_90**2 / (2 * n) - spread) / (1 + Z_90**2 / n), 0.0)

@@ -85,7 +85,7 @@ class ContactCalibration:
     sensor : SensorSpec
         The specification with the fitted parameters.
     summary : dict
-        All figures, as ``calibration.json`` holds them.
+        Content of ``calibration.json``.
     written : list of Path
         The specification, then the page.
     """
@@ -95,7 +95,7 @@ class ContactCalibration:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """The parameters with their uncertainty, and the errors before and after; for people."""
+        """The result as lines of text: the parameters with their uncertainty, and the errors before and after."""
         lines = [f"note: {problem}" for problem in self.summary["problems"]]
         for p in self.summary["parameters"]:
             doubt = "" if p["known"] else "  (these frames do not tell it)"
@@ -126,7 +126,8 @@ def calibrate_to_file(
 ) -> ContactCalibration:
     """Fit the contact of a specification to labelled frames, and write it.
 
-    Beside the specification a folder ``NAME-contact`` holds the page and the simulated contacts: an interrupted run goes on there.
+    The folder ``NAME-contact`` beside the specification holds the page and the simulated contacts, so that an interrupted run can be
+    continued.
 
     Parameters
     ----------
@@ -135,18 +136,18 @@ def calibrate_to_file(
     out : Path
         The ``.toml`` file to write.
     touched : ObjectSpec, optional
-        What the sensor touched; the experiment's own object by default.
-    labels : int
-        How many frames to fit to; they are chosen at random.
+        The object; the experiment's own by default.
+        labels : int
+            Number of frames to fit to; they are chosen at random.
     seed : int
         Seed of this choice.
     hold : collection of str
-        Names of parameters that stay as they are.
+        Names of parameters that are not fitted.
 
     Raises
     ------
     FrameError
-        No labels, no pins, too few frames, an unknown parameter, or ``out`` is no name of a ``.toml`` file.
+        There are no labels, no pins or too few frames, a parameter is unknown, or ``out`` is not the name of a ``.toml`` file.
     """
     names = [parameter.name for parameter in PARAMETERS]
     if unknown := set(hold) - set(names):

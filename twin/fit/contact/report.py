@@ -19,11 +19,11 @@ from twin.rig.kinematics import rig_of
 from twin.store import made_by, write_json
 
 TOLD = 0.5
-"""Frames tell a parameter if they remove at least this share of its prior variance."""
+"""Least share of a parameter's prior variance that the frames must remove for it to count as determined."""
 TRUSTED = 0.5
-"""A frame with less trust than this is listed as not trusted, and not drawn."""
+"""Trust below which a frame is listed as not trusted, and not drawn."""
 ALIKE = 0.9
-"""From this correlation on, two parameters can hardly be told apart."""
+"""Absolute correlation from which on two parameters are listed as hardly distinguishable."""
 
 
 def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out: tuple | None, held_frames: int) -> dict:
@@ -80,12 +80,12 @@ def warnings_of(fit: ContactFit, held_out: tuple | None, held_frames: int) -> li
 
 
 def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray, fit: ContactFit, summary: dict) -> Path:
-    """Write ``calibration.json``, charts and ``index.html``; the page.
+    """Write ``calibration.json``, charts and ``index.html``, and return the page.
 
     Parameters
     ----------
     moved : (2, 2, M, N, 2) float
-        Simulated displacements, px, before and after the calibration: each after the tap and after the move.
+        Simulated displacements, px. Axes: before and after the calibration; after the tap and after the move; frame; pin; x and y.
     """
     figures = write_json(folder / "calibration.json", summary | {"made_by": made_by("twin.fit.contact.fit")})
     solved = np.flatnonzero(np.isfinite(fit.after_px) & np.isfinite(fit.before_px) & (fit.trust >= TRUSTED))

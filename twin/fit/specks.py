@@ -120,7 +120,7 @@ def _window_view(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np
 
 
 def _without_spots(behind: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Gray levels (H, W) without small bright spots: gaps are filled from their surroundings, then the median around each pixel is taken."""
+    """Gray levels (H, W) without small bright spots: the median around each pixel, after gaps were filled from their surroundings."""
     weight = blurred(usable.astype(np.float32), GROUND_PX / 4)
     filled = np.where(usable, behind, blurred(behind, GROUND_PX / 4) / np.maximum(weight, 1e-6))
     return cv2.medianBlur(np.clip(np.rint(filled), 0, 255).astype(np.uint8), GROUND_PX).astype(np.float32)

@@ -69,7 +69,7 @@ def draw_pins(ax: Axes, observation: Observation) -> None:
 
 
 def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title: str, *, limit: float | None = None) -> None:
-    """Draw Voronoi cells coloured by the relative change of their area from rest, percent, up to ``limit`` (default: the largest change)."""
+    """Draw Voronoi cells coloured by the relative change of their area from rest in percent, up to ``limit`` (default: the largest)."""
     change = 100 * (graph.area_px2 / rest_area_px2 - 1)
     limit = limit or max(5.0, float(np.nanpercentile(np.abs(change), 99)))
     cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors=BORDER, linewidths=0.4)

@@ -18,7 +18,7 @@ from twin.store import made_by, write_json, write_text
 
 
 def summary_of(found: Comparison, sensor: str) -> dict:
-    """All figures, as ``validation.json`` holds them."""
+    """All figures of a comparison, as ``validation.json`` holds them; ``sensor`` is the sensor's name."""
     moved = np.linalg.norm(found.measured.pins_px - found.measured.no_contact_px, axis=-1)
     sought = np.isfinite(found.friction_error_px)
     friction = {}
@@ -50,7 +50,7 @@ def write_validation(out: Path, found: Comparison, description: str, summary: di
         Existing folder.
     found : Comparison
     description : str
-        Of the sensor; the page begins with it.
+        Description of the sensor, with which the page begins.
     summary : dict
         As ``summary_of`` gives it.
 
@@ -133,7 +133,7 @@ def _draw_errors(found: Comparison) -> Figure:
 
 
 def _draw_worst(found: Comparison) -> Figure:
-    """Error of each pin in the median and in the worst frame."""
+    """Draw the error of each pin in the frame with the median error and in the worst frame."""
     order = np.argsort(np.where(np.isfinite(found.error_px), found.error_px, -1.0))[-np.isfinite(found.error_px).sum() :]
     figure, axes = new_figure(2, panel_inch=5.0)
     for ax, k, title in ((axes[0], order[len(order) // 2], "median frame"), (axes[1], order[-1], "worst frame")):

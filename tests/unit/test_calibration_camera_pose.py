@@ -47,7 +47,7 @@ def test_a_known_camera_is_found_again_within_its_standard_deviations(sensor):
     assert found.camera.fy_px / found.camera.fx_px == pytest.approx(sensor.camera.fy_px / sensor.camera.fx_px)
 
 
-def test_a_dome_at_rest_does_not_tell_distance_nor_polar_angle(sensor):
+def test_pins_at_rest_determine_neither_distance_nor_polar_angle(sensor):
     """They are held at the specification's values and named with what would tell them."""
     pins_px = seen(sensor, np.random.default_rng(2))
     found, report = fit_camera(sensor, pins_px, free=tuple(PARAMETERS))
@@ -58,7 +58,7 @@ def test_a_dome_at_rest_does_not_tell_distance_nor_polar_angle(sensor):
     assert found.pins.max_polar_deg == sensor.pins.max_polar_deg
 
 
-def test_what_is_held_could_not_have_been_seen(sensor):
+def test_a_wrong_value_of_a_held_parameter_is_compensated_by_the_others(sensor):
     """A wrong polar angle is hidden by the other parameters: so well that pins at rest cannot tell."""
     pins_px = seen(sensor, np.random.default_rng(3))
     wrong = changed(sensor, pins={"max_polar_deg": sensor.pins.max_polar_deg + 4})

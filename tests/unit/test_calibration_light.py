@@ -114,7 +114,7 @@ def test_each_caps_reflectance_and_outline_are_recovered(known):
         assert left.std() < 0.25 * true[seen].std()
 
 
-def test_outlines_that_fit_are_left(known, frame):
+def test_outlines_that_fit_are_not_changed(known, frame):
     steps = outline_steps(known, [frame], [frame.image])
     assert np.abs(steps).max() < 1e-9
 

@@ -97,7 +97,7 @@ def test_each_step_acts_in_the_chain(section, key, value):
     assert (expose(picture(), full.capture) != expose(picture(), without.capture)).any()
 
 
-def test_a_neutral_step_hands_the_very_same_light_on():
+def test_a_neutral_step_returns_its_input():
     light, frame, rng = picture(), expose(picture(), PLAIN.capture), np.random.default_rng(0)
     optics = hazed(light, PLAIN.gel), dispersed(light, PLAIN.camera), blurred(light, 0.0), vignetted(light, PLAIN.camera)
     film = amplified(light, PLAIN.response, rng), noisy(light, PLAIN.response, rng), sharpened(light, PLAIN.response)
@@ -332,7 +332,7 @@ def test_colour_frames_are_recorded_as_their_gray():
     assert (record(np.repeat(raw[..., None], 3, axis=2), RECORDING) == record(raw, RECORDING)).all()
 
 
-def test_shifted_colours_move_alone():
+def test_a_colour_shift_moves_only_that_colour():
     """A spot's red moves by the shift, green stays."""
     spec = plain()
     camera = spec.camera.model_copy(update={"red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.4, -0.3), "blue_shift_px": (0.0, 0.0)})

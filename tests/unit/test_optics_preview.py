@@ -123,7 +123,7 @@ def test_caps_cover_their_projected_area(small):
     assert covered == pytest.approx(sum(area_and_centroid(disc)[0] for disc in projected_discs(clear)), rel=share)
 
 
-def test_outlines_of_their_own_keep_to_their_shape(small):
+def test_caps_with_measured_outlines_have_their_shape(small):
     """``1 + a cos 2t`` has (1 + a^2 / 2) of the circle's area and is longest along x."""
     clear = changed(small, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.0})
     round_, oval = (
@@ -194,7 +194,7 @@ def test_a_window_is_a_part_of_the_whole_frame(small):
     np.testing.assert_allclose(preview.render(), Preview(small, static=NOTHING).render()[20:77, 30:91], atol=1e-5)
 
 
-def test_what_is_static_lies_over_the_gel(small):
+def test_the_static_layer_covers_the_gel(small):
     rng = np.random.default_rng(0)
     shine, cover = rng.uniform(0, 1, (100, 120, 3)), rng.uniform(0, 1, (100, 120))
     grayish = shine @ [0.212671, 0.715160, 0.072169]

@@ -28,7 +28,7 @@ def test_a_stage_begins_unknown_and_tells_each_step_under_its_title():
     assert heard.calls == [("frames", 0, 0, ""), ("frames", 1, 3, ""), ("frames", 3, 3, "good")]
 
 
-def test_a_stage_that_tells_nothing_is_one_thing_done():
+def test_a_stage_without_reports_counts_as_one_finished_item():
     heard = Heard()
     with stage(heard, "render"):
         pass
@@ -42,7 +42,7 @@ def test_a_stage_that_fails_is_not_told_as_done():
     assert heard.calls == [("render", 0, 0, "")]
 
 
-def test_nobody_needs_to_listen():
+def test_progress_is_optional():
     with stage(silent, "frames") as step:
         step(0.5)
 

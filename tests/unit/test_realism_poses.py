@@ -77,7 +77,7 @@ def test_a_known_rig_is_recovered_from_its_pins(start):
     )
 
 
-def test_what_the_polynomial_misses_is_made_good_in_the_second_round():
+def test_the_second_round_corrects_the_polynomials_errors():
     """Pins that stand elsewhere than the polynomial has them by a constant: only the second round knows."""
     labels, off_px = spread(12), np.array([1.5, -0.7])
     meant = contacts_of(TRUE, SURFACE, labels, RADIUS_MM)
@@ -91,7 +91,7 @@ def test_what_the_polynomial_misses_is_made_good_in_the_second_round():
     assert np.abs(contacts_of(first, SURFACE, labels, RADIUS_MM) - meant).max() > 10 * SAME_CONTACT
 
 
-def test_the_bank_covers_the_labels_of_a_rig_that_is_some_off():
+def test_the_bank_covers_labels_of_a_wrong_rig():
     labels = spread(30)
     bank = contacts_of(PLAIN, SURFACE, bank_labels(PLAIN, SURFACE, labels, RADIUS_MM), RADIUS_MM)
     true = contacts_of(TRUE, SURFACE, labels, RADIUS_MM)

@@ -65,7 +65,7 @@ def test_steady_spots_are_found_and_paired(disc):
     np.testing.assert_allclose(pair_spots(*shifted), 2.0, atol=0.05)
 
 
-def test_bins_have_equal_counts_and_keep_strangers_at_the_ends():
+def test_bins_have_equal_counts_and_outer_bins_take_values_beyond_the_edges():
     distance = RNG.uniform(0, 100, 800) ** 0.5
     edges = equal_count_edges(distance)
     assert np.bincount(bin_of(distance, edges)).tolist() == [100] * 8
@@ -81,7 +81,7 @@ def test_a_difference_shows_in_its_bin_alone():
     assert [round(row.difference, 6) for row in rows] == [0.1, *[0.0] * 7]
 
 
-def test_pixel_figures_know_the_disc_only(disc):
+def test_pixel_figures_depend_on_pixels_in_the_disc_only(disc):
     real = RNG.integers(20, 200, (*SIZE[::-1], 3)).astype(np.uint8)
     other = np.where(disc.inside[..., None], real, 255).astype(np.uint8)
     same = compare_images(real, other, disc.inside)

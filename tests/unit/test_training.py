@@ -238,7 +238,7 @@ def test_each_network_watches_rows_of_its_own():
     assert all(not set(held) & set(learnt) for held, learnt in folds)
 
 
-def test_a_model_that_reads_the_clock_is_found_out(data):
+def test_a_model_that_estimates_from_time_is_found(data):
     undone = data.targets.executed < 0.5
     honest = Prediction(data.targets.corrected, np.ones((FRAMES, 2)), np.ones((FRAMES, 2)), np.full(FRAMES, np.nan))
     clock = Prediction(data.targets.corrected + 0.5 * np.column_stack([np.zeros(FRAMES), data.targets.move[:, 1]]), *[None] * 3)

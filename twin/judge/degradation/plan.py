@@ -16,7 +16,7 @@ from twin.judge.degradation.sweep import SEVERITIES
 
 
 class ConditionPlan(Section):
-    """``severe``: the parameter's value at severity 1, in the condition's unit. The default is the condition's own, which is the largest."""
+    """``severe``: value at severity 1, in the unit of the parameter. The default is the condition's own value, which is the largest."""
 
     name: str
     severe: float | None = None

@@ -1,8 +1,8 @@
 """Comparison of a real frame with its render, pixel by pixel, over the lens disc.
 
 The figures are PSNR, SSIM (Wang et al. 2004, computed by scikit-image) and FLIP (Andersson et al. 2020). FLIP is the difference, from 0 to
-1, that is visible when both pictures alternate on a normal screen (67 px per degree). Outside the disc both pictures are made equal, so that
-these pixels do not affect SSIM and FLIP near the disc's edge.
+1, that is visible when both pictures alternate on a normal screen (67 px per degree). Outside the disc both pictures are made equal, so
+that these pixels do not affect SSIM and FLIP near the disc's edge.
 """
 
 from dataclasses import asdict, dataclass

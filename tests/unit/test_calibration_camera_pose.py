@@ -59,7 +59,7 @@ def test_pins_at_rest_determine_neither_distance_nor_polar_angle(sensor):
 
 
 def test_a_wrong_value_of_a_held_parameter_is_compensated_by_the_others(sensor):
-    """With a wrong polar angle the other parameters still fit the pins at rest, to less than the error of the model."""
+    """With a wrong polar angle the other parameters still fit the pins at rest, nearly as well as any model fits real pins."""
     pins_px = seen(sensor, np.random.default_rng(3))
     wrong = changed(sensor, pins={"max_polar_deg": sensor.pins.max_polar_deg + 4})
     _, report = fit_camera(wrong, pins_px)

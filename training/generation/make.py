@@ -77,7 +77,7 @@ def make_contact(text: str, index: int) -> Outcome:
 
 
 def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
-    simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, keep=False)
+    simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor)
     contact = RigContact(simulator.solver, config.experiment, config.object)
     way = contact.way(draw.label)
     found = list(contact.along(way, friction=draw.friction))
@@ -129,8 +129,8 @@ def _config(text: str) -> GenerationConfig:
 @lru_cache(maxsize=1)
 def _nominal(text: str) -> Simulator:
     config = _config(text)
-    return _simulator(config, config.sensor, keep=True)
+    return _simulator(config, config.sensor)
 
 
-def _simulator(config: GenerationConfig, sensor: SensorSpec, *, keep: bool) -> Simulator:
-    return Simulator(sensor, quality=config.quality, solver=SkinSolver(sensor, resolution=Resolution(config.across), keep=keep))
+def _simulator(config: GenerationConfig, sensor: SensorSpec) -> Simulator:
+    return Simulator(sensor, quality=config.quality, solver=SkinSolver(sensor, resolution=Resolution(config.across)))

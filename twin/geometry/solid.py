@@ -7,8 +7,8 @@ elements. The displacement inside the gel is even smoother: below the gel's surf
 nested in it.
 """
 
-from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,11 +16,8 @@ from scenes.sensor import GeometrySpec
 from twin.geometry.bspline import Basis
 from twin.geometry.chart import Chart, Focus, disc_points, dome_points
 from twin.geometry.pins import rest_pins
-from twin.store import cached_arrays
 from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-_CELL_PARTS = ("controls", "gradients", "weights_mm3")
-"""Names on disk of the arrays of ``Cells``."""
 _GEL_GRADING = 1.5
 """Boundary k of n elements through the gel lies at the depth (k / n)^1.5: elements are thin below the skin."""
 
@@ -120,61 +117,16 @@ class Solid:
         return foot, np.linalg.inv(frame)
 
 
-def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None, focus: Focus | None = None, keep: bool = True) -> Solid:
-    """Build the body of a sensor. Its grid is fine around a focus (default: around the apex).
-
-    The body depends on the sensor's geometry alone. With ``keep`` it is stored on disk (see ``twin.store``).
-    """
+def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None, focus: Focus | None = None) -> Solid:
+    """The body of a sensor, its grid fine around a focus (default: around the apex)."""
     resolution, focus = resolution or Resolution(), focus or Focus()
     inner_mm = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm
     basis = Basis(np.linspace(-1, 1, resolution.across + 1))
     chart = Chart(focus, float(np.arccos(geometry.skin.rim_z_mm / inner_mm)))
     coarse = Basis(basis.breaks[::2])
     through = Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING)
-    shape_of_skin = ("outer_radius_mm", "thickness_mm", "rim_z_mm")
-    key = {
-        "skin": {name: getattr(geometry.skin, name) for name in shape_of_skin},
-        "lens_mm": geometry.lens.z_mm,
-        "pins": geometry.pins.model_dump(mode="json"),
-        "resolution": asdict(resolution),
-        "focus": asdict(focus),
-    }
-    arrays = partial(_arrays, geometry, resolution, chart, basis, coarse, through)
-    kept = cached_arrays("solid", key, arrays) if keep else arrays()
-    upper = basis.count**2
-    return Solid(
-        control_mm=kept["control_mm"],
-        fixed=kept["fixed"],
-        skin=_kept_cells(kept, "skin"),
-        gel_top=_kept_cells(kept, "gel_top"),
-        gel_deep=_kept_cells(kept, "gel_deep"),
-        boxes=(kept["boxes_0"], kept["boxes_1"], kept["boxes_2"]),
-        chart=chart,
-        basis=basis,
-        coarse=coarse,
-        through=through,
-        pin_value=kept["pin_value"],
-        pin_slope_u=kept["pin_slope_u"],
-        pin_slope_v=kept["pin_slope_v"],
-        pin_base_mm=kept["pin_base_mm"],
-        pin_axis=kept["pin_axis"],
-        inner=slice(resolution.skin_layers * upper, (resolution.skin_layers + 1) * upper),
-        pin_cap_length_mm=geometry.pins.length_mm + geometry.pins.cap_height_mm / 2,
-    )
-
-
-def _kept_cells(kept: dict[str, np.ndarray], name: str) -> Cells:
-    """One kind of cells from the arrays that ``_arrays`` gives."""
-    return Cells(kept[f"{name}_controls"], kept[f"{name}_gradients"], kept[f"{name}_weights_mm3"])
-
-
-def _arrays(
-    geometry: GeometrySpec, resolution: Resolution, chart: Chart, basis: Basis, coarse: Basis, through: Basis
-) -> dict[str, np.ndarray]:
-    """The arrays of a ``Solid``, by name."""
-    inner_mm, layers = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm, resolution.skin_layers
+    layers, side, coarse_side = resolution.skin_layers, basis.count, coarse.count
     through_skin = Basis(np.linspace(0, 1, layers + 1), degree=1)
-    side, coarse_side = basis.count, coarse.count
 
     fine = [_fit(basis, chart, geometry, depth) for depth in through_skin.greville]
     deep = [_fit(coarse, chart, geometry, depth) for depth in through.greville[1:]]
@@ -189,26 +141,31 @@ def _arrays(
     skin_parts = [[(index[e + d], basis, _local(through_skin, e, d)) for d in (0, 1)] for e in range(layers)]
     top = [(index[-1], basis, _local(through, 0, 0))] + [(below[d - 1], coarse, _local(through, 0, d)) for d in (1, 2)]
     deep_parts = [[(below[e + d - 1], coarse, _local(through, e, d)) for d in range(3)] for e in range(1, resolution.gel_layers)]
-    cells = {
-        "skin": joined_cells([spline_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)]),
-        "gel_top": spline_cells(basis, top, through, 0, control),
-        "gel_deep": joined_cells([spline_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
-    }
     pins = rest_pins(geometry)
     value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, geometry.skin.rim_z_mm)))
-    return {
-        **{f"{name}_{part}": getattr(kind, part) for name, kind in cells.items() for part in _CELL_PARTS},
-        "boxes_0": np.tile(_boxes(resolution.across, 1), (layers, 1)),
-        "boxes_1": _boxes(resolution.across, 1),
-        "boxes_2": np.tile(_boxes(resolution.across // 2, 2), (resolution.gel_layers - 1, 1)),
-        "control_mm": control,
-        "fixed": np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
-        "pin_value": value,
-        "pin_slope_u": slope_u,
-        "pin_slope_v": slope_v,
-        "pin_base_mm": pins.base_mm,
-        "pin_axis": pins.axis,
-    }
+    return Solid(
+        control_mm=control,
+        fixed=np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
+        skin=joined_cells([spline_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)]),
+        gel_top=spline_cells(basis, top, through, 0, control),
+        gel_deep=joined_cells([spline_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
+        boxes=(
+            np.tile(_boxes(resolution.across, 1), (layers, 1)),
+            _boxes(resolution.across, 1),
+            np.tile(_boxes(resolution.across // 2, 2), (resolution.gel_layers - 1, 1)),
+        ),
+        chart=chart,
+        basis=basis,
+        coarse=coarse,
+        through=through,
+        pin_value=value,
+        pin_slope_u=slope_u,
+        pin_slope_v=slope_v,
+        pin_base_mm=pins.base_mm,
+        pin_axis=pins.axis,
+        inner=slice(layers * side**2, (layers + 1) * side**2),
+        pin_cap_length_mm=geometry.pins.length_mm + geometry.pins.cap_height_mm / 2,
+    )
 
 
 def surface_operators(basis: Basis, square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -307,7 +264,7 @@ def joined_cells(parts: list[Cells]) -> Cells:
     """The elements of several layers as one list. Without layers it has no elements, and the shape for 27 controls, as in the gel."""
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
-    return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in _CELL_PARTS))
+    return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("controls", "gradients", "weights_mm3")))
 
 
 def _boxes(count: int, size: int) -> IntArray:

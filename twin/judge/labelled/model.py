@@ -107,7 +107,7 @@ class ContactModel:
     def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
         self.spec, self.experiment, self.form = spec, experiment, form
         self.rig = rig_of(spec)
-        self.solver = SkinSolver(spec, resolution=Resolution(across), keep=False)
+        self.solver = SkinSolver(spec, resolution=Resolution(across))
         self.contact = RigContact(self.solver, experiment, touched)
         self.rest_px = self._pixels(self.solver.rest().caps_mm)
 

@@ -8,7 +8,6 @@ exactly on the small dense problem that remains: which points touch, stick or sl
 
 import numpy as np
 
-from twin.errors import ContactError
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
@@ -38,6 +37,8 @@ _SHIFT_GROWTH = 8
 """Factor from one shift to the next."""
 _LARGEST_SHIFT_N_MM = 50.0
 """With a shift beyond this (N/mm) the step counts as not solved."""
+_PROVIDED_MM = 1.0
+"""Skin that is nearer to the object than this is kept in the elimination, so that it need not be prepared anew in the next load steps."""
 _REACH_MM = 0.15
 """Contact points farther than this from the object are left out of the equations; at the end it is checked that none of them touches."""
 
@@ -56,24 +57,21 @@ class LoadStepper:
     Parameters
     ----------
     body : Body
-    frontal : FrontalSolver
-        Keeps the controls that the object may touch.
+    boxes : list of (m, 4) int
+        Where each element of each kind lies (see ``FrontalSolver``).
     field : ObjectField
     friction : Friction
     compliance_mm_per_n : float
     """
 
-    def __init__(self, body: Body, frontal: FrontalSolver, field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
-        self._body, self._frontal, self._field, self._friction = body, frontal, field, friction
+    def __init__(self, body: Body, boxes: list[IntArray], field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
+        self._body, self._boxes, self._field, self._friction = body, boxes, field, friction
         self._compliance = compliance_mm_per_n
         shapes = [(len(kind.cells.controls), 6, *2 * kind.cells.controls.shape[1:]) for kind in body.kinds]
         self._blocks = [np.empty(shape, np.float32) for shape in shapes]
-        local = np.full(len(body.free), -1)  # place of each control among the kept ones
-        kept_controls = np.flatnonzero(np.isin(frontal.unknown[:, 0], frontal.kept))
-        local[kept_controls] = np.arange(len(kept_controls))
-        self._local = local[body.points.controls]
-        # a point may be carried by kept and by clamped controls only
-        self._reachable: BoolArray = np.all((self._local >= 0) | ~body.free[body.points.controls], axis=1)
+        self._frontal: FrontalSolver | None = None
+        self._kept: BoolArray = np.zeros(len(body.free), bool)
+        self._local: IntArray = np.zeros((0, 9), int)
         self._tangent: Tangent | None = None
         self._shift = 0.0
         self._near: tuple[Tangent, IntArray, Near] | None = None
@@ -97,7 +95,8 @@ class LoadStepper:
         control, border = self._extrapolate(state, T)
         before, after = self._seen(state.control_mm, state.border, state.T), self._seen(control, border, T)
         gap_before, gap = self._field.distance(before), self._field.distance(after)
-        looked = np.flatnonzero(self._reachable & (gap < _REACH_MM) | state.held)
+        looked = np.flatnonzero((gap < _REACH_MM) | state.held)
+        self._provide(looked, gap)
         # a point that is driven into the object is anchored where it meets the surface on the way
         driven = (gap_before > 0) & (gap < 0)
         share = np.where(driven, gap_before / np.where(driven, gap_before - gap, 1.0), 0.0)[:, None]
@@ -120,16 +119,28 @@ class LoadStepper:
             left_out = np.setdiff1d(np.arange(len(gap)), looked, assume_unique=True)
             missed = left_out[self._field.distance(self._seen(control, border, T)[left_out]) < 0]
             if len(missed):
-                if not self._reachable[missed].all():
-                    raise ContactError(
-                        "skin far from where the rigid object would press has come to touch it; use less indentation or shear"
-                    )
                 looked = np.sort(np.concatenate([looked, missed]))
+                self._provide(looked, gap)
             elif balance.contact.penetration_mm.max(initial=0.0) > GAP_BOUND_MM:
                 penalty *= _PENALTY_GROWTH
             else:
                 return self._accepted(state, problem, control, border, balance), balance, looked
         raise NoConvergence(balance.relative)
+
+    def _provide(self, looked: IntArray, gap: FloatArray) -> None:
+        """Prepare the elimination for contact at the points looked at (q,); ``gap`` (p,) in mm are the distances of all points."""
+        controls, free = self._body.points.controls, self._body.free
+        needed = np.zeros(len(free), bool)
+        needed[controls[looked]] = True
+        needed &= free
+        if self._frontal is not None and not (needed & ~self._kept).any():
+            return
+        kept = needed.copy()
+        kept[controls[gap < _PROVIDED_MM]] = True
+        self._kept = kept & free
+        self._frontal = FrontalSolver([kind.cells.controls for kind in self._body.kinds], self._boxes, ~free, self._kept)
+        self._local = np.where(self._kept, np.cumsum(self._kept) - 1, -1)[controls]
+        self._tangent = self._near = None
 
     def _extrapolate(self, state: LoadState, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Controls and border to start from: the last step continued, or the present state if the object moves another way now.
@@ -208,6 +219,7 @@ class LoadStepper:
 
     def _linearise(self, problem: Problem, control: FloatArray, border: FloatArray, shift: float) -> Tangent:
         """The body's tangent at a state, plus a shift on the diagonal."""
+        assert self._frontal is not None, "provide first"
         self.eliminations += 1
         self._tangent = None  # its memory is overwritten below
         problem.stiffness(control, border, self._blocks)

@@ -46,6 +46,7 @@ class OngoingContact:
     Parameters
     ----------
     setting : Setting
+    stepper : LoadStepper
     T : (4, 4) float
         The object's pose at the start, free of contact.
     one_thread : callable
@@ -57,9 +58,10 @@ class OngoingContact:
         The last converged one, of all controls.
     """
 
-    def __init__(self, setting: Setting, T: FloatArray, one_thread: Callable[[], AbstractContextManager]) -> None:
-        self.setting, self._one_thread = setting, one_thread
-        self.stepper: LoadStepper | None = None  # set before the first step
+    def __init__(
+        self, setting: Setting, stepper: LoadStepper, T: FloatArray, one_thread: Callable[[], AbstractContextManager]
+    ) -> None:
+        self.setting, self.stepper, self._one_thread = setting, stepper, one_thread
         body = setting.body
         count = len(body.points.area_mm2)
         self.load = LoadState(
@@ -78,8 +80,6 @@ class OngoingContact:
         """The converged state with the object at ``T`` (4, 4), ``span_s`` later; after ``NoConvergence`` the contact is where it was."""
         kinds = self.setting.body.kinds
         now = [p.before(kind, term, span_s) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
-        if self.stepper is None:
-            raise RuntimeError("this contact has no stepper yet; SkinSolver.begin gives it one")
         with self._one_thread():
             self.stepper.follow(replace(self.setting.body, kinds=tuple(kind for kind, _ in now)))
             self.load, balance, looked = self.stepper.step(self.load, T, [given for _, given in now])

@@ -18,7 +18,6 @@ from twin.mechanics.balance import Body, Friction
 from twin.mechanics.contact import contact_points
 from twin.mechanics.elements import Elements
 from twin.mechanics.law import ContactLaw
-from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
 from twin.mechanics.ongoing import OngoingContact, Setting
@@ -44,8 +43,6 @@ _TOUCH_MM = 1e-4
 """The object counts as just touching when its distance to the dome is at most this."""
 _MOST_LIFTS = 60
 """Most steps in which the object is brought to its first touch; it usually takes three."""
-_MARGIN_RAD = np.radians(15.0)
-"""Skin within this angle of a direction that the rigid object would pass through may come to touch it."""
 _START_INSIDE_MM = 0.05
 """A path may begin with the object this deep inside the undeformed dome: rounding of a first touch."""
 
@@ -137,7 +134,7 @@ class SkinSolver:
             yield 1.0, self.rest(T_sensor_object=plan.at(1.0))
             return
         reached = self._reached(field, plan)
-        contact = self.begin(field, law, reached, plan.at(0.0), focus=self.focus(field, plan))
+        contact = self.begin(field, law, plan.at(0.0), focus=self.focus(field, plan))
         stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
         force_n: FloatArray = np.zeros(3)
 
@@ -150,25 +147,12 @@ class SkinSolver:
                 force_n = state.force_n
                 yield float(at / stops[-1]), state
 
-    def begin(self, field: ObjectField, law: ContactLaw, reached: FloatArray, T: FloatArray, *, focus: Focus) -> OngoingContact:
-        """A contact at its start, the object at ``T`` and free of the skin.
-
-        Parameters
-        ----------
-        reached : (k, 3) float
-            Directions of the dome that the object may come to press, and ``focus``: where the solid is fine.
-        """
+    def begin(self, field: ObjectField, law: ContactLaw, T: FloatArray, *, focus: Focus) -> OngoingContact:
+        """A contact at its start, the object at ``T`` (4, 4) and free of the skin; the solid is fine at ``focus``."""
         with self._one_thread():
             setting = self._setting(focus)
-        contact = OngoingContact(setting, T, self._one_thread)
-        self.reach(contact, field, law, reached)
-        return contact
-
-    def reach(self, contact: OngoingContact, field: ObjectField, law: ContactLaw, reached: FloatArray) -> None:
-        """Prepare the contact for an object that comes to press other directions (k, 3) of the dome than before."""
-        with self._one_thread():
-            frontal = self._frontal(contact.setting, reached)
-            contact.stepper = LoadStepper(contact.setting.body, frontal, field, law.friction, law.compliance_mm_per_n)
+        stepper = LoadStepper(setting.body, list(setting.solid.boxes), field, law.friction, law.compliance_mm_per_n)
+        return OngoingContact(setting, stepper, T, self._one_thread)
 
     def _one_thread(self) -> AbstractContextManager[object]:
         """BLAS on one thread: the matrices are small, and the result must not depend on the number of cores."""
@@ -187,16 +171,6 @@ class SkinSolver:
         body = Body(kinds, points, ~solid.fixed, spec.gel.sealed)
         relaxation = spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation
         return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
-
-    def _frontal(self, setting: Setting, reached: FloatArray) -> FrontalSolver:
-        """Elimination of all but the outer controls that may be touched: those that carry points around the reached directions."""
-        solid, points = setting.solid, setting.body.points
-        directions = points.positions(solid.control_mm) / self.spec.skin.outer_radius_mm
-        near = (directions @ reached.T).max(axis=1) > np.cos(_MARGIN_RAD)
-        keep = np.zeros(len(solid.fixed), bool)
-        keep[points.controls[near]] = True
-        groups = [kind.cells.controls for kind in setting.body.kinds]
-        return FrontalSolver(groups, list(solid.boxes), solid.fixed, keep & ~solid.fixed)
 
     def _reached(self, field: ObjectField, plan: ContactPath) -> FloatArray:
         """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""

@@ -31,6 +31,8 @@ _WORSE = 2.0
 """A move that makes the residual larger than this many times is refused."""
 _KEEP_TANGENT = 0.3
 """An old tangent is kept as long as it lowers the residual to this share or less."""
+_SECANTS = 4
+"""Most earlier residuals that the outer iteration combines."""
 _SMALLEST_SHIFT_N_MM = 0.01
 """First shift on the diagonal of a tangent that leads to refused moves, or is not positive definite (N/mm)."""
 _SHIFT_GROWTH = 8
@@ -49,6 +51,30 @@ class NoConvergence(Exception):
     def __init__(self, relative: float) -> None:
         super().__init__(relative)
         self.relative = relative
+
+
+class _Secants:
+    """What the outer iteration has learnt about the error of a tangent that it keeps (Anderson 1965).
+
+    With a tangent K the body is K x + c, and each iteration solves the contact for the last c. At the solution x the elastic force
+    says c + r, r being the residual. The next c is the combination of those seen so far whose residuals, combined alike, are smallest.
+    """
+
+    def __init__(self) -> None:
+        self._offset: FloatArray | float = 0.0
+        self._seen: list[tuple[FloatArray, FloatArray]] = []
+
+    def mend(self, residual: FloatArray) -> FloatArray | float:
+        """What to add to the elastic force at the present state, whose residual is given, (unknowns,)."""
+        offset = self._offset + residual
+        mend: FloatArray | float = 0.0
+        if self._seen:
+            errors = np.column_stack([residual - old for _, old in self._seen])
+            shares = np.linalg.lstsq(errors, residual, rcond=1e-6)[0]
+            mend = -np.column_stack([offset - old for old, _ in self._seen]) @ shares
+        self._seen = [*self._seen[1 - _SECANTS :], (offset, residual)]
+        self._offset = offset + mend
+        return mend
 
 
 class LoadStepper:
@@ -182,6 +208,7 @@ class LoadStepper:
             raise NoConvergence(np.inf)
         astray = False
         tangent, fresh, shift, last, accepted = self._tangent, False, 0.0, np.inf, 0
+        secants: _Secants | None = None
         most_inner = self.inner_iterations + _INNER_ITERATIONS
         for _ in range(_ITERATIONS):
             if balance.relative <= RESIDUAL_TOLERANCE:
@@ -191,18 +218,20 @@ class LoadStepper:
             self.iterations += 1
             if tangent is None or (not fresh and balance.absolute > _KEEP_TANGENT * last) or shift != self._shift:
                 self._tangent = tangent = self._linearise(problem, control, border, shift)
-                self._shift, fresh = shift, True
+                self._shift, fresh, secants = shift, True, None
             else:
                 fresh = False
+            mend = secants.mend(balance.residual) if secants else 0.0
+            secants = secants or _Secants()
             soften = astray or not (accepted or extrapolated)
-            move, border_move = self._contact_move(problem, tangent, control, border, balance, soften)
+            move, border_move = self._contact_move(problem, tangent, control, border, balance, balance.elastic + mend, soften)
             size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move).max(), 1e-300))
             new, new_border = control.copy(), border + size * border_move
             new[self._body.free] += size * move.reshape(-1, 3)
             trial = problem.balance(new, new_border)
             # the first move takes up the object's motion, and its residual may be of any size; no later one may
             if trial is None or size < 1 or (accepted and trial.absolute > _WORSE * balance.absolute):
-                astray = True
+                astray, secants = True, None
                 if not fresh:
                     last = 0.0  # first the old tangent is suspected: make a new one
                 else:
@@ -242,12 +271,19 @@ class LoadStepper:
         return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]))
 
     def _contact_move(
-        self, problem: Problem, tangent: Tangent, control: FloatArray, border: FloatArray, balance: Balance, soften: bool
+        self,
+        problem: Problem,
+        tangent: Tangent,
+        control: FloatArray,
+        border: FloatArray,
+        balance: Balance,
+        elastic: FloatArray,
+        soften: bool,
     ) -> tuple[FloatArray, FloatArray]:
         """The move (unknowns,) and (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept
-        forward = eliminated.forward(balance.elastic)
+        forward = eliminated.forward(elastic)
         volume_residual = balance.border_residual[1]
         if tangent.volume_column is not None:
             inner = np.ones(len(forward), bool)

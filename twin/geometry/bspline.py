@@ -5,11 +5,15 @@ equals its first and last coefficient (open knot vector; Piegl & Tiller, "The NU
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.interpolate import BSpline
 
 from twin.types import FloatArray, IntArray
+
+
+_legendre = cache(np.polynomial.legendre.leggauss)
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,8 @@ class Basis:
         return np.array([knots[i + 1 : i + 1 + self.degree].mean() for i in range(self.count)])
 
     def values(self, at: FloatArray, *, derivative: int = 0) -> FloatArray:
-        """(k, count) values of all functions, or of a derivative of them, at points (k,)."""
-        splines = BSpline(self._knots, np.eye(self.count), self.degree)
+        """(k, count) values, or a derivative's, of all functions at points (k,)."""
+        splines = BSpline.construct_fast(self._knots, np.eye(self.count), self.degree)
         return (splines.derivative(derivative) if derivative else splines)(np.clip(at, self.breaks[0], self.breaks[-1]))
 
     def element_of(self, at: FloatArray) -> IntArray:
@@ -50,6 +54,6 @@ class Basis:
 
     def gauss(self, points: int) -> tuple[FloatArray, FloatArray]:
         """Gauss points and weights (elements, points) of every element."""
-        local, weights = np.polynomial.legendre.leggauss(points)
+        local, weights = _legendre(points)
         half = np.diff(self.breaks)[:, None] / 2
         return (self.breaks[1:] + self.breaks[:-1])[:, None] / 2 + half * local, half * weights

@@ -17,7 +17,7 @@ from twin.types import BoolArray, FloatArray, IntArray
 
 GAP_BOUND_MM = 0.01
 """No contact point ends deeper inside the object than this."""
-RESIDUAL_TOLERANCE = 1e-6
+RESIDUAL_TOLERANCE = 1e-4
 """A step is solved when the norm of the residual is at most this share of the sum of the contact forces."""
 _PENALTY_GROWTH = 4.0
 """Factor on the penalty when a point ends too deep."""
@@ -29,9 +29,9 @@ _INNER_ITERATIONS = 400
 """Most inner iterations of one solution, all outer ones together. Where contact flickers for longer, shorter load steps are faster."""
 _WORSE = 2.0
 """A move that makes the residual larger than this many times is refused."""
-_KEEP_TANGENT = 0.3
+_KEEP_TANGENT = 0.8
 """An old tangent is kept as long as it lowers the residual to this share or less."""
-_SECANTS = 4
+_SECANTS = 6
 """Most earlier residuals that the outer iteration combines."""
 _SMALLEST_SHIFT_N_MM = 0.01
 """First shift on the diagonal of a tangent that leads to refused moves, or is not positive definite (N/mm)."""

@@ -58,9 +58,7 @@ class OngoingContact:
         The last converged one, of all controls.
     """
 
-    def __init__(
-        self, setting: Setting, stepper: LoadStepper, T: FloatArray, one_thread: Callable[[], AbstractContextManager]
-    ) -> None:
+    def __init__(self, setting: Setting, stepper: LoadStepper, T: FloatArray, one_thread: Callable[[], AbstractContextManager]) -> None:
         self.setting, self.stepper, self._one_thread = setting, stepper, one_thread
         body = setting.body
         count = len(body.points.area_mm2)

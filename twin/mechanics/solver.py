@@ -33,6 +33,7 @@ _FOCUS_POINTS = 2000
 """Directions on the whole sphere in which the solver looks where the object will press."""
 _FOCUS_GAP_MM = 0.5
 """At a first touch a direction counts for the focus with exp(-gap / this): the object's local shape decides, not how deep it will press."""
+
 _GRID_TURN_RAD = np.radians(30.0)
 """Turn of the grid's rows against the object's x axis. Rows along an edge would all cross it at the same moment."""
 _FOCUS_RADIUS_RAD = np.radians([28.0, 52.0])

@@ -12,7 +12,6 @@ from scipy.interpolate import BSpline
 
 from twin.types import FloatArray, IntArray
 
-
 _legendre = cache(np.polynomial.legendre.leggauss)
 
 

@@ -188,13 +188,14 @@ class LoadStepper:
     def _accepted(self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance) -> LoadState:
         contact, looked, count = balance.contact, problem.looked, len(state.held)
         self._last = state
-        held, anchor, slid = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count)
+        held, anchor, slid, limit = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count), np.zeros(count)
         held[looked], anchor[looked] = contact.penetration_mm > 0, contact.anchor_mm
+        limit[looked] = np.minimum(problem.friction * contact.normal_n, problem.bound_n)
         moved = np.linalg.norm(contact.anchor_mm - problem.anchor_mm, axis=1)
         slid[looked] = np.where(contact.slipping, state.slid_mm[looked] + moved, 0.0)
-        tangential = np.linalg.norm(contact.force_n - contact.normal_n[:, None] * contact.normal, axis=1)
-        lost = float((tangential * moved)[contact.slipping].sum())
-        return LoadState(control, border, anchor, held, slid, problem.penalty, problem.T, balance.elastic_nmm, lost)
+        # a point that slips bears the limit of friction, which changes in the step with its normal force and its slip
+        lost = float(((state.limit_n + limit)[looked] / 2 * moved)[contact.slipping].sum())
+        return LoadState(control, border, anchor, held, slid, limit, problem.penalty, problem.T, balance.elastic_nmm, lost)
 
     def _seen(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
         """All contact points in the object's frame, (p, 3)."""

@@ -68,6 +68,7 @@ class OngoingContact:
             anchor_mm=np.zeros((count, 3)),
             held=np.zeros(count, bool),
             slid_mm=np.zeros(count),
+            limit_n=np.zeros(count),
             penalty_mpa_mm=_PENALTY_MPA_MM,
             T=T,
         )

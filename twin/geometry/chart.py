@@ -21,8 +21,8 @@ _POWER = 5
 """Power in s(r) = c r + (1 - c) r^5: the higher it is, the more evenly the lines lie within the focus."""
 _FINE = 0.75
 """Share of the square's half side whose image is the focus."""
-_LARGEST_SHIFT = 0.6
-"""Largest shift a of the Moebius transformation: it bounds how far the elements opposite the focus are stretched."""
+_LARGEST_SHIFT = 0.45
+"""Largest shift a of the Moebius transformation. Beyond 0.5 elements at the rim turn inside out for some turns of the grid."""
 _LEAST_SLOPE = 0.2
 """Smallest c: it bounds how small the elements at the centre of the focus get."""
 

@@ -257,7 +257,7 @@ def spline_cells(
     if volume.min() <= 0:
         raise ValueError(f"{np.count_nonzero(volume.min(axis=1) <= 0)} elements are inside out at rest; check the sensor's geometry")
     gradients = np.matmul(np.linalg.inv(jacobian).swapaxes(2, 3), shapes)
-    return Cells(controls, np.ascontiguousarray(gradients, np.float32), volume)
+    return Cells(controls, np.ascontiguousarray(gradients), volume)
 
 
 def joined_cells(parts: list[Cells]) -> Cells:

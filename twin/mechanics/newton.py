@@ -17,7 +17,7 @@ from twin.types import BoolArray, FloatArray, IntArray
 
 GAP_BOUND_MM = 0.01
 """No contact point ends deeper inside the object than this."""
-RESIDUAL_TOLERANCE = 1e-4
+RESIDUAL_TOLERANCE = 1e-5
 """A step is solved when the norm of the residual is at most this share of the sum of the contact forces."""
 _PENALTY_GROWTH = 4.0
 """Factor on the penalty when a point ends too deep."""

@@ -36,10 +36,15 @@ _FOCUS_GAP_MM = 0.5
 
 _GRID_TURN_RAD = np.radians(30.0)
 """Turn of the grid's rows against the object's x axis. Rows along an edge would all cross it at the same moment."""
-_FOCUS_RADIUS_RAD = np.radians([28.0, 52.0])
-"""Least and largest angle around the focus that the grid is fine in."""
+_LEAST_FOCUS_RAD = np.radians(28.0)
+"""Least angle around the focus that the grid is fine in."""
+_LARGEST_FOCUS_RAD = np.radians(50.0)
+"""Largest such angle."""
+_COARSE_FOCUS_RAD = np.radians(2.4)
+"""On a grid of fewer than 16 elements across the least angle grows by this for each that is missing: the elements at the rim would turn
+inside out."""
 _FOCUS_SPREADS = 1.5
-"""Root mean square angles of the weights that the fine part reaches beyond its least angle."""
+"""The fine part reaches beyond its least angle by this many root mean square angles of the weights."""
 _TOUCH_MM = 1e-4
 """The object counts as just touching when its distance to the dome is at most this."""
 _MOST_LIFTS = 60
@@ -202,6 +207,10 @@ class SkinSolver:
         """
         radius = self.spec.skin.outer_radius_mm
         directions = dome_directions(self.spec.skin, _FOCUS_POINTS)
+        turn = plan.poses[0][:3, :3]
+        about_z = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])  # the directions turn with the object, too
+        cosine, sine = np.cos(about_z), np.sin(about_z)
+        directions = directions @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
         depths, gaps = [], []
         for at in _stops(plan, directions, radius, _LOOK_MM):
             depth, gap = _gaps_at_touch(field, plan.at(at), radius * directions)
@@ -213,9 +222,10 @@ class SkinSolver:
         middle = weights @ directions
         middle /= np.linalg.norm(middle)
         spread = np.sqrt(weights @ np.sum((directions - middle) ** 2, axis=1) / weights.sum())
-        radius_rad = float(np.minimum(_FOCUS_RADIUS_RAD[0] + _FOCUS_SPREADS * spread, _FOCUS_RADIUS_RAD[1]))
+        least = _LEAST_FOCUS_RAD + _COARSE_FOCUS_RAD * max(16 - self.resolution.across, 0)
+        radius_rad = float(max(least, min(_LEAST_FOCUS_RAD + _FOCUS_SPREADS * spread, _LARGEST_FOCUS_RAD)))
         polar, azimuth = float(np.arctan2(np.hypot(*middle[:2]), middle[2])), float(np.arctan2(middle[1], middle[0]))
-        return Focus(polar, azimuth, radius_rad, _turn(plan.poses[0][:3, :3], polar, azimuth) + _GRID_TURN_RAD)
+        return Focus(polar, azimuth, radius_rad, _turn(turn, polar, azimuth) + _GRID_TURN_RAD)
 
 
 def _gaps_at_touch(field: ObjectField, T: FloatArray, points_mm: FloatArray) -> tuple[float, FloatArray]:

@@ -118,7 +118,7 @@ class Solid:
 
 
 def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None, focus: Focus | None = None) -> Solid:
-    """The body of a sensor, its grid fine around a focus (default: around the apex)."""
+    """Build the body of a sensor. Its grid is fine around a focus (default: around the apex)."""
     resolution, focus = resolution or Resolution(), focus or Focus()
     inner_mm = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm
     basis = Basis(np.linspace(-1, 1, resolution.across + 1))

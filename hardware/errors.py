@@ -7,6 +7,8 @@ is left.
 import errno
 import socket
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from types import TracebackType
 from typing import Self
 
 from twin.errors import TwinError
@@ -50,5 +52,23 @@ class Connection(ABC):
         self.connect()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.disconnect()
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+        leave(self.disconnect, error)
+
+
+def leave(disconnect: Callable[[], None], error: BaseException | None) -> None:
+    """Disconnect at the end of a context. A failure becomes a note of the exception that is on its way, if there is one."""
+    try:
+        disconnect()
+    except DeviceError as failed:
+        if error is None:
+            raise
+        error.add_note(str(failed))
+
+
+def also(error: BaseException, what: str) -> None:
+    """Say in an error what failed after it: at the end of a device's message, else as a note."""
+    if isinstance(error, DeviceError) and error.args:
+        error.args = (f"{error.args[0]}; {what}", *error.args[1:])
+    else:
+        error.add_note(what)

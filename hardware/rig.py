@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Literal
 
 import numpy as np
@@ -20,7 +21,7 @@ from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, leave
 from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
@@ -145,9 +146,9 @@ class Rig:
             raise
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
         try:
-            self.arm.disconnect()
+            leave(self.arm.disconnect, error)
         finally:
             self.source.disconnect()
 

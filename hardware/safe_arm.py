@@ -8,13 +8,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Self
 
 import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
 from hardware.arms.kinematics import Kinematics
-from hardware.errors import DeviceError, StaleDataError
+from hardware.errors import DeviceError, StaleDataError, leave
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
 
 # Newest decisions that are kept in memory.
@@ -122,12 +123,12 @@ class SafeArm:
         self.connect()
         return self
 
-    def __exit__(self, kind: type | None, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
         try:
             if kind is not None and self.is_connected:
                 self.shutdown(kind.__name__)
         finally:
-            self.disconnect()
+            leave(self.disconnect, error)
 
     def enable(self) -> None:
         self.arm.enable()
@@ -168,7 +169,7 @@ class SafeArm:
         Raises
         ------
         RefusedMoveError
-            The move was not allowed. Depending on the reason the arm was stopped, or stopped and retreated.
+            The move was not allowed. The arm was stopped, and retreated if it is too deep in contact.
         """
         state = self._newest_state("move_linear")
         decision = decide(pose, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
@@ -216,7 +217,7 @@ class SafeArm:
         if decision.action is Action.MOVE:
             return
         try:
-            if decision.action in (Action.HOLD, Action.RETRACT):
+            if decision.code is not Code.NOT_ENABLED:  # such an arm stands
                 self.arm.stop()
             if decision.action is Action.RETRACT:
                 self.retreat()

@@ -90,7 +90,7 @@ class Action(StrEnum):
     """Action that follows from a decision."""
 
     MOVE = "move"
-    REFUSE = "refuse"  # do not send it; a move in progress may go on
+    REFUSE = "refuse"  # do not send it; stop an earlier move
     HOLD = "hold"  # stop and stand still
     RETRACT = "retract"  # stop, and leave the object along its normal
 

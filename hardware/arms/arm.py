@@ -5,8 +5,8 @@ Units are mm and degrees; times are ``time.monotonic()`` seconds.
 
 import time
 from abc import abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
@@ -14,7 +14,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from hardware.arms.motion import turn_between_deg
-from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
+from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError, also
 
 # Interval in s at which feedback is read. It is shorter than the 8 ms period of the fastest feedback.
 POLL_S = 0.005
@@ -52,6 +52,9 @@ class Arm(Protocol):
 
     Every method but ``connect`` raises ``DeviceNotConnectedError`` when not connected, and ``DeviceError`` when the arm
     refuses or fails; ``stop``, ``emergency_stop``, ``disable`` and ``clear_error`` are never gated.
+
+    No exception of a move or of a wait leaves the arm moving, Ctrl-C included: the arm is stopped first, earlier moves too. If that
+    fails, the message says that the arm may move, and to press its emergency stop.
     """
 
     name: str
@@ -63,7 +66,13 @@ class Arm(Protocol):
     def connect(self) -> None: ...
 
     def disconnect(self) -> None:
-        """Stop the arm and close the connection. It has no effect when the arm is not connected."""
+        """Stop the arm and close the connection. It has no effect when the arm is not connected.
+
+        Raises
+        ------
+        DeviceError
+            The arm could not be stopped, and no call before this one has said so. The connection is closed all the same.
+        """
 
     def __enter__(self) -> Self: ...
 
@@ -110,6 +119,7 @@ class BaseArm(Connection):
 
     name: str
     axes: int
+    _unstopped = False  # whether the newest stop failed, which its error told
 
     @property
     @abstractmethod
@@ -131,6 +141,11 @@ class BaseArm(Connection):
 
     def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
         """Wait for feedback of the arm at rest at ``pose``; see ``Arm``."""
+        with self._watched():
+            return self._settled(pose, tolerance_mm=tolerance_mm, tolerance_deg=tolerance_deg, timeout_s=timeout_s)
+
+    def _settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float) -> ArmState:
+        """As ``wait_settled``, for callers that stop the arm after an error themselves."""
         deadline = time.monotonic() + timeout_s
         asked_s, rest_since = time.monotonic(), None
         while True:
@@ -148,24 +163,43 @@ class BaseArm(Connection):
             if rest_since is not None and state.time_s - rest_since > max(BELIEVE_REST_S, 0.1 * timeout_s):
                 raise DeviceError(
                     f"{self.name}: at rest {off_mm:.2f} mm and {off_deg:.2f} deg from where it was sent; the move was not executed. "
-                    "Check for a stop button, a brake or an obstacle, call stop() and clear_error(), then move again"
+                    "Check for a stop button, a brake or an obstacle, call clear_error(), then move again"
                 )
             if time.monotonic() > deadline:
                 raise DeviceError(
-                    f"{self.name}: not there after {timeout_s:g} s ({off_mm:.2f} mm and {off_deg:.2f} deg to go); "
-                    "call stop(), then give more time or more speed"
+                    f"{self.name}: not there after {timeout_s:g} s ({off_mm:.2f} mm and {off_deg:.2f} deg to go) and stopped; "
+                    "give more time or more speed"
                 )
             time.sleep(POLL_S)
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
-        """Context in which a move is waited for. After any error, Ctrl-C included, the arm is stopped: no move goes on unwatched."""
+        """Context in which a move is sent and waited for. After any error, Ctrl-C included, the arm is stopped, earlier moves too."""
         try:
             yield
-        except BaseException:
-            with suppress(DeviceError):
-                self.stop()
+        except BaseException as error:
+            if self._may_move():
+                try:
+                    self.stop()
+                except DeviceError as failed:
+                    also(error, str(failed))
             raise
+
+    def _may_move(self) -> bool:
+        """Whether a move that was sent may not have ended."""
+        return self.is_connected
+
+    def _disconnect(self, *acts: Callable[[], None], close: Callable[[], None]) -> None:
+        """Call ``stop`` and other acts, then ``close``. If the stop failed and no earlier stop has told so, its error is raised."""
+        told, failed = self._unstopped, None
+        for act in (self.stop, *acts):
+            try:
+                act()
+            except DeviceError as error:
+                failed = failed or (error if act == self.stop else None)
+        close()
+        if failed is not None and not told:
+            raise failed
 
     def _too_long(self, timeout_s: float) -> DeviceError:
         return DeviceError(

@@ -10,6 +10,7 @@
 """
 
 from collections.abc import Sequence
+from types import TracebackType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,7 @@ from hardware.arms.arm import Arm
 from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS
 from hardware.arms.open_arm import open_arm
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, leave
 
 # Euler axes that cri knows: s for static, r for rotating axes, then their order.
 EULER_AXES = tuple(
@@ -156,8 +157,8 @@ class SyncRobot:
     def __enter__(self) -> "SyncRobot":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+        leave(self.close, error)
 
     @property
     def info(self) -> str:

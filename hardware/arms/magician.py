@@ -76,9 +76,7 @@ class Magician(BaseArm):
 
     def disconnect(self) -> None:
         if self.is_connected:
-            with contextlib.suppress(DeviceError):
-                self.stop()
-            self._close()
+            self._disconnect(close=self._close)
 
     def enable(self) -> None:
         self._require_connected()
@@ -100,14 +98,21 @@ class Magician(BaseArm):
         self._request(Id.QUEUE_START, ctrl=WRITE)
 
     def stop(self) -> None:
-        self._forget_queue()
-        self._request(Id.QUEUE_START, ctrl=WRITE)  # the queue is empty now; it must run, or the next move would never begin
+        self._require_connected()
+        self._unstopped = True
+        try:
+            self._forget_queue()
+            self._request(Id.QUEUE_START, ctrl=WRITE)  # the queue is empty now; it must run, or the next move would never begin
+        except DeviceError as error:
+            raise type(error)(f"{self.name}: can't be stopped and may move. Switch it off! {error}") from error
+        self._unstopped = False
 
     def home(self, *, timeout_s: float = HOME_TIMEOUT_S) -> None:
         """Find the joints' zeros. The arm moves through its whole range: keep clear of it."""
         self._require_enabled()
-        self._last_index = self._index_of(self._request(Id.HOME, struct.pack("<I", 0), ctrl=WRITE | QUEUED))
-        self._await_queue(timeout_s)
+        with self._watched():
+            self._last_index = self._index_of(self._request(Id.HOME, struct.pack("<I", 0), ctrl=WRITE | QUEUED))
+            self._await_queue(timeout_s)
 
     def state(self, *, max_age_s: float = 1.0) -> ArmState:
         self._require_connected()
@@ -137,13 +142,15 @@ class Magician(BaseArm):
         self._request(Id.PTP_JOINT_PARAMS, struct.pack("<8f", *joints), ctrl=WRITE)
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent, joints = linear_target(self.name, self.kinematics, pose)
-        self._move(Ptp.MOVL_XYZ, sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
+        with self._watched():
+            sent, joints = linear_target(self.name, self.kinematics, pose)
+            self._move(Ptp.MOVL_XYZ, sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent = joint_target(self.name, joints_deg)
-        self._move(Ptp.MOVJ_ANGLE, sent, sent, self.kinematics.forward(sent), wait=wait, timeout_s=timeout_s)
+        with self._watched():
+            sent = joint_target(self.name, joints_deg)
+            self._move(Ptp.MOVJ_ANGLE, sent, sent, self.kinematics.forward(sent), wait=wait, timeout_s=timeout_s)
         return sent
 
     def _move(self, mode: Ptp, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray, *, wait: bool, timeout_s: float) -> None:
@@ -155,9 +162,8 @@ class Magician(BaseArm):
         self._last_index = self._index_of(self._request(Id.PTP, struct.pack("<B4f", mode, *numbers), ctrl=WRITE | QUEUED))
         if not wait:
             return
-        with self._watched():
-            self._await_queue(timeout_s)
-            self.wait_settled(pose, timeout_s=max(begun_s + timeout_s - time.monotonic(), 0.2))
+        self._await_queue(timeout_s)
+        self._settled(pose, timeout_s=max(begun_s + timeout_s - time.monotonic(), 0.2))
 
     def _await_queue(self, timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s

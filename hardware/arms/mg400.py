@@ -12,7 +12,7 @@ from hardware.arms import kinematics as arms
 from hardware.arms.arm import POLL_S, ArmState, BaseArm
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import LinkageKinematics, joint_target, linear_target, require_possible
-from hardware.arms.mg400_link import SILENCE_S, CommandPort, Feedback
+from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback
 from hardware.arms.mg400_wire import (
     DASHBOARD_PORT,
     DEFAULT_HOSTS,
@@ -25,10 +25,14 @@ from hardware.arms.mg400_wire import (
     require_ports,
     why_refused,
 )
-from hardware.errors import DeviceError, DeviceNotConnectedError
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait in s until feedback shows that the arm is enabled, or that an alarm is cleared.
 ENABLE_TIMEOUT_S = 5.0
+# Longest wait in s for the reply to a move, which an arm that works sends at once.
+MOTION_REPLY_S = 1.0
+# The same for a stop, an emergency stop and a disable. After it the next means is tried, because the arm may still move.
+STOP_REPLY_S = 0.5
 # Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
 SETTLE_S = 0.5
 PAUSED = "paused by another client; stop() drops the queue, Continue() of that client would execute it"
@@ -83,6 +87,8 @@ class MG400(BaseArm):
         self._alarm_text: str | None = None
         self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after percents were set
         self._sent: np.ndarray | None = None  # end of the queue, as long as the arm may still move there
+        self._under_way = False  # whether a move was sent that feedback has not shown to have ended
+        self._late_replies = False  # whether replies to moves may come that nobody waits for any more
 
     @property
     def is_connected(self) -> bool:
@@ -104,10 +110,9 @@ class MG400(BaseArm):
 
     def disconnect(self) -> None:
         if self._in_use:
-            for act in (self.stop, self.disable):
-                with contextlib.suppress(DeviceError):
-                    act()
-        self._close()
+            self._disconnect(self.disable, close=self._close)
+        else:
+            self._close()
 
     def enable(self) -> None:
         self._require_connected()
@@ -119,6 +124,7 @@ class MG400(BaseArm):
 
     def disable(self) -> None:
         self._tell_in_any_case("DisableRobot()", "disabled")
+        self._under_way = False
 
     def clear_error(self) -> None:
         """Clear the alarms and forget the queue; after an emergency stop ``enable`` brings the arm back."""
@@ -132,20 +138,35 @@ class MG400(BaseArm):
 
     def stop(self) -> None:
         """Stop and drop the queue. If the arm refuses to stop it is switched off, and a ``DeviceError`` says so."""
-        self._sent = None
+        self._require_in_use()
+        self._sent, self._unstopped = None, True
         try:
             self._tell_in_any_case("ResetRobot()", "stopped")
         except DeviceNotConnectedError:
             raise
         except DeviceError as error:
-            self.emergency_stop()
-            raise DeviceError(
-                f"{self.name}: would not stop and was switched off by its emergency stop; call clear_error() and enable(). {error}"
-            ) from error
+            if not self._stands():
+                self.emergency_stop()
+                raise DeviceError(
+                    f"{self.name}: would not stop and was switched off by its emergency stop; call clear_error() and enable(). {error}"
+                ) from error
+        self._unstopped = self._under_way = False
+
+    def _stands(self) -> bool:
+        """Whether feedback that came after a command shows the arm at rest: the command was obeyed, and its reply was lost."""
+        asked_s = time.monotonic()
+        with contextlib.suppress(StaleDataError):
+            while time.monotonic() - asked_s < STOP_REPLY_S:
+                packet, time_s = self._feedback.newest(STOP_REPLY_S)
+                if time_s > asked_s:
+                    return int(packet["mode"]) not in (Mode.RUNNING, Mode.JOG)
+                time.sleep(POLL_S)
+        return False
 
     def emergency_stop(self) -> None:
         self._sent = None
         self._tell_in_any_case("EmergencyStop()", "switched off")
+        self._unstopped = self._under_way = False
 
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
         self._require_connected()
@@ -183,8 +204,9 @@ class MG400(BaseArm):
                 self._ask(f"{name}({int(np.clip(np.floor(percent + 1e-9), 1, 100))})")
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent, joints = linear_target(self.name, self.kinematics, pose)
-        self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
+        with self._watched():
+            sent, joints = linear_target(self.name, self.kinematics, pose)
+            self._move("MovL", sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def _turning_option(self, pose: np.ndarray) -> str:
@@ -204,8 +226,9 @@ class MG400(BaseArm):
         return f",SpeedL={int(np.clip(np.floor(100 * turn_deg / MAX_JOINT_DEG_S / wanted_s + 1e-9), 1, 100))}"
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent = joint_target(self.name, joints_deg)
-        self._move("JointMovJ", sent, sent, None, wait=wait, timeout_s=timeout_s)
+        with self._watched():
+            sent = joint_target(self.name, joints_deg)
+            self._move("JointMovJ", sent, sent, None, wait=wait, timeout_s=timeout_s)
         return sent
 
     def _move(
@@ -223,50 +246,58 @@ class MG400(BaseArm):
         self._sent = pose
         if not wait:
             return
-        with self._watched():
-            self._await_queue(begun_s + timeout_s, timeout_s)
-            left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
-            if pose is not None:
-                self.wait_settled(pose, timeout_s=left_s)
-            else:
-                self._await_joints(joints, left_s)
+        self._await_queue(begun_s + timeout_s, timeout_s)
+        left_s = max(begun_s + timeout_s - time.monotonic(), SETTLE_S)
+        if pose is not None:
+            self._settled(pose, timeout_s=left_s)
+        else:
+            self._await_joints(joints, left_s)
+        self._under_way = False
 
     def _send_motion(self, text: str) -> None:
+        if self._late_replies:  # a late reply to an old request would be taken for the reply to this one
+            self._motion.open()
+            self._late_replies = False
+        self._under_way = True
         if self._bare:
             self._motion.send(text)
-        else:
-            self._check(text, self._motion.request(text))
+            return
+        self._late_replies = True
+        reply = self._motion.request(text, timeout_s=MOTION_REPLY_S)
+        self._late_replies = False
+        self._check(text, reply)
 
     def _await_queue(self, deadline: float, timeout_s: float) -> None:
         """Wait for the reply to ``Sync``; an alarm, silence or the time limit ends the wait. A short move may never show as RUNNING."""
         if not self._bare:
+            self._late_replies = True
             self._motion.send("Sync()")
         rest_since, asked_s = None, time.monotonic()
         while True:
             if not self._bare and self._motion.poll("Sync()", wait_s=POLL_S):
+                self._late_replies = False
                 return
             state = self.state()
             if state.error:
-                self._forget_sync()
                 raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
             rest_since = None if state.moving or state.time_s < asked_s else rest_since or state.time_s
             if self._bare and rest_since is not None and state.time_s - rest_since > RESTED_S:
                 return
             if time.monotonic() > deadline:
-                self._forget_sync()
                 raise self._too_long(timeout_s)
             if self._bare:
                 time.sleep(POLL_S)
 
-    def _forget_sync(self) -> None:
-        """Open the connection again: the late reply to an old ``Sync`` would be taken for the reply to the next one."""
-        with contextlib.suppress(DeviceError):
-            self._motion.open()
-
     def _await_joints(self, joints: np.ndarray, timeout_s: float) -> None:
-        self.wait_settled(
-            self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s
-        )  # our link lengths are not exactly those of this arm
+        self._settled(self.kinematics.forward(joints), tolerance_mm=1.0, timeout_s=timeout_s)  # our link lengths are not exactly this arm's
+
+    def _may_move(self) -> bool:
+        return self._in_use and self._under_way
+
+    def _require_in_use(self) -> None:
+        """``DeviceNotConnectedError`` before ``connect`` and after ``disconnect``, but not while a connection is lost."""
+        if not self._in_use:
+            self._require_connected()
 
     def _await_mode(self, reached: Callable[[int], bool], otherwise: str) -> None:
         """Wait for feedback newer than now whose mode is one of those wanted."""
@@ -294,18 +325,17 @@ class MG400(BaseArm):
 
     def _tell_in_any_case(self, request: str, what: str) -> None:
         """Needs only the dashboard connection. If that is lost it is opened once more, because the arm may still move."""
-        if not self._in_use:
-            self._require_connected()
+        self._require_in_use()
         try:
             if not self._dashboard.is_open:
-                self._dashboard.open()
-            self._ask(request)
+                self._dashboard.open(timeout_s=STOP_REPLY_S)
+            self._ask(request, timeout_s=STOP_REPLY_S)
         except DeviceError as error:
             kind = DeviceNotConnectedError if isinstance(error, DeviceNotConnectedError) else DeviceError
-            raise kind(f"{self.name}: can't be {what}. Press its emergency stop! {error}") from error
+            raise kind(f"{self.name}: can't be {what} and may move. Press its emergency stop! {error}") from error
 
-    def _ask(self, request: str) -> Reply:
-        reply = self._dashboard.request(request)
+    def _ask(self, request: str, *, timeout_s: float = REPLY_TIMEOUT_S) -> Reply:
+        reply = self._dashboard.request(request, timeout_s=timeout_s)
         self._check(request, reply)
         return reply
 
@@ -314,7 +344,7 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: {why_refused(reply.error_id, request)}")
 
     def _close(self) -> None:
-        self._in_use = False
+        self._in_use = self._under_way = self._late_replies = self._unstopped = False
         self._dashboard.close()
         self._motion.close()
         self._feedback.close()

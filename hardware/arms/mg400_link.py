@@ -34,10 +34,10 @@ class CommandPort:
     def is_open(self) -> bool:
         return self._socket is not None
 
-    def open(self) -> None:
+    def open(self, *, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         self.close()
         try:
-            self._socket = socket.create_connection(self._address, CONNECT_TIMEOUT_S)
+            self._socket = socket.create_connection(self._address, timeout_s)
         except OSError as error:
             host, port = self._address
             raise DeviceNotConnectedError(

@@ -120,15 +120,17 @@ class SimulatedArm(BaseArm):
         self._speeds = Speeds(linear_mm_s, angular_deg_s, self._speeds.linear_mm_s2, self._speeds.angular_deg_s2)
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent = self.kinematics.nearest_pose(pose)
-        self._move(sent, linear=True, wait=wait, settled=sent, timeout_s=timeout_s)
+        with self._watched():
+            sent = self.kinematics.nearest_pose(pose)
+            self._move(sent, linear=True, wait=wait, settled=sent, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        sent = np.array(joints_deg, float)
-        if sent.shape != (self.axes,):
-            raise DeviceError(f"{self.name}: {sent.size} joint angles; it has {self.axes} joints")
-        self._move(sent, linear=False, wait=wait, settled=self.kinematics.forward(sent), timeout_s=timeout_s)
+        with self._watched():
+            sent = np.array(joints_deg, float)
+            if sent.shape != (self.axes,):
+                raise DeviceError(f"{self.name}: {sent.size} joint angles; it has {self.axes} joints")
+            self._move(sent, linear=False, wait=wait, settled=self.kinematics.forward(sent), timeout_s=timeout_s)
         return sent
 
     def _move(self, end: np.ndarray, *, linear: bool, wait: bool, settled: np.ndarray, timeout_s: float) -> None:
@@ -143,7 +145,7 @@ class SimulatedArm(BaseArm):
         if SimulatedFault.IGNORE not in self.faults:
             self._begin(end, linear, now_s)
         if wait:
-            self.wait_settled(settled, timeout_s=timeout_s)
+            self._settled(settled, timeout_s=timeout_s)
 
     def _begin(self, end: np.ndarray, linear: bool, now_s: float) -> None:
         factor = self._scale * (SLOW_FACTOR if SimulatedFault.SLOW in self.faults else 1.0)

@@ -1,5 +1,6 @@
 """What a loop knows of a camera: a source of frames. Times are ``time.monotonic()`` seconds."""
 
+from types import TracebackType
 from typing import Protocol
 
 from hardware.errors import DeviceError
@@ -40,7 +41,7 @@ class FrameSource(Protocol):
 
     def __enter__(self) -> "FrameSource": ...
 
-    def __exit__(self, *_: object) -> None: ...
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None: ...
 
     def read(self, *, timeout_s: float = 1.0) -> Frame:
         """The newest frame that has not been read yet, waiting for one if need be; ``TimeoutError``.

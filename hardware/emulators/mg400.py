@@ -56,7 +56,9 @@ FAULTS = {
     "stall": (0.5, "each move stops without an alarm after this share of its time"),
     "ignore-moves": (None, "moves are accepted and not executed"),
     "slow": (0.1, "moves at this share of the speed"),
+    "no-move-reply": (None, "moves are executed, and their replies are lost"),
     "no-sync-reply": (None, "Sync() is never answered"),
+    "frozen": (5.0, "the controller answers nothing and sends no feedback, from this many seconds after the start; the arm goes on"),
     "six-value-pose": (None, "GetPose() gives six values"),
     "error-groups": (7.0, "GetErrorID() gives this many groups"),
     "die": (5.0, "the arm goes dead, this many seconds after the start"),
@@ -114,6 +116,7 @@ class Mg400Emulator:
         self._clients: dict[socket.socket, int] = {}
         self._lock, self._ended = Lock(), Event()
         self._threads: list[Thread] = []
+        self._started_s = time.monotonic()
 
     def __enter__(self) -> "Mg400Emulator":
         self.start()
@@ -150,6 +153,7 @@ class Mg400Emulator:
             if port not in deaf:
                 listener.listen()
                 self._listeners[listener] = port
+        self._started_s = time.monotonic()
         self._run(self._accept)
         for name, action in (("emergency-stop", self.arm.press_emergency_stop), ("die", self.kill)):
             if (after_s := self.faults.value(name)) is not None:
@@ -221,7 +225,8 @@ class Mg400Emulator:
         count = 0
         while not self._ended.is_set():
             silent_after_s = self.faults.value("silent-feedback")
-            if silent_after_s is None or time.monotonic() - begun_s < silent_after_s:
+            silent = silent_after_s is not None and time.monotonic() - begun_s >= silent_after_s
+            if not silent and not self._frozen:
                 count += 1
                 client.sendall(self._packet(count))
             due_s = max(due_s + period_s, time.monotonic())
@@ -242,7 +247,8 @@ class Mg400Emulator:
             buffer += data.decode("ascii", errors="replace")
             request, buffer = take_request(buffer)
             while request is not None:
-                self._answer(client, port, request)
+                if not self._frozen:
+                    self._answer(client, port, request)
                 request, buffer = take_request(buffer)
 
     def _answer(self, client: socket.socket, port: int, request: Request) -> None:
@@ -258,6 +264,8 @@ class Mg400Emulator:
                 reply = f"{request.text};"
             else:
                 reply = f"{refusal.error_id},{{}},{request.text};"
+        if port == MOTION_PORT and "no-move-reply" in self.faults and request.name not in ("sync", "syncall"):
+            return
         if not self._bare:
             client.sendall(reply.encode())
         elif port == DASHBOARD_PORT:
@@ -276,9 +284,14 @@ class Mg400Emulator:
         with self.arm.lock:
             return commands[request.name](request)
 
+    @property
+    def _frozen(self) -> bool:
+        after_s = self.faults.value("frozen")
+        return after_s is not None and time.monotonic() - self._started_s >= after_s
+
     def _wait_until_done(self, client: socket.socket) -> bool:
         """Wait until the queue is empty. False if the client has gone or no reply will be sent."""
-        while self.arm.busy() or "no-sync-reply" in self.faults:
+        while self.arm.busy() or self._frozen or "no-sync-reply" in self.faults:
             readable, _, _ = select.select([client], [], [], POLL_S)
             if self._ended.is_set() or (readable and not client.recv(1, socket.MSG_PEEK)):
                 return False

@@ -17,6 +17,8 @@ from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_pa
 from hardware.emulators.mg400 import FAULTS, Mg400Emulator
 from hardware.emulators.mg400_grammar import RefusedError
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.safe_arm import SafeArm
+from hardware.safety import load_limits
 from twin.errors import TwinError
 
 HOME = np.array([300.0, 0, 0, 0, 0, 10])
@@ -68,6 +70,8 @@ def test_these_disturb_nothing(fault):
         (("ignore-moves",), "not executed"),
         (("slow=0.01",), "more time"),
         (("no-sync-reply",), "more time"),
+        (("no-move-reply",), "no reply to MovL"),
+        (("frozen=0.3", "slow=0.05"), "Press its emergency stop"),
         (("silent-feedback=0.2", "slow=0.05"), "no feedback"),
         (("die=0.15", "slow=0.05"), "power and cable"),
     ],
@@ -77,7 +81,7 @@ def test_these_end_in_an_error_with_a_remedy_and_the_arm_stands_still(faults, re
         arm = mg400_of(emulator)
         with pytest.raises(DeviceError, match=remedy):
             go(arm, timeout_s=1.5)
-        if "die=0.15" not in faults:  # a dead arm can't be told
+        if not {"die=0.15", "frozen=0.3"} & set(faults):  # such an arm can't be told
             time.sleep(0.1)
             still = emulator.pose()
             time.sleep(0.1)
@@ -297,6 +301,88 @@ def test_a_reader_that_ends_late_does_not_live_on():
         assert not first.is_alive()
         feedback.close()
     assert not [thread for thread in set(threading.enumerate()) - others if thread.name == "mg400-feedback"]
+
+
+def assert_stands(emulator, *, within_s=0.3):
+    """The arm itself, not what the driver believes of it."""
+    time.sleep(within_s)
+    still = emulator.pose()
+    time.sleep(0.1)
+    assert np.array_equal(emulator.pose(), still) and not emulator.arm.busy()
+
+
+@pytest.mark.parametrize("wait", [True, False])
+def test_a_move_whose_reply_is_lost_is_stopped(wait):
+    with emulated() as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        arm.move_linear(HOME)
+        arm.set_speed(20.0, 60.0)
+        emulator.faults.add("no-move-reply")
+        begun_s = time.monotonic()
+        with pytest.raises(DeviceError, match="no reply to MovL"):
+            arm.move_linear(HOME + [0, 100, 0, 0, 0, 0], wait=wait)
+        assert time.monotonic() - begun_s < 2.0
+        assert_stands(emulator)
+        assert emulator.pose()[1] < 40.0
+        emulator.faults.clear()
+        arm.set_speed(1000.0, 300.0)
+        arm.move_linear(AWAY)  # no late reply is taken for that of a new move
+        assert np.allclose(emulator.pose(), AWAY, atol=0.01)
+
+
+@pytest.mark.parametrize("target", [[900.0, 0, 0, 0, 0, 0], HOME * np.nan, HOME[:3]], ids=["reach", "nan", "shape"])
+def test_a_move_that_is_refused_ends_the_one_before_it(target):
+    with emulated() as emulator, mg400_of(emulator) as arm:
+        arm.enable()
+        arm.set_speed(20.0, 60.0)
+        arm.move_linear(AWAY, wait=False)
+        with pytest.raises((DeviceError, ValueError)):
+            arm.move_linear(np.array(target), wait=False)
+        assert_stands(emulator)
+
+
+@pytest.mark.parametrize("broken", ["move", "wait", "joints", "outside"])
+def test_whatever_a_safe_arm_raises_it_stands(broken):
+    with emulated() as emulator:
+        arm = SafeArm(mg400_of(emulator), load_limits("mg400"))
+        with arm:
+            arm.enable()
+            arm.set_speed(20.0, 60.0)
+            arm.move_linear(HOME + [0, 80, 0, 0, 0, 0], wait=False)
+            if broken == "move":
+                emulator.faults.add("no-move-reply")
+            with pytest.raises(DeviceError):
+                if broken == "wait":
+                    arm.wait_settled(AWAY, timeout_s=0.2)
+                elif broken == "joints":
+                    arm.move_joints(np.array([0.0, 89, 0, 0]))
+                else:
+                    arm.move_linear(HOME + [0, 60.0 if broken == "move" else 500.0, 0, 0, 0, 0], wait=False)
+            assert_stands(emulator)
+
+
+def test_leaving_a_safe_arm_stops_what_goes_on():
+    with emulated() as emulator:
+        with SafeArm(mg400_of(emulator), load_limits("mg400")) as arm:
+            arm.enable()
+            arm.set_speed(20.0, 60.0)
+            arm.move_linear(AWAY, wait=False)
+        assert_stands(emulator)
+
+
+def test_a_stop_that_fails_on_leaving_is_said():
+    with emulated() as emulator:
+        begun_s = None
+        with (
+            pytest.raises(DeviceError, match="may move. Press its emergency stop"),
+            SafeArm(mg400_of(emulator), load_limits("mg400")) as arm,
+        ):
+            arm.enable()
+            arm.set_speed(20.0, 60.0)
+            arm.move_linear(AWAY, wait=False)
+            emulator.faults.add("frozen=0")
+            begun_s = time.monotonic()
+        assert time.monotonic() - begun_s < 2.0
 
 
 def test_the_default_ports_are_the_arms():

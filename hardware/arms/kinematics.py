@@ -99,7 +99,7 @@ class LinkageKinematics:
     def violation(self, joints_deg: np.ndarray) -> Violation | None:
         for n, (angle, (low, high)) in enumerate(zip(joints_deg, self.limits_deg, strict=True)):
             if not low - LIMIT_TOLERANCE_DEG <= angle <= high + LIMIT_TOLERANCE_DEG:
-                code = FIRST_JOINT_ALARM + 2 * n + (angle < low)
+                code = FIRST_JOINT_ALARM + 2 * n + int(angle < low)
                 return Violation(code, f"J{n + 1} at {angle:.2f} deg is outside [{low:g}, {high:g}] deg")
         apart = joints_deg[2] - joints_deg[1]
         if self.linkage_deg is not None and apart > self.linkage_deg + LIMIT_TOLERANCE_DEG:

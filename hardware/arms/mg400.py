@@ -1,7 +1,6 @@
 """Driver of the Dobot MG400 over TCP."""
 
 import contextlib
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -318,8 +317,7 @@ class MG400(BaseArm):
         if self._alarm_text is None:
             ids: list[int] = []
             with contextlib.suppress(DeviceError):
-                groups = re.findall(r"\[([^\[\]]*)\]", self._dashboard.request("GetErrorID()").values)  # 5 to 7 of them
-                ids = [int(text) for group in groups for text in re.findall(r"-?\d+", group)]
+                ids = self._dashboard.request("GetErrorID()").alarms()
             self._alarm_text = explain(ids)
         return self._alarm_text
 

@@ -69,6 +69,11 @@ class Reply:
     def numbers(self) -> list[float]:
         return [float(text) for text in re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", self.values)]
 
+    def alarms(self) -> list[int]:
+        """The alarms of a reply to ``GetErrorID``, from 5 to 7 groups. What is not a whole number is left out."""
+        listed = [text.strip() for group in re.findall(r"\[([^\[\]]*)\]", self.values) for text in group.split(",")]
+        return [int(text) for text in listed if re.fullmatch(r"-?\d+", text)]
+
 
 def take_reply(buffer: str) -> tuple[Reply | None, str]:
     """The first complete reply in what has arrived, and what is left.

@@ -1,6 +1,7 @@
 """A Dobot Magician emulated on this machine, over a real pseudo-terminal."""
 
 import contextlib
+import logging
 import os
 import pty
 import random
@@ -14,11 +15,12 @@ from threading import Event, Lock, Thread, Timer
 
 import numpy as np
 
-from hardware.arms.magician_wire import take_message
+from hardware.arms.magician_wire import Message, take_message
 from hardware.emulators.faults import Faults
 from hardware.emulators.magician_controller import START_JOINTS_DEG, MagicianController
 from twin.errors import TwinError
 
+LOG = logging.getLogger(__name__)
 SPLIT_AT = 4
 FAULTS = {
     "noise": (5.0, "this many random bytes come before each reply"),
@@ -139,8 +141,16 @@ class MagicianEmulator:
                 continue
             message, buffer = take_message(buffer + data)
             while message is not None:
-                self._send(self.arm.answer(message).to_bytes())
+                self._send(self._answer(message).to_bytes())
                 message, buffer = take_message(buffer)
+
+    def _answer(self, message: Message) -> Message:
+        """The controller's reply. A command that fails in the emulator raises the alarm of one that the device does not understand."""
+        try:
+            return self.arm.answer(message)
+        except Exception:
+            LOG.exception("emulated Magician: command %d failed", message.id)
+            return self.arm.refuse(message)
 
     def _send(self, frame: bytes) -> None:
         self._replies += 1

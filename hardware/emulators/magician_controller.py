@@ -85,14 +85,19 @@ class MagicianController:
         with self.lock:
             now_s = self.advance()
             if not self._understood(message):
-                self.alarms.add(NOT_UNDERSTOOD)
-                return Message(message.id, message.ctrl)
+                return self.refuse(message)
             if message.is_write and message.is_queued:
                 self._issued += 1
                 self._queue.append(Queued(self._issued, message, now_s))
                 self.advance()
                 return Message(message.id, message.ctrl, struct.pack("<Q", self._issued))
             return Message(message.id, message.ctrl, self._write(message, now_s) if message.is_write else self._read(message, now_s))
+
+    def refuse(self, message: Message) -> Message:
+        """Raise the alarm of a command that is not understood. The reply is empty."""
+        with self.lock:
+            self.alarms.add(NOT_UNDERSTOOD)
+        return Message(message.id, message.ctrl)
 
     def advance(self) -> float:
         """Execute the queue up to the present time, which is returned."""

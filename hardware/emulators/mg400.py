@@ -1,6 +1,7 @@
 """A Dobot MG400 emulated on this machine, over real TCP sockets on all five ports."""
 
 import contextlib
+import logging
 import select
 import socket
 import struct
@@ -29,6 +30,7 @@ from hardware.emulators.mg400_grammar import RefusedError, Request, take_request
 from hardware.errors import cannot_listen
 from twin.errors import TwinError
 
+LOG = logging.getLogger(__name__)
 PORTS = (DASHBOARD_PORT, MOTION_PORT, *FEEDBACK_PERIOD_S)
 OLD_FIRMWARE, NEW_FIRMWARE = "1.5.5", "1.7.0"
 # First firmware whose replies have numbers; older firmware answers bare echoes.
@@ -257,7 +259,10 @@ class Mg400Emulator:
             if request.name in ("sync", "syncall") and not self._wait_until_done(client):
                 return
             reply = f"0,{{{values}}},{request.text};"
-        except RefusedError as refusal:
+        except Exception as error:
+            refusal = error if isinstance(error, RefusedError) else RefusedError(ErrorId.FAILED)
+            if refusal is not error:
+                LOG.exception("emulated MG400: %s failed and was refused", request.text)
             if "split-refusals" in self.faults and not self._bare:
                 client.sendall(f"{refusal.error_id},{{}},;".encode())
                 time.sleep(0.02)  # the client receives two pieces

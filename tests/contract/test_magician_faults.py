@@ -1,12 +1,15 @@
 """Whatever a Magician's line does wrong, the driver recovers, or stops it and says what to do."""
 
+import struct
 import time
 
 import numpy as np
 import pytest
+import serial
 from tried_faults import tried_in
 
 from hardware.arms.magician import Magician
+from hardware.arms.magician_wire import BAUD, QUEUED, WRITE, Id, Message, Ptp, take_message
 from hardware.emulators.magician import FAULTS, MagicianEmulator
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.errors import TwinError
@@ -110,3 +113,48 @@ def test_a_link_that_can_not_be_made_is_one_clear_error(tmp_path):
     with pytest.raises(TwinError, match="--link"):
         MagicianEmulator(link=tmp_path / "arm").start()
     assert (tmp_path / "arm").read_text() == "mine"
+
+
+# Joints (J1 to J4, deg) beyond each limit, and the alarm of each.
+BEYOND = [
+    ((130, 45, 45, 0), 64),
+    ((-130, 45, 45, 0), 65),
+    ((0, 91, 45, 0), 66),
+    ((0, -6, 45, 0), 67),
+    ((0, 45, 71, 0), 68),
+    ((0, 45, -16, 0), 69),
+    ((0, 45, 45, 151), 70),
+    ((0, 45, 45, -151), 71),
+]
+
+
+def ask(emulator, id, params=b"", ctrl=0):
+    """One command as any client sends it; None where no reply comes."""
+    with serial.Serial(emulator.device, BAUD, timeout=0.5) as port:
+        port.write(Message(id, ctrl, params).to_bytes())
+        data = b""
+        while (message := take_message(data)[0]) is None:
+            new = port.read(1)
+            if not new:
+                return None
+            data += new
+        return message
+
+
+@pytest.mark.parametrize(("joints", "alarm"), BEYOND)
+def test_each_joint_limit_is_an_alarm_and_the_emulator_goes_on(joints, alarm):
+    with MagicianEmulator() as emulator:
+        ask(emulator, Id.QUEUE_START, ctrl=WRITE)
+        assert ask(emulator, Id.PTP, struct.pack("<B4f", Ptp.MOVJ_ANGLE, *joints), WRITE | QUEUED).params == struct.pack("<Q", 1)
+        told = int.from_bytes(ask(emulator, Id.ALARMS).params, "little")
+        assert told == 1 << alarm
+        assert len(ask(emulator, Id.GET_POSE).params) == 32
+
+
+def test_a_command_that_fails_in_the_emulator_is_an_alarm_and_reported(monkeypatch, caplog):
+    with MagicianEmulator() as emulator:
+        monkeypatch.setattr(emulator.arm, "_ptp", lambda *_: 1 / 0)
+        ask(emulator, Id.QUEUE_START, ctrl=WRITE)
+        assert ask(emulator, Id.PTP, struct.pack("<B4f", Ptp.MOVJ_ANGLE, 0, 45, 45, 0), WRITE | QUEUED) is not None
+        assert int.from_bytes(ask(emulator, Id.ALARMS).params, "little") == 1 << 1
+    assert "division" in caplog.text

@@ -13,7 +13,7 @@ from tried_faults import tried_in
 from hardware.arms import kinematics as arms
 from hardware.arms.mg400 import Mg400Ports
 from hardware.arms.mg400_link import CommandPort, Feedback
-from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet
+from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet, take_reply
 from hardware.emulators.mg400 import FAULTS, Mg400Emulator
 from hardware.emulators.mg400_grammar import RefusedError
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
@@ -383,6 +383,52 @@ def test_a_stop_that_fails_on_leaving_is_said():
             emulator.faults.add("frozen=0")
             begun_s = time.monotonic()
         assert time.monotonic() - begun_s < 2.0
+
+
+# Joints (J1 to J4, deg) beyond each limit, and the alarm of each.
+BEYOND = [
+    ((170, 20, 40, 0), 64),
+    ((-170, 20, 40, 0), 65),
+    ((0, 86, 100, 0), 66),
+    ((0, -26, 20, 0), 67),
+    ((0, 60, 106, 0), 68),
+    ((0, 0, -26, 0), 69),
+    ((0, 20, 40, 185), 70),
+    ((0, 20, 40, -185), 71),
+    ((0, 0, 61, 0), 72),
+]
+
+
+@pytest.mark.parametrize(("joints", "alarm"), BEYOND)
+def test_each_joint_limit_is_one_alarm_in_digits(joints, alarm):
+    """What a client reads in the reply is that alarm and no other number."""
+    with emulated(time_scale=20.0) as emulator:
+        replies = {}
+        for number, text in ((29999, "EnableRobot()"), (30003, f"JointMovJ({','.join(map(str, joints))})"), (29999, "GetErrorID()")):
+            with socket.create_connection(("127.0.0.1", emulator.ports[number]), timeout=5) as connection:
+                connection.sendall(text.encode())
+                replies[text] = connection.recv(1024).decode()
+        assert replies["GetErrorID()"] == f"0,{{[[{alarm}],[],[],[],[]]}},GetErrorID();"
+        with mg400_of(emulator) as arm:
+            error = arm.state().error
+            assert f"alarm {alarm}" in error and error.count("alarm") == 1
+
+
+def test_the_driver_takes_only_whole_numbers_for_alarms():
+    reply, _ = take_reply("0,{[[np.int64(70), 18],[],[-2]]},GetErrorID();")
+    assert reply.alarms() == [18, -2]
+
+
+def test_a_command_that_fails_in_the_emulator_is_refused_and_reported(caplog):
+    def fail(request):
+        raise ZeroDivisionError("a defect")
+
+    with emulated() as emulator, mg400_of(emulator) as arm:
+        emulator._commands.dashboard["speedl"] = fail
+        with pytest.raises(DeviceError, match="refused SpeedL"):
+            arm.set_speed(10, 10)
+        arm.enable()  # it goes on answering
+    assert "a defect" in caplog.text and "SpeedL" in caplog.text
 
 
 def test_the_default_ports_are_the_arms():

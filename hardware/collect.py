@@ -25,6 +25,7 @@ from hardware.rig import Rig, build_rig
 from hardware.rig_geometry import PlacedObject, matrix_of, pose_of
 from hardware.safe_arm import try_each
 from hardware.step import Guard
+from hardware.watch import ArmWatch
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import shown
@@ -258,8 +259,8 @@ def collect(
     """
     if not source.is_live:
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
-    rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s)
-    with locked(collection.folder):
+    rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s, ArmWatch(arm))
+    with locked(collection.folder), rig.watch.watched():
         failed = _collect_all(rig, experiment, collection, seed=seed, count=count, progress=progress, on_rest=on_rest, speed=speed)
     if failed:
         raise DeviceError("; ".join(failed))
@@ -279,22 +280,24 @@ def _collect_all(
 ) -> list[str]:
     """Go to the object, make the contacts that are missing, and let go of the arm. Returns what failed while letting go."""
     try:
-        rig.arm.enable()
-        rig.arm.set_speed(*speed)
-        state = rig.go_around(rig.label, CLEAR_MM)
-        rig.at_object = True
-        if not collection.has_rest:
-            rest = rig.frame_after(state)
-            collection.keep_rest(rest)
-            if on_rest is not None:
-                on_rest(rest)
-        for index in range(collection.count, count):
-            _collect_one(rig, experiment, collection, index, draw_contact(experiment, seed, index))
-            if progress is not None:
-                progress(index + 1, count)
+        with rig.watch.alert():
+            rig.arm.enable()
+            rig.arm.set_speed(*speed)
+            state = rig.go_around(rig.label, CLEAR_MM)
+            rig.at_object = True
+            if not collection.has_rest:
+                rest = rig.frame_after(state)
+                collection.keep_rest(rest)
+                if on_rest is not None:
+                    on_rest(rest)
+            for index in range(collection.count, count):
+                _collect_one(rig, experiment, collection, index, draw_contact(experiment, seed, index))
+                if progress is not None:
+                    progress(index + 1, count)
     finally:
         back = {"retreat": rig.withdraw} if rig.at_object else {}
-        failed = try_each(stop=rig.arm.stop, **back, disable=rig.arm.disable)
+        with rig.watch.doing("letting go"):
+            failed = try_each(stop=rig.arm.stop, **back, disable=rig.arm.disable)
     return failed
 
 
@@ -344,6 +347,7 @@ class _Stops:
     speed: tuple[float, float]
     guards: tuple[Guard, ...]
     frame_timeout_s: float
+    watch: ArmWatch
     label: np.ndarray = field(default_factory=lambda: np.zeros(6))
     at_object: bool = False
 
@@ -365,12 +369,13 @@ class _Stops:
     def frame_after(self, state: ArmState) -> Frame:
         """The first frame exposed after a state."""
         try:
-            return self.source.read_after(state.time_s, timeout_s=self.frame_timeout_s)
+            return self.watch.frame_after(self.source, state.time_s, timeout_s=self.frame_timeout_s)
         except TimeoutError as error:
             raise DeviceError(f"the arm stands, but {error}; check the camera, then give the same command again to go on") from error
 
     def _go_to(self, target: np.ndarray) -> ArmState:
         """Go straight to a pose (6,). Returns the state that confirms it."""
+        self.watch.require()
         state = self.arm.state()
         for guard in self.guards:
             target = guard(state, target)
@@ -380,7 +385,8 @@ class _Stops:
             raise DeviceError(
                 f"{self.arm.name}: a move ends {short_mm:.1f} mm from where it should; give --limits without step_mm and step_deg"
             )
-        return self.arm.wait_settled(sent, timeout_s=timeout_s)
+        with self.watch.doing("moving"):
+            return self.arm.wait_settled(sent, timeout_s=timeout_s)
 
 
 @dataclass(frozen=True)

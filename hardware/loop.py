@@ -1,21 +1,19 @@
 """The servo loop: frame, estimate, law, move. It knows a frame source, an estimator and an arm, and not what stands behind them.
 
-A frame is exposed while the arm moves. So the loop keeps the newest states of the arm (``ArmTrack``) and takes the pose at the time of the
-frame's exposure from them.
+A frame is exposed while the arm moves. So the loop keeps the newest states of the arm (``ArmWatch``) and takes the pose at the time of the
+frame's exposure from them. The same thread stops an arm that answers no more.
 """
 
-import threading
+import logging
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
-from hardware.cameras.source import FrameSource, await_frame
+from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
 from hardware.rig_geometry import matrix_of, moved
 from hardware.safe_arm import RefusedMoveError, try_each
@@ -23,15 +21,12 @@ from hardware.safety import Code
 from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
 from hardware.timing import Spread, Timing
+from hardware.watch import ArmWatch
 from scenes.servo import ServoSpec
-from twin.errors import TwinError
 from twin.rig.mounting import Mounting
 from twin.types import Frame
 
-# States of the arm that are kept: 256 states of 20 ms are 5 s, ten times the oldest frame that a servo accepts.
-KEPT_STATES = 256
-# Interval in s at which a thread asks the arm for its state.
-WATCH_S = 0.02
+LOG = logging.getLogger(__name__)
 # Largest number of pieces into which guards and arm may divide a move that is waited for.
 MOST_PIECES = 200
 # A move that ends nearer than this to its target (mm) needs no further piece.
@@ -42,49 +37,6 @@ MOVE_TIMEOUT_S = 10.0
 SPARE = 2.0
 # The arm may lag behind its target by this number of the servo's largest moves. When it lags farther, it gets no new target.
 BEHIND_MOVES = 2.0
-
-
-class ArmTrack:
-    """Keeps the newest states of an arm.
-
-    Parameters
-    ----------
-    arm : Arm
-    """
-
-    def __init__(self, arm: Arm) -> None:
-        self._arm = arm
-        self._states: deque[ArmState] = deque(maxlen=KEPT_STATES)
-
-    def add(self, state: ArmState) -> None:
-        """Remember a state."""
-        self._states.append(state)
-
-    def pose_at(self, time_s: float) -> np.ndarray:
-        """Pose (6,) of the arm at a ``time.monotonic()``, interpolated between known states. Its turn about z is unwrapped."""
-        states = sorted(self._states.copy(), key=lambda state: state.time_s)
-        times = np.array([state.time_s for state in states])
-        poses = np.array([state.pose for state in states])
-        poses[:, 5] = np.unwrap(poses[:, 5], period=360.0)
-        return np.array([np.interp(time_s, times, column) for column in poses.T])
-
-    @contextmanager
-    def watched(self) -> Iterator[None]:
-        """Context in which a thread asks the arm for its state many times a step, because frames are exposed while the arm moves."""
-        end = threading.Event()
-
-        def watch() -> None:
-            while not end.wait(WATCH_S):
-                with suppress(TwinError):  # the caller that moves the arm gets the same error
-                    self.add(self._arm.state())
-
-        thread = threading.Thread(target=watch, name="arm watch", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            end.set()
-            thread.join()
 
 
 class Decided(StrEnum):
@@ -172,7 +124,7 @@ class ServoLoop:
         self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has a queue
         self._behind_since: float | None = None  # when the arm began to lag too far behind for a new target
         self._view, self._memory = _View(), Memory()
-        self._track = ArmTrack(self.arm)
+        self._watch = ArmWatch(self.arm)
         self._started_s = self._ended_s = 0.0
 
     def run(self, start_pose: np.ndarray) -> Timing:
@@ -186,23 +138,35 @@ class ServoLoop:
             No usable frame or estimate for ``give_up_s``, or the arm failed.
         """
         touching = False
-        try:
+        with self._watch.watched():
+            try:
+                with self._watch.alert():
+                    self._approach(start_pose)
+                    touching = True
+                    with self._watch.doing("moving to the object"):
+                        self._move(start_pose, wait=True)
+                    self._follow()
+            finally:
+                self._ended_s = time.monotonic()
+                with self._watch.doing("letting go"):
+                    self._let_go(retreat=touching)
+        return self.timing()
+
+    def _approach(self, start_pose: np.ndarray) -> None:
+        """Go to the place clear of the object, and take the frame without contact there."""
+        with self._watch.doing("enabling"):
             self.arm.enable()
             self.arm.set_speed(self.servo.linear_mm_s, self.servo.angular_deg_s)
-            clear = self._away_from(start_pose)
+        clear = self._away_from(start_pose)
+        with self._watch.doing("moving clear of the object"):
             for pose in self.way(self._state().pose, clear) if self.way else [clear]:
                 self._move(pose, wait=True)
-            if self.take_rest is not None:
-                rest = await_frame(self.source, timeout_s=self.settings.frame_timeout_s, after_s=self._state().time_s)
-                self.estimator = self.take_rest(rest)
-            touching = True
-            self._move(start_pose, wait=True)
-            with nullcontext() if self.settings.blocking else self._track.watched():
-                self._follow()
-        finally:
-            self._ended_s = time.monotonic()
-            self._let_go(retreat=touching)
-        return self.timing()
+        if self.take_rest is not None:
+            try:
+                rest = self._exposed_after(self._state().time_s)
+            except (TimeoutError, EOFError) as error:
+                raise DeviceError(f"{error}; check the camera") from error
+            self.estimator = self.take_rest(rest)
 
     def require_labels(self, names: tuple[str, ...]) -> None:
         """Raise ``DeviceError`` if the model's labels are not those that following needs. Call it before anything moves."""
@@ -270,11 +234,14 @@ class ServoLoop:
                 raise
             self._hold(str(refused), refused, age_s)
             return
+        if self._held_since is not None:
+            LOG.warning("%s: goes on after %.1f s", self.arm.name, time.monotonic() - self._held_since)
         self._memory, self._held_since = step.memory, None
         self.decided.append((Decided.MOVE, age_s))
         self._record(state, from_pose, self._sent, fresh=fresh, taken_s=taken_s)
         if self.settings.blocking:
-            self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
+            with self._watch.doing(f"waiting for the end of step {len(self.records)}"):
+                self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
 
     def _look(self, frame: Frame, state: ArmState) -> bool:
         """Estimate the pose in a frame if it was not used before. Returns whether the frame is fresh."""
@@ -285,7 +252,7 @@ class ServoLoop:
         view.frame, view.estimate = frame, self.estimator(frame)
         view.reading, view.doubt = self._reading(view.estimate)
         if not view.doubt:
-            view.exposed_pose = self._track.pose_at(frame.time_s) if self.source.is_live else state.pose
+            view.exposed_pose = self._watch.pose_at(frame.time_s) if self.source.is_live else state.pose
             view.tangent = tangent_of(self.mounting, view.exposed_pose, view.reading)
             if self.sense is not None:
                 self.sense(view.reading.depth_mm, frame.time_s)
@@ -340,10 +307,14 @@ class ServoLoop:
         if not self.source.is_live:
             return self.source.read()
         if self.settings.blocking:
-            return self.source.read_after(state.time_s, timeout_s=self.settings.frame_timeout_s)
+            return self._exposed_after(state.time_s)
         if not self.records:  # the first decision must not use a frame of the approach
-            return self.source.read_after(arrived_s, timeout_s=self.settings.frame_timeout_s)
+            return self._exposed_after(arrived_s)
         return self.source.read_latest(max_age_s=self.servo.max_frame_age_s)
+
+    def _exposed_after(self, time_s: float) -> Frame:
+        """The first frame exposed after a time; ``TimeoutError``. The wait ends when the arm is lost."""
+        return self._watch.frame_after(self.source, time_s, timeout_s=self.settings.frame_timeout_s)
 
     def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
         """The depth and angle of an estimate, and why they can't be trusted ("" if they can)."""
@@ -369,6 +340,7 @@ class ServoLoop:
             self._sent = None  # a stop empties the queue, even if feedback reports a motion for some time
             self.arm.stop()
             self.notes.append(f"held still before step {len(self.records)}: {reason}")
+            LOG.warning("%s: %s", self.arm.name, self.notes[-1])
         held_s = time.monotonic() - self._held_since
         if held_s > self.settings.give_up_s:
             raise DeviceError(f"no usable frame for {held_s:.1f} s, the arm holds still: {reason}") from problem
@@ -376,10 +348,11 @@ class ServoLoop:
 
     def _state(self) -> ArmState:
         """The arm's newest state, which is also kept in the track; ``DeviceError`` if the arm reports an error."""
+        self._watch.require()
         state = self.arm.state()
         if state.error:
             raise DeviceError(f"{self.arm.name}: {state.error}")
-        self._track.add(state)
+        self._watch.add(state)
         return state
 
     def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:

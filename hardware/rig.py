@@ -203,8 +203,8 @@ def build_rig(
 
 
 def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form: Form, *, fps: float, plain_light: bool) -> TwinCamera:
-    """The twin as a camera on an arm whose pose comes from elsewhere."""
-    return TwinCamera(sensor, placed, pose, form, fps=fps, preview=drawn(sensor, form, plain_light))
+    """The twin as a camera on an arm whose pose comes from elsewhere. It waits for an arm that is lost."""
+    return TwinCamera(sensor, placed, pose, form, fps=fps, preview=drawn(sensor, form, plain_light), waits_for_arm=True)
 
 
 def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:

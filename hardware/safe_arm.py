@@ -13,9 +13,9 @@ from typing import Self
 
 import numpy as np
 
-from hardware.arms.arm import Arm, ArmState
+from hardware.arms.arm import FEEDBACK_AGE_S, Arm, ArmState
 from hardware.arms.kinematics import Kinematics
-from hardware.errors import DeviceError, StaleDataError, leave
+from hardware.errors import DeviceError, StaleDataError, also, leave
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
 
 # Newest decisions that are kept in memory.
@@ -30,7 +30,8 @@ def try_each(**steps: Callable[[], object]) -> list[str]:
     Returns
     -------
     list of str
-        What failed. If an exception is being handled, each failure is also added to it as a note.
+        What failed. If an exception is being handled, each failure is also added to it as a note; that of ``stop``, after which the arm
+        may move, is added to the message.
 
     Raises
     ------
@@ -43,7 +44,9 @@ def try_each(**steps: Callable[[], object]) -> list[str]:
             act()
         except Exception as error:
             failed.append(f"{name} failed: {error}")
-            if on_its_way is not None:
+            if on_its_way is not None and name == "stop":
+                also(on_its_way, failed[-1])
+            elif on_its_way is not None:
                 on_its_way.add_note(failed[-1])
         except BaseException as error:
             failed.append(f"{name} was interrupted")
@@ -150,7 +153,7 @@ class SafeArm:
         self._note("emergency_stop", Decision(Action.MOVE, Code.UNGATED, ""))
         self.arm.emergency_stop()
 
-    def state(self, *, max_age_s: float = 1.0) -> ArmState:
+    def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         return self.arm.state(max_age_s=max_age_s)
 
     def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator
 
-from hardware.arms.arm import ArmState
+from hardware.arms.arm import FEEDBACK_AGE_S, ArmState
 from hardware.arms.kinematics import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError
 from hardware.arms.motion import check_line, turn_between_deg
 from hardware.errors import DeviceError
@@ -40,7 +40,7 @@ class SafetyLimits(Section):
     angular_deg_s: Positive = 90.0
     contact_mm: Positive = 6.0  # deepest contact that the sensor may report
     frame_age_s: Positive = 0.5
-    feedback_age_s: Positive = 1.0
+    feedback_age_s: Positive = FEEDBACK_AGE_S
     retreat_mm: Positive = 50.0  # distance of the tool from the object at the end and after a failure
     retreat_mm_s: Positive = 50.0
 

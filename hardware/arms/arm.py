@@ -18,6 +18,8 @@ from hardware.errors import Connection, DeviceAlreadyConnectedError, DeviceError
 
 # Interval in s at which feedback is read. It is shorter than the 8 ms period of the fastest feedback.
 POLL_S = 0.005
+# Feedback older than this (s) is not used. So an arm that is lost or frozen is stopped, and that is said, within a second.
+FEEDBACK_AGE_S = 0.8
 # A commanded move shows in feedback sooner than this (s). An arm that rests elsewhere for longer does not execute the move.
 BELIEVE_REST_S = 0.15
 
@@ -90,7 +92,7 @@ class Arm(Protocol):
     def emergency_stop(self) -> None:
         """Stop and cut the motors' power, where the arm has a command for it; ``clear_error`` and ``enable`` bring it back."""
 
-    def state(self, *, max_age_s: float = 1.0) -> ArmState:
+    def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         """The newest state; ``StaleDataError`` if it is older than ``max_age_s``."""
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None: ...
@@ -137,7 +139,7 @@ class BaseArm(Connection):
         self.disable()
 
     @abstractmethod
-    def state(self, *, max_age_s: float = 1.0) -> ArmState: ...
+    def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState: ...
 
     def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
         """Wait for feedback of the arm at rest at ``pose``; see ``Arm``."""

@@ -11,7 +11,7 @@ import numpy as np
 import serial
 from serial.tools import list_ports
 
-from hardware.arms.arm import POLL_S, ArmState, BaseArm
+from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import MAGICIAN, joint_target, linear_target, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
@@ -114,7 +114,7 @@ class Magician(BaseArm):
             self._last_index = self._index_of(self._request(Id.HOME, struct.pack("<I", 0), ctrl=WRITE | QUEUED))
             self._await_queue(timeout_s)
 
-    def state(self, *, max_age_s: float = 1.0) -> ArmState:
+    def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         self._require_connected()
         begun_s = time.monotonic()
         try:

@@ -32,6 +32,8 @@ ENABLE_TIMEOUT_S = 5.0
 MOTION_REPLY_S = 1.0
 # The same for a stop, an emergency stop and a disable. After it the next means is tried, because the arm may still move.
 STOP_REPLY_S = 0.5
+# For MUTE_S (s) after one of these has failed, further ones wait only STOP_AGAIN_S (s), so that the end of a program isn't delayed.
+MUTE_S, STOP_AGAIN_S = 3.0, 0.1
 # Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
 SETTLE_S = 0.5
 PAUSED = "paused by another client; stop() drops the queue, Continue() of that client would execute it"
@@ -87,6 +89,7 @@ class MG400(BaseArm):
         self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after percents were set
         self._sent: np.ndarray | None = None  # end of the queue, as long as the arm may still move there
         self._under_way = False  # whether a move was sent that feedback has not shown to have ended
+        self._mute_s = -np.inf  # when the newest stop or its like failed
         self._late_replies = False  # whether replies to moves may come that nobody waits for any more
 
     @property
@@ -145,7 +148,10 @@ class MG400(BaseArm):
             raise
         except DeviceError as error:
             if not self._stands():
-                self.emergency_stop()
+                try:
+                    self.emergency_stop()
+                except DeviceError:
+                    raise error from None
                 raise DeviceError(
                     f"{self.name}: would not stop and was switched off by its emergency stop; call clear_error() and enable(). {error}"
                 ) from error
@@ -262,7 +268,7 @@ class MG400(BaseArm):
             self._motion.send(text)
             return
         self._late_replies = True
-        reply = self._motion.request(text, timeout_s=MOTION_REPLY_S)
+        reply = self._motion.request(text, timeout_s=MOTION_REPLY_S, look=lambda: self._feedback.newest(SILENCE_S))
         self._late_replies = False
         self._check(text, reply)
 
@@ -322,13 +328,17 @@ class MG400(BaseArm):
         return self._alarm_text
 
     def _tell_in_any_case(self, request: str, what: str) -> None:
-        """Needs only the dashboard connection. If that is lost it is opened once more, because the arm may still move."""
+        """Needs only the dashboard connection. If that is or gets lost it is opened once more, because the arm may still move."""
         self._require_in_use()
+        timeout_s = STOP_REPLY_S if time.monotonic() - self._mute_s > MUTE_S else STOP_AGAIN_S
         try:
-            if not self._dashboard.is_open:
-                self._dashboard.open(timeout_s=STOP_REPLY_S)
-            self._ask(request, timeout_s=STOP_REPLY_S)
+            with contextlib.suppress(DeviceNotConnectedError):
+                self._ask(request, timeout_s=timeout_s)
+                return
+            self._dashboard.open(timeout_s=timeout_s)
+            self._ask(request, timeout_s=timeout_s)
         except DeviceError as error:
+            self._mute_s = time.monotonic()
             kind = DeviceNotConnectedError if isinstance(error, DeviceNotConnectedError) else DeviceError
             raise kind(f"{self.name}: can't be {what} and may move. Press its emergency stop! {error}") from error
 

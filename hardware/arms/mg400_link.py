@@ -3,10 +3,12 @@
 import contextlib
 import socket
 import time
+from collections.abc import Callable
 from threading import Condition, Event, RLock, Thread
 
 import numpy as np
 
+from hardware.arms.arm import FEEDBACK_AGE_S
 from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
@@ -14,8 +16,10 @@ from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 CONNECT_TIMEOUT_S = 2.0
 # Longest wait for a reply, in s.
 REPLY_TIMEOUT_S = 2.0
-# Feedback older than this (s) is not used. A connection that is silent for this time is closed.
-SILENCE_S = 1.0
+# A feedback connection that is silent for this time (s) is closed and opened again.
+SILENCE_S = FEEDBACK_AGE_S
+# Interval in s at which a wait for a reply looks whether the arm is still there.
+LOOK_S = 0.05
 # Pause before feedback is connected again, in s. Public clients wait 5 s, but a servo that stands still needs feedback sooner.
 RECONNECT_S = 0.5
 # Largest number of bytes in one read: more than half a second of feedback.
@@ -53,8 +57,8 @@ class CommandPort:
                 self._socket.close()
             self._socket, self._buffer = None, ""
 
-    def request(self, text: str, *, timeout_s: float = REPLY_TIMEOUT_S) -> Reply:
-        """Send a request and wait for its reply; late replies to others are dropped.
+    def request(self, text: str, *, timeout_s: float = REPLY_TIMEOUT_S, look: Callable[[], object] = lambda: None) -> Reply:
+        """Send a request and wait for its reply; late replies to others are dropped. ``look`` is called meanwhile and may raise an error.
 
         Raises
         ------
@@ -67,8 +71,9 @@ class CommandPort:
             self.send(text)
             deadline = time.monotonic() + timeout_s
             while time.monotonic() < deadline:
-                if reply := self.poll(text, wait_s=deadline - time.monotonic()):
+                if reply := self.poll(text, wait_s=min(LOOK_S, deadline - time.monotonic())):
                     return reply
+                look()
         host, port = self._address
         raise DeviceError(f"{self._name}: no reply to {text} from {host}:{port} within {timeout_s:g} s; check the arm, then connect again")
 

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from hardware.arms.arm import ArmState, BaseArm
+from hardware.arms.arm import FEEDBACK_AGE_S, ArmState, BaseArm
 from hardware.arms.kinematics import MG400, Kinematics, StageKinematics, Violation
 from hardware.arms.motion import MotionTrack, Speeds
 from hardware.errors import DeviceError, StaleDataError
@@ -96,7 +96,7 @@ class SimulatedArm(BaseArm):
         self.track.stop(now_s)
         self._errors = [(since, text) for since, text in self._errors if since <= now_s]
 
-    def state(self, *, max_age_s: float = 1.0) -> ArmState:
+    def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         self._require_connected()
         now_s = time.monotonic()
         told_s = self._told_s(now_s)

@@ -1,5 +1,6 @@
 """A camera in the twin: the sensor's view, drawn for the contact that the arm's pose makes."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from twin.optics.preview import Preview
 from twin.rig.contact import contact_law
 from twin.types import ContactState, Form, Frame
 
+LOG = logging.getLogger(__name__)
 PoseSource = Callable[[], ArmState]
 # Pause after a pose that could not be drawn, in s.
 RETRY_S = 0.05
@@ -52,6 +54,8 @@ class TwinCamera(LiveSource):
         A preview of the window that the form needs. By default it draws the direct light alone.
     on_demand : bool
         Draw only while a reader waits for a frame. This is for loops that stop for each frame: they do not use the frames in between.
+    waits_for_arm : bool
+        Deliver nothing while the arm's pose is not known, however long that takes. Otherwise the camera ends after some failed reads.
     """
 
     notices_still = False  # the twin has a memory, not a cable
@@ -68,6 +72,7 @@ class TwinCamera(LiveSource):
         seed: int = 0,
         preview: Preview | None = None,
         on_demand: bool = False,
+        waits_for_arm: bool = False,
     ) -> None:
         super().__init__(f"twin of {spec.name}", form)
         frame_size(spec, self.form)
@@ -75,6 +80,7 @@ class TwinCamera(LiveSource):
         self._seed, self._preview = seed, preview
         self._recording = spec.recording if self.form is Form.RECORDING else None
         self._on_demand, self._asked = on_demand, threading.Event()
+        self._waits_for_arm = waits_for_arm
         self._follower: Follower | None = None
         self._drawn, self._due_s = 0, 0.0
         self.state: ContactState | None = None  # of the newest frame
@@ -101,7 +107,7 @@ class TwinCamera(LiveSource):
         self._end.wait(max(0.0, self._due_s - time.monotonic()))
         self._due_s = time.monotonic() + self._period_s
         try:
-            told = self._arm()
+            told = self._pose()
             self.state = follower.move(self._placed.seen_from(told.pose), told.time_s)
         except (ContactError, DeviceError) as error:
             self._end.wait(RETRY_S)
@@ -112,6 +118,24 @@ class TwinCamera(LiveSource):
         rng = np.random.default_rng((self._seed, self._drawn))
         image = expose(light, self._spec.capture, rng, origin_px=preview.window_px[:2])
         return Picture(steady(image, self._spec.response, rng), told.time_s)
+
+    def _pose(self) -> ArmState:
+        """The arm's newest state. A camera that waits for its arm says when the arm is lost and when it is back."""
+        lost = False
+        while True:
+            try:
+                told = self._arm()
+            except DeviceError as error:
+                if not self._waits_for_arm or self._end.is_set():
+                    raise
+                if not lost:
+                    LOG.warning("%s: waits for its arm: %s", self.name, error)
+                lost = True
+                self._end.wait(RETRY_S)
+            else:
+                if lost:
+                    LOG.warning("%s: its arm is back", self.name)
+                return told
 
     def _opened(self) -> tuple[Follower, Preview]:
         """What ``_open`` made; ``DeviceNotConnectedError`` before it."""

@@ -8,6 +8,8 @@ from hardware.arms.arm import Arm
 from hardware.cameras.source import FrameSource
 from hardware.doctor import cameras
 from hardware.errors import StaleDataError
+from hardware.newest import NewestTarget
+from hardware.safe_arm import SafeArm
 
 _POSE = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -19,10 +21,17 @@ class LeRobotArm:
     ----------
     arm : Arm
         Give a ``SafeArm`` to have actions clipped; ``send_action`` tells what was really sent.
+    linear_mm_s, angular_deg_s : float
+        Speed of the arm. The limits of a ``SafeArm`` may reduce it.
     """
 
-    def __init__(self, arm: Arm) -> None:
+    def __init__(self, arm: Arm, *, linear_mm_s: float = 100.0, angular_deg_s: float = 90.0) -> None:
         self.arm, self.name = arm, arm.name
+        limits = arm.limits if isinstance(arm, SafeArm) else None
+        self._speed = (linear_mm_s, angular_deg_s)
+        if limits is not None:
+            self._speed = min(linear_mm_s, limits.linear_mm_s), min(angular_deg_s, limits.angular_deg_s)
+        self._newest = NewestTarget(arm, *self._speed)
 
     @cached_property
     def _keys(self) -> tuple[str, ...]:
@@ -51,9 +60,11 @@ class LeRobotArm:
         self.arm.connect()
         try:
             self.arm.enable()
+            self.arm.set_speed(*self._speed)
         except BaseException:
             self.arm.disconnect()
             raise
+        self._newest.start()
 
     def get_observation(self) -> dict[str, float]:
         state = self.arm.state()
@@ -61,15 +72,21 @@ class LeRobotArm:
         return {key: pose[key] for key in self._keys} | {f"joint_{n}.pos": float(q) for n, q in enumerate(state.joints_deg, start=1)}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
-        """Begin a move to the pose and do not wait for its end. A missing key keeps its present value. Returns what was really sent."""
+        """Send the arm towards a pose and do not wait. A missing key keeps its present value.
+
+        The newest action wins: the arm goes in short pieces and turns to a newer action after at most 0.2 s, without replaying older ones.
+        An action beyond the limits of a ``SafeArm`` is clipped to them. Returns what was really sent to the arm: the pose of the action,
+        or the end of the present piece on the way to it.
+        """
         unknown = set(action) - set(_POSE)
         if unknown:
             raise KeyError(f"an action has the keys {', '.join(self._keys)}, not {', '.join(sorted(unknown))}")
         pose = dict(zip(_POSE, self.arm.state().pose.tolist(), strict=True)) | action
-        sent = self.arm.move_linear(np.array([pose[key] for key in _POSE], float), wait=False)
+        sent = self._newest.go(np.array([pose[key] for key in _POSE], float))
         return {key: float(value) for key, value in zip(_POSE, sent, strict=True) if key in self._keys}
 
     def disconnect(self) -> None:
+        self._newest.end()
         self.arm.disconnect()
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from hardware.arms.arm import FEEDBACK_AGE_S, Arm, ArmState
 from hardware.arms.kinematics import Kinematics
 from hardware.errors import DeviceError, StaleDataError, also, leave
-from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, decide, decide_joints
+from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, clip, decide, decide_joints
 
 # Newest decisions that are kept in memory.
 KEPT_DECISIONS = 10_000
@@ -178,6 +178,10 @@ class SafeArm:
         decision = decide(pose, state, self.limits, now_s=time.monotonic(), kinematics=self.kinematics, sensed=self._sensed)
         self._obey("move_linear", decision)
         return self.arm.move_linear(decision.allowed, wait=wait, timeout_s=timeout_s)
+
+    def clipped(self, pose: np.ndarray) -> np.ndarray:
+        """The pose (6,) that ``move_linear`` would allow from where the arm is, as near to the one given as the limits permit."""
+        return clip(pose, self._newest_state("clipped").pose, self.limits, self.kinematics)
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         """As ``Arm.move_joints``; see ``move_linear``."""

@@ -15,6 +15,8 @@ from hardware.errors import DeviceError
 from scenes.base import NonNegative, Positive, Section, SpecError
 from scenes.load import read_section
 
+# Halvings of a way in the search for its last allowed place: 100 mm are divided to 0.01 mm.
+CLIP_HALVINGS = 14
 SHIPPED_LIMITS = Path(__file__).parent / "limits"
 
 
@@ -160,6 +162,33 @@ def decide(
     if shortened:
         return Decision(Action.MOVE, Code.STEP_SHORTENED, f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg", pose)
     return Decision(Action.MOVE, Code.OK, "", pose)
+
+
+def clip(target: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics | None = None) -> np.ndarray:
+    """The pose (6,) to which a move straight from ``start`` (6,) may go, as near to the target (6,) as simple means find.
+
+    It is the target moved into the box, shortened to a step, and then, if other limits forbid it, the last allowed place on the way.
+    """
+    pose = np.array(target, float)
+    if not np.isfinite(pose).all():
+        return pose
+    low, high = np.array(limits.box_mm).T
+    pose[:3] = np.clip(pose[:3], low, high)
+    unwrapped = kinematics is not None and kinematics.axes == 4
+    if kinematics is not None:
+        pose = kinematics.nearest_pose(pose)
+    pose, _ = shorten(start, pose, limits, unwrapped=unwrapped)
+    way, allowed, refused = pose - start, 0.0, 2.0
+    for _ in range(CLIP_HALVINGS + 1):  # the whole way first
+        share = (allowed + refused) / 2
+        at = start + share * way
+        if _place(at, start, limits) or (kinematics is not None and _joints(at, start, limits, kinematics)):
+            refused = share
+        else:
+            allowed = share
+        if allowed == 1.0:
+            return pose
+    return start + allowed * way
 
 
 def decide_joints(

@@ -78,7 +78,7 @@ class ArmWatch:
 
     @contextmanager
     def alert(self) -> Iterator[None]:
-        """Context of the work. After an error in it the arm is looked at once more, so that a lost arm is told before anything else is done."""
+        """Context of the work. After an error in it the arm is looked at once more, so that a lost arm is told first."""
         try:
             yield
         except BaseException:

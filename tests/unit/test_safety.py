@@ -12,7 +12,7 @@ from hardware.arms.kinematics import MG400
 from hardware.arms.simulated import SimulatedArm, SimulatedFault
 from hardware.errors import DeviceError
 from hardware.safe_arm import RefusedMoveError, SafeArm
-from hardware.safety import Action, Code, SafetyLimits, Sensed, decide, decide_joints, load_limits
+from hardware.safety import Action, Code, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
 
 NOW_S = 1000.0
 HOME = np.array([300.0, 0, 0, 0, 0, 0])
@@ -69,6 +69,14 @@ def test_what_may_be_sent_keeps_every_limit(target):
         assert np.linalg.norm(sent[:3] - HOME[:3]) <= LIMITS.step_mm + 1e-9
         joints = MG400.inverse(MG400.nearest_pose(sent))
         assert MG400.violation(joints) is None and joints[2] - joints[1] <= LIMITS.linkage_deg + 1e-6
+
+
+@given(st.lists(st.floats(-600, 600), min_size=6, max_size=6), st.sampled_from([LIMITS, FREE, WIDE, RING]))
+def test_what_a_target_is_clipped_to_may_be_sent(target, limits):
+    clipped = clip(np.array(target), HOME, limits, MG400)
+    assert decided(clipped, limits).action is Action.MOVE
+    if decided(target, limits).code is Code.OK:
+        np.testing.assert_allclose(clipped, decided(target, limits).pose)
 
 
 @given(st.floats(0.01, 200.0), st.floats(0, 2 * np.pi))

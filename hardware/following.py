@@ -1,6 +1,7 @@
 """One run of surface following: from a plan to results, which are also written to disk."""
 
 import json
+import logging
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hardware.errors import DeviceError
+from hardware.last_axis import LastAxis, turns_back_mm
 from hardware.loop import ServoLoop
 from hardware.rig import Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
 from hardware.session import SessionWriter, plain
@@ -22,6 +24,7 @@ from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import save_figure
 from twin.types import FIRST, Frame
 
+LOG = logging.getLogger(__name__)
 # Following ends after this time in s without a usable frame.
 GIVE_UP_S = 5.0
 # Rate in Hz from which the loop's period is set if no rate is given. Then each decision waits for the move before it, and the period is
@@ -155,6 +158,7 @@ def follow(
         loop.on_step = partial(_note_step, session, step, steps)
         if plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live:
             loop.take_rest = partial(_take_rest, session, model)
+        _say_turns(rig, plan.servo, wanted_mm)
         try:
             loop.run(rig.placed.start_pose(plan.servo.indent_mm))
         except TwinError as error:
@@ -200,6 +204,13 @@ def _told(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
     """What is kept beside the results."""
     names = {"sensor": model.sensor.name, "object": plan.stimulus.name, "camera": plan.camera, "arm": plan.arm}
     return names | {"servo": plan.servo.model_dump()}
+
+
+def _say_turns(rig: Rig, servo: ServoSpec, wanted_mm: float) -> None:
+    """Say beforehand where on the way the last axis of an arm of four axes will turn back."""
+    axis = LastAxis(getattr(rig.arm, "kinematics", None), rig.mounting.centre_mm)
+    for distance_mm in turns_back_mm(rig.placed, axis, servo.indent_mm, wanted_mm):
+        LOG.warning("%s: its last axis will turn back by a full turn after about %.0f mm, clear of the object", rig.arm.name, distance_mm)
 
 
 def _note_step(session: SessionWriter | None, step: Step, steps: int, record: StepRecord, frame: Frame, estimate: Estimate) -> None:

@@ -13,8 +13,10 @@ from enum import StrEnum
 import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
+from hardware.arms.motion import turn_between_deg
 from hardware.cameras.source import FrameSource
 from hardware.errors import DeviceError, StaleDataError
+from hardware.last_axis import HOLD_DEG, LastAxis
 from hardware.rig_geometry import matrix_of, moved
 from hardware.safe_arm import RefusedMoveError, try_each
 from hardware.safety import Code
@@ -31,6 +33,8 @@ LOG = logging.getLogger(__name__)
 MOST_PIECES = 200
 # A move that ends nearer than this to its target (mm) needs no further piece.
 NEAR_MM = 0.5
+# The same for its turn, in deg.
+NEAR_DEG = 0.5
 # Time in s that a move may take beyond what its way and speed give.
 MOVE_TIMEOUT_S = 10.0
 # Factor on the time that a move's way and speed give: arms round their speed to whole percents.
@@ -91,6 +95,8 @@ class ServoLoop:
         Called before every move, in this order. Each may change the target or refuse it.
     sense : callable, optional
         Called before the move with the depth (mm) and the exposure (``time.monotonic()``) of each fresh estimate.
+    forget : callable, optional
+        Called when the sensor leaves the object on purpose, to turn back the last axis of an arm of four axes.
     retreat : callable, optional
         Withdraws the arm. It gets the direction (3,) away from the object in the base frame. By default the arm moves straight by the
         servo's ``clear_mm``.
@@ -111,6 +117,7 @@ class ServoLoop:
     settings: LoopSettings
     guards: list[Guard] = field(default_factory=list)
     sense: Callable[[float, float], None] | None = None
+    forget: Callable[[], object] | None = None
     retreat: Callable[[np.ndarray], object] | None = None
     way: Callable[[np.ndarray, np.ndarray], list[np.ndarray]] | None = None
     take_rest: Callable[[Frame], Estimator] | None = None
@@ -125,6 +132,8 @@ class ServoLoop:
         self._behind_since: float | None = None  # when the arm began to lag too far behind for a new target
         self._view, self._memory = _View(), Memory()
         self._watch = ArmWatch(self.arm)
+        self._axis = LastAxis(getattr(self.arm, "kinematics", None), self.mounting.centre_mm)
+        self._arrived_s: float | None = None  # when the arm came to the object; None once a frame exposed after that was used
         self._started_s = self._ended_s = 0.0
 
     def run(self, start_pose: np.ndarray) -> Timing:
@@ -193,14 +202,14 @@ class ServoLoop:
     def _follow(self) -> None:
         """Take frames and decide on each one, until all steps are made or the recording ends."""
         self._view, self._memory, self._sent, self._behind_since = _View(), Memory(), None, None
-        self._started_s = arrived_s = due_s = time.monotonic()
+        self._started_s = self._arrived_s = due_s = time.monotonic()
         while len(self.records) < self.settings.steps:
             if not self.settings.blocking:
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 due_s = max(due_s + self.settings.period_s, time.monotonic())
             state = self._state()
             try:
-                frame = self._frame(state, arrived_s)
+                frame = self._frame(state)
             except EOFError:
                 return
             except (StaleDataError, TimeoutError, DeviceError) as problem:
@@ -227,8 +236,12 @@ class ServoLoop:
             return
         assert self._view.tangent is not None  # a view without doubt has one
         step = servo_step(self.servo, self.mounting, self._view.tangent, from_pose, self._memory, fresh=fresh)
+        pose, held_deg = self._axis.on_turn(step.pose, from_pose[5])
+        if held_deg > HOLD_DEG:
+            self._turn_back(step.pose)
+            return
         try:
-            self._sent = self._move(step.pose, wait=False)
+            self._sent = self._move(pose, wait=False)
         except RefusedMoveError as refused:
             if refused.decision.code is not Code.STALE_FRAME:
                 raise
@@ -302,14 +315,16 @@ class ServoLoop:
         if self.on_step is not None:
             self.on_step(record, view.frame, view.estimate)
 
-    def _frame(self, state: ArmState, arrived_s: float) -> Frame:
+    def _frame(self, state: ArmState) -> Frame:
         """The frame to decide on: a recording's next one, one exposed at the present stop, or the newest one."""
         if not self.source.is_live:
             return self.source.read()
         if self.settings.blocking:
             return self._exposed_after(state.time_s)
-        if not self.records:  # the first decision must not use a frame of the approach
-            return self._exposed_after(arrived_s)
+        if self._arrived_s is not None:  # the first decision must not use a frame of the approach
+            frame = self._exposed_after(self._arrived_s)
+            self._arrived_s = None
+            return frame
         return self.source.read_latest(max_age_s=self.servo.max_frame_age_s)
 
     def _exposed_after(self, time_s: float) -> Frame:
@@ -358,17 +373,50 @@ class ServoLoop:
     def _move(self, target: np.ndarray, *, wait: bool) -> np.ndarray:
         """Move to a pose (6,) and return the pose that was sent last.
 
-        With ``wait``, the move is repeated until it ends at the target, because guards and arm may shorten it.
+        With ``wait``, the move is repeated until it ends at the target, because guards and arm may shorten it. If the last axis has to
+        turn back for it, it turns first, where the arm is.
         """
+        if wait:
+            target = self._turned_for(target)
         for _ in range(MOST_PIECES if wait else 1):
             state, allowed = self._state(), target
             for guard in self.guards:
                 allowed = guard(state, allowed)
-            way_s = SPARE * _apart_mm(allowed, state.pose) / self.servo.linear_mm_s
-            sent = self.arm.move_linear(allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S + way_s)
-            if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM:
+            way_s = max(_apart_mm(allowed, state.pose) / self.servo.linear_mm_s, abs(allowed[5] - state.pose[5]) / self.servo.angular_deg_s)
+            sent = self.arm.move_linear(allowed, wait=wait, timeout_s=MOVE_TIMEOUT_S + SPARE * way_s)
+            if np.linalg.norm(sent[:3] - target[:3]) < NEAR_MM and turn_between_deg(sent, target) < NEAR_DEG:
                 break
         return sent
+
+    def _turned_for(self, target: np.ndarray) -> np.ndarray:
+        """The target (6,) on the turn that the last axis is on, after it has turned back if it had to."""
+        here = self._state().pose
+        pose, held_deg = self._axis.on_turn(target, here[5])
+        if held_deg <= HOLD_DEG:
+            return pose
+        turned = self._axis.turned_back(here, target)
+        if turned is None:
+            raise DeviceError(
+                f"{self.arm.name}: its last axis can't turn the sensor that far, {held_deg:.0f} deg are missing; turn the object "
+                "('placement.turn_deg' in a file for --servo), or give no more --steps than were made"
+            )
+        for share in (1 / 3, 2 / 3, 1.0):  # each less than half a turn, so that nobody can take it for a turn the other way
+            self._move(here + share * (turned - here), wait=True)
+        return self._axis.on_turn(target, turned[5])[0]
+
+    def _turn_back(self, target: np.ndarray) -> None:
+        """Leave the object, turn the last axis back by a full turn, and touch the object again at a target (6,) of the other turn."""
+        self.notes.append(f"step {len(self.records)}: the last axis was at its end and turned back, clear of the object")
+        LOG.warning("%s: the last axis is at its end; it turns back, clear of the object", self.arm.name)
+        with self._watch.doing("turning its last axis back"):
+            self.arm.stop()
+            if self.forget is not None:
+                self.forget()
+            here = self._state().pose
+            self._move(self._axis.on_turn(self._away_from(here), here[5])[0], wait=True)
+            self._move(self._away_from(target), wait=True)
+            self._move(target, wait=True)
+        self._view, self._sent, self._arrived_s = _View(), None, time.monotonic()
 
     def _away_from(self, pose: np.ndarray) -> np.ndarray:
         """The pose (6,) withdrawn by the servo's ``clear_mm`` along the sensor's axis."""
@@ -382,7 +430,7 @@ class ServoLoop:
             if self.retreat is not None:
                 self.retreat(-matrix_of(pose)[:3, :3] @ self.mounting.axis)
             else:
-                self.arm.move_linear(self._away_from(pose), wait=True, timeout_s=MOVE_TIMEOUT_S)
+                self.arm.move_linear(self._axis.on_turn(self._away_from(pose), pose[5])[0], wait=True, timeout_s=MOVE_TIMEOUT_S)
 
         between = {"retreat": back} if retreat else {}
         self.notes += try_each(stop=self.arm.stop, **between, disable=self.arm.disable)

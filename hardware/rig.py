@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from hardware.approach import way_around
-from hardware.arms.arm import Arm, ArmState
+from hardware.arms.arm import Arm
 from hardware.arms.open_arm import open_arm
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.choose import open_camera
@@ -26,7 +26,7 @@ from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SHIPPED_LIMITS, load_limits
-from hardware.step import Estimate, Estimator, Guard, LoopSettings, SensorModel, StepRecord
+from hardware.step import Estimate, Estimator, LoopSettings, SensorModel, StepRecord
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
 from twin.errors import FrameError, RenderError
@@ -233,11 +233,12 @@ def servo_loop(
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None,
 ) -> ServoLoop:
     """The loop on a connected rig. A ``SafeArm`` is told what the sensor feels, and retreats as its limits allow."""
-    loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, guards=[no_full_turn(rig.arm)], on_step=on_step)
+    loop = ServoLoop(rig.source, estimator, rig.arm, servo, rig.mounting, settings, on_step=on_step)
     loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
         arm = rig.arm
         loop.sense = lambda depth_mm, time_s: arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
+        loop.forget = arm.forget_contact
         loop.retreat = lambda away: _retreat(arm, away)
     return loop
 
@@ -260,19 +261,3 @@ def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[
     closed = bool(np.allclose(outline[0], outline[-1]))
     way_mm = rounds * (length_mm + closed * 2 * np.pi * max(tool_mm, 0.0))
     return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
-
-
-def no_full_turn(arm: Arm) -> Guard:
-    """A guard that ends the loop before an arm of four axes would turn back by a full turn at the object."""
-    kinematics = getattr(arm, "kinematics", None)
-
-    def guard(state: ArmState, target: np.ndarray) -> np.ndarray:
-        if kinematics is not None and abs(kinematics.nearest_pose(target)[5] - state.pose[5]) > 180.0:
-            raise DeviceError(
-                f"{arm.name}: its last axis turns no farther than here (R {state.pose[5]:.0f} deg, J4 {state.joints_deg[3]:.0f} deg). "
-                "To go on, it would have to turn the sensor back by a full turn at the object; give no more --steps than were made, or "
-                "turn the object ('placement.turn_deg' in a file for --servo) so that the way begins near the other end of the axis"
-            )
-        return target
-
-    return guard

@@ -16,6 +16,7 @@ import numpy as np
 from hardware.arms.arm import FEEDBACK_AGE_S, Arm, ArmState
 from hardware.arms.kinematics import Kinematics
 from hardware.errors import DeviceError, StaleDataError, also, leave
+from hardware.last_axis import LastAxis
 from hardware.safety import Action, Code, Decision, SafetyLimits, Sensed, clip, decide, decide_joints
 
 # Newest decisions that are kept in memory.
@@ -111,6 +112,10 @@ class SafeArm:
         """Report what the sensor shows. After the first call a move needs a frame that is new enough. A depth of NaN means not known."""
         self._sensed = Sensed(depth_mm, frame_time_s)
 
+    def forget_contact(self) -> None:
+        """Forget what ``sense`` told: the sensor leaves the object. No move needs a frame until ``sense`` is called again."""
+        self._sensed = None
+
     @property
     def is_connected(self) -> bool:
         return self.arm.is_connected
@@ -200,6 +205,7 @@ class SafeArm:
         for share in RETREAT_SHARES:
             target = state.pose.copy()
             target[:3] += share * self.limits.retreat_mm * self.normal / np.linalg.norm(self.normal)
+            target, _ = LastAxis(self.kinematics).on_turn(target, state.pose[5])
             decision = decide(target, state, free, now_s=time.monotonic(), kinematics=self.kinematics)
             self._note("retreat", decision)
             if decision.action is Action.MOVE:

@@ -88,11 +88,11 @@ class ArmWatch:
     @contextmanager
     def doing(self, what: str) -> Iterator[None]:
         """Context of something that may take long. What it is will be said while it lasts."""
-        self._doing = what, time.monotonic()
+        around, self._doing = self._doing, (what, time.monotonic())
         try:
             yield
         finally:
-            self._doing = None
+            self._doing = around
 
     def frame_after(self, source: FrameSource, time_s: float, *, timeout_s: float) -> Frame:
         """The first frame of a camera that was exposed after a time; ``TimeoutError``. The wait ends when the arm is lost."""

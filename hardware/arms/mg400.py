@@ -32,6 +32,8 @@ ENABLE_TIMEOUT_S = 5.0
 MOTION_REPLY_S = 1.0
 # The same for a stop, an emergency stop and a disable. After it the next means is tried, because the arm may still move.
 STOP_REPLY_S = 0.5
+# Feedback shows within this time (s) that a stop or a disable was obeyed: two periods of the slower of the two ports in use.
+SHOWS_S = 0.4
 # For MUTE_S (s) after one of these has failed, further ones wait only STOP_AGAIN_S (s), so that the end of a program isn't delayed.
 MUTE_S, STOP_AGAIN_S = 3.0, 0.1
 # Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
@@ -127,6 +129,7 @@ class MG400(BaseArm):
     def disable(self) -> None:
         self._tell_in_any_case("DisableRobot()", "disabled")
         self._under_way = False
+        self._shows(lambda packet: not packet["enabled"])  # so that the next state tells it
 
     def clear_error(self) -> None:
         """Clear the alarms and forget the queue; after an emergency stop ``enable`` brings the arm back."""
@@ -147,7 +150,7 @@ class MG400(BaseArm):
         except DeviceNotConnectedError:
             raise
         except DeviceError as error:
-            if not self._stands():
+            if not self._shows(lambda packet: int(packet["mode"]) not in (Mode.RUNNING, Mode.JOG)):  # else only the reply was lost
                 try:
                     self.emergency_stop()
                 except DeviceError:
@@ -157,14 +160,14 @@ class MG400(BaseArm):
                 ) from error
         self._unstopped = self._under_way = False
 
-    def _stands(self) -> bool:
-        """Whether feedback that came after a command shows the arm at rest: the command was obeyed, and its reply was lost."""
+    def _shows(self, obeyed: Callable[[np.void], bool]) -> bool:
+        """Whether feedback soon shows that a command was obeyed."""
         asked_s = time.monotonic()
         with contextlib.suppress(StaleDataError):
-            while time.monotonic() - asked_s < STOP_REPLY_S:
-                packet, time_s = self._feedback.newest(STOP_REPLY_S)
-                if time_s > asked_s:
-                    return int(packet["mode"]) not in (Mode.RUNNING, Mode.JOG)
+            while time.monotonic() - asked_s < SHOWS_S:
+                packet, time_s = self._feedback.newest(SHOWS_S)
+                if time_s > asked_s and obeyed(packet):
+                    return True
                 time.sleep(POLL_S)
         return False
 

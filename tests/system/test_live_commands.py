@@ -19,8 +19,6 @@ from true_estimator import TrueEstimate, TrueEstimator
 from typer.testing import CliRunner
 
 from hardware import following
-from hardware.arms.arm import ArmState
-from hardware.arms.kinematics import MG400
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.twin import preview_of
@@ -28,7 +26,7 @@ from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import run_until_told
 from hardware.errors import DeviceError
 from hardware.live import LiveSession, Shower
-from hardware.rig import build_rig, no_full_turn, steps_round
+from hardware.rig import build_rig, steps_round
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource
 from hardware.view.draw import draw_view, voronoi_map
@@ -293,15 +291,6 @@ def test_pins_are_not_counted_from_a_pressed_sensor(tmp_path):
     told = refused(*common, "first")
     assert "seems pressed" in told and "--at-rest FRAME" in told and not (tmp_path / "s").exists()
     assert "1 steps" in run(*common, tmp_path / "pressed" / "frame_0.png")  # who gives a frame is believed
-
-
-def test_an_arm_that_can_turn_no_farther_says_how_to_go_on():
-    guard = no_full_turn(SimpleNamespace(name="mg400", kinematics=MG400))
-    here = ArmState(np.array([300.0, 0, 0, 0, 0, 179.0]), np.array([0.0, 30, 30, 179]), 0.0, True, False)
-    within = np.array([300.0, 0, 0, 0, 0, 170.0])
-    assert guard(here, within) is within
-    with pytest.raises(DeviceError, match=r"no farther than here \(R 179 deg, J4 179 deg\).*full turn.*--steps.*placement\.turn_deg"):
-        guard(here, np.array([300.0, 0, 0, 0, 0, 181.0]))
 
 
 def test_an_emulator_that_fails_ends_with_its_error():

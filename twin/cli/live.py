@@ -159,6 +159,9 @@ The arm goes around the object to a place 50 mm in front of it. If the object ha
 stays in front of it. The program does not know the arm's links and the object's holder: make sure that both have room. After any
 end, Ctrl-C included, the arm stops, retreats along the surface's normal and is disabled.
 
+Once on a round the last axis of an MG400 comes to its end. Then the sensor leaves the object by 50 mm, the axis turns back by a full
+turn, and the sensor touches the same place again. The place is said before the arm moves.
+
 Before the arm touches anything, a frame is taken from which the model counts pins. With --at-rest none it counts them from the
 specification's layout, as models on graphs always do.
 

@@ -1,6 +1,6 @@
 """The last axis of an arm of four axes. It turns the sensor about the vertical, and it has an end on both sides.
 
-R = J1 + J4 is not wrapped, and J4 has a range of at most one full turn. So each orientation of the sensor has at most one R within the range.
+R = J1 + J4 is not wrapped, and J4 has a range of at most one full turn: each orientation of the sensor has at most one R within the range.
 An orientation a little beyond an end is held at the end. Farther beyond, the axis has to turn back by a full turn, for which the sensor
 leaves the object.
 """

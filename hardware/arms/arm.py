@@ -22,6 +22,8 @@ POLL_S = 0.005
 FEEDBACK_AGE_S = 0.8
 # A commanded move shows in feedback sooner than this (s). An arm that rests elsewhere for longer does not execute the move.
 BELIEVE_REST_S = 0.15
+# With a long time limit an arm may rest for a tenth of it, but not longer than this (s), before that is an error.
+MOST_REST_S = 1.5
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ class BaseArm(Connection):
                 return state
             else:
                 rest_since = rest_since or state.time_s
-            if rest_since is not None and state.time_s - rest_since > max(BELIEVE_REST_S, 0.1 * timeout_s):
+            if rest_since is not None and state.time_s - rest_since > min(max(BELIEVE_REST_S, 0.1 * timeout_s), MOST_REST_S):
                 raise DeviceError(
                     f"{self.name}: at rest {off_mm:.2f} mm and {off_deg:.2f} deg from where it was sent; the move was not executed. "
                     "Check for a stop button, a brake or an obstacle, call clear_error(), then move again"

@@ -211,6 +211,12 @@ class MG400(BaseArm):
             if percent is not None:
                 self._ask(f"{name}({int(np.clip(np.floor(percent + 1e-9), 1, 100))})")
 
+    @property
+    def overall_percent(self) -> float:
+        """``SpeedFactor`` in %, as feedback tells it."""
+        self._require_connected()
+        return float(self._feedback.newest(SILENCE_S)[0]["speed_scaling"])
+
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watched():
             sent, joints = linear_target(self.name, self.kinematics, pose)

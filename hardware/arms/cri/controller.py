@@ -1,0 +1,316 @@
+"""Arms with the interface of ``cri``'s controllers: poses of the flange in the base frame as quaternions.
+
+``Controller["mg400"]`` gives a class of arms, as ``cri.controller.Controller`` does.
+"""
+
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from hardware.arms.arm import POLL_S, Arm
+from hardware.arms.cri.transforms import Numbers, euler2mat, mat2euler, mat2quat, quat2mat
+from hardware.arms.mg400 import MG400
+from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
+from hardware.arms.motion import turn_between_deg
+from hardware.arms.open_arm import open_arm
+from hardware.errors import DeviceError, leave
+from hardware.newest import NewestTarget
+
+# Speeds at the start: % of the MG400's fastest, mm/s and deg/s of other arms. They are cri's.
+START_SPEED = 20.0
+# A move may take this time (s), and this number of times as long as its way and speed give.
+PATIENCE_S, PATIENCE = 10.0, 5.0
+# Largest distance in mm between a circle and the lines that are driven for it, and the largest number of lines: a Magician queues 32.
+CIRCLE_MM, CIRCLE_LINES = 0.02, 30
+NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+class RobotController:
+    """An arm with the interface of ``cri``. It is connected and enabled when it is made.
+
+    Parameters
+    ----------
+    arm : str or Arm
+        A specification for ``open_arm``, or an arm that isn't connected yet.
+
+    Attributes
+    ----------
+    servo_delay : (float, float) or None
+        With a delay a move does not wait for its end: the arm goes towards the newest pose. The call returns after the first number (s).
+    tolerance : float or None
+        With a tolerance (mm and deg) a move ends as soon as the arm is that near. Otherwise it ends when the arm is at rest there.
+    """
+
+    def __init__(self, arm: str | Arm) -> None:
+        self.arm = open_arm(arm) if isinstance(arm, str) else arm
+        self._linear = self._angular = START_SPEED
+        self._overall: float | None = None
+        self._tilt_deg = np.zeros(2)  # last commanded tilt; poses are returned with it, as an arm of four axes does not report it
+        self._tcp = np.array(NO_POSE)
+        self._servo_delay: tuple[float, float] | None = None
+        self._newest: NewestTarget | None = None
+        self.tolerance: float | None = None
+        self.commanded_pose: np.ndarray | None = None
+        self.commanded_joint_angles: np.ndarray | None = None
+        self.arm.connect()
+        try:
+            self.arm.clear_error()
+            self.arm.enable()
+            self._set_speeds()
+        except BaseException as error:
+            leave(self.arm.disconnect, error)
+            raise
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__} ({self.info})"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+        leave(self.close, error)
+
+    @property
+    def info(self) -> str:
+        return self.arm.name
+
+    @property
+    def tcp(self) -> np.ndarray:
+        """The place (7,) on the flange whose pose is told and commanded."""
+        return self._tcp
+
+    @tcp.setter
+    def tcp(self, tcp: Numbers) -> None:
+        self._tcp = np.asarray(tcp, float)
+
+    @property
+    def linear_speed(self) -> float:
+        """mm/s; on the MG400 % of its fastest."""
+        return self._linear
+
+    @linear_speed.setter
+    def linear_speed(self, speed: float) -> None:
+        self._linear = self._speed_of("linear_speed", speed)
+        self._set_speeds()
+
+    @property
+    def angular_speed(self) -> float:
+        """deg/s; on the MG400 % of its fastest."""
+        return self._angular
+
+    @angular_speed.setter
+    def angular_speed(self, speed: float) -> None:
+        self._angular = self._speed_of("angular_speed", speed)
+        self._set_speeds()
+
+    @property
+    def speed(self) -> float:
+        """% of everything. Until it is set it is what an MG400 tells, and 100 for other arms."""
+        if self._overall is not None:
+            return self._overall
+        return self.arm.overall_percent if isinstance(self.arm, MG400) else 100.0
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        self._overall = _percent("speed", speed)
+        self._set_speeds()
+
+    @property
+    def servo_delay(self) -> tuple[float, float] | None:
+        return self._servo_delay
+
+    @servo_delay.setter
+    def servo_delay(self, delay: float | tuple[float, float] | None) -> None:
+        self._servo_delay = (float(delay), 0.02) if isinstance(delay, int | float) else delay
+        self._end_servo()
+
+    @property
+    def blend_radius(self) -> float:
+        """0: each move ends before the next begins."""
+        return 0.0
+
+    @blend_radius.setter
+    def blend_radius(self, blend_radius: float) -> None:
+        if blend_radius:
+            warnings.warn(f"{self.arm.name}: moves are not blended; blend_radius stays 0", stacklevel=2)
+
+    @property
+    def elbow(self) -> None:
+        """Arms of four and six axes have none."""
+
+    @property
+    def commanded_elbow(self) -> None:
+        """Arms of four and six axes have none."""
+
+    @property
+    def pose(self) -> np.ndarray:
+        pose = self.arm.state().pose.copy()
+        if self.arm.axes == 4:
+            pose[3:5] = self._tilt_deg
+        return mat2quat(euler2mat(pose) @ quat2mat(self._tcp))
+
+    @property
+    def joint_angles(self) -> np.ndarray:
+        return self.arm.state().joints_deg
+
+    def move_joints(self, joint_angles: Numbers) -> None:
+        self._end_servo()
+        joints = np.asarray(joint_angles, float)
+        way_deg = float(np.abs(joints - self.joint_angles).max()) if joints.shape == self.joint_angles.shape else 0.0
+        self.commanded_joint_angles = self.arm.move_joints(joints, timeout_s=PATIENCE_S + PATIENCE * way_deg / self._speeds()[1])
+
+    def move_linear(self, pose: Numbers, elbow: float | None = None) -> None:
+        """Move the tool straight to a pose (7,). Arms of four and six axes have no elbow."""
+        flange = self._flange(pose)
+        if self._servo_delay is not None:
+            if self._newest is None:
+                self._newest = NewestTarget(self.arm, *self._speeds())
+                self._newest.start()
+            self._newest.go(flange)
+            time.sleep(self._servo_delay[0])
+        else:
+            self._go([flange])
+        self.commanded_pose, self._tilt_deg = np.asarray(pose, float), flange[3:5]
+
+    def move_circular(self, via_pose: Numbers, end_pose: Numbers, elbow: float | None = None) -> None:
+        """Move the tool along the circle through its place, ``via_pose`` and ``end_pose`` (7,), turning evenly from pose to pose."""
+        via, end = self._flange(via_pose), self._flange(end_pose)
+        start = self.arm.state().pose
+        self._go(circle(start, via, end))
+        self.commanded_pose, self._tilt_deg = np.asarray(end_pose, float), end[3:5]
+
+    def close(self) -> None:
+        self._end_servo()
+        self.arm.disconnect()
+
+    def _flange(self, pose: Numbers) -> np.ndarray:
+        """The flange's pose (6,) in Euler angles for one (7,) of the tcp."""
+        return mat2euler(quat2mat(pose) @ np.linalg.inv(quat2mat(self._tcp)))
+
+    def _go(self, poses: list[np.ndarray]) -> None:
+        """Go through poses (6,) without a stop, and wait for the last one."""
+        self._end_servo()
+        here, time_s = self.arm.state().pose, 0.0
+        linear_mm_s, angular_deg_s = self._speeds()
+        for pose in poses:
+            turn_deg = turn_between_deg(here, pose) if self.arm.axes == 6 else abs(pose[5] - here[5])
+            time_s += float(np.linalg.norm(pose[:3] - here[:3])) / linear_mm_s + turn_deg / angular_deg_s
+            here = pose
+        timeout_s = PATIENCE_S + PATIENCE * time_s
+        for pose in poses[:-1]:
+            self.arm.move_linear(pose, wait=False, timeout_s=timeout_s)
+        if self.tolerance is None:
+            self.arm.move_linear(poses[-1], timeout_s=timeout_s)
+            return
+        sent, deadline = self.arm.move_linear(poses[-1], wait=False, timeout_s=timeout_s), time.monotonic() + timeout_s
+        while not _near(self.arm.state().pose, sent, self.tolerance):
+            if time.monotonic() > deadline:
+                self.arm.wait_settled(sent, timeout_s=0.0)  # says what is wrong, after a stop
+            time.sleep(POLL_S)
+
+    def _end_servo(self) -> None:
+        if self._newest is not None:
+            self._newest.end()
+        self._newest = None
+
+    def _speed_of(self, name: str, speed: float) -> float:
+        if isinstance(self.arm, MG400):
+            return _percent(name, speed)
+        if not 0 < speed < np.inf:
+            raise DeviceError(f"{name} {speed}: expected a positive number of mm/s or deg/s")
+        return float(speed)
+
+    def _speeds(self) -> tuple[float, float]:
+        """Speed of a line in mm/s and of turns in deg/s."""
+        overall = self.speed / 100.0
+        if isinstance(self.arm, MG400):
+            return overall * self._linear / 100.0 * MAX_LINEAR_MM_S, overall * min(self._linear, self._angular) / 100.0 * MAX_JOINT_DEG_S
+        return overall * self._linear, overall * self._angular
+
+    def _set_speeds(self) -> None:
+        self._end_servo()
+        if isinstance(self.arm, MG400):
+            self.arm.set_speed_percent(linear=self._linear, angular=self._angular, overall=self._overall)
+        else:
+            self.arm.set_speed(*self._speeds())
+
+
+class MG400Controller(RobotController):
+    """The MG400 at its address, or at ``ADDRESS:DASHBOARD_PORT``."""
+
+    def __init__(self, ip: str = DEFAULT_HOSTS["LAN1"]) -> None:
+        super().__init__(f"mg400:{ip}")
+
+
+class MagicianController(RobotController):
+    """The Magician at a serial port, or the only one that is attached."""
+
+    def __init__(self, port: str = "") -> None:
+        super().__init__(f"magician:{port}" if port else "magician")
+
+
+class DummyController(RobotController):
+    """A simulated arm of six axes. The address of a real one may stand there and is not used."""
+
+    def __init__(self, ip: str = "", port: int | str | None = None) -> None:
+        super().__init__("simulated")
+
+
+class _Controllers(Mapping[str, type[RobotController]]):
+    """Classes of arms by cri's names."""
+
+    _classes = {"mg400": MG400Controller, "magician": MagicianController, "dummy": DummyController}
+
+    def __getitem__(self, kind: str) -> type[RobotController]:
+        if kind not in self._classes:
+            raise KeyError(f"no controller '{kind}'; there are: {', '.join(self._classes)}")
+        return self._classes[kind]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._classes)
+
+    def __len__(self) -> int:
+        return len(self._classes)
+
+
+Controller = _Controllers()
+
+
+def circle(start: np.ndarray, via: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
+    """Poses (6,) of short lines along the circle through the places of three poses (6,), which turn evenly; the last one is ``end``.
+
+    Places on one line give the two lines between them.
+    """
+    a, b, c = start[:3], via[:3], end[:3]
+    ab, ac = b - a, c - a
+    normal = np.cross(ab, ac)
+    if np.linalg.norm(normal) < 1e-6 * max(float(ab @ ab), float(ac @ ac), 1e-9):
+        return [via, end]
+    middle = a + np.cross(normal, ab) * (ac @ ac) / (2 * normal @ normal) + np.cross(ac, normal) * (ab @ ab) / (2 * normal @ normal)
+    radius = float(np.linalg.norm(a - middle))
+    x = (a - middle) / radius
+    y = np.cross(normal / np.linalg.norm(normal), x)
+    at_via, at_end = (float(np.arctan2((p - middle) @ y, (p - middle) @ x) % (2 * np.pi)) for p in (b, c))
+    lines = int(np.ceil(at_end / (2 * np.arccos(1 - min(1.0, CIRCLE_MM / radius)))))
+    angles = np.linspace(0.0, at_end, int(np.clip(lines, 2, CIRCLE_LINES)) + 1)[1:]
+    turns = Slerp([0.0, at_via, at_end], Rotation.from_euler("xyz", [start[3:], via[3:], end[3:]], degrees=True))(angles)
+    poses = [
+        np.r_[middle + radius * (np.cos(t) * x + np.sin(t) * y), turn.as_euler("xyz", degrees=True)]
+        for t, turn in zip(angles, turns, strict=True)
+    ]
+    return [*poses[:-1], end]
+
+
+def _near(pose: np.ndarray, target: np.ndarray, tolerance: float) -> bool:
+    return float(np.linalg.norm(pose[:3] - target[:3])) <= tolerance and turn_between_deg(pose, target) <= tolerance
+
+
+def _percent(name: str, speed: float) -> float:
+    if not 1.0 <= speed <= 100.0:
+        raise DeviceError(f"{name} {speed}: expected 1 to 100 (% of the fastest)")
+    return float(speed)

@@ -1,0 +1,253 @@
+"""Robots with the interface of ``cri``: an arm with a tool and a work frame, poses in Euler angles.
+
+``SyncRobot`` waits for each move; ``AsyncRobot`` has moves that go on while the program does something else.
+"""
+
+from collections.abc import Callable
+from threading import Thread
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from hardware.arms.cri.controller import NO_POSE, RobotController
+from hardware.arms.cri.transforms import (
+    EULER_AXES,
+    InvalidEulerAxes,
+    Numbers,
+    euler2mat,
+    euler2quat,
+    mat2euler,
+    mat2quat,
+    quat2euler,
+    quat2mat,
+)
+from hardware.errors import DeviceError, leave
+
+# Numbers of joints that arms have.
+FEWEST_JOINTS, MOST_JOINTS = 4, 7
+
+
+class InvalidJointAngles(DeviceError, ValueError):  # noqa: N818  (cri's name)
+    """No arm has that number of joints."""
+
+
+class AsyncBusy(DeviceError):  # noqa: N818  (cri's name)
+    """A move goes on; call ``async_result`` first."""
+
+
+class AsyncNotBusy(DeviceError):  # noqa: N818  (cri's name)
+    """No move was begun."""
+
+
+class SyncRobot:
+    """An arm with a tool and a work frame; poses are 6-tuples in mm and deg.
+
+    As in ``cri``, the flange goes to ``coord_frame * pose * tcp``: ``tcp`` is where the flange sits seen from the tool's tip.
+    """
+
+    EULER_AXES = EULER_AXES
+
+    def __init__(self, controller: RobotController) -> None:
+        self.controller = controller
+        self._axes = "sxyz"
+        self._T_base_work = self._T_tip_flange = np.eye(4)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__} ({self.info})"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+        leave(self.close, error)
+
+    @property
+    def info(self) -> str:
+        return self.controller.info
+
+    @property
+    def axes(self) -> str:
+        """Euler axes of all poses, ``sxyz`` unless set."""
+        return self._axes
+
+    @axes.setter
+    def axes(self, axes: str) -> None:
+        if axes not in EULER_AXES:
+            raise InvalidEulerAxes(f"no Euler axes '{axes}'; there are: {', '.join(EULER_AXES)}")
+        self._axes = axes
+
+    @property
+    def tcp(self) -> np.ndarray:
+        return mat2euler(self._T_tip_flange, self._axes)
+
+    @tcp.setter
+    def tcp(self, tcp: Numbers) -> None:
+        self._T_tip_flange = euler2mat(tcp, self._axes)
+        self.controller.tcp = np.array(NO_POSE)
+
+    @property
+    def tcp_controller(self) -> np.ndarray:
+        """The controller's own tool (6,), whose pose the controller tells and commands."""
+        return quat2euler(self.controller.tcp, self._axes)
+
+    @tcp_controller.setter
+    def tcp_controller(self, tcp: Numbers) -> None:
+        self.controller.tcp = euler2quat(tcp, self._axes)
+
+    @property
+    def coord_frame(self) -> np.ndarray:
+        return mat2euler(self._T_base_work, self._axes)
+
+    @coord_frame.setter
+    def coord_frame(self, frame: Numbers) -> None:
+        self._T_base_work = euler2mat(frame, self._axes)
+
+    @property
+    def linear_speed(self) -> float:
+        return self.controller.linear_speed
+
+    @linear_speed.setter
+    def linear_speed(self, speed: float) -> None:
+        self.controller.linear_speed = speed
+
+    @property
+    def angular_speed(self) -> float:
+        return self.controller.angular_speed
+
+    @angular_speed.setter
+    def angular_speed(self, speed: float) -> None:
+        self.controller.angular_speed = speed
+
+    @property
+    def speed(self) -> float:
+        return self.controller.speed
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        self.controller.speed = speed
+
+    @property
+    def blend_radius(self) -> float:
+        return self.controller.blend_radius
+
+    @blend_radius.setter
+    def blend_radius(self, blend_radius: float) -> None:
+        self.controller.blend_radius = blend_radius
+
+    @property
+    def pose(self) -> np.ndarray:
+        return self._seen(self.controller.pose)
+
+    @property
+    def target_pose(self) -> np.ndarray | None:
+        """The pose last asked for, None if there was none."""
+        commanded = self.controller.commanded_pose
+        return None if commanded is None else self._seen(commanded)
+
+    @property
+    def joint_angles(self) -> np.ndarray:
+        return self.controller.joint_angles
+
+    @property
+    def target_joint_angles(self) -> np.ndarray | None:
+        return self.controller.commanded_joint_angles
+
+    @property
+    def elbow(self) -> None:
+        """Arms of four and six axes have none."""
+
+    @property
+    def target_elbow(self) -> None:
+        """Arms of four and six axes have none."""
+
+    def move_joints(self, joint_angles: Numbers) -> None:
+        if not FEWEST_JOINTS <= len(joint_angles) <= MOST_JOINTS:
+            raise InvalidJointAngles(f"{len(joint_angles)} joint angles; expected as many as the arm has joints")
+        self.controller.move_joints(joint_angles)
+
+    def move_linear(self, pose: Numbers, elbow: float | None = None) -> None:
+        self.controller.move_linear(self._commanded(pose), elbow)
+
+    def move_circular(self, via_pose: Numbers, end_pose: Numbers, elbow: float | None = None) -> None:
+        """Along the circle through the present place, that of ``via_pose`` and that of ``end_pose``."""
+        self.controller.move_circular(self._commanded(via_pose), self._commanded(end_pose), elbow)
+
+    def close(self) -> None:
+        self.controller.close()
+
+    def _commanded(self, pose: Numbers) -> np.ndarray:
+        """The controller's pose (7,) for one (6,) in the work frame."""
+        return mat2quat(self._T_base_work @ euler2mat(pose, self._axes) @ self._T_tip_flange)
+
+    def _seen(self, pose: np.ndarray) -> np.ndarray:
+        """The reverse of ``_commanded``."""
+        return mat2euler(np.linalg.inv(self._T_base_work) @ quat2mat(pose) @ np.linalg.inv(self._T_tip_flange), self._axes)
+
+
+class AsyncRobot(SyncRobot):
+    """A ``SyncRobot`` with moves that go on while the program does something else: begin one, then ask for its result.
+
+    Parameters
+    ----------
+    sync_robot : SyncRobot
+        Its frames, tool and axes are taken over. It isn't used on its own any more.
+    """
+
+    def __init__(self, sync_robot: SyncRobot) -> None:
+        super().__init__(sync_robot.controller)
+        self.sync_robot = sync_robot
+        self._axes, self._T_base_work, self._T_tip_flange = sync_robot._axes, sync_robot._T_base_work, sync_robot._T_tip_flange
+        self._worker: Thread | None = None
+        self._error: BaseException | None = None
+
+    def async_move_joints(self, joint_angles: Numbers) -> None:
+        self._begin(lambda: self.move_joints(joint_angles))
+
+    def async_move_linear(self, pose: Numbers, elbow: float | None = None) -> None:
+        self._begin(lambda: self.move_linear(pose, elbow))
+
+    def async_move_circular(self, via_pose: Numbers, end_pose: Numbers, elbow: float | None = None) -> None:
+        self._begin(lambda: self.move_circular(via_pose, end_pose, elbow))
+
+    def async_result(self) -> None:
+        """Wait for the end of the move; its error is raised here.
+
+        Raises
+        ------
+        AsyncNotBusy
+            No move was begun.
+        """
+        if self._worker is None:
+            raise AsyncNotBusy("no move was begun; call async_move_linear or its like first")
+        self._worker.join()
+        self._worker, error = None, self._error
+        if error is not None:
+            raise error
+
+    def async_done(self) -> bool:
+        """Whether the move has ended; ``AsyncNotBusy`` if none was begun."""
+        if self._worker is None:
+            raise AsyncNotBusy("no move was begun; call async_move_linear or its like first")
+        return not self._worker.is_alive()
+
+    def close(self) -> None:
+        """Stop what goes on, and disconnect."""
+        if self._worker is not None and self._worker.is_alive():
+            self.controller.arm.stop()
+            self._worker.join()
+        super().close()
+
+    def _begin(self, move: Callable[[], None]) -> None:
+        if self._worker is not None:
+            raise AsyncBusy("a move goes on; call async_result first")
+        self._error = None
+
+        def work() -> None:
+            try:
+                move()
+            except BaseException as error:
+                self._error = error
+
+        self._worker = Thread(target=work, name="cri move", daemon=True)
+        self._worker.start()

@@ -192,7 +192,7 @@ def build_rig(
     if simulated and camera == TWIN and at_once:
         device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
     if not simulated or limits is not None:
-        kind = arm.partition(":")[0]
+        kind = arm.partition(":")[0].removesuffix("-lenient")
         if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file():
             device = SafeArm(device, load_limits(limits or kind))
     twin = None

@@ -38,6 +38,9 @@ SHOWS_S = 0.4
 MUTE_S, STOP_AGAIN_S = 3.0, 0.1
 # Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
 SETTLE_S = 0.5
+# Modes of an arm that is enabled, and of one that moves. All questions about them ask the feedback's mode, and no other field.
+ENABLED_MODES = {Mode.ENABLED, Mode.BACKDRIVE, Mode.RUNNING, Mode.RECORDING, Mode.PAUSE, Mode.JOG}
+MOVING_MODES = {Mode.RUNNING, Mode.JOG}
 PAUSED = "paused by another client; stop() drops the queue, Continue() of that client would execute it"
 # In a move shorter than this (mm) the turn may determine the speed.
 SHORT_MM = 5.0
@@ -70,6 +73,9 @@ class MG400(BaseArm):
     ports : Mg400Ports
     kinematics : LinkageKinematics
         Used to check targets before they are sent, so that the arm does not raise an alarm.
+    lenient : bool
+        For controllers and emulators that are only alike: feedback counts whatever its test value is, a motion is seen in the joints,
+        and ``Sync`` is not used.
     """
 
     axes = 4
@@ -80,11 +86,13 @@ class MG400(BaseArm):
         *,
         ports: Mg400Ports = Mg400Ports(),  # noqa: B008  (frozen)
         kinematics: LinkageKinematics = arms.MG400,
+        lenient: bool = False,
     ) -> None:
         self.name, self.kinematics = f"MG400 at {host}", kinematics
         self._dashboard = CommandPort(self.name, host, ports.dashboard)
         self._motion = CommandPort(self.name, host, ports.motion)
-        self._feedback = Feedback(self.name, host, ports.feedback)
+        self._feedback = Feedback(self.name, host, ports.feedback, lenient=lenient)
+        self._lenient = lenient
         self._in_use = False  # true from connect to disconnect, even while a connection is lost
         self._bare = False  # old firmware: echoes on the dashboard, nothing on the motion port
         self._alarm_text: str | None = None
@@ -124,12 +132,12 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: {self._alarm()}")
         for request in ("EnableRobot()", "User(0)", "Tool(0)"):
             self._ask(request)
-        self._await_mode(lambda mode: mode in (Mode.ENABLED, Mode.RUNNING), "was not enabled; check its button and that no stop is pressed")
+        self._await_mode(lambda mode: mode in ENABLED_MODES, "was not enabled; check its button and that no stop is pressed")
 
     def disable(self) -> None:
         self._tell_in_any_case("DisableRobot()", "disabled")
         self._under_way = False
-        self._shows(lambda packet: not packet["enabled"])  # so that the next state tells it
+        self._shows(lambda packet: int(packet["mode"]) not in ENABLED_MODES)  # so that the next state tells it
 
     def clear_error(self) -> None:
         """Clear the alarms and forget the queue; after an emergency stop ``enable`` brings the arm back."""
@@ -150,7 +158,7 @@ class MG400(BaseArm):
         except DeviceNotConnectedError:
             raise
         except DeviceError as error:
-            if not self._shows(lambda packet: int(packet["mode"]) not in (Mode.RUNNING, Mode.JOG)):  # else only the reply was lost
+            if not self._shows(lambda packet: int(packet["mode"]) not in MOVING_MODES):  # else only the reply was lost
                 try:
                     self.emergency_stop()
                 except DeviceError:
@@ -187,8 +195,8 @@ class MG400(BaseArm):
             np.array([x, y, z, 0.0, 0.0, turn]),
             packet["q_actual"][:4].copy(),
             time_s,
-            bool(packet["enabled"]),
-            mode in (Mode.RUNNING, Mode.JOG),
+            mode in ENABLED_MODES,
+            mode in MOVING_MODES or (self._lenient and time.monotonic() - self._feedback.turned_s < RESTED_S),
             self._alarm() if mode == Mode.ERROR else PAUSED if mode == Mode.PAUSE else "",
         )
 
@@ -253,7 +261,7 @@ class MG400(BaseArm):
         packet, _ = self._feedback.newest(SILENCE_S)  # old firmware does not report a refusal
         if int(packet["mode"]) == Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
-        if not packet["enabled"]:
+        if int(packet["mode"]) not in ENABLED_MODES:
             raise DeviceError(f"{self.name}: not enabled; call enable() first")
         begun_s, options = time.monotonic(), "" if pose is None else self._turning_option(pose)
         self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)}{options})")
@@ -283,23 +291,24 @@ class MG400(BaseArm):
 
     def _await_queue(self, deadline: float, timeout_s: float) -> None:
         """Wait for the reply to ``Sync``; an alarm, silence or the time limit ends the wait. A short move may never show as RUNNING."""
-        if not self._bare:
+        syncs = not (self._bare or self._lenient)
+        if syncs:
             self._late_replies = True
             self._motion.send("Sync()")
         rest_since, asked_s = None, time.monotonic()
         while True:
-            if not self._bare and self._motion.poll("Sync()", wait_s=POLL_S):
+            if syncs and self._motion.poll("Sync()", wait_s=POLL_S):
                 self._late_replies = False
                 return
             state = self.state()
             if state.error:
                 raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
             rest_since = None if state.moving or state.time_s < asked_s else rest_since or state.time_s
-            if self._bare and rest_since is not None and state.time_s - rest_since > RESTED_S:
+            if not syncs and rest_since is not None and state.time_s - rest_since > RESTED_S:
                 return
             if time.monotonic() > deadline:
                 raise self._too_long(timeout_s)
-            if self._bare:
+            if not syncs:
                 time.sleep(POLL_S)
 
     def _await_joints(self, joints: np.ndarray, timeout_s: float) -> None:

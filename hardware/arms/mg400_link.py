@@ -9,7 +9,7 @@ from threading import Condition, Event, RLock, Thread
 import numpy as np
 
 from hardware.arms.arm import FEEDBACK_AGE_S
-from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply
+from hardware.arms.mg400_wire import PACKET_BYTES, Reply, newest_packet, take_reply, told_apart, why_no_packet
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait for a connection, in s.
@@ -22,6 +22,8 @@ SILENCE_S = FEEDBACK_AGE_S
 LOOK_S = 0.05
 # Pause before feedback is connected again, in s. Public clients wait 5 s, but a servo that stands still needs feedback sooner.
 RECONNECT_S = 0.5
+# Joints that differ by more than this (deg) from one packet to the next are in motion.
+MOTION_DEG = 1e-4
 # Largest number of bytes in one read: more than half a second of feedback.
 BACKLOG_BYTES = 64 * PACKET_BYTES
 
@@ -33,6 +35,7 @@ class CommandPort:
         self._name, self._address = name, (host, port)
         self._socket: socket.socket | None = None
         self._lock, self._buffer = RLock(), ""
+        self._heard = False  # whether anything came over this connection
 
     @property
     def is_open(self) -> bool:
@@ -50,6 +53,7 @@ class CommandPort:
                 "'twin emulate mg400' and mg400:127.0.0.1"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._heard = False
 
     def close(self) -> None:
         with self._lock:
@@ -74,8 +78,12 @@ class CommandPort:
                 if reply := self.poll(text, wait_s=min(LOOK_S, deadline - time.monotonic())):
                     return reply
                 look()
+            came = self._buffer
         host, port = self._address
-        raise DeviceError(f"{self._name}: no reply to {text} from {host}:{port} within {timeout_s:g} s; check the arm, then connect again")
+        instead = f", {told_apart(came.encode('ascii', errors='replace'))} came instead: is this an MG400?" if came else ""
+        raise DeviceError(
+            f"{self._name}: no reply to {text} from {host}:{port} within {timeout_s:g} s{instead}; check the arm, then connect again"
+        )
 
     def send(self, text: str) -> None:
         with self._lock:
@@ -111,19 +119,40 @@ class CommandPort:
             self._lost(error)
         if not data:
             self._lost(None)
+        self._heard = True
         self._buffer += data.decode("ascii", errors="replace")
         return True
 
     def _lost(self, error: OSError | None) -> None:
+        came = self._buffer
         self.close()
         reason = f" ({error.strerror or error})" if error else ""
+        if came and not self._numbered(came):
+            said, (host, port) = told_apart(came.encode("ascii", errors="replace")), self._address
+            raise DeviceNotConnectedError(
+                f"{self._name}: {said} came from {host}:{port}: this is no MG400. Check address and port"
+            ) from error
+        why = "Check its power and cable" if self._heard else "Another program may hold it (DobotStudio Pro, a script): close that"
         raise DeviceNotConnectedError(
-            f"{self._name}: the arm closed the connection{reason}. Check its power and cable, then disconnect() and connect() again"
+            f"{self._name}: the arm closed the connection{reason}. {why}, then disconnect() and connect() again"
         ) from error
+
+    @staticmethod
+    def _numbered(text: str) -> bool:
+        """Whether a text may be the beginning of a reply."""
+        return text.lstrip()[:1] in "-0123456789"
 
 
 class Feedback:
     """Keeps the newest feedback packet. A thread reads all that arrives and reconnects after silence.
+
+    Parameters
+    ----------
+    name, host : str
+    ports : tuple of int
+        Tried in order.
+    lenient : bool
+        Whether packets count whatever their test value is.
 
     Attributes
     ----------
@@ -132,8 +161,11 @@ class Feedback:
     reconnects : int
     """
 
-    def __init__(self, name: str, host: str, ports: tuple[int, ...]) -> None:
-        self._name, self._host, self._ports = name, host, ports
+    def __init__(self, name: str, host: str, ports: tuple[int, ...], *, lenient: bool = False) -> None:
+        self._name, self._host, self._ports, self._lenient = name, host, ports, lenient
+        self._came, self._closed = b"", False  # the first bytes that held no packet, and whether the newest connection was closed
+        self._joints: np.ndarray | None = None
+        self.turned_s = -np.inf  # when the joints were last seen in motion
         self._newest: tuple[np.void, float] | None = None
         self._arrived, self._ended = Condition(), Event()
         self._thread: Thread | None = None
@@ -153,14 +185,15 @@ class Feedback:
         self._thread.start()
         with self._arrived:
             if not self._arrived.wait_for(lambda: self._newest is not None, CONNECT_TIMEOUT_S):
+                why = why_no_packet(self._came, closed=self._closed)
                 self.close()
-                raise DeviceNotConnectedError(f"{self._name}: connected, but no valid feedback came; restart the arm, then connect again")
+                raise DeviceNotConnectedError(f"{self._name}: no feedback from {self._host}: {why}")
 
     def close(self) -> None:
         self._ended.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
-        self._thread, self._newest = None, None
+        self._thread, self._newest, self._came = None, None, b""
 
     def newest(self, max_age_s: float) -> tuple[np.void, float]:
         """The newest packet and when it arrived.
@@ -212,12 +245,18 @@ class Feedback:
                 data = connection.recv(BACKLOG_BYTES)
             except TimeoutError:
                 continue
+            self._closed = not data
             if not data:
                 return
-            packet, buffer, skipped = newest_packet(buffer + data)
+            if self._newest is None:
+                self._came = (self._came + data)[-2 * PACKET_BYTES :]
+            packet, buffer, skipped = newest_packet(buffer + data, lenient=self._lenient)
             self.skipped_bytes += skipped
             if packet is not None and len(data) < BACKLOG_BYTES:  # otherwise newer packets are still waiting to be read
                 valid_s = time.monotonic()
+                if self._joints is not None and np.abs(packet["q_actual"] - self._joints).max() > MOTION_DEG:
+                    self.turned_s = valid_s
+                self._joints = packet["q_actual"].copy()
                 with self._arrived:
                     self._newest = (packet, valid_s)
                     self._arrived.notify_all()

@@ -165,11 +165,11 @@ PACKET = np.dtype(
 )
 
 
-def newest_packet(buffer: bytes) -> tuple[np.void | None, bytes, int]:
+def newest_packet(buffer: bytes, *, lenient: bool = False) -> tuple[np.void | None, bytes, int]:
     """The newest whole packet in what has arrived.
 
     A packet counts if its length is 1440, its test value is at its place, no other packet begins inside it, and it is
-    followed by another packet or by nothing yet. Otherwise it was cut short.
+    followed by another packet or by nothing yet. Otherwise it was cut short. ``lenient``: the test value may be anything.
 
     Returns
     -------
@@ -180,14 +180,49 @@ def newest_packet(buffer: bytes) -> tuple[np.void | None, bytes, int]:
         Number of bytes before it that are not part of a packet.
     """
     newest, begin, used = None, 0, 0
-    at = buffer.find(TEST_BYTES)
+    mark, offset = (_LENGTH, 0) if lenient else (TEST_BYTES, TEST_OFFSET)
+    at = buffer.find(mark)
     while at >= 0:
-        start, following = at - TEST_OFFSET, buffer.find(TEST_BYTES, at + 1)
-        whole = start >= 0 and start + PACKET_BYTES <= len(buffer) and not 0 <= following < start + PACKET_BYTES
+        start, following = at - offset, buffer.find(mark, at + 1)
+        alone = lenient or not 0 <= following < start + PACKET_BYTES
+        whole = alone and start >= 0 and start + PACKET_BYTES <= len(buffer)
         if whole and buffer.startswith(_LENGTH, start) and _LENGTH.startswith(buffer[start + PACKET_BYTES :][:2]):
             newest, begin = np.frombuffer(buffer[start : start + PACKET_BYTES], PACKET)[0], start
             used += PACKET_BYTES
+            following = buffer.find(mark, at + PACKET_BYTES)
         at = following
     if newest is None:
         return None, buffer[-2 * PACKET_BYTES :], max(0, len(buffer) - 2 * PACKET_BYTES)
     return newest, buffer[begin + PACKET_BYTES :], begin + PACKET_BYTES - used
+
+
+def told_apart(came: bytes) -> str:
+    """What bytes are, that came where something else was expected, in words: text is quoted, others are counted."""
+    text = came[:60].split(b"\r\n")[0]
+    if not came:
+        return "nothing"
+    if text.isascii() and text.decode("ascii").isprintable():
+        return f"the text '{text.decode('ascii')}'"
+    return f"{len(came)} bytes that begin with {came[:8].hex(' ')}"
+
+
+def why_no_packet(came: bytes, *, closed: bool) -> str:
+    """Why what came from a feedback port holds no packet of an MG400, with the remedy."""
+    if not came and closed:
+        return "it hung up at once: another program holds the arm (DobotStudio Pro, a script). Close it, then connect again"
+    if not came:
+        return (
+            "connected, but nothing came: the controller hangs, another program holds the feedback, or this is no MG400 "
+            "(a server that waits to be asked). Check the address, close other programs, else restart the arm"
+        )
+    packet, _, _ = newest_packet(came, lenient=True)
+    if packet is not None:
+        return (
+            f"packets came whose test value is {int(packet['test_value']):#x} instead of {TEST_VALUE:#x}: an emulator, or a controller of "
+            "another kind. If their poses can be trusted, use it as 'mg400-lenient:ADDRESS'"
+        )
+    if told_apart(came).startswith("the text"):
+        return f"{told_apart(came)} came instead of feedback: this is no MG400. Check address and port"
+    return (
+        f"{told_apart(came)} came, and no packet of {PACKET_BYTES} bytes: its firmware or the arm may be of another kind. Check the address"
+    )

@@ -9,7 +9,8 @@ from hardware.arms.simulated import SimulatedArm
 from hardware.errors import DeviceError
 
 ARM_SPECS = (
-    "mg400 or mg400:ADDRESS[:DASHBOARD_PORT] (an arm, or 127.0.0.1 with 'twin emulate mg400'), magician or magician:/dev/ttyUSB0, "
+    "mg400 or mg400:ADDRESS[:DASHBOARD_PORT] (an arm, or 127.0.0.1 with 'twin emulate mg400'), mg400-lenient:ADDRESS[:DASHBOARD_PORT] "
+    "(a controller that is only alike), magician or magician:/dev/ttyUSB0, "
     "simulated (six axes) or simulated:4"
 )
 
@@ -31,11 +32,12 @@ def open_arm(spec: str) -> Arm:
     kind, _, rest = spec.partition(":")
     if kind == "simulated" and rest in ("", "4", "6"):
         return SimulatedArm(axes=int(rest or 6), name=f"simulated arm of {rest or 6} axes")
-    if kind == "mg400":
+    if kind in ("mg400", "mg400-lenient"):
         host, _, port = rest.partition(":")
         if port and not port.isdigit():
             raise DeviceError(f"arm '{spec}': '{port}' is no port; for example mg400:127.0.0.1:29999")
-        return MG400(host or DEFAULT_HOSTS["LAN1"], ports=Mg400Ports().shifted(int(port) - DASHBOARD_PORT if port else 0))
+        ports = Mg400Ports().shifted(int(port) - DASHBOARD_PORT if port else 0)
+        return MG400(host or DEFAULT_HOSTS["LAN1"], ports=ports, lenient=kind == "mg400-lenient")
     if kind == "magician":
         return Magician(rest or _attached_magician())
     raise DeviceError(f"no arm '{spec}'; there are: {ARM_SPECS}")

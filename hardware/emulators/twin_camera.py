@@ -31,21 +31,23 @@ class FeedbackPose:
     host : str
     ports : tuple of int
         Feedback ports, tried in order.
+    lenient : bool
+        See ``Feedback``.
     """
 
-    def __init__(self, host: str, ports: tuple[int, ...] = tuple(FEEDBACK_PERIOD_S)) -> None:
-        self._feedback = Feedback(f"arm at {host}", host, ports)
+    def __init__(self, host: str, ports: tuple[int, ...] = tuple(FEEDBACK_PERIOD_S), *, lenient: bool = False) -> None:
+        self._feedback = Feedback(f"arm at {host}", host, ports, lenient=lenient)
 
     @classmethod
     def of(cls, spec: str) -> "FeedbackPose":
         """From ``mg400:ADDRESS[:DASHBOARD_PORT]``. The feedback ports have the same offset as the dashboard port."""
         kind, _, rest = spec.partition(":")
         host, _, port = rest.partition(":")
-        if kind != "mg400" or not host or (port and not port.isdecimal()):
+        if kind not in ("mg400", "mg400-lenient") or not host or (port and not port.isdecimal()):
             raise OptionError(f"--arm {spec}: expected mg400:ADDRESS, for example mg400:127.0.0.1 with 'twin emulate mg400' running")
         offset = int(port) - DASHBOARD_PORT if port else 0
         require_ports(offset)
-        return cls(host, tuple(number + offset for number in FEEDBACK_PERIOD_S))
+        return cls(host, tuple(number + offset for number in FEEDBACK_PERIOD_S), lenient=kind != "mg400")
 
     def __enter__(self) -> "FeedbackPose":
         self._feedback.open()

@@ -32,8 +32,8 @@ ENABLE_TIMEOUT_S = 5.0
 MOTION_REPLY_S = 1.0
 # The same for a stop, an emergency stop and a disable. After it the next means is tried, because the arm may still move.
 STOP_REPLY_S = 0.5
-# Feedback shows within this time (s) that a stop or a disable was obeyed: two periods of the slower of the two ports in use.
-SHOWS_S = 0.4
+# Feedback shows within this time (s) that a stop or a disable was obeyed: more than two periods of the slower of the two ports in use.
+SHOWS_S = 0.5
 # For MUTE_S (s) after one of these has failed, further ones wait only STOP_AGAIN_S (s), so that the end of a program isn't delayed.
 MUTE_S, STOP_AGAIN_S = 3.0, 0.1
 # Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
@@ -169,12 +169,13 @@ class MG400(BaseArm):
         self._unstopped = self._under_way = False
 
     def _shows(self, obeyed: Callable[[np.void], bool]) -> bool:
-        """Whether feedback soon shows that a command was obeyed."""
-        asked_s = time.monotonic()
+        """Whether feedback soon shows that a command was obeyed, and goes on showing it: the first packet may be older than the command."""
+        asked_s, since_s = time.monotonic(), np.inf
         with contextlib.suppress(StaleDataError):
             while time.monotonic() - asked_s < SHOWS_S:
                 packet, time_s = self._feedback.newest(SHOWS_S)
-                if time_s > asked_s and obeyed(packet):
+                since_s = min(since_s, time_s) if time_s > asked_s and obeyed(packet) else np.inf
+                if time_s - since_s >= RESTED_S:
                     return True
                 time.sleep(POLL_S)
         return False

@@ -10,6 +10,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from hardware.arms.kinematics import LINE_LEAVES_WORKSPACE, NO_INVERSE, TARGET_LIMIT, Kinematics, OutOfReachError, Violation
 
 LINE_STEP_MM = 5.0  # distance between the places of a line at which limits are checked
+# Largest distance in mm between a circle and the lines that stand for it, and the largest number of lines: a Magician queues 32.
+CIRCLE_MM, CIRCLE_LINES = 0.02, 30
+# Places are on one line if the sine of the angle between them is below this.
+STRAIGHT = 1e-6
 HISTORY_N = 512  # moves that are remembered, so that a camera can ask where the arm was
 
 
@@ -168,6 +172,15 @@ class MotionTrack:
             self._pieces.append(piece)
             return piece
 
+    def dwell(self, duration_s: float, *, now_s: float) -> Piece:
+        """Append a time in which the arm stands where the last piece ended."""
+        with self._lock:
+            last = self._pieces[-1]
+            begins_s = max(now_s, last.end_s)
+            joints = last.joints_deg(begins_s)
+            self._pieces.append(Piece(self.kinematics, joints, joints, False, begins_s, duration_s, 0.0))
+            return self._pieces[-1]
+
     def stop(self, now_s: float) -> None:
         """Stand still from ``now_s`` on and forget what was still to come."""
         with self._lock:
@@ -193,3 +206,32 @@ def turn_between_deg(a: np.ndarray, b: np.ndarray) -> float:
     """Angle between the orientations of two poses (6,)."""
     first, second = Rotation.from_euler("xyz", [a[3:], b[3:]], degrees=True)
     return float(np.degrees((first.inv() * second).magnitude()))
+
+
+def circle(start: np.ndarray, via: np.ndarray, end: np.ndarray, *, whole: bool = False) -> list[np.ndarray]:
+    """Poses (6,) of short lines along the circle through the places of three poses (6,).
+
+    They turn evenly from pose to pose, and the last one is ``end``. A ``whole`` circle comes back to ``start`` and does not turn. Places on
+    one straight line give the two lines between them.
+    """
+    a, ab, ac = start[:3], via[:3] - start[:3], end[:3] - start[:3]
+    normal = np.cross(ab, ac)
+    if np.linalg.norm(normal) < STRAIGHT * max(float(ab @ ab), float(ac @ ac), STRAIGHT):
+        return [via, end]
+    middle = a + np.cross(normal, ab) * (ac @ ac) / (2 * normal @ normal) + np.cross(ac, normal) * (ab @ ab) / (2 * normal @ normal)
+    radius = float(np.linalg.norm(a - middle))
+    x = (a - middle) / radius
+    y = np.cross(normal / np.linalg.norm(normal), x)
+    at_via, at_end = (float(np.arctan2((pose[:3] - middle) @ y, (pose[:3] - middle) @ x) % (2 * np.pi)) for pose in (via, end))
+    length = 2 * np.pi if whole else at_end
+    lines = int(np.ceil(length / (2 * np.arccos(1 - min(1.0, CIRCLE_MM / radius)))))
+    angles = np.linspace(0.0, length, int(np.clip(lines, 2, CIRCLE_LINES)) + 1)[1:]
+    places = middle + radius * (np.cos(angles)[:, None] * x + np.sin(angles)[:, None] * y)
+    if whole:
+        return [*np.c_[places, np.tile(start[3:], (len(angles), 1))][:-1], start]
+    known = np.array([start[3:], via[3:], end[3:]])
+    if np.any(known[:, :2]):
+        turns = Slerp([0.0, at_via, at_end], Rotation.from_euler("xyz", known, degrees=True))(angles).as_euler("xyz", degrees=True)
+    else:  # about z alone, where R is not wrapped
+        turns = np.c_[np.zeros((len(angles), 2)), np.interp(angles, [0.0, at_via, at_end], known[:, 2])]
+    return [*np.c_[places, turns][:-1], end]

@@ -1,15 +1,15 @@
 """The commands of the emulated MG400 for each of its ports, with their parameters and replies."""
 
-import math
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 
 from hardware.arms.mg400_wire import ErrorId
-from hardware.arms.motion import Speeds
+from hardware.arms.motion import Speeds, circle
 from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame
-from hardware.emulators.mg400_grammar import Parameter, RefusedError, Request, keyword_number, read_numbers
+from hardware.emulators.mg400_grammar import Parameter, RefusedError, Request, keyword_number, read_numbers, read_table
 
 # A coordinate or an angle of any size.
 NUMBER = Parameter()
@@ -23,8 +23,18 @@ INDEX = Parameter(integer=True, low=0, high=9)
 LOAD_KG = Parameter(low=0.0, high=0.5)
 # Number of a digital output.
 OUTPUT = Parameter(integer=True, low=1, high=24)
+# Number of a digital input.
+INPUT = Parameter(integer=True, low=1, high=16)
+# Number of an input or output at the tool.
+TOOL_PORT = Parameter(integer=True, low=1, high=2)
 # Level of a digital output.
 BIT = Parameter(integer=True, low=0, high=1)
+# Number of whole circles.
+LAPS = Parameter(integer=True, low=1, high=999)
+# Distance of the load's centre from the flange's axis, mm.
+CENTRE_MM = Parameter(low=-500.0, high=500.0)
+# Time that the queue waits, ms.
+WAIT_MS = Parameter(integer=True, low=1, high=3_600_000)
 # Names of the directions of a jog.
 AXES = {f"{axis}{sign}" for axis in ("j1", "j2", "j3", "j4", "x", "y", "z", "r") for sign in "+-"}
 # Number of servos. GetErrorID replies with the controller's alarms, followed by those of each servo.
@@ -62,16 +72,35 @@ class Mg400Commands:
             "tool": lambda request: self._select(request, "tool", arm.tools),
             "positivesolution": self._forward,
             "inversesolution": self._inverse,
-            "do": self._output,
-            "doexecute": self._output,
+            "do": lambda request: self._output(request, queued=True),
+            "doexecute": lambda request: self._output(request, queued=False),
+            "dogroup": self._outputs,
+            "tooldo": self._tool_output,
+            "tooldoexecute": self._tool_output,
+            "di": lambda request: self._input(request, INPUT),
+            "tooldi": lambda request: self._input(request, TOOL_PORT),
+            "setpayload": self._payload,
+            "payload": self._payload,
+            "arch": lambda request: self._only_check(request, INDEX),
+            "limz": lambda request: self._only_check(request, NUMBER),
+            "startdrag": self._plain(lambda: arm.drag(True)),
+            "stopdrag": self._plain(lambda: arm.drag(False)),
             **{key: self._percentage for key in arm.percent},
         }
+        if firmware >= (1, 5, 9):
+            self.dashboard["wait"] = self._wait
         if firmware >= (1, 6):
             self.dashboard["setuser"] = lambda request: self._define(request, arm.users)
             self.dashboard["settool"] = lambda request: self._define(request, arm.tools)
+            self.dashboard["calcuser"] = lambda request: self._calculate(request, arm.users)
+            self.dashboard["calctool"] = lambda request: self._calculate(request, arm.tools)
         self.motion: dict[str, Command] = {
             "movj": lambda request: self._to_pose(request, linear=False),
             "movl": lambda request: self._to_pose(request, linear=True),
+            "movlio": lambda request: self._to_pose(request, linear=True),
+            "movjio": lambda request: self._to_pose(request, linear=False),
+            "arc": self._arc,
+            "circle": self._circle,
             "jointmovj": lambda request: self._to_joints(request, relative=False),
             "reljointmovj": lambda request: self._to_joints(request, relative=True),
             "movejog": self._jog,
@@ -88,14 +117,18 @@ class Mg400Commands:
         return run
 
     def _enable(self, request: Request) -> str:
-        load = read_numbers(request, (LOAD_KG, NUMBER, NUMBER, NUMBER), (0, 1, 4))
+        load = read_numbers(request, (LOAD_KG, CENTRE_MM, CENTRE_MM, CENTRE_MM), (0, 1, 4))
         self.arm.enable()
         kg, x_mm, y_mm, z_mm = load + [0.0] * (4 - len(load))
         self.arm.load = kg, x_mm, y_mm, z_mm
         return ""
 
     def _percentage(self, request: Request) -> str:
-        (self.arm.percent[request.name],) = read_numbers(request, (RATIO if request.name == "cp" else PERCENT,), (1,))
+        (percent,) = read_numbers(request, (RATIO if request.name == "cp" else PERCENT,), (1,))
+        if request.name == "speedfactor":
+            self.arm.set_speed_factor(percent)
+        else:
+            self.arm.percent[request.name] = percent
         return ""
 
     def _only_check(self, request: Request, parameter: Parameter) -> str:
@@ -108,25 +141,75 @@ class Mg400Commands:
         setattr(self.arm, attribute, int(index))
         return ""
 
-    def _define(self, request: Request, frames: dict) -> str:
-        if len(request.values) != 2:
-            raise RefusedError(ErrorId.PARAMETER_COUNT)
-        try:
-            index, values = int(request.values[0]), [float(text) for text in request.values[1].strip("{}").split(",")]
-        except ValueError as error:
-            raise RefusedError(ErrorId.PARAMETER_TYPE - 2) from error
-        whole = len(values) in (4, 6) and all(map(math.isfinite, values))
-        if not 1 <= index <= 9 or not whole:  # frame 0 cannot be changed
-            raise RefusedError(ErrorId.PARAMETER_RANGE - (1 if whole else 2))
+    def _frame_of(self, request: Request, first: int) -> PlanarFrame:
+        """The frame ``{x,y,z,r}`` that begins at a parameter; its braces may be missing."""
+        text, n = ",".join(request.values[first:]), first + 1
+        values = read_table(text, (4, 6), n)
         x, y, z = values[:3]
-        frames[index] = PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
+        return PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
+
+    def _define(self, request: Request, frames: dict) -> str:
+        if len(request.values) not in (2, 5, 7):
+            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        frame = self._frame_of(request, 1)
+        frames[self._whole(request, 0, INDEX)] = frame
         return ""
 
-    def _output(self, request: Request) -> str:
-        index, level = (int(value) for value in read_numbers(request, (OUTPUT, BIT), (2,)))
-        bit = 1 << (index - 1)
-        self.arm.digital_out = self.arm.digital_out | bit if level else self.arm.digital_out & ~bit
+    def _calculate(self, request: Request, frames: dict) -> str:
+        """A frame after an offset along the base's axes (1) or along its own (0)."""
+        if len(request.values) not in (3, 6, 8):
+            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        frame, offset = self._frame(frames, self._whole(request, 0, INDEX)), self._frame_of(request, 2)
+        along_base = self._whole(request, 1, BIT)
+        found = (
+            PlanarFrame(frame.x + offset.x, frame.y + offset.y, frame.z + offset.z, frame.r + offset.r) if along_base else frame @ offset
+        )
+        return _text([found.x, found.y, found.z, found.r])
+
+    @staticmethod
+    def _whole(request: Request, n: int, parameter: Parameter) -> int:
+        """The whole number at a place of the parameters."""
+        ahead = (NUMBER,) * n
+        values = Request(request.name, (*["0"] * n, request.values[n]), {}, request.text)
+        return int(read_numbers(values, (*ahead, parameter), (n + 1,))[n])
+
+    def _payload(self, request: Request) -> str:
+        kg = read_numbers(request, (LOAD_KG, NUMBER), (1, 2))[0]
+        self.arm.load = kg, *self.arm.load[1:]
         return ""
+
+    def _wait(self, request: Request) -> str:
+        times_ms = read_numbers(request, (WAIT_MS,), (0, 1))
+        self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), wait_s=(times_ms[0] if times_ms else 0.0) / 1000.0))
+        return ""
+
+    def _output(self, request: Request, *, queued: bool) -> str:
+        index, level = (int(value) for value in read_numbers(request, (OUTPUT, BIT), (2,)))
+        if queued and self.arm.busy():
+            self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), outputs=((0.0, index, level),), wait_s=0.0))
+        else:
+            self.arm.set_output(index, level)
+        return ""
+
+    def _outputs(self, request: Request) -> str:
+        if not request.values or len(request.values) % 2:
+            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        count = len(request.values)
+        values = [int(value) for value in read_numbers(request, (OUTPUT, BIT) * (count // 2), (count,))]
+        for index, level in zip(values[::2], values[1::2], strict=True):
+            self.arm.set_output(index, level)
+        return ""
+
+    def _tool_output(self, request: Request) -> str:
+        index, level = (int(value) for value in read_numbers(request, (TOOL_PORT, BIT), (2,)))
+        bit = 1 << (index - 1)
+        self.arm.tool_out = self.arm.tool_out | bit if level else self.arm.tool_out & ~bit
+        return ""
+
+    def _input(self, request: Request, parameter: Parameter) -> str:
+        """Nothing is attached, so no input has a signal."""
+        read_numbers(request, (parameter,), (1,))
+        return "0"
 
     def _error_ids(self) -> str:
         self.arm.update()
@@ -160,9 +243,60 @@ class Mg400Commands:
         return _text(joints)
 
     def _to_pose(self, request: Request, *, linear: bool) -> str:
-        pose = read_numbers(request, (NUMBER,) * 4, (4,))
-        self._order(self._flange(pose, *self._frames(request)), request, linear=linear)
+        place, groups = self._split(request)
+        pose = read_numbers(place, (NUMBER,) * 4, (4,))
+        flange = self._flange(pose, *self._frames(request))
+        length_mm = float(np.linalg.norm(flange.pose[:3] - self.arm.last_target().pose[:3]))
+        outputs = tuple(self._on_the_way(text, n, length_mm) for n, text in enumerate(groups, start=5))
+        self._order(flange, request, linear=linear, outputs=outputs)
         return ""
+
+    @staticmethod
+    def _split(request: Request) -> tuple[Request, tuple[str, ...]]:
+        """A move and the outputs ``{Mode,Distance,Index,Status}`` that it sets on its way; only the moves with IO have any."""
+        if not request.name.endswith("io"):
+            return request, ()
+        groups = tuple(value for value in request.values if value[0] in "{(")
+        if not groups:
+            raise RefusedError(ErrorId.PARAMETER_COUNT)
+        return replace(request, values=request.values[: len(request.values) - len(groups)]), groups
+
+    @staticmethod
+    def _on_the_way(text: str, n: int, length_mm: float) -> tuple[float, int, int]:
+        """Share of the way at which an output is set, its index and its level."""
+        mode, distance, index, level = read_table(text, (4,), n)
+        share = distance / 100.0 if mode == 0 else distance / max(length_mm, 1e-9)
+        if mode not in (0, 1) or not -1.0 <= share <= 1.0 or not OUTPUT.low <= index <= OUTPUT.high or level not in (0, 1):
+            raise RefusedError(ErrorId.PARAMETER_RANGE - n)
+        return share if share >= 0 else 1.0 + share, int(index), int(level)
+
+    def _arc(self, request: Request) -> str:
+        """``Arc(X1,Y1,Z1,R1,X2,Y2,Z2,R2)``: along the circle through the present place and two others."""
+        numbers = read_numbers(request, (NUMBER,) * 8, (8,))
+        self._go_round(request, numbers, laps=0)
+        return ""
+
+    def _circle(self, request: Request) -> str:
+        """``Circle(count,{X1,Y1,Z1,R1},{X2,Y2,Z2,R2})``, or as the vendor's client sends it: eight numbers and the count."""
+        if len(request.values) == 3:
+            laps = self._whole(request, 0, LAPS)
+            numbers = read_table(request.values[1], (4,), 2) + read_table(request.values[2], (4,), 3)
+        else:
+            *numbers, count = read_numbers(request, (NUMBER,) * 8 + (LAPS,), (9,))
+            laps = int(count)
+        self._go_round(request, numbers, laps=laps)
+        return ""
+
+    def _go_round(self, request: Request, numbers: list[float], *, laps: int) -> None:
+        """Order the lines of an arc, or of whole circles. Places on one line are refused."""
+        via, end = (self._flange(part, *self._frames(request)).pose for part in (numbers[:4], numbers[4:]))
+        start = self.arm.last_target().pose
+        poses = circle(start, via, end, whole=laps > 0)
+        if len(poses) == 2:
+            raise RefusedError(ErrorId.FAILED)
+        speeds = replace(self._speeds(request, "l"), linear_mm_s2=np.inf, angular_deg_s2=np.inf)  # no stop between the lines
+        for pose in poses * max(laps, 1):
+            self.arm.order(Order(pose, True, speeds))
 
     def _relative(self, request: Request) -> str:
         """``RelMovLUser(dx, dy, dz, dr, user)`` and similar commands. The offset is along the axes of the user or tool frame."""
@@ -179,15 +313,15 @@ class Mg400Commands:
         self._order(end, request, linear=request.name[6] == "l")
         return ""
 
-    def _order(self, flange: PlanarFrame, request: Request, *, linear: bool) -> None:
+    def _order(self, flange: PlanarFrame, request: Request, *, linear: bool, outputs: tuple[tuple[float, int, int], ...] = ()) -> None:
         speeds = self._speeds(request, "l" if linear else "j")
         if linear:
-            self.arm.order(Order(flange.pose, True, speeds))
+            self.arm.order(Order(flange.pose, True, speeds, outputs=outputs))
             return
         try:
-            self.arm.order(Order(self.arm.joints_at(flange), False, speeds))
+            self.arm.order(Order(self.arm.joints_at(flange), False, speeds, outputs=outputs))
         except RefusedError:
-            self.arm.order(Order(flange.pose, True, speeds))  # the target is out of reach, and planning raises the alarm
+            self.arm.order(Order(flange.pose, True, speeds, outputs=outputs))  # planning raises the alarm if the target is out of reach
 
     def _to_joints(self, request: Request, *, relative: bool) -> str:
         joints = np.array(read_numbers(request, (NUMBER,) * 4, (4,)))
@@ -201,8 +335,9 @@ class Mg400Commands:
             self.arm.reset()
             return ""
         axis = request.values[0].lower().replace(" ", "")
-        if axis not in AXES:
-            raise RefusedError(ErrorId.PARAMETER_RANGE - 1)
+        if axis not in AXES:  # by the vendor's document any other text stops a jog
+            self.arm.stop_jog()
+            return ""
         self.arm.jog(axis, user=self._frames(request)[0])
         return ""
 

@@ -2,14 +2,14 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import RLock
 
 import numpy as np
 
 from hardware.arms.kinematics import MG400, OutOfReachError, Violation
 from hardware.arms.mg400_wire import MAX_JOINT_DEG_S, MAX_LINEAR_MM_S, ErrorId, Mode
-from hardware.arms.motion import MotionTrack, Speeds, check_line
+from hardware.arms.motion import MotionTrack, Piece, Speeds, check_line
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400_grammar import RefusedError
 
@@ -53,13 +53,20 @@ class PlanarFrame:
 
 @dataclass(frozen=True)
 class Order:
-    """A queued move: to a pose in a line, or to joints. ``end_s`` is when it will be done."""
+    """A queued command: a move to a pose in a line or to joints, or a wait. ``end_s`` is when it will be done."""
 
     end: np.ndarray
     linear: bool
     speeds: Speeds
     jog: bool = False
     end_s: float = np.inf
+    outputs: tuple[tuple[float, int, int], ...] = ()  # share of the time at which a digital output is set, its index and level
+    wait_s: float | None = None  # time to stand, instead of a move
+
+    def at(self, share: float) -> "Order":
+        """The same at a share of its speed."""
+        speeds = replace(self.speeds, linear_mm_s=share * self.speeds.linear_mm_s, angular_deg_s=share * self.speeds.angular_deg_s)
+        return replace(self, speeds=speeds)
 
 
 class Mg400Controller:
@@ -81,7 +88,9 @@ class Mg400Controller:
         self.enabled = self.paused = False
         self.alarms: list[int] = []
         self.load = (0.0, 0.0, 0.0, 0.0)
-        self.digital_out = 0
+        self.digital_out = self.tool_out = 0
+        self.dragged = False
+        self._outputs: list[tuple[float, int, int]] = []  # time, index and level of outputs that moves will set
         self.percent = {"speedj": 100.0, "speedl": 100.0, "accj": 100.0, "accl": 100.0, "cp": 0.0, "speedfactor": 100.0}
         self.users, self.tools = {0: PlanarFrame()}, {0: PlanarFrame()}
         self.user, self.tool = 0, 0
@@ -93,6 +102,9 @@ class Mg400Controller:
         """Raise the alarms that are due. Returns the present time."""
         now_s = time.monotonic()
         with self.lock:
+            for _, index, level in sorted(one for one in self._outputs if one[0] <= now_s):
+                self.set_output(index, level)
+            self._outputs = [one for one in self._outputs if one[0] > now_s]
             for due_s, alarms in sorted(self._due):
                 if due_s <= now_s and not self.alarms:
                     self.raise_alarm(*alarms, time_s=due_s)
@@ -109,7 +121,7 @@ class Mg400Controller:
         with self.lock:
             self.raise_alarm(EMERGENCY_STOP)
             self._held.clear()
-            self.enabled = False
+            self.enabled = self.dragged = False
 
     def mode(self) -> Mode:
         now_s = self.update()
@@ -118,6 +130,8 @@ class Mg400Controller:
                 return Mode.ERROR
             if not self.enabled:
                 return Mode.DISABLED
+            if self.dragged:
+                return Mode.BACKDRIVE
             if self.paused:
                 return Mode.PAUSE
             if self.track.moving(now_s):
@@ -143,7 +157,7 @@ class Mg400Controller:
     def disable(self) -> None:
         with self.lock:
             self.reset()
-            self.enabled = False
+            self.enabled = self.dragged = False
 
     def clear_error(self) -> None:
         with self.lock:
@@ -156,6 +170,42 @@ class Mg400Controller:
             self._hold(time.monotonic())
             self._held.clear()
             self.paused = False
+
+    def set_output(self, index: int, level: int) -> None:
+        """Set a digital output at once."""
+        bit = 1 << (index - 1)
+        self.digital_out = self.digital_out | bit if level else self.digital_out & ~bit
+
+    def drag(self, begin: bool) -> None:
+        """Begin or end the mode in which a person moves the arm by hand; not in error, and only while the arm is enabled."""
+        with self.lock:
+            if self.alarms or not self.enabled:
+                raise RefusedError(ErrorId.FAILED)
+            self.reset()
+            self.dragged = begin
+
+    def set_speed_factor(self, percent: float) -> None:
+        """``SpeedFactor``: it also holds for the moves that go on and wait."""
+        with self.lock:
+            now_s = self.update()
+            share = percent / self.percent["speedfactor"]
+            self.percent["speedfactor"] = percent
+            waiting = [one for one in self._orders if one.end_s > now_s]
+            self._held = [one.at(share) for one in self._held]
+            if not waiting:
+                return
+            due, self._due = self._due, []
+            self._orders = [one for one in self._orders if one.end_s <= now_s]
+            self._outputs = []
+            self.track.stop(now_s)
+            for one in waiting:
+                self._plan(one.at(share))
+            self._due += [(self.track.end_s, alarms) for _, alarms in due]
+
+    def stop_jog(self) -> None:
+        """End a jog; other moves go on."""
+        if self.mode() == Mode.JOG:
+            self.reset()
 
     def pause(self) -> None:
         with self.lock:
@@ -182,7 +232,7 @@ class Mg400Controller:
         """
         with self.lock:
             self.update()
-            if self.alarms or not self.enabled:
+            if self.alarms or self.dragged or not self.enabled:
                 raise RefusedError(ErrorId.FAILED)
             if "ignore-moves" in self.faults:
                 return
@@ -194,7 +244,7 @@ class Mg400Controller:
     def last_target(self) -> PlanarFrame:
         """Flange frame at the end of the queue."""
         with self.lock:
-            last = self._held[-1] if self._held else None
+            last = next((one for one in reversed(self._held) if one.wait_s is None), None)
             if last is None:
                 return PlanarFrame.of_pose(self.track.pose(max(self.track.end_s, time.monotonic())))
             return PlanarFrame.of_pose(last.end if last.linear else self.kinematics.forward(last.end))
@@ -253,12 +303,16 @@ class Mg400Controller:
         return check_line(self.kinematics, end, end) if linear else self.kinematics.violation(end)
 
     def _plan(self, order: Order) -> None:
-        planned = self.track.move(order.end, order.speeds, linear=order.linear, now_s=time.monotonic())
+        if order.wait_s is not None:
+            planned: Piece | Violation = self.track.dwell(order.wait_s, now_s=time.monotonic())
+        else:
+            planned = self.track.move(order.end, order.speeds, linear=order.linear, now_s=time.monotonic())
         if isinstance(planned, Violation):
             self._due.append((max(self.track.end_s, time.monotonic()), (planned.code,)))
             return
         waiting = [one for one in self._orders if one.end_s > time.monotonic()]
-        self._orders = [*waiting, Order(order.end, order.linear, order.speeds, order.jog, planned.end_s)]
+        self._orders = [*waiting, replace(order, end_s=planned.end_s)]
+        self._outputs += [(planned.start_s + share * planned.duration_s, index, level) for share, index, level in order.outputs]
         if planned.duration_s > 0 and (share := self.faults.value("collision")) is not None:
             self._due.append((planned.start_s + share * planned.duration_s, COLLISIONS))
         if planned.duration_s > 0 and (share := self.faults.value("stall")) is not None:
@@ -268,4 +322,5 @@ class Mg400Controller:
         """Stop and keep the moves that are not finished."""
         self._held = [order for order in self._orders if order.end_s > time_s and not order.jog] + self._held
         self._orders, self._due = [order for order in self._orders if order.end_s <= time_s], []
+        self._outputs = [one for one in self._outputs if one[0] <= time_s]
         self.track.stop(time_s)

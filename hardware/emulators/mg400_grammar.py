@@ -41,7 +41,7 @@ def take_request(buffer: str) -> tuple[Request | None, str]:
 def _parse(text: str) -> Request:
     name, _, inside = text.partition("(")
     values, keywords = [], {}
-    for part in re.split(r",(?![^{(]*[})])", inside[:-1]):  # not at commas within braces
+    for part in re.split(r",(?![^{(]*[})])", inside[:-1]):  # not at commas within braces or parentheses
         key, equals, value = part.partition("=")
         if equals:
             keywords[key.strip().lower()] = value.strip()
@@ -70,6 +70,23 @@ def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tu
     if len(request.values) not in counts:
         raise RefusedError(ErrorId.PARAMETER_COUNT)
     return [_number(text, parameter, n) for n, (text, parameter) in enumerate(zip(request.values, parameters, strict=False), start=1)]
+
+
+def read_table(text: str, counts: tuple[int, ...], n: int) -> list[float]:
+    """Numbers of the n-th parameter, ``{x,y,z,r}`` or ``(x,y,z,r)``.
+
+    Raises
+    ------
+    RefusedError
+        They are no numbers (-3000n), not finite or not as many as they should be (-4000n).
+    """
+    try:
+        numbers = [float(part) for part in text.strip("{}() ").split(",")]
+    except ValueError as error:
+        raise RefusedError(ErrorId.PARAMETER_TYPE - n) from error
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
+        raise RefusedError(ErrorId.PARAMETER_RANGE - n)
+    return numbers
 
 
 def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:

@@ -18,7 +18,6 @@ from hardware.arms.cri import (
     RobotController,
     SyncRobot,
 )
-from hardware.arms.cri.controller import circle
 from hardware.arms.cri.transforms import (
     EULER_AXES,
     euler2mat,
@@ -31,6 +30,7 @@ from hardware.arms.cri.transforms import (
     transform_euler,
 )
 from hardware.arms.mg400 import MG400, Mg400Ports
+from hardware.arms.motion import circle
 from hardware.arms.simulated import SimulatedArm
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError

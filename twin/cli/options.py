@@ -60,9 +60,7 @@ Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a
 # Sensor whose trained weights are shipped with the package.
 SHIPPED_MODEL = Path("mg400-331")
 Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
-ArmOption = Annotated[
-    str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400:ADDRESS, mg400-lenient:ADDRESS, magician:PORT")
-]
+ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
 PlainLight = Annotated[bool, typer.Option("--plain-light", help="draw the twin's frames with direct light alone, without path tracing")]
 ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
 Limits = Annotated[str | None, typer.Option("--limits", help="safety limits: mg400, magician, or a TOML file")]

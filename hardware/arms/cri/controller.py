@@ -10,13 +10,12 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from hardware.arms.arm import POLL_S, Arm
 from hardware.arms.cri.transforms import Numbers, euler2mat, mat2euler, mat2quat, quat2mat
 from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
-from hardware.arms.motion import turn_between_deg
+from hardware.arms.motion import circle, turn_between_deg
 from hardware.arms.open_arm import open_arm
 from hardware.errors import DeviceError, leave
 from hardware.newest import NewestTarget
@@ -25,8 +24,6 @@ from hardware.newest import NewestTarget
 START_SPEED = 20.0
 # A move may take this time (s), and this number of times as long as its way and speed give.
 PATIENCE_S, PATIENCE = 10.0, 5.0
-# Largest distance in mm between a circle and the lines that are driven for it, and the largest number of lines: a Magician queues 32.
-CIRCLE_MM, CIRCLE_LINES = 0.02, 30
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
@@ -279,31 +276,6 @@ class _Controllers(Mapping[str, type[RobotController]]):
 
 
 Controller = _Controllers()
-
-
-def circle(start: np.ndarray, via: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
-    """Poses (6,) of short lines along the circle through the places of three poses (6,), which turn evenly; the last one is ``end``.
-
-    Places on one line give the two lines between them.
-    """
-    a, b, c = start[:3], via[:3], end[:3]
-    ab, ac = b - a, c - a
-    normal = np.cross(ab, ac)
-    if np.linalg.norm(normal) < 1e-6 * max(float(ab @ ab), float(ac @ ac), 1e-9):
-        return [via, end]
-    middle = a + np.cross(normal, ab) * (ac @ ac) / (2 * normal @ normal) + np.cross(ac, normal) * (ab @ ab) / (2 * normal @ normal)
-    radius = float(np.linalg.norm(a - middle))
-    x = (a - middle) / radius
-    y = np.cross(normal / np.linalg.norm(normal), x)
-    at_via, at_end = (float(np.arctan2((p - middle) @ y, (p - middle) @ x) % (2 * np.pi)) for p in (b, c))
-    lines = int(np.ceil(at_end / (2 * np.arccos(1 - min(1.0, CIRCLE_MM / radius)))))
-    angles = np.linspace(0.0, at_end, int(np.clip(lines, 2, CIRCLE_LINES)) + 1)[1:]
-    turns = Slerp([0.0, at_via, at_end], Rotation.from_euler("xyz", [start[3:], via[3:], end[3:]], degrees=True))(angles)
-    poses = [
-        np.r_[middle + radius * (np.cos(t) * x + np.sin(t) * y), turn.as_euler("xyz", degrees=True)]
-        for t, turn in zip(angles, turns, strict=True)
-    ]
-    return [*poses[:-1], end]
 
 
 def _near(pose: np.ndarray, target: np.ndarray, tolerance: float) -> bool:

@@ -8,6 +8,7 @@ ALARMS = {
     16: "the target is at a singularity",
     17: "no joint angles reach the target",
     18: "the target is beyond a joint's range",
+    20: "the places of an arc lie on one line",
     23: "the line to the target leaves the workspace",
     **dict(enumerate(_JOINT_ENDS, start=64)),
     72: "the parallelogram is at its end (J3 - J2 too large)",

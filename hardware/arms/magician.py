@@ -25,6 +25,8 @@ TRIES = 4
 HOME_TIMEOUT_S = 60.0
 # What pyserial raises when a port vanishes.
 PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)
+# Bytes of a queue index.
+INDEX_BYTES = 8
 # Acceleration in mm/s2 (deg/s2) for each mm/s (deg/s) of speed, in 1/s: full speed is reached within a quarter of a second.
 ACCELERATION = 4.0
 
@@ -185,9 +187,10 @@ class Magician(BaseArm):
         bits = int.from_bytes(self._request(Id.ALARMS), "little")
         return [n for n in range(bits.bit_length()) if bits >> n & 1]
 
-    @staticmethod
-    def _index_of(payload: bytes) -> int:
-        return int.from_bytes(payload[:8], "little")
+    def _index_of(self, payload: bytes) -> int:
+        if len(payload) < INDEX_BYTES:
+            raise DeviceError(f"{self.name}: did not take the command, its queue is full; wait for its moves, or call stop()")
+        return int.from_bytes(payload[:INDEX_BYTES], "little")
 
     def _require_enabled(self) -> None:
         self._require_connected()

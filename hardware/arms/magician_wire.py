@@ -18,6 +18,7 @@ class Id(IntEnum):
     ALARMS = 20  # read: the state; write: clear them (the manual prints 21, devices use 20)
     HOME_PARAMS = 30
     HOME = 31
+    HANDHELD_OUTPUT = 41
     END_EFFECTOR = 60
     LASER = 61
     SUCTION = 62
@@ -33,8 +34,15 @@ class Id(IntEnum):
     PTP = 84
     CP_PARAMS = 90
     CP = 91
+    CP_LASER = 92
+    ARC_PARAMS = 100
+    ARC = 101
     WAIT = 110
     IO = 131
+    MOTOR = 135  # of a conveyor or a slide
+    MOTOR_STEPS = 136
+    COLOR = 137
+    INFRARED = 138
     QUEUE_START = 240
     QUEUE_STOP = 241
     QUEUE_FORCE_STOP = 242

@@ -10,13 +10,13 @@ import numpy as np
 
 from hardware.arms.kinematics import MAGICIAN, NO_INVERSE, OutOfReachError, Violation
 from hardware.arms.magician_wire import Id, Message, Ptp
-from hardware.arms.motion import MotionTrack, Speeds
+from hardware.arms.motion import MotionTrack, Speeds, circle
 from hardware.emulators.faults import Faults
 
 # Commands that the queue holds.
 QUEUE_N = 32
 # Numbers of alarms (see ``hardware.arms.dobot_alarms``).
-NOT_UNDERSTOOD, LOST_STEPS = 1, 80
+NOT_UNDERSTOOD, ARC_PLACES, LOST_STEPS = 1, 20, 80
 START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
 # Speed of the joints while homing, in deg/s. Chosen for the emulator.
 HOME_SPEED_DEG_S = 30.0
@@ -38,6 +38,15 @@ PARAMETERS: dict[int, bytes] = {
     Id.PTP_JUMP_PARAMS: struct.pack("<2f", 20.0, 100.0),
     Id.PTP_COMMON_PARAMS: struct.pack("<2f", 50.0, 50.0),
     Id.CP_PARAMS: struct.pack("<3fB", 100.0, 50.0, 10.0, 0),
+    Id.ARC_PARAMS: struct.pack("<4f", 100.0, 100.0, 100.0, 100.0),
+    Id.HANDHELD_OUTPUT: bytes(1),
+}
+# What is not attached to the arm: bytes of a write, and the reply to a read, which tells no signal.
+NOT_ATTACHED: dict[int, tuple[int, bytes]] = {
+    Id.MOTOR: (6, b""),
+    Id.MOTOR_STEPS: (10, b""),
+    Id.COLOR: (3, bytes(3)),
+    Id.INFRARED: (2, bytes(1)),
 }
 # Bytes of parameters that a command may have. pydobot sends CP without its last number: 14 bytes.
 SIZES: dict[int, tuple[int, ...]] = {
@@ -46,6 +55,8 @@ SIZES: dict[int, tuple[int, ...]] = {
     Id.JOG: (2,),
     Id.PTP: (17,),
     Id.CP: (17, 14),
+    Id.CP_LASER: (17,),
+    Id.ARC: (32,),
     Id.WAIT: (4,),
 }
 
@@ -86,7 +97,9 @@ class MagicianController:
             now_s = self.advance()
             if not self._understood(message):
                 return self.refuse(message)
-            if message.is_write and message.is_queued:
+            if message.is_queued:  # with the write bit or, from some clients, without
+                if len(self._queue) >= QUEUE_N:
+                    return Message(message.id, message.ctrl)  # no index: it was not taken
                 self._issued += 1
                 self._queue.append(Queued(self._issued, message, now_s))
                 self.advance()
@@ -119,10 +132,13 @@ class MagicianController:
             return now_s
 
     def _understood(self, message: Message) -> bool:
+        writes = message.is_write or message.is_queued
         if message.id in SIZES:
-            return message.is_write and len(message.params) in SIZES[message.id]
+            return writes and len(message.params) in SIZES[message.id]
         if message.id in PARAMETERS:
-            return not message.is_write or len(message.params) == len(PARAMETERS[message.id])
+            return not writes or len(message.params) == len(PARAMETERS[message.id])
+        if message.id in NOT_ATTACHED:
+            return not writes or len(message.params) == NOT_ATTACHED[message.id][0]
         return message.id in set(Id)
 
     def _read(self, message: Message, now_s: float) -> bytes:
@@ -135,6 +151,8 @@ class MagicianController:
             return struct.pack("<Q", self._current)
         if message.id == Id.QUEUE_SPACE:
             return struct.pack("<Q" if "wide-queue-space" in self.faults else "<I", max(0, QUEUE_N - len(self._queue)))
+        if message.id in NOT_ATTACHED:
+            return NOT_ATTACHED[message.id][1]
         return self._params.get(message.id, b"")
 
     def _write(self, message: Message, now_s: float) -> bytes:
@@ -164,7 +182,9 @@ class MagicianController:
         elif message.id == Id.PTP:
             mode, *numbers = struct.unpack("<B4f", params)
             return self._ptp(mode, np.array(numbers), begins_s)
-        elif message.id == Id.CP:
+        elif message.id == Id.ARC:
+            return self._arc(np.array(struct.unpack("<8f", params)), begins_s)
+        elif message.id in (Id.CP, Id.CP_LASER):
             absolute, x, y, z = struct.unpack("<B3f", params[:13])
             here = self._target_pose()
             end = np.array([x, y, z, 0, 0, 0]) if absolute else here + [x, y, z, 0, 0, 0]
@@ -204,6 +224,17 @@ class MagicianController:
             across = mode == Ptp.JUMP_MOVL_XYZ
             begins_s = self._go(above, line, begins_s, linear=True) if across else self._go_to(above, turn, begins_s)
         return self._go(target, line, begins_s, linear=True)
+
+    def _arc(self, numbers: np.ndarray, begins_s: float) -> float:
+        """Along the circle through the present place and two others."""
+        via, end = (np.array([*part[:3], 0.0, 0.0, part[3]]) for part in (numbers[:4], numbers[4:]))
+        lines = circle(self._target_pose(), via, end)
+        if len(lines) == 2:  # on one straight line
+            return self._alarm(ARC_PLACES, begins_s)
+        speed, turn, _, _ = self._floats(Id.ARC_PARAMS, "<4f")
+        for pose in lines:
+            begins_s = self._go(pose, Speeds(speed, turn), begins_s, linear=True)
+        return begins_s
 
     def _jog(self, joints: int, command: int, begins_s: float) -> None:
         self.track.stop(begins_s)

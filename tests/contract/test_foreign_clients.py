@@ -110,33 +110,88 @@ def packages(tmp_path_factory):
 
 
 PYDOBOT = """
-import sys
+import struct, sys, warnings
+import numpy as np
 from pydobot import Dobot
+from pydobot.enums import PTPMode
 arm = Dobot(port=sys.argv[1])
+def at(*place):
+    assert np.allclose(arm.pose()[:4], place, atol=0.01), (arm.pose(), place)
 arm.speed(200, 200)
 arm.move_to(220.0, 30.0, 20.0, 10.0, wait=True)
-x, y, z, r, *joints = arm.pose()
-assert max(abs(x - 220), abs(y - 30), abs(z - 20), abs(r - 10)) < 0.01, (x, y, z, r)
-arm.wait(1); arm.suck(True); arm.grip(False)
+at(220, 30, 20, 10)
+warnings.simplefilter("ignore")
+arm.go(230.0, 30.0, 20.0, 10.0)
+arm._set_wait_cmd(1)
+for mode in PTPMode:
+    target = (0, 45, 45, 0) if "ANGLE" in mode.name else (1, 1, 1, 1) if "INC" in mode.name else (220.0, 30.0, 20.0, 10.0)
+    arm._set_ptp_cmd(*target, mode, True)
+arm.move_to(220.0, 30.0, 20.0, 10.0, wait=True)
+at(220, 30, 20, 10)
+arm._set_cp_cmd(225.0, 30.0, 20.0)
+arm.wait(1); arm.suck(True); arm.suck(False); arm.grip(True); arm.grip(False)
+arm.set_eio(3, 1); assert arm.get_eio(3) is not None
+arm._set_queued_cmd_stop_exec(); arm._set_queued_cmd_clear(); arm._set_queued_cmd_start_exec()
+arm.move_to(220.0, 30.0, 20.0, 10.0, wait=True)
+at(220, 30, 20, 10)
+arm.move_to(100.0, 0.0, 50.0, 0.0)  # beyond a joint's range: an alarm, and the device goes on answering
+at(220, 30, 20, 10)
 arm.close()
 print("done")
 """
 PYDOBOTPLUS = """
 import sys
+import numpy as np
 from pydobotplus import Dobot
-from pydobotplus.dobotplus import MODE_PTP
+from pydobotplus.dobotplus import MODE_PTP, CustomPosition, DobotException
 arm = Dobot(port=sys.argv[1])
+def at(*place):
+    assert np.allclose(arm.get_pose().position, place, atol=0.01), (arm.get_pose(), place)
 arm.speed(200, 200)
+arm.set_home(200.0, 0.0, 0.0)
 arm.wait_for_cmd(arm.home())
-arm._set_ptp_cmd(220.0, 30.0, 20.0, 10.0, MODE_PTP.MOVJ_XYZ, True)
-pose = arm.get_pose()
-assert max(abs(a - b) for a, b in zip(pose.position, (220, 30, 20, 10))) < 0.01, pose
+at(200, 0, 0, 0)
+for mode in MODE_PTP:
+    target = (0, 45, 45, 0) if "ANGLE" in mode.name else (1, 1, 1, 1) if "INC" in mode.name else (220.0, 30.0, 20.0, 10.0)
+    arm._set_ptp_cmd(*target, mode, True)
+    assert not arm.get_alarms(), mode
+arm.move_to(220.0, 30.0, 20.0, 10.0)
+arm.move_to(position=CustomPosition(220.0, 30.0, 20.0, 10.0))
+arm.move_rel(x=5, y=-5, z=1, r=2)
+at(225, 25, 21, 12)
+assert len(arm.get_pose().joints.in_radians()) == 4
+arm.wait_for_cmd(arm.go_arc(245.0, 25.0, 21.0, 12.0, 235.0, 35.0, 21.0, 12.0))
+at(245, 25, 21, 12)
 assert not arm.get_alarms()
-arm.jog_x(50.0); arm.jog_x(0)
+for jog in (arm.jog_x, arm.jog_y, arm.jog_z, arm.jog_r):
+    jog(50.0); jog(-50.0); jog(0)
+for call in (arm.suck, arm.grip):
+    arm.wait_for_cmd(call(True)); arm.wait_for_cmd(call(False))
+arm.wait_for_cmd(arm.laze(100, True)); arm.wait_for_cmd(arm.laze(0, False))
+arm.set_io(5, True)
+arm.set_hht_trig_output(True); assert arm.get_hht_trig_output() in (True, False)
+arm.conveyor_belt(0.5); arm.conveyor_belt(0.0)
+arm.wait_for_cmd(arm.conveyor_belt_distance(50, 10))
+arm.wait_for_cmd(arm.set_color()); assert arm.get_color() == [False, False, False]
+arm.wait_for_cmd(arm.set_ir()); assert arm.get_ir() is False
+arm.engrave(np.arange(48).reshape(6, 8) * 5, 0.5)  # fewer pixels never start its queue
+assert not arm.get_alarms()
+arm._set_queued_cmd_stop_exec()
+taken = 0
+try:
+    while taken < 99:
+        arm._extract_cmd_index(arm._set_ptp_cmd(220.0, 30.0, 20.0, 10.0, MODE_PTP.MOVL_XYZ, False)); taken += 1
+except Exception as full:
+    assert taken == 32, (taken, full)
+arm._set_queued_cmd_clear(); arm._set_queued_cmd_start_exec()
 arm._set_ptp_cmd(900.0, 30.0, 20.0, 10.0, MODE_PTP.MOVL_XYZ, False)
 assert {int(alarm) for alarm in arm.get_alarms()} == {17}
 arm.clear_alarms()
 assert not arm.get_alarms()
+arm._set_queued_cmd_clear()
+arm._set_ptp_cmd(100.0, 0.0, 50.0, 0.0, MODE_PTP.MOVJ_XYZ, False)
+assert 64 <= min(int(alarm) for alarm in arm.get_alarms()) <= 73
+arm.clear_alarms()
 arm.close()
 print("done")
 """

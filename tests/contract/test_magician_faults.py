@@ -158,3 +158,51 @@ def test_a_command_that_fails_in_the_emulator_is_an_alarm_and_reported(monkeypat
         assert ask(emulator, Id.PTP, struct.pack("<B4f", Ptp.MOVJ_ANGLE, 0, 45, 45, 0), WRITE | QUEUED) is not None
         assert int.from_bytes(ask(emulator, Id.ALARMS).params, "little") == 1 << 1
     assert "division" in caplog.text
+
+
+def pose_of(emulator):
+    return struct.unpack("<8f", ask(emulator, Id.GET_POSE).params)
+
+
+def test_the_queue_refuses_when_it_is_full():
+    with MagicianEmulator(time_scale=20.0) as emulator, Magician(emulator.device) as arm:
+        arm.enable()
+        arm._request(Id.QUEUE_STOP, ctrl=WRITE)
+        for n in range(32):
+            arm.move_linear(AWAY + [0, n % 2, 0, 0, 0, 0], wait=False)
+        with pytest.raises(DeviceError, match="queue is full"):
+            arm.move_linear(AWAY, wait=False)
+        arm.move_linear(AWAY)  # the refusal stopped the arm and emptied the queue
+
+
+def test_an_arc_goes_through_its_places_and_a_line_is_none():
+    with MagicianEmulator(time_scale=20.0) as emulator:
+        ask(emulator, Id.QUEUE_START, ctrl=WRITE)
+        here = pose_of(emulator)[:4]
+        via, end = (here[0] + 20, here[1] + 20, here[2], here[3]), (here[0] + 40, here[1], here[2], here[3] + 10)
+        ask(emulator, Id.ARC, struct.pack("<8f", *via, *end), WRITE | QUEUED)
+        deadline, most = time.monotonic() + 5.0, 0.0
+        while np.abs(np.array(pose_of(emulator)[:4]) - end).max() > 0.01:
+            most = max(most, pose_of(emulator)[1])
+            assert time.monotonic() < deadline
+        assert most > here[1] + 10
+        ask(emulator, Id.ARC, struct.pack("<8f", end[0] + 5, *end[1:], end[0] + 10, *end[1:]), WRITE | QUEUED)
+        assert int.from_bytes(ask(emulator, Id.ALARMS).params, "little") == 1 << 20
+
+
+@pytest.mark.parametrize(
+    ("id", "write", "read", "told"),
+    [
+        (Id.COLOR, bytes([1, 1, 1]), bytes([1, 1, 1]), bytes(3)),
+        (Id.INFRARED, bytes([1, 2]), bytes([2]), bytes(1)),
+        (Id.MOTOR, struct.pack("<BBi", 0, 1, 1000), b"", b""),
+        (Id.MOTOR_STEPS, struct.pack("<BBiI", 0, 1, 1000, 10), b"", b""),
+    ],
+)
+def test_what_is_not_attached_tells_no_signal(id, write, read, told):
+    with MagicianEmulator() as emulator:
+        ask(emulator, Id.QUEUE_START, ctrl=WRITE)
+        assert ask(emulator, id, write, WRITE | QUEUED).params == struct.pack("<Q", 1)
+        assert ask(emulator, id, write, QUEUED).params == struct.pack("<Q", 2)  # as some clients send it
+        assert ask(emulator, id, read).params == told
+        assert not any(ask(emulator, Id.ALARMS).params)

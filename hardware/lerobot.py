@@ -1,105 +1,54 @@
 """An arm and a camera with the interfaces that LeRobot expects of a robot and a camera. LeRobot itself is not imported."""
 
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 
 from hardware.arms.arm import Arm
+from hardware.arms.open_arm import kind_of, open_arm
+from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource
 from hardware.doctor import cameras
-from hardware.errors import StaleDataError
+from hardware.errors import DeviceError, StaleDataError, leave
 from hardware.newest import NewestTarget
 from hardware.safe_arm import SafeArm
+from hardware.safety import load_limits
+from scenes.sensor import SensorSpec
+from twin.frames.forms import frame_size
+from twin.types import Form, Frame
 
 _POSE = ("x", "y", "z", "rx", "ry", "rz")
 
 
-class LeRobotArm:
-    """An arm for LeRobot's scripts: observations and actions are dicts of floats, in mm and deg.
-
-    Parameters
-    ----------
-    arm : Arm
-        Give a ``SafeArm`` to have actions clipped; ``send_action`` tells what was really sent.
-    linear_mm_s, angular_deg_s : float
-        Speed of the arm. The limits of a ``SafeArm`` may reduce it.
-    """
-
-    def __init__(self, arm: Arm, *, linear_mm_s: float = 100.0, angular_deg_s: float = 90.0) -> None:
-        self.arm, self.name = arm, arm.name
-        limits = arm.limits if isinstance(arm, SafeArm) else None
-        self._speed = (linear_mm_s, angular_deg_s)
-        if limits is not None:
-            self._speed = min(linear_mm_s, limits.linear_mm_s), min(angular_deg_s, limits.angular_deg_s)
-        self._newest = NewestTarget(arm, *self._speed)
-
-    @cached_property
-    def _keys(self) -> tuple[str, ...]:
-        return _POSE if self.arm.axes == 6 else tuple(key for key in _POSE if key not in ("rx", "ry"))
-
-    @property
-    def observation_features(self) -> dict[str, type]:
-        joints: dict[str, type] = {f"joint_{n}.pos": float for n in range(1, self.arm.axes + 1)}
-        return {key: float for key in self._keys} | joints
-
-    @property
-    def action_features(self) -> dict[str, type]:
-        return {key: float for key in self._keys}
-
-    @property
-    def is_connected(self) -> bool:
-        return self.arm.is_connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Always true: these arms know their joints' zeros (a Magician after it was homed)."""
-        return True
-
-    def connect(self, calibrate: bool = True) -> None:
-        """Connect and enable; there is nothing to calibrate."""
-        self.arm.connect()
-        try:
-            self.arm.enable()
-            self.arm.set_speed(*self._speed)
-        except BaseException:
-            self.arm.disconnect()
-            raise
-        self._newest.start()
-
-    def get_observation(self) -> dict[str, float]:
-        state = self.arm.state()
-        pose = dict(zip(_POSE, state.pose.tolist(), strict=True))
-        return {key: pose[key] for key in self._keys} | {f"joint_{n}.pos": float(q) for n, q in enumerate(state.joints_deg, start=1)}
-
-    def send_action(self, action: dict[str, float]) -> dict[str, float]:
-        """Send the arm towards a pose and do not wait. A missing key keeps its present value.
-
-        The newest action wins: the arm goes in short pieces and turns to a newer action after at most 0.2 s, without replaying older ones.
-        An action beyond the limits of a ``SafeArm`` is clipped to them. Returns what was really sent to the arm: the pose of the action,
-        or the end of the present piece on the way to it.
-        """
-        unknown = set(action) - set(_POSE)
-        if unknown:
-            raise KeyError(f"an action has the keys {', '.join(self._keys)}, not {', '.join(sorted(unknown))}")
-        pose = dict(zip(_POSE, self.arm.state().pose.tolist(), strict=True)) | action
-        sent = self._newest.go(np.array([pose[key] for key in _POSE], float))
-        return {key: float(value) for key, value in zip(_POSE, sent, strict=True) if key in self._keys}
-
-    def disconnect(self) -> None:
-        self._newest.end()
-        self.arm.disconnect()
-
-
 class LeRobotCamera:
-    """A frame source with ``connect``, ``read``, ``async_read``, ``read_latest`` and ``disconnect`` of LeRobot's cameras.
+    """A frame source with what LeRobot's cameras have. Its pictures are (H, W, 3), those of a gray camera too.
 
     Parameters
     ----------
     source : FrameSource
+    fps, width, height : int, optional
+        What the pictures are, if it is to be known before the camera is connected. By default it is that of the source's sensor, else it
+        is known from the first picture on.
     """
 
-    def __init__(self, source: FrameSource) -> None:
+    def __init__(self, source: FrameSource, *, fps: int | None = None, width: int | None = None, height: int | None = None) -> None:
         self._source = source
+        spec: SensorSpec | None = getattr(source, "_spec", None)
+        known = frame_size(spec, source.form) if spec is not None else (None, None)
+        self.fps = fps if fps is not None else round(getattr(source, "fps", 0.0)) or None
+        self.width = width if width is not None else known[0]
+        self.height = height if height is not None else known[1]
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+        self.disconnect()
 
     @property
     def is_connected(self) -> bool:
@@ -114,23 +63,190 @@ class LeRobotCamera:
         """Open the camera. With ``warmup`` wait for the first frame."""
         self._source.connect()
         if warmup:
-            self._source.read(timeout_s=self._source.first_frame_s)
+            self._picture(self._source.read(timeout_s=self._source.first_frame_s))
 
     def read(self) -> np.ndarray:
-        """The next image (H, W) or (H, W, 3), uint8 RGB."""
-        return self._source.read().image
+        """The next image (H, W, 3), uint8 RGB."""
+        return self._picture(self._source.read())
 
     def async_read(self, timeout_ms: float = 200) -> np.ndarray:
         """The newest image not read yet; ``TimeoutError``."""
-        return self._source.read(timeout_s=timeout_ms / 1e3).image
+        return self._picture(self._source.read(timeout_s=timeout_ms / 1e3))
 
     def read_latest(self, max_age_ms: float = 500) -> np.ndarray:
         """The newest image; ``TimeoutError`` if it is older."""
         try:
-            return self._source.read_latest(max_age_s=max_age_ms / 1e3).image
+            return self._picture(self._source.read_latest(max_age_s=max_age_ms / 1e3))
         except StaleDataError as error:
             raise TimeoutError(str(error)) from error
 
     def disconnect(self) -> None:
         """Close the camera."""
         self._source.disconnect()
+
+    def _picture(self, frame: Frame) -> np.ndarray:
+        image = frame.image if frame.image.ndim == 3 else np.repeat(frame.image[..., None], 3, axis=2)
+        self.height, self.width = image.shape[:2]
+        return image
+
+
+@dataclass(kw_only=True)
+class LeRobotArmConfig:
+    """What LeRobot's scripts know of a robot before it is made.
+
+    Attributes
+    ----------
+    arm : str
+        As ``open_arm`` takes it.
+    limits : str or None
+        Safety limits, by name or file: actions are clipped to them. None: those of the arm's kind.
+    cameras : dict of str to str
+        Names, and what ``open_camera`` takes.
+    linear_mm_s, angular_deg_s : float
+        Speed of the arm. The limits may reduce it.
+    id : str or None
+        Tells robots of one kind apart.
+    calibration_dir : Path or None
+        LeRobot's; these arms need no calibration.
+    """
+
+    arm: str = "simulated"
+    limits: str | None = None
+    cameras: dict[str, str] = field(default_factory=dict)
+    linear_mm_s: float = 100.0
+    angular_deg_s: float = 90.0
+    id: str | None = None
+    calibration_dir: Path | None = None
+
+    @property
+    def type(self) -> str:
+        """The kind of the robot."""
+        return kind_of(self.arm)
+
+
+class LeRobotArm:
+    """An arm for LeRobot's scripts: observations and actions are dicts of floats, in mm and deg.
+
+    Parameters
+    ----------
+    arm : Arm or LeRobotArmConfig
+        Give a ``SafeArm`` or a configuration to have actions clipped; ``send_action`` tells what was really sent.
+    id : str, optional
+    cameras : mapping of str to LeRobotCamera
+        They are connected and read with the arm.
+    linear_mm_s, angular_deg_s : float
+        Speed of the arm. The limits of a ``SafeArm`` may reduce it.
+    """
+
+    config_class = LeRobotArmConfig
+    name = "twin_arm"
+
+    def __init__(
+        self,
+        arm: Arm | LeRobotArmConfig,
+        *,
+        id: str | None = None,
+        cameras: Mapping[str, LeRobotCamera] | None = None,
+        linear_mm_s: float = 100.0,
+        angular_deg_s: float = 90.0,
+    ) -> None:
+        if isinstance(arm, LeRobotArmConfig):
+            config, arm = arm, SafeArm(open_arm(arm.arm), load_limits(arm.limits or kind_of(arm.arm)))
+            id, linear_mm_s, angular_deg_s = config.id, config.linear_mm_s, config.angular_deg_s
+            cameras = {name: LeRobotCamera(open_camera(text, form=Form.RAW)) for name, text in config.cameras.items()}
+        self.arm, self.id = arm, id
+        self.name = self.robot_type = type(arm.arm if isinstance(arm, SafeArm) else arm).__name__.lower()
+        self.cameras = dict(cameras or {})
+        self.calibration: dict[str, Any] = {}
+        limits = arm.limits if isinstance(arm, SafeArm) else None
+        self._speed = (linear_mm_s, angular_deg_s)
+        if limits is not None:
+            self._speed = min(linear_mm_s, limits.linear_mm_s), min(angular_deg_s, limits.angular_deg_s)
+        self._newest = NewestTarget(arm, *self._speed)
+        self._keys = _POSE if arm.axes == 6 else tuple(key for key in _POSE if key not in ("rx", "ry"))
+
+    def __str__(self) -> str:
+        return f"{self.id} {type(self).__name__}"
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+        leave(self.disconnect, error)
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        """Types of the numbers, and shapes (H, W, 3) of the cameras' pictures."""
+        joints: dict[str, Any] = {f"joint_{n}.pos": float for n in range(1, self.arm.axes + 1)}
+        return {key: float for key in self._keys} | joints | {name: self._shape(name) for name in self.cameras}
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        return {key: float for key in self._keys}
+
+    @property
+    def is_connected(self) -> bool:
+        return self.arm.is_connected and all(camera.is_connected for camera in self.cameras.values())
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Always true: these arms know their joints' zeros (a Magician after it was homed)."""
+        return True
+
+    def calibrate(self) -> None:
+        """There is nothing to calibrate."""
+
+    def configure(self) -> None:
+        """Set the speed."""
+        self.arm.set_speed(*self._speed)
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Connect and enable the arm, and connect the cameras; there is nothing to calibrate."""
+        self.arm.connect()
+        try:
+            self.arm.enable()
+            self.configure()
+            for camera in self.cameras.values():
+                camera.connect()
+        except BaseException as error:
+            leave(self.disconnect, error)
+            raise
+        self._newest.start()
+
+    def get_observation(self) -> dict[str, Any]:
+        """Pose and joints in mm and deg, and each camera's newest picture."""
+        state = self.arm.state()
+        pose = dict(zip(_POSE, state.pose.tolist(), strict=True))
+        joints = {f"joint_{n}.pos": float(q) for n, q in enumerate(state.joints_deg, start=1)}
+        return {key: pose[key] for key in self._keys} | joints | {name: camera.read_latest() for name, camera in self.cameras.items()}
+
+    def send_action(self, action: Mapping[str, Any]) -> dict[str, float]:
+        """Send the arm towards a pose and do not wait. A missing key keeps its present value; an observation is an action, too.
+
+        The newest action wins: the arm goes in short pieces and turns to a newer action after at most 0.2 s, without replaying older ones.
+        An action beyond the limits of a ``SafeArm`` is clipped to them. Returns what was really sent to the arm: the pose of the action,
+        or the end of the present piece on the way to it.
+        """
+        unknown = set(action) - set(_POSE) - set(self.observation_features)
+        if unknown:
+            raise KeyError(f"an action has the keys {', '.join(self._keys)}, not {', '.join(sorted(unknown))}")
+        asked = {key: float(action[key]) for key in _POSE if key in action}
+        pose = dict(zip(_POSE, self.arm.state().pose.tolist(), strict=True)) | asked
+        sent = self._newest.go(np.array([pose[key] for key in _POSE], float))
+        return {key: float(value) for key, value in zip(_POSE, sent, strict=True) if key in self._keys}
+
+    def disconnect(self) -> None:
+        """Stop and disconnect the arm, and disconnect the cameras."""
+        self._newest.end()
+        try:
+            self.arm.disconnect()
+        finally:
+            for camera in self.cameras.values():
+                camera.disconnect()
+
+    def _shape(self, name: str) -> tuple[int, int, int]:
+        camera = self.cameras[name]
+        if camera.height is None or camera.width is None:
+            raise DeviceError(f"camera '{name}': its size is not known before it is connected; give LeRobotCamera its width and height")
+        return camera.height, camera.width, 3

@@ -16,7 +16,7 @@ import numpy as np
 
 from hardware.approach import way_around
 from hardware.arms.arm import Arm
-from hardware.arms.open_arm import open_arm
+from hardware.arms.open_arm import kind_of, open_arm
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, await_frame
@@ -192,7 +192,7 @@ def build_rig(
     if simulated and camera == TWIN and at_once:
         device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
     if not simulated or limits is not None:
-        kind = arm.partition(":")[0].removesuffix("-lenient")
+        kind = kind_of(arm)
         if limits or (SHIPPED_LIMITS / f"{kind}.toml").is_file():
             device = SafeArm(device, load_limits(limits or kind))
     twin = None

@@ -43,6 +43,11 @@ def open_arm(spec: str) -> Arm:
     raise DeviceError(f"no arm '{spec}'; there are: {ARM_SPECS}")
 
 
+def kind_of(spec: str) -> str:
+    """The kind of an arm by its specification: ``mg400``, ``magician`` or ``simulated``."""
+    return spec.partition(":")[0].removesuffix("-lenient")
+
+
 def _attached_magician() -> str:
     from serial.tools import list_ports
 

@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from noisy_camera import NoisyCamera
 from scipy.spatial.transform import Rotation
 
 from hardware.arms.cri import (
@@ -32,11 +33,14 @@ from hardware.arms.cri.transforms import (
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.motion import circle
 from hardware.arms.simulated import SimulatedArm
+from hardware.cameras.mjpeg import MjpegCamera
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError
-from hardware.lerobot import LeRobotArm
+from hardware.lerobot import LeRobotArm, LeRobotCamera
 from hardware.safe_arm import SafeArm
 from hardware.safety import load_limits
+from scenes import load_sensor
+from twin.types import Form
 
 WORK = (300, 0, 0, -180, 0, 0)
 
@@ -244,3 +248,41 @@ def test_lerobots_shape(axes):
         robot.send_action({"gripper": 1.0})
     robot.disconnect()
     assert not robot.is_connected
+
+
+def test_the_whole_of_lerobots_robot():
+    camera = LeRobotCamera(NoisyCamera(fps=50), fps=50, width=64, height=48)
+    robot = LeRobotArm(SafeArm(SimulatedArm(axes=4, time_scale=20.0), load_limits("mg400")), id="left", cameras={"tactip": camera})
+    assert robot.name == robot.robot_type == "simulatedarm" and robot.id == "left" and str(robot) == "left LeRobotArm"
+    assert robot.observation_features["tactip"] == (48, 64, 3) and robot.calibration == {}
+    with robot:
+        assert robot.is_connected and camera.is_connected
+        robot.calibrate()
+        robot.configure()
+        seen = robot.get_observation()
+        assert seen["tactip"].shape == (48, 64, 3) and seen["tactip"].dtype == np.uint8
+        sent = robot.send_action(seen)  # an observation is an action
+        assert all(sent[key] == pytest.approx(seen[key], abs=0.05) for key in robot.action_features)
+        assert robot.send_action({"y": 1e9})["y"] < 301  # clipped, not refused
+    assert not robot.is_connected and not camera.is_connected
+
+
+def test_a_robot_from_its_configuration():
+    config = LeRobotArm.config_class(arm="simulated:4", limits="mg400", id="one")
+    robot = LeRobotArm(config)
+    assert config.type == "simulated" and robot.id == "one" and isinstance(robot.arm, SafeArm)
+    assert "192" not in LeRobotArm(LeRobotArm.config_class(arm="mg400:192.168.1.6")).name
+
+
+def test_a_gray_camera_gives_pictures_of_three_channels():
+    camera = LeRobotCamera(NoisyCamera(fps=50))
+    assert camera.width is None and camera.fps == 50
+    with camera:
+        assert (camera.width, camera.height) == (64, 48)
+        for picture in (camera.read(), camera.async_read(), camera.read_latest()):
+            assert picture.shape == (48, 64, 3) and np.array_equal(picture[..., 0], picture[..., 2])
+    known = LeRobotCamera(MjpegCamera("http://127.0.0.1:1/", load_sensor("mg400-331"), Form.RECORDING))
+    assert (known.width, known.height) == (360, 360)
+    robot = LeRobotArm(SimulatedArm(), cameras={"front": LeRobotCamera(NoisyCamera())})
+    with pytest.raises(DeviceError, match="width and height"):
+        dict(robot.observation_features)

@@ -25,6 +25,8 @@ TRIES = 4
 HOME_TIMEOUT_S = 60.0
 # What pyserial raises when a port vanishes.
 PORT_ERRORS = (serial.SerialException, OSError, termios.error, TypeError, ValueError)
+# Bytes of the replies to commands that read.
+REPLY_BYTES = {Id.GET_POSE: 32, Id.ALARMS: 16, Id.QUEUE_INDEX: 8}
 # Bytes of a queue index.
 INDEX_BYTES = 8
 # Acceleration in mm/s2 (deg/s2) for each mm/s (deg/s) of speed, in 1/s: full speed is reached within a quarter of a second.
@@ -227,11 +229,24 @@ class Magician(BaseArm):
         return self._serial
 
     def _reply(self, port: serial.Serial, id: Id, ctrl: int) -> Message | None:
+        """The reply to a command, if it comes in time.
+
+        Raises
+        ------
+        DeviceError
+            A reply of another length came: what is attached is no Magician.
+        """
+        wanted = REPLY_BYTES.get(id) if ctrl == 0 else None
         deadline = time.monotonic() + REPLY_TIMEOUT_S
         while time.monotonic() < deadline:
             self._buffer += port.read(max(1, port.in_waiting))
             message, self._buffer = take_message(self._buffer)
             while message is not None:
+                if (message.id, message.ctrl) == (id, ctrl) and wanted not in (None, len(message.params)):
+                    raise DeviceError(
+                        f"{self.name}: replied {len(message.params)} bytes to command {int(id)} instead of {wanted}: what is attached "
+                        "echoes what it is sent, or is no Magician. Name the port of the arm"
+                    )
                 if (message.id, message.ctrl) == (id, ctrl):
                     return message
                 message, self._buffer = take_message(self._buffer)

@@ -1,6 +1,7 @@
 """Driver of the Dobot MG400 over TCP."""
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from hardware.arms.mg400_wire import (
 )
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
+LOG = logging.getLogger(__name__)
 # Longest wait in s until feedback shows that the arm is enabled, or that an alarm is cleared.
 ENABLE_TIMEOUT_S = 5.0
 # Longest wait in s for the reply to a move, which an arm that works sends at once.
@@ -42,6 +44,7 @@ SETTLE_S = 0.5
 ENABLED_MODES = {Mode.ENABLED, Mode.BACKDRIVE, Mode.RUNNING, Mode.RECORDING, Mode.PAUSE, Mode.JOG}
 MOVING_MODES = {Mode.RUNNING, Mode.JOG}
 PAUSED = "paused by another client; stop() drops the queue, Continue() of that client would execute it"
+DISABLED = "was disabled by another program or at its button; call enable() when nobody else uses it"
 # In a move shorter than this (mm) the turn may determine the speed.
 SHORT_MM = 5.0
 # Old firmware does not reply to moves. There a move counts as done after the arm has rested for this time (s).
@@ -98,6 +101,7 @@ class MG400(BaseArm):
         self._alarm_text: str | None = None
         self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after percents were set
         self._sent: np.ndarray | None = None  # end of the queue, as long as the arm may still move there
+        self._enabled = False  # whether this driver has enabled the arm, and not disabled it since
         self._under_way = False  # whether a move was sent that feedback has not shown to have ended
         self._mute_s = -np.inf  # when the newest stop or its like failed
         self._late_replies = False  # whether replies to moves may come that nobody waits for any more
@@ -121,22 +125,27 @@ class MG400(BaseArm):
             raise
 
     def disconnect(self) -> None:
-        if self._in_use:
+        if self._in_use and (self._enabled or self._under_way):
             self._disconnect(self.disable, close=self._close)
-        else:
+        else:  # an arm that this driver has not enabled may be at work for another program
             self._close()
 
     def enable(self) -> None:
         self._require_connected()
         if self._mode() == Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
+        if self._mode() in ENABLED_MODES and not self._enabled:
+            LOG.warning(
+                "%s: is enabled already, so another program may use it; what one of the two stops or disables stands for both", self.name
+            )
         for request in ("EnableRobot()", "User(0)", "Tool(0)"):
             self._ask(request)
         self._await_mode(lambda mode: mode in ENABLED_MODES, "was not enabled; check its button and that no stop is pressed")
+        self._enabled = True
 
     def disable(self) -> None:
         self._tell_in_any_case("DisableRobot()", "disabled")
-        self._under_way = False
+        self._under_way = self._enabled = False
         self._shows(lambda packet: int(packet["mode"]) not in ENABLED_MODES)  # so that the next state tells it
 
     def clear_error(self) -> None:
@@ -183,7 +192,7 @@ class MG400(BaseArm):
     def emergency_stop(self) -> None:
         self._sent = None
         self._tell_in_any_case("EmergencyStop()", "switched off")
-        self._unstopped = self._under_way = False
+        self._unstopped = self._under_way = self._enabled = False
 
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
         self._require_connected()
@@ -198,8 +207,16 @@ class MG400(BaseArm):
             time_s,
             mode in ENABLED_MODES,
             mode in MOVING_MODES or (self._lenient and time.monotonic() - self._feedback.turned_s < RESTED_S),
-            self._alarm() if mode == Mode.ERROR else PAUSED if mode == Mode.PAUSE else "",
+            self._trouble(mode),
         )
+
+    def _trouble(self, mode: int) -> str:
+        """What is wrong with the arm in a mode, in words; "" if nothing."""
+        if mode == Mode.ERROR:
+            return self._alarm()
+        if mode == Mode.PAUSE:
+            return PAUSED
+        return DISABLED if mode == Mode.DISABLED and self._enabled else ""
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
         """The arm takes whole percents of its largest speed. A speed below 1 % becomes 1 %.
@@ -263,7 +280,7 @@ class MG400(BaseArm):
         if int(packet["mode"]) == Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if int(packet["mode"]) not in ENABLED_MODES:
-            raise DeviceError(f"{self.name}: not enabled; call enable() first")
+            raise DeviceError(f"{self.name}: {DISABLED if self._enabled else 'not enabled; call enable() first'}")
         begun_s, options = time.monotonic(), "" if pose is None else self._turning_option(pose)
         self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)}{options})")
         self._sent = pose
@@ -371,7 +388,7 @@ class MG400(BaseArm):
             raise DeviceError(f"{self.name}: {why_refused(reply.error_id, request)}")
 
     def _close(self) -> None:
-        self._in_use = self._under_way = self._late_replies = self._unstopped = False
+        self._in_use = self._under_way = self._late_replies = self._unstopped = self._enabled = False
         self._dashboard.close()
         self._motion.close()
         self._feedback.close()

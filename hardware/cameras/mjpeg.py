@@ -1,6 +1,7 @@
 """JPEG pictures over HTTP (multipart/x-mixed-replace): what a server of such a stream writes, and a camera that reads it."""
 
 import http.client
+import socket
 import time
 from typing import Protocol
 from urllib.parse import urlsplit
@@ -26,6 +27,8 @@ LARGEST_PART = 32_000_000
 TIME_HEADER = "x-timestamp"
 # A time stamp that differs from now by more than this (s) comes from another clock and is not used.
 CLOCK_SLACK_S = 60.0
+# Bytes that a server's connection holds. The kernel doubles it; what the client's side holds comes on top.
+HELD_BYTES = 16_384
 # First and last bytes of a JPEG.
 START, END = b"\xff\xd8", b"\xff\xd9"
 
@@ -47,6 +50,11 @@ def write_part(out: Writable, jpeg: bytes, headers: dict[str, object] | None = N
     more = "".join(f"{name}: {value}\r\n" for name, value in (headers or {}).items())
     head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n{more}\r\n"
     out.write(head.encode("ascii") + jpeg + b"\r\n")
+
+
+def hold_little(connection: socket.socket) -> None:
+    """Let a server's connection hold few pictures: a client that pauses gets few old ones, and then the newest."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD_BYTES)
 
 
 class Readable(Protocol):

@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from hardware.cameras.mjpeg import CONTENT_TYPE, jpeg_of, write_part
+from hardware.cameras.mjpeg import CONTENT_TYPE, hold_little, jpeg_of, write_part
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import Faults
 from hardware.errors import DeviceError, cannot_listen
@@ -167,13 +167,17 @@ class _Server(ThreadingHTTPServer):
 
 def _handler_of(camera: CameraEmulator) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
+        def do_HEAD(self) -> None:
             if camera.pulled_out:
                 self.send_error(503, "unplugged")
                 return
             self.send_response(200)
             self.send_header("Content-Type", CONTENT_TYPE)
             self.end_headers()
+
+        def do_GET(self) -> None:
+            hold_little(self.connection)
+            self.do_HEAD()
             number = 0
             while not (camera._end.is_set() or camera.pulled_out):
                 part = camera.next_part(number)

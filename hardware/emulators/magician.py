@@ -43,7 +43,7 @@ class MagicianEmulator:
     Parameters
     ----------
     link : Path or None
-        A symbolic link to make to the terminal; removed at the end.
+        A symbolic link to make to the terminal; removed at the end. One that leads nowhere is replaced.
     faults : iterable of str
         ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` may be changed while it runs.
     joints_deg : (4,) float
@@ -97,6 +97,8 @@ class MagicianEmulator:
         self.device = os.ttyname(self._ends[1])
         if self._link is not None:
             try:
+                if self._link.is_symlink() and (not self._link.exists() or os.readlink(self._link) == self.device):
+                    self._link.unlink()  # left by an emulator that was killed
                 self._link.symlink_to(self.device)
             except OSError as error:
                 self.unplug()

@@ -6,10 +6,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from hardware.cameras.mjpeg import CONTENT_TYPE, jpeg_of, write_part
+from hardware.cameras.mjpeg import CONTENT_TYPE, hold_little, jpeg_of, write_part
 from hardware.errors import cannot_listen
 from twin.report.page import render_page
 
+# What each path of the view is.
+KINDS = {"/": "text/html; charset=utf-8", "/stats.json": "application/json", "/stream.mjpg": CONTENT_TYPE}
 # Interval in s at which a stream looks whether the view was closed.
 WAIT_S = 0.5
 
@@ -66,14 +68,23 @@ class BrowserView:
         view = self
 
         class Handler(BaseHTTPRequestHandler):
+            def do_HEAD(self) -> None:
+                path = self.path.partition("?")[0]
+                if path not in KINDS:
+                    self.send_error(404)
+                    return
+                self.send_response(200)
+                self.send_header("Content-Type", KINDS[path])
+                self.end_headers()
+
             def do_GET(self) -> None:
                 path = self.path.partition("?")[0]
                 if path == "/":
-                    self._send("text/html; charset=utf-8", view._page)
+                    self._send(KINDS[path], view._page)
                 elif path == "/stats.json":
                     with view._new:
                         stats = dict(view._stats)
-                    self._send("application/json", json.dumps(stats).encode())
+                    self._send(KINDS[path], json.dumps(stats).encode())
                 elif path == "/stream.mjpg":
                     self._stream()
                 else:
@@ -87,6 +98,7 @@ class BrowserView:
                 self.wfile.write(body)
 
             def _stream(self) -> None:
+                hold_little(self.connection)
                 self.send_response(200)
                 self.send_header("Content-Type", CONTENT_TYPE)
                 self.end_headers()

@@ -1,7 +1,10 @@
 """One suite over every frame source: the twin, a folder, a video, a session, a stream over a real socket, a USB camera."""
 
+import socket
 import time
+import urllib.request
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -11,7 +14,7 @@ from noisy_camera import NoisyCamera, number_of
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
-from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.mjpeg import MjpegCamera, next_part
 from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
@@ -23,6 +26,7 @@ from hardware.examining import frames_of
 from hardware.lerobot import LeRobotCamera
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionWriter
+from hardware.view.server import BrowserView
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from twin.errors import FrameError
 from twin.frames.images import write_image
@@ -363,3 +367,29 @@ def test_a_first_frame_is_waited_for_as_long_as_its_source_may_need():
         assert late.delivered == 1
         with MjpegCamera(emulator.url) as camera:
             assert number_of(camera.read(timeout_s=camera.first_frame_s).image) >= 1
+
+
+@pytest.mark.parametrize("path", ["stream.mjpg", ""])
+def test_head_is_answered_without_a_body(path):
+    with CameraEmulator(NoisyCamera()) as emulator, BrowserView("view") as view:
+        for url in (emulator.url, view.url + path):
+            with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=5) as answer:
+                assert answer.status == 200 and answer.read() == b"" and answer.headers["Content-Type"]
+
+
+def test_a_client_that_pauses_gets_few_old_pictures():
+    with CameraEmulator(NoisyCamera(fps=100)) as emulator:
+        parts = urlsplit(emulator.url)
+        with socket.create_connection((parts.hostname, parts.port), timeout=5) as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            client.sendall(b"GET /stream.mjpg HTTP/1.0\r\n\r\n")
+            stream = client.makefile("rb")
+            while stream.readline().strip():
+                pass
+            next_part(stream)
+            time.sleep(0.6)  # 60 pictures
+            resumed_s = time.time()
+            old = 0
+            while float(next_part(stream)[0]["x-timestamp"]) < resumed_s:
+                old += 1
+            assert old < 30  # of 60; without a small buffer all of them come

@@ -1,7 +1,12 @@
 """Whatever a Magician's line does wrong, the driver recovers, or stops it and says what to do."""
 
+import os
+import pty
+import select
 import struct
+import threading
 import time
+import tty
 
 import numpy as np
 import pytest
@@ -206,3 +211,35 @@ def test_what_is_not_attached_tells_no_signal(id, write, read, told):
         assert ask(emulator, id, write, QUEUED).params == struct.pack("<Q", 2)  # as some clients send it
         assert ask(emulator, id, read).params == told
         assert not any(ask(emulator, Id.ALARMS).params)
+
+
+def test_what_echoes_is_no_magician():
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    ended = threading.Event()
+
+    def echo():
+        while not ended.is_set():
+            if select.select([ours], [], [], 0.05)[0]:
+                os.write(ours, os.read(ours, 4096))
+
+    thread = threading.Thread(target=echo, daemon=True)
+    thread.start()
+    arm = Magician(os.ttyname(theirs))
+    with pytest.raises(DeviceError, match="0 bytes to command 10 instead of 32.*echoes"):
+        arm.connect()
+    assert not arm.is_connected
+    ended.set()
+    thread.join()
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_a_link_that_leads_nowhere_is_replaced_and_one_in_use_is_not(tmp_path):
+    link = tmp_path / "arm"
+    link.symlink_to("/dev/pts/no-such-terminal")  # as a killed emulator leaves it
+    with MagicianEmulator(link=link), Magician(str(link)) as arm:
+        assert arm.state().joints_deg.shape == (4,)
+        with pytest.raises(TwinError, match="--link"):
+            MagicianEmulator(link=link).start()
+        assert arm.state().joints_deg.shape == (4,)

@@ -431,5 +431,27 @@ def test_a_command_that_fails_in_the_emulator_is_refused_and_reported(caplog):
     assert "a defect" in caplog.text and "SpeedL" in caplog.text
 
 
+def test_two_clients_that_disable_each_other_are_told(caplog):
+    with emulated(time_scale=4.0) as emulator, mg400_of(emulator) as first:
+        first.enable()
+        assert "another program" not in caplog.text
+        with mg400_of(emulator) as watcher:
+            watcher.state()
+        assert first.state().enabled  # who only watches does not switch it off
+        with mg400_of(emulator) as second:
+            second.enable()
+            assert "enabled already, so another program may use it" in caplog.text
+        deadline = time.monotonic() + 1.0
+        while first.state().enabled:
+            assert time.monotonic() < deadline
+        assert "disabled by another program" in first.state().error
+        with pytest.raises(DeviceError, match="disabled by another program"):
+            first.move_linear(AWAY)
+        first.enable()
+        first.move_linear(AWAY)
+        first.disable()
+        assert not first.state().error
+
+
 def test_the_default_ports_are_the_arms():
     assert Mg400Ports() == Mg400Ports(29999, 30003, (30004, 30005))

@@ -20,6 +20,7 @@ from hardware.arms.mg400_wire import (
     MAX_JOINT_DEG_S,
     MAX_LINEAR_MM_S,
     MOTION_PORT,
+    ErrorId,
     Mode,
     Reply,
     require_ports,
@@ -36,6 +37,8 @@ MOTION_REPLY_S = 1.0
 STOP_REPLY_S = 0.5
 # Feedback shows within this time (s) that a stop or a disable was obeyed: more than two periods of the slower of the two ports in use.
 SHOWS_S = 0.5
+# Feedback shows within this time (s) the alarm because of which a move was refused.
+ALARM_S = 0.2
 # For MUTE_S (s) after one of these has failed, further ones wait only STOP_AGAIN_S (s), so that the end of a program isn't delayed.
 MUTE_S, STOP_AGAIN_S = 3.0, 0.1
 # Feedback has at least this time (s) to confirm a move: two periods of the slower of the two ports in use.
@@ -177,11 +180,11 @@ class MG400(BaseArm):
                 ) from error
         self._unstopped = self._under_way = False
 
-    def _shows(self, obeyed: Callable[[np.void], bool]) -> bool:
+    def _shows(self, obeyed: Callable[[np.void], bool], *, within_s: float = SHOWS_S) -> bool:
         """Whether feedback soon shows that a command was obeyed, and goes on showing it: the first packet may be older than the command."""
         asked_s, since_s = time.monotonic(), np.inf
         with contextlib.suppress(StaleDataError):
-            while time.monotonic() - asked_s < SHOWS_S:
+            while time.monotonic() - asked_s < within_s:
                 packet, time_s = self._feedback.newest(SHOWS_S)
                 since_s = min(since_s, time_s) if time_s > asked_s and obeyed(packet) else np.inf
                 if time_s - since_s >= RESTED_S:
@@ -305,6 +308,8 @@ class MG400(BaseArm):
         self._late_replies = True
         reply = self._motion.request(text, timeout_s=MOTION_REPLY_S, look=lambda: self._feedback.newest(SILENCE_S))
         self._late_replies = False
+        if reply.error_id == ErrorId.FAILED and self._shows(lambda packet: int(packet["mode"]) == Mode.ERROR, within_s=ALARM_S):
+            raise DeviceError(f"{self.name}: {self._alarm()}")  # it came up only now
         self._check(text, reply)
 
     def _await_queue(self, deadline: float, timeout_s: float) -> None:

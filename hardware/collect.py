@@ -32,7 +32,7 @@ from scenes.files import shown
 from twin.frames.images import write_image
 from twin.pins import require_untouched
 from twin.progress import Progress, Step, silent, stage
-from twin.store import locked, made_by, write_json, write_text
+from twin.store import contents, made_by, output, write_json, write_text, writes
 from twin.types import Form, Frame
 
 # Distance from the object at the start and at the end, in mm.
@@ -102,7 +102,7 @@ class Collection:
                 raise DeviceError(
                     f"{self.folder}: holds a collection made otherwise ({', '.join(other)}); repeat its options or give another --out"
                 )
-        elif any(self.folder.iterdir()):
+        elif contents(self.folder):
             raise DeviceError(f"{self.folder}: holds something else; give an empty or a new folder")
         else:
             write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
@@ -260,7 +260,7 @@ def collect(
     if not source.is_live:
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
     rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s, ArmWatch(arm))
-    with locked(collection.folder), rig.watch.watched():
+    with output(collection.folder), rig.watch.watched():
         failed = _collect_all(rig, experiment, collection, seed=seed, count=count, progress=progress, on_rest=on_rest, speed=speed)
     if failed:
         raise DeviceError("; ".join(failed))
@@ -451,6 +451,7 @@ class Collected:
         return [f"{self.count} contacts in {self.folder} ({self.count - self.before} new)"]
 
 
+@writes("images", "frames_bw", gone_on=(TABLE, META, LOG))
 def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent) -> Collected:
     """Collect labelled frames into a folder, or continue a collection that was made with the same plan.
 

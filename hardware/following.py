@@ -1,6 +1,5 @@
 """One run of surface following: from a plan to results, which are also written to disk."""
 
-import json
 import logging
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -22,6 +21,7 @@ from scenes import ObjectSpec, ServoSpec, load_experiment
 from twin.errors import TwinError
 from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import save_figure
+from twin.store import write_json, writes
 from twin.types import FIRST, Frame
 
 LOG = logging.getLogger(__name__)
@@ -121,6 +121,7 @@ class Followed:
         return out + ([f"ended early: {self.failure}"] if self.failure else [])
 
 
+@writes("trajectory.csv", "trajectory.png", "measures.json", "session")
 def follow(
     plan: FollowPlan, model: SensorModel, out: Path, *, about: dict[str, Any] | None = None, progress: Progress = silent
 ) -> Followed:
@@ -245,6 +246,5 @@ def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, 
         "failure": followed.failure,
         "notes": followed.notes,
     }
-    measures = out / "measures.json"
-    measures.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
+    measures = write_json(out / "measures.json", plain(content))
     return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]

@@ -18,7 +18,7 @@ from hardware.cameras.recorded import SequentialSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.rig import counting_from_first, given_frame
-from hardware.session import SessionSource, SessionWriter
+from hardware.session import SESSION_FILES, SessionSource, SessionWriter
 from hardware.step import Estimate, Estimator, SensorModel
 from hardware.timing import Spread, Timing
 from hardware.view.draw import WindowView, draw_view, has_window
@@ -26,6 +26,7 @@ from hardware.view.rerun import RerunView
 from hardware.view.server import BrowserView
 from twin.errors import FrameError, OptionError
 from twin.pins import Pipeline
+from twin.store import output
 from twin.types import FIRST, NONE, Frame
 
 # Newest times of each kind that the figures are computed from.
@@ -350,6 +351,7 @@ def watch(
                 on_shown(view.url)
         if plan.record is not None:  # the last step: no folder is made if one of the steps before fails
             about = {"sensor": model.sensor.name, "form": str(source.form), "camera": source.name, "model": name}
+            stack.enter_context(output(plan.record, *SESSION_FILES))
             session.record = stack.enter_context(SessionWriter(plan.record, about))
             if rest is not None:
                 session.record.keep_rest(rest)

@@ -11,9 +11,10 @@ from hardware.following import Followed, FollowPlan, follow
 from hardware.step import SensorModel
 from hardware.trajectory import comparison_figure
 from scenes import ObjectSpec, ServoSpec
-from twin.errors import TwinError
+from twin.errors import StoreError, TwinError
 from twin.progress import Progress, silent
 from twin.report.charts import save_figure
+from twin.store import text_file, writes
 
 # the measures that are printed, with their headings
 SHOWN = {
@@ -85,20 +86,27 @@ class ServoStudy:
         return lines
 
 
+@writes("study.csv", "study.png")
 def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent) -> ServoStudy:
     """Follow each object with each model, in the twin; each run and the comparison are written to ``out``.
 
     Writes a folder for each model and object as ``follow`` writes it, ``study.csv`` and ``study.png``. A run that can't make a single
     step is a result of the study, too.
+
+    Raises
+    ------
+    StoreError
+        A run can't be written.
     """
     found: dict[tuple[str, str], Followed | str] = {}
     for label, model in plan.models.items():
         for thing in plan.objects:
             asked = FollowPlan(thing, plan.servo, steps=plan.steps, seed=plan.seed, plain_light=plan.plain_light)
             folder = out / folder_name(label) / thing.name
-            folder.mkdir(parents=True, exist_ok=True)
             try:
                 found[label, thing.name] = follow(asked, model, folder, about={"model": label})
+            except StoreError:
+                raise
             except TwinError as error:
                 found[label, thing.name] = str(error)
             progress("objects followed", len(found), len(plan.models) * len(plan.objects))
@@ -117,7 +125,7 @@ def folder_name(label: str) -> str:
 
 def _write_rows(path: Path, rows: list[dict[str, Any]]) -> Path:
     names = list(rows[0]) if rows else ["model", "object", "failure"]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with text_file(path) as file:
         writer = csv.writer(file)
         writer.writerow(names)
         writer.writerows(row.values() for row in rows)

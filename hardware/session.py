@@ -21,10 +21,11 @@ from scenes.base import Name
 from scenes.files import read_regular, shown
 from twin.errors import FrameError
 from twin.frames.images import read_image, write_image
-from twin.store import write_json
+from twin.store import contents, unwritten, write_json
 from twin.types import Form, Frame
 
 ABOUT, STEPS, FRAMES, REST = "session.json", "steps.jsonl", "frames", "rest.png"
+SESSION_FILES = (ABOUT, STEPS, FRAMES, REST)
 VERSION = 1
 LARGEST_BYTES = 1_000_000_000  # of the steps: a million of them, which a day at 10 Hz has
 LARGEST_ABOUT_BYTES = 1_000_000  # of what the session is
@@ -49,7 +50,7 @@ class SessionWriter:
     def __init__(self, folder: str | Path, about: dict) -> None:
         self.folder = Path(folder)
         begun_only = is_session(self.folder) and not (self.folder / STEPS).stat().st_size
-        if self.folder.exists() and any(self.folder.iterdir()) and not begun_only:
+        if contents(self.folder) and not begun_only:
             raise DeviceError(f"{self.folder}: not empty; give a new folder for the session")
         (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
         (self.folder / REST).unlink(missing_ok=True)
@@ -67,8 +68,11 @@ class SessionWriter:
             self._written = {frame.sequence: name}
         about_frame = {"file": name, "name": frame.name, "form": str(frame.form), "time_s": frame.time_s, "sequence": frame.sequence}
         line = {"step": self.count, "frame": about_frame, **{key: plain(value) for key, value in step.items()}}
-        self._lines.write(json.dumps(line) + "\n")
-        self._lines.flush()
+        try:
+            self._lines.write(json.dumps(line) + "\n")
+            self._lines.flush()
+        except OSError as error:
+            raise unwritten(self.folder / STEPS, error) from error
         self.count += 1
 
     def keep_rest(self, frame: Frame) -> None:

@@ -24,7 +24,7 @@ from training.simulated import is_pins_only
 from training.targets import Targets
 from twin.frames import open_recording
 from twin.progress import Step
-from twin.report.charts import new_figure
+from twin.report.charts import new_figure, save_figure
 from twin.rig.labels import EXECUTED_FILES
 from twin.store import made_by, text_file, write_json
 from twin.types import Form, Frame
@@ -218,8 +218,7 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
         axes[count + k].set(xlabel=f"label, {unit}", ylabel=f"error, {unit}")
         axes[count + k].axhline(0, color="#888888", linewidth=0.6)
     axes[0].legend(markerscale=4)
-    figure.savefig(path, dpi=110)
-    return path
+    return save_figure(path, figure, dpi=110)
 
 
 # A change of an image: ``change(image, rng, estimator)`` returns the changed image.

@@ -21,7 +21,7 @@ from training.models import model_named
 from training.recipes import TrainingError
 from training.run_files import CONFIG, TENSORS, read_config, read_tensors
 from twin.pins import make_reference
-from twin.store import write_bytes, write_text
+from twin.store import write_bytes, write_text, writes
 
 WEIGHTS = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "weights"
@@ -37,6 +37,7 @@ def shipped_names() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
 
 
+@writes(WEIGHTS, "config.json")
 def pack(run: Path, out: Path) -> int:
     """Write the small copy of a finished run that has no Gaussian processes of its modes, and return its size in bytes.
 
@@ -59,7 +60,6 @@ def pack(run: Path, out: Path) -> int:
     whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith(f"{BESIDE}.")}
     small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
     small["reference_px"] = content["reference_px"].numpy()  # in full precision, because the graph is made from it
-    out.mkdir(parents=True, exist_ok=True)
     weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})
     write_bytes(out / WEIGHTS, weights)
     about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}

@@ -30,8 +30,9 @@ from training.networks import parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
 from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, write_tensors
 from twin.frames.forms import blob_spec
-from twin.store import fingerprint, write_text
+from twin.store import fingerprint, write_text, writes
 
+RUN_FILES = (CONFIG, "curves.csv", TENSORS)
 FOLDS = 10  # parts of the training rows; each network of an ensemble watches another part
 KEEP_EVERY_S = 20.0  # s between two checkpoints
 FEWEST_PARTS = 3  # rows, or groups of rows, to learn from: with fewer a network that watches one learns from next to nothing
@@ -81,6 +82,7 @@ class RunConfig:
                 raise TrainingError(f"--{name} {seed}: give a whole number from 0 to {MOST_SEED}")
 
 
+@writes(*RUN_FILES, gone_on=(CHECKPOINT,))
 def train_run(
     config: RunConfig,
     data: Dataset,
@@ -123,7 +125,6 @@ def train_run(
             f"{', '.join(map(str, data.folders))}: {len(data)} usable frames, {parts} {what} of them to learn from, are too few; "
             f"{FEWEST_PARTS} {what} to learn from are needed{_said(data.problems)}"
         )
-    out.mkdir(parents=True, exist_ok=True)
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     prepared = model_named(config.model).prepare(data, train)

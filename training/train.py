@@ -11,11 +11,12 @@ from training.dataset import joined, load_dataset
 from training.loop import epoch_step
 from training.models import recipe_of
 from training.networks import choose_device
-from training.run import RunConfig, train_run
-from training.run_files import CONFIG, TENSORS
+from training.run import RUN_FILES, RunConfig, train_run
+from training.run_files import CHECKPOINT, CONFIG, TENSORS
 from training.targets import PRESETS
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
+from twin.store import writes
 from twin.types import Form
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helpers of its other labels
@@ -39,8 +40,8 @@ class Trained:
         The label columns.
     labels : str
         Kind of labels: corrected or raw.
-        problems : list of str
-            Irregularities of the recordings.
+    problems : list of str
+        Irregularities of the recordings.
     """
 
     out: Path
@@ -64,6 +65,7 @@ class Trained:
         return lines
 
 
+@writes(*RUN_FILES, gone_on=(CHECKPOINT,))
 def train_model(
     model: str,
     sensor: SensorSpec,
@@ -97,8 +99,8 @@ def train_model(
     labels : {"corrected", "raw"}
     seed : int
         Seed of the weights and of the order of rows.
-        split : int or None
-            Seed of the random fifth of the rows that is kept out of training; None: train on all rows.
+    split : int or None
+        Seed of the random fifth of the rows that is kept out of training; None: train on all rows.
     epochs, batch, members, kernel : optional
         Values that replace the recipe's own.
     max_minutes : float, optional

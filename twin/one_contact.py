@@ -11,11 +11,15 @@ from twin.objects import build_field
 from twin.optics.render import Quality, write_exr
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
+from twin.report.charts import save_figure
 from twin.report.plots import Look, contact_panel
 from twin.report.skin3d import displaced_skin, draw_contact_skin
 from twin.simulator import Shot, Simulator
-from twin.store import made_by, write_json, write_npz
+from twin.store import made_by, write_by, write_json, write_npz, writes
 from twin.types import ContactState, FloatArray, Form
+
+FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
+"""Files of a contact, in the order in which they are written."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class RenderedContact:
         ]
 
 
+@writes(*FILES)
 def render_contact(
     sensor: SensorSpec,
     touched: ObjectSpec,
@@ -52,7 +57,7 @@ def render_contact(
     Parameters
     ----------
     out : Path
-        An existing folder.
+        The folder to write to; made if missing.
     form : Form
         The camera's frame, or the form of the sensor's recordings.
     quality : {"preview", "standard", "high"}
@@ -96,13 +101,12 @@ def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Co
     write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, touched, pose])})
 
     mesh = simulator.solver.mesh
-    displaced_skin(mesh, state).save(out / "skin.vtp")
+    write_by(out / "skin.vtp", displaced_skin(mesh, state).save)
     draw_contact_skin(mesh, spec.pins, state, build_field(touched), out / "skin.png")
     look = look_at(simulator, shot)
     title = f"{spec.name} against {touched.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
-    contact_panel(out / "skin.png", look, title).savefig(out / "panel.png", dpi=110)
-    names = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
-    return [out / name for name in names]
+    save_figure(out / "panel.png", contact_panel(out / "skin.png", look, title), dpi=110)
+    return [out / name for name in FILES]
 
 
 def contact_arrays(state: ContactState) -> dict[str, FloatArray]:

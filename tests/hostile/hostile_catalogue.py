@@ -557,7 +557,8 @@ WRITE = {
     "study sim-to-real": f"study sim-to-real {S} --frames {{recording}} --labels 12 --count 10 --epochs 1 --workers 1 --out {{there}}",
     "study tac-vgnn": f"study tac-vgnn --data {{recording}} {S} --out {{there}} --models gnn --epochs 1 --batches 8 --no-contacts",
 }
-QUICK_TO_WRITE = ("audit", "train", "evaluate", "preprocess", "graph", "tune", "dataset", "live", "study tac-vgnn")
+# commands that take seconds and may be given again for the same folder
+AGAIN = ("audit", "evaluate", "preprocess", "graph", "tune", "dataset", "render", "validate", "collect", "servo", "study tac-vgnn")
 
 
 def _dangling(folder: Path, good: given.Harmless) -> Path:
@@ -596,6 +597,20 @@ OVERWRITTEN = {  # files of the user's own in --out that a command of the same n
     "graph": ("graph.npz", "graph.png"),
     "tune": ("mine.toml",),
     "dataset": ("targets.csv", "meta.json", "generation.json"),
+    "pack": ("config.json", "weights.safetensors"),
+    "render": ("frame.png", "truth.json"),
+    "realism": ("metrics.json", "index.html"),
+    "robustness": ("frames.csv", "index.html"),
+    "validate": ("frames.csv", "index.html"),
+    "calibrate optics": ("spec.toml",),
+    "calibrate contact": ("spec.toml",),
+    "collect": ("targets.csv", "meta.json"),
+    "servo": ("measures.json", "trajectory.csv"),
+    "live": ("session.json", "steps.jsonl"),
+    "demo": ("index.html",),
+    "study servo": ("study.csv",),
+    "study objects": ("objects.csv", "index.html"),
+    "study sim-to-real": ("study.csv", "index.html"),
     "study tac-vgnn": ("index.html", "models.csv"),
 }
 FULL_BYTES = 2000  # a disk that is full: no file becomes larger
@@ -607,13 +622,15 @@ def _outputs() -> list[Entry]:
         for what, make in PLACES.items():
             sample = command in ("preprocess", "tune") and what == "a file"
             found.append(Entry("outputs", what, call, {"there": make}, (REFUSED,), sample=sample))
-        if command in QUICK_TO_WRITE:
-            full = call.replace("{there}", "{out}")
-            found.append(
-                Entry("outputs", "a full disk", full, exit=(REFUSED,), says=("can't be written",), file_bytes=FULL_BYTES, leaves=("*",))
-            )
+        if command == "pack":  # the harmless run is of a model that has no small copy
+            continue
+        full = call.replace("{there}", "{out}")
+        found.append(Entry("outputs", "a full disk", full, says=("can't be written",), file_bytes=FULL_BYTES, leaves=("*",)))
     for command, names in OVERWRITTEN.items():
         found.append(Entry("outputs", "files of the user's own", WRITE[command], {"there": _foreign(*names)}))
+    for command in AGAIN:
+        call = WRITE[command].replace("{there}", "{out}")
+        found.append(Entry("outputs", "its own, once more", call, exit=(DONE,), first=call, seconds=60, sample=command == "graph"))
     own = "tune --sensor {spec} --frames {frames} --limit 2 --out {spec}"
     found.append(
         Entry("outputs", "its own specification", own, {"spec": shipped(f"sensors/{SENSOR}.toml", "my.toml")}, (REFUSED,), ("my.toml",))

@@ -1,9 +1,10 @@
 """The command line is options and one call: what it does can be done from Python, and nothing else depends on it."""
 
 import ast
+import inspect
 import io
 from collections.abc import Iterator
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,25 @@ def test_a_function_of_the_packages_is_behind_every_command(command):
     }
     ours = {name for source, name in [*imported(command), *IMPORTS[command.name]] if _is_ours(source)}
     assert {name for name in called & ours if not name.startswith("load_")}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_that_writes_overwrites_nothing_foreign_unless_it_is_forced(command):
+    """Every command with ``--out`` has ``--force``, and what it calls opens its output by the store before it works."""
+    names = {argument.arg for argument in command.args.args}
+    assert ("force" in names) == ("out" in names)
+    if "out" in names:
+        entered = [ast.unparse(item.context_expr) for part in ast.walk(command) if isinstance(part, ast.With) for item in part.items]
+        assert entered[0] == "overwriting(force)"
+        behind = [_behind(source, name) for source, name in imported(command) if _is_ours(source)]
+        opens = ("@writes", " generate(")  # the second opens the folder of a data set
+        assert [each for each in behind if inspect.isfunction(each) and any(word in inspect.getsource(each) for word in opens)]
+
+
+def _behind(source, name):
+    """What a command imports; of a study its function ``run``."""
+    found = getattr(import_module(source), name, None) or import_module(f"{source}.{name}")
+    return found.run if inspect.ismodule(found) else found
 
 
 @pytest.mark.parametrize("path", sorted(CLI.glob("*.py")), ids=lambda path: path.stem)

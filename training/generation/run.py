@@ -6,11 +6,12 @@ from pathlib import Path
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_object
 from training.generation.config import GenerationConfig, Images, Quality, States, require_count
 from training.generation.make import REST, make_contact
-from training.generation.store import Store, refuse_foreign
+from training.generation.store import CONFIG, FILES, Store, refuse_foreign
 from twin.frames.forms import frame_size
 from twin.progress import Progress, Step, silent, stage
 from twin.rig.contact import friction_between
-from twin.store import locked
+from twin.store import output
+from twin.store.resume import MADE_BY
 from twin.types import FINE
 from twin.workers import outcomes, require_scheduler
 
@@ -65,7 +66,7 @@ def generate(
     if scheduler:
         require_scheduler(scheduler)
     refuse_foreign(folder)
-    with locked(folder):
+    with output(folder, *FILES, gone_on=(CONFIG, MADE_BY)):
         store = Store(folder, config)
         done = store.finished()
         before = len(done - {REST})

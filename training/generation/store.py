@@ -21,9 +21,17 @@ from scenes.experiment import LABELS
 from training.generation.config import DatasetError, GenerationConfig
 from training.generation.make import REST, Outcome, make_contact
 from twin.errors import StoreError
-from twin.store import remove_parts, replace_folder, require_same_code, unwritten, write_bytes, write_npz, write_text
-from twin.store.atomic import LOCK, PART
-from twin.store.resume import MADE_BY
+from twin.store import (
+    contents,
+    remove_parts,
+    replace_folder,
+    require_same_code,
+    unwritten,
+    write_bytes,
+    write_npz,
+    write_text,
+    written_by_us,
+)
 
 # File of the data set's configuration.
 CONFIG = "generation.json"
@@ -35,6 +43,11 @@ DRAWS = "draws.csv"
 FAILURE_COLUMNS = ("path_id", "attempt", "reason")
 # Zarr group of everything that is known about the frames.
 TRUTH = "truth.zarr"
+# Files and folders of a data set, except CONFIG and MADE_BY.
+FILES = (
+    *("meta.json", "init_0.png", "images", "frames_bw", RECORDS, TRUTH),
+    *("targets.csv", "move_executed.csv", DRAWS, "failures.csv"),
+)
 # Number of rows in a chunk of this group's arrays.
 CHUNK_ROWS = 256
 UNITS = {  # unit and meaning of each array in this group
@@ -213,12 +226,11 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def refuse_foreign(folder: Path) -> None:
     """Raise DatasetError if a folder holds files but no configuration of a data set."""
-    if not folder.exists() or (folder / CONFIG).is_file():
+    found = contents(folder)
+    if CONFIG in found:
         return
-    try:
-        strange = [p.name for p in folder.iterdir() if p.name not in (LOCK, MADE_BY) and not p.name.endswith(PART)]
-    except OSError as error:
-        raise DatasetError(f"{folder}: can't be read ({error.strerror}); give another folder with --out") from error
+    ours = written_by_us(folder)  # of a run that was killed before it wrote its configuration
+    strange = [name for name in found if name not in ours]
     if strange:
         raise DatasetError(f"{folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with --out")
 

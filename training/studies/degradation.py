@@ -14,8 +14,10 @@ from training.estimator import PoseEstimator, digest_of
 from twin.camera.capture import record
 from twin.judge.degradation.envelope import Envelope
 from twin.judge.degradation.plan import SweepPlan
+from twin.judge.degradation.report import REPORT_FILES
 from twin.judge.degradation.study import check_pipelines, real_study, rendered_study
 from twin.progress import Progress, silent
+from twin.store import writes
 from twin.types import Form, Frame
 
 # Pipelines that are judged if none are named.
@@ -71,6 +73,7 @@ class Result:
         return [f"{e.pipeline:10} {e.case.name:18} {e.label}{f' ({e.measure})' if e.measure else ''}" for e in found]
 
 
+@writes(*REPORT_FILES, "cells", "pictures", "pipelines", "rendered")
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     """Sweep every condition from severity 0 to 1, judge pipelines and models on every frame, and write the result.
 

@@ -14,6 +14,7 @@ from twin.errors import FrameError
 from twin.frames import Recording, open_recording
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
+from twin.store import writes
 
 # Choices of the rows to judge.
 ROWS = ("validation", "all")
@@ -146,6 +147,7 @@ class Evaluation:
         return lines
 
 
+@writes("predictions.csv", "metrics.json", "errors.png", "robustness.csv")
 def evaluate_run(
     run: str | Path,
     recordings: Sequence[Path],
@@ -156,7 +158,7 @@ def evaluate_run(
     robustness: bool = False,
     progress: Progress = silent,
 ) -> Evaluation:
-    """Judge a trained model, and write the result to an existing folder.
+    """Judge a trained model, and write the result to a folder.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from twin.report.charts import muted, new_figure, write_chart
 from twin.report.numbers import number
 from twin.report.page import Page, Picture
 from twin.report.table import Column
-from twin.store import made_by, write_json, write_text
+from twin.store import made_by, write_json, write_text, writes
 from twin.types import Form
 
 # Preset of the labels that an audit needs.
@@ -74,8 +74,9 @@ class LabelAudit:
         ]
 
 
+@writes("labels_corrected.csv", "audit.json", "audit.png", "audit-dark.png", "audit.html")
 def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
-    """Audit the labels of a flat-surface recording, and write the result to an existing folder.
+    """Audit the labels of a flat-surface recording, and write the result to a folder.
 
     A recording of too few frames is not judged: the result says so (``Audit.untold``), and no corrected labels are written.
 

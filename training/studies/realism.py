@@ -11,6 +11,7 @@ from training.two_sample import TwoSample, two_sample
 from twin.judge.pictures.realism import run_realism
 from twin.optics.render import Quality
 from twin.progress import Progress, Step, silent
+from twin.store import writes
 
 IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip")
 
@@ -48,6 +49,7 @@ class Realism:
         return lines
 
 
+@writes("index.html", "metrics.json", "frames.csv", "radial.csv", "spectrum.csv", "spots.csv", "pictures")
 def compare_with_renders(
     frames: Path,
     sensor: SensorSpec,
@@ -59,7 +61,7 @@ def compare_with_renders(
     test: bool = True,
     progress: Progress = silent,
 ) -> Realism:
-    """Compare a folder of real raw frames with their renders, and write the result to an existing folder.
+    """Compare a folder of real raw frames with their renders, and write the result to a folder.
 
     Parameters
     ----------

@@ -9,6 +9,7 @@ from twin.judge.labelled import ContactModel, compare, measure_frames
 from twin.judge.labelled.compare import Comparison
 from twin.judge.labelled.report import summary_of, write_validation
 from twin.progress import Progress, silent, stage
+from twin.store import writes
 from twin.types import FINE, Form
 
 # Number of frames for which an individual friction is fitted.
@@ -48,6 +49,7 @@ class Validation:
         return lines
 
 
+@writes("index.html", "frames.csv", "validation.json", "errors*.png", "frames*.png")
 def validate_contacts(
     sensor: SensorSpec,
     frames: Path,
@@ -62,7 +64,7 @@ def validate_contacts(
     form: Form | None = None,
     progress: Progress = silent,
 ) -> Validation:
-    """Simulate the contacts of labelled frames, compare the pins, and write the result to an existing folder.
+    """Simulate the contacts of labelled frames, compare the pins, and write the result to a folder.
 
     Parameters
     ----------

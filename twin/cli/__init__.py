@@ -4,8 +4,10 @@ Each module of this package holds the commands of one kind of work. A command im
 ``--help`` does not wait for libraries that it does not need.
 """
 
+import errno
 import io
 import logging
+import os
 import sys
 import warnings
 from importlib import import_module
@@ -78,6 +80,10 @@ def main() -> None:
         command_line()(prog_name="twin")
     except KeyboardInterrupt as interrupt:  # before a command runs
         _end_interrupted(interrupt)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+        _end_without_room(error)
     except Exception as error:
         if not _for_user(error):
             raise
@@ -90,6 +96,14 @@ def _end_interrupted(interrupt: KeyboardInterrupt) -> NoReturn:
     print("twin: interrupted", file=sys.stderr)
     _print_notes(interrupt)
     sys.exit(INTERRUPTED)
+
+
+def _end_without_room(error: OSError) -> NoReturn:
+    """End after a full disk that is not the output's: the standard output is written to it, or a library's cache lies on it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what still waits to be printed would fail again at the end
+    place = error.filename or "the standard output or a cache"
+    print(f"twin: error: {place}: can't be written ({error.strerror}); free some space and give the same command again", file=sys.stderr)
+    sys.exit(FAILED)
 
 
 def _for_user(error: Exception) -> bool:

@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, FormOrAuto, Out, Quality, Sensor, Workers, if_given, say, tell, writable_folder
+from twin.cli.options import CORES, Across, Force, FormOrAuto, Out, Quality, Sensor, Workers, if_given, say, tell
 from twin.types import FINE
 
 calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
@@ -51,12 +51,14 @@ def optics(
         Path | None, typer.Option("--no-contact", metavar="FRAME", help="a raw frame without contact: fits the camera")
     ] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from twin.cli.progress import shown
     from twin.fit.optics import calibrate_optics
+    from twin.store import overwriting
 
-    with shown() as progress:
+    with overwriting(force), shown() as progress:
         found = calibrate_optics(frames, load_sensor(sensor), out, limit=limit, no_contact=no_contact, progress=progress)
     tell(found)
 
@@ -103,12 +105,14 @@ def contact(
     workers: Workers = CORES,
     across: Across = FINE,
     form: FormOrAuto = None,
+    force: Force = False,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor
     from twin.cli.progress import shown
     from twin.fit.contact.calibrate import calibrate_to_file
+    from twin.store import overwriting
 
-    with shown() as progress:
+    with overwriting(force), shown() as progress:
         found = calibrate_to_file(
             frames,
             load_sensor(sensor),
@@ -160,17 +164,19 @@ def validate(
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
     across: Across = FINE,
     form: FormOrAuto = None,
+    force: Force = False,
 ) -> None:
     from scenes import load_experiment, load_object, load_sensor
     from training.studies.validation import validate_contacts
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
-    with shown() as progress:
+    with overwriting(force), shown() as progress:
         found = validate_contacts(
             load_sensor(sensor),
             frames,
             load_experiment(experiment),
-            writable_folder(out),
+            out,
             touched=if_given(load_object, object_),
             limit=limit,
             friction_frames=friction_frames,
@@ -227,16 +233,18 @@ def realism(
     limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = None,
     quality: Annotated[Quality, typer.Option(help="samples per pixel")] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from training.studies.realism import compare_with_renders
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
-    with shown() as progress:
+    with overwriting(force), shown() as progress:
         found = compare_with_renders(
             path,
             load_sensor(sensor),
-            writable_folder(out),
+            out,
             pose_aligned=pose_aligned,
             limit=limit,
             quality=quality,
@@ -315,11 +323,13 @@ def robustness(
     rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
     jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = CORES,
     show: Annotated[bool, typer.Option("--list", is_eager=True, callback=_list_conditions, help="list the conditions and stop")] = False,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from training.studies import degradation
     from twin.cli.progress import shown
     from twin.judge.degradation.plan import SweepPlan, load_plan
+    from twin.store import overwriting
 
     plan = degradation.Plan(
         load_sensor(sensor),
@@ -331,8 +341,8 @@ def robustness(
         rendered=rendered,
         jobs=jobs,
     )
-    with shown() as progress:
-        found = degradation.run(plan, writable_folder(out), progress=progress)
+    with overwriting(force), shown() as progress:
+        found = degradation.run(plan, out, progress=progress)
     tell(found)
 
 
@@ -358,12 +368,14 @@ def audit(
     sensor: Sensor,
     out: Out,
     form: FormOrAuto = None,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from training.studies.label_audit import audit_recording
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
     spec = load_sensor(sensor)
-    with shown() as progress:
-        found = audit_recording(data, spec, writable_folder(out), form=form, progress=progress)
+    with overwriting(force), shown() as progress:
+        found = audit_recording(data, spec, out, form=form, progress=progress)
     tell(found)

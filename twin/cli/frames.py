@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, Out, Sensor, if_given, say, tell, writable_folder
+from twin.cli.options import Force, FormOrAuto, Out, Sensor, if_given, say, tell
 
 HELP_PREPROCESS = """Find the pins in every frame.
 
@@ -44,15 +44,17 @@ def preprocess(
     out: Out,
     form: FormOrAuto = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="also write a picture of every frame with its pins and graph")] = False,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from twin.cli.progress import shown
     from twin.pins.batch import preprocess_recording
     from twin.progress import stage
+    from twin.store import overwriting
 
     spec = load_sensor(sensor)
-    with shown() as progress, stage(progress, "frames") as step:
-        summary = preprocess_recording(path, spec, writable_folder(out), form=form, overlay=overlay, progress=step)
+    with overwriting(force), shown() as progress, stage(progress, "frames") as step:
+        summary = preprocess_recording(path, spec, out, form=form, overlay=overlay, progress=step)
     say(_lines(summary, spec.pins.count))
     say(f"wrote {out / name}" for name in ("pins.npz", "summary.json") + (("overlay",) if overlay else ()))
 
@@ -108,13 +110,15 @@ def graph(
     kind: Annotated[Kind, typer.Option("--kind", help="kind of graph")] = Kind.VORONOI,
     form: FormOrAuto = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from twin.cli.progress import shown
     from twin.pins.graph_files import write_graphs_of
+    from twin.store import overwriting
 
-    with shown():
-        made = write_graphs_of(path, load_sensor(sensor), writable_folder(out), kind=kind.value, form=form, legacy=legacy)
+    with overwriting(force), shown():
+        made = write_graphs_of(path, load_sensor(sensor), out, kind=kind.value, form=form, legacy=legacy)
     tell(made)
 
 
@@ -144,12 +148,14 @@ def tune_command(
     ] = "twin",
     form: FormOrAuto = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 12,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from twin.cli.progress import shown
     from twin.pins.tune_files import tune_on_frames
+    from twin.store import overwriting
 
-    with shown() as progress:
+    with overwriting(force), shown() as progress:
         found = tune_on_frames(frames, load_sensor(sensor), out=out, method=method, form=form, limit=limit, progress=progress)
     tell(found)
 

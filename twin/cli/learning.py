@@ -19,6 +19,7 @@ from twin.cli.options import (
     MOST_SEED,
     Across,
     Device,
+    Force,
     FormOrAuto,
     Out,
     Quality,
@@ -31,7 +32,6 @@ from twin.cli.options import (
     if_given,
     say,
     tell,
-    writable_folder,
 )
 from twin.types import FINE
 
@@ -118,10 +118,12 @@ def dataset(
         Quality | None, typer.Option(help="samples per pixel", show_default="preview for --images recording, else standard")
     ] = None,
     across: Across = FINE,
+    force: Force = False,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.generation.run import config_for, simulate_dataset
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
     config = config_for(
         load_sensor(sensor),
@@ -134,7 +136,7 @@ def dataset(
         quality=quality,
         across=across,
     )
-    with shown() as progress:
+    with overwriting(force), shown() as progress:
         made = simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, progress=progress)
     tell(made)
 
@@ -193,12 +195,14 @@ def train(
     threads: Threads = None,
     device: Device = "auto",
     form: FormOrAuto = None,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from training.train import train_model
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
-    with shown() as progress:
+    with overwriting(force), shown() as progress:
         made = train_model(
             model,
             load_sensor(sensor),
@@ -251,12 +255,14 @@ def evaluate(
     rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
     labels: Annotated[str, typer.Option("--labels", help="truth in predictions.csv and errors.png: corrected or raw")] = "corrected",
     robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
+    force: Force = False,
 ) -> None:
     from training.studies.evaluation import evaluate_run
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
-    with shown() as progress:
-        found = evaluate_run(run, data, writable_folder(out), rows=rows, labels=labels, robustness=robustness, progress=progress)
+    with overwriting(force), shown() as progress:
+        found = evaluate_run(run, data, out, rows=rows, labels=labels, robustness=robustness, progress=progress)
     tell(found)
 
 
@@ -285,15 +291,19 @@ weights below training/weights were made with these commands:
 \b
   twin study sim-to-real --sensor mg400-331 --frames DIR \\
       --contacts surface-2d-wide --draws 2 --epochs 60 --out study
-  twin pack study/sim_only --out training/weights/mg400-331
+  twin pack study/sim_only --out training/weights/mg400-331 --force
 """
 
 
 @app.command("pack", help=HELP_PACK)
-def pack(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, trained with --no-kernel")], out: Out) -> None:
+def pack(
+    run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, trained with --no-kernel")], out: Out, force: Force = False
+) -> None:
     from training.estimator import PoseEstimator
     from training.packed import WEIGHTS, pack
+    from twin.store import overwriting
 
     PoseEstimator.load(run)  # says what is wrong with a folder that holds no run
-    size = pack(run, writable_folder(out))
+    with overwriting(force):
+        size = pack(run, out)
     say([f"wrote {out / WEIGHTS} ({size / 1e3:.0f} kB), {out / 'config.json'}"])

@@ -17,6 +17,7 @@ from twin.cli.options import (
     ArmOption,
     AtRest,
     Camera,
+    Force,
     FormOrAuto,
     Limits,
     Model,
@@ -27,7 +28,6 @@ from twin.cli.options import (
     ServoName,
     say,
     tell,
-    writable_folder,
 )
 from twin.types import FIRST, NONE
 
@@ -125,11 +125,13 @@ def collect_command(
     limits: Limits = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of the drawn contacts; the experiment's own if not given")] = None,
     plain_light: PlainLight = False,
+    force: Force = False,
 ) -> None:
     from hardware.collect import CollectPlan, collect_frames
     from hardware.rig import signals_as_ctrl_c
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
     asked = load_experiment(experiment)
     plan = CollectPlan(
@@ -145,8 +147,8 @@ def collect_command(
         limits=limits,
         plain_light=plain_light,
     )
-    with signals_as_ctrl_c(), shown() as progress:
-        collected = collect_frames(plan, writable_folder(out), progress=progress)
+    with overwriting(force), signals_as_ctrl_c(), shown() as progress:
+        collected = collect_frames(plan, out, progress=progress)
     say(collected.lines())
 
 
@@ -202,12 +204,14 @@ def servo(
     known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")] = False,
     plain_light: PlainLight = False,
     at_rest: AtRest = FIRST,
+    force: Force = False,
 ) -> None:
     from hardware.following import FollowPlan, follow
     from hardware.rig import signals_as_ctrl_c
     from scenes import load_object, load_servo
     from training.estimator import PoseEstimator
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
     plan = FollowPlan(
         stimulus=load_object(object_name),
@@ -223,8 +227,8 @@ def servo(
         known_place=known_place,
         at_rest=at_rest,
     )
-    with signals_as_ctrl_c(), shown() as progress:
-        followed = follow(plan, PoseEstimator.load(model), writable_folder(out), about={"model": str(model)}, progress=progress)
+    with overwriting(force), signals_as_ctrl_c(), shown() as progress:
+        followed = follow(plan, PoseEstimator.load(model), out, about={"model": str(model)}, progress=progress)
     tell(followed)
     if followed.failure:
         raise SystemExit(1)

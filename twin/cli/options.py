@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Protocol, TypeVar
 
 import typer
 
-from twin.errors import OptionError, TwinError
+from twin.errors import OptionError
 from twin.types import Form
 
 Given = TypeVar("Given", str, Path)
@@ -32,6 +32,7 @@ Quality = Literal["preview", "standard", "high"]
 Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
 Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
+Force = Annotated[bool, typer.Option("--force", help="write over files that this program did not write")]
 FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; found from size and content if not given")]
 Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
 
@@ -104,18 +105,6 @@ def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
 def if_given(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
     """The specification of a name or file; None if none is given."""
     return load(name) if name else None
-
-
-def writable_folder(path: Path) -> Path:
-    """Make the folder, or say in one line why it can't be written to."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        probe = path / ".write-probe"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise TwinError(f"{path}: can't write there ({error.strerror}); give another folder with --out") from error
-    return path
 
 
 class Result(Protocol):

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import Object, Out, Pair, Quality, Sensor, say, tell, writable_folder
+from twin.cli.options import Force, Object, Out, Pair, Quality, Sensor, say, tell
 from twin.types import Form
 
 
@@ -70,16 +70,17 @@ def doctor() -> None:
 
 
 @app.command("demo")
-def demo(out: Out = Path("out/demo")) -> None:
+def demo(out: Out = Path("out/demo"), force: Force = False) -> None:
     """Run the whole chain on shipped sensors, as one page.
 
     It presses, renders, finds pins and builds graphs for several sensors and objects. It writes pictures and a page (index.html).
     """
     from twin.cli.progress import shown
     from twin.demo.make_demo import run_demo
+    from twin.store import overwriting
 
-    with shown() as progress:
-        made = run_demo(writable_folder(out), progress=progress)
+    with overwriting(force), shown() as progress:
+        made = run_demo(out, progress=progress)
     tell(made)
     say([f"open {out / 'index.html'} in a browser"])
 
@@ -145,14 +146,16 @@ def render(
     form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
     quality: Annotated[Quality, typer.Option(help="samples per pixel")] = "standard",
     seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
+    force: Force = False,
 ) -> None:
     from scenes import load_object, load_sensor
     from twin.cli.progress import shown
     from twin.mechanics.path import ContactPose
     from twin.one_contact import render_contact
+    from twin.store import overwriting
 
     spec, stimulus = load_sensor(sensor), load_object(object_)
     pose = ContactPose(indent_mm=indent_mm, tilt_deg=tilt_deg, shear_mm=shear_mm, twist_deg=twist_deg, offset_mm=offset_mm)
-    with shown() as progress:
-        made = render_contact(spec, stimulus, pose, writable_folder(out), form=form, quality=quality, seed=seed, progress=progress)
+    with overwriting(force), shown() as progress:
+        made = render_contact(spec, stimulus, pose, out, form=form, quality=quality, seed=seed, progress=progress)
     tell(made)

@@ -17,6 +17,7 @@ from twin.cli.options import (
     MOST_SEED,
     Across,
     Device,
+    Force,
     FormOrAuto,
     Out,
     PlainLight,
@@ -31,7 +32,6 @@ from twin.cli.options import (
     names_in,
     numbers_in,
     tell,
-    writable_folder,
 )
 from twin.types import FINE
 
@@ -60,11 +60,13 @@ def servo_command(
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="steps on each object, instead of once around it")] = None,
     seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
     plain_light: PlainLight = False,
+    force: Force = False,
 ) -> None:
     from hardware.servo_study import ServoStudyPlan, study_servo
     from scenes import load_object, load_servo
     from training.estimator import load_by_name
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
     plan = ServoStudyPlan(
         models=load_by_name(models),
@@ -74,8 +76,8 @@ def servo_command(
         seed=seed,
         plain_light=plain_light,
     )
-    with shown() as progress:
-        found = study_servo(plan, writable_folder(out), progress=progress)
+    with overwriting(force), shown() as progress:
+        found = study_servo(plan, out, progress=progress)
     tell(found)
 
 
@@ -121,10 +123,12 @@ def study_objects(
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
+    force: Force = False,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.studies import objects
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
     plan = objects.Plan(
         sensor=load_sensor(sensor),
@@ -139,8 +143,8 @@ def study_objects(
         epochs=epochs,
         workers=workers,
     )
-    with shown() as progress:
-        found = objects.run(plan, writable_folder(out), progress=progress)
+    with overwriting(force), shown() as progress:
+        found = objects.run(plan, out, progress=progress)
     tell(found)
 
 
@@ -204,10 +208,12 @@ def study_sim_to_real(
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of every training, instead of the model's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
+    force: Force = False,
 ) -> None:
     from scenes import load_experiment, load_sensor
     from training.studies import sim_to_real
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
     plan = sim_to_real.Plan(
         sensor=load_sensor(sensor),
@@ -225,8 +231,8 @@ def study_sim_to_real(
         workers=workers,
         across=across,
     )
-    with shown() as progress:
-        found = sim_to_real.run(plan, writable_folder(out), progress=progress)
+    with overwriting(force), shown() as progress:
+        found = sim_to_real.run(plan, out, progress=progress)
     tell(found)
 
 
@@ -273,11 +279,13 @@ def study_tac_vgnn(
     device: Device = "auto",
     threads: Threads = None,
     form: FormOrAuto = None,
+    force: Force = False,
 ) -> None:
     from scenes import load_sensor
     from training.studies import tac_vgnn
     from training.train import columns_of
     from twin.cli.progress import shown
+    from twin.store import overwriting
 
     plan = tac_vgnn.Plan(
         data=data,
@@ -295,6 +303,6 @@ def study_tac_vgnn(
         threads=threads,
         form=form,
     )
-    with shown() as progress:
-        found = tac_vgnn.run(plan, writable_folder(out), progress=progress)
+    with overwriting(force), shown() as progress:
+        found = tac_vgnn.run(plan, out, progress=progress)
     tell(found)

@@ -19,6 +19,7 @@ from twin.progress import Progress, silent, stage
 from twin.report.charts import write_chart
 from twin.report.skin3d import draw_contact_skin
 from twin.simulator import Simulator
+from twin.store import writes
 from twin.types import Form
 
 
@@ -51,6 +52,7 @@ class Demo:
         return lines
 
 
+@writes("index.html", "pictures")
 def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     """Run the whole demo into a folder."""
     bar = partial(stage, progress)

@@ -33,7 +33,7 @@ from twin.pins.pipeline import Pipeline
 from twin.progress import Bar, Progress, Step, silent, stage
 from twin.report.page import Page, Picture, code
 from twin.report.table import Column
-from twin.store import Item, inputs_digest, kept_arrays, kept_json
+from twin.store import KEPT, Item, inputs_digest, kept_arrays, kept_json, output, writes_file
 from twin.types import Form, Frame
 
 FRAMES = 6
@@ -133,6 +133,7 @@ class _Studio:
         return [expose(light, spec.capture) for light in self.light(spec, frames, title)]
 
 
+@writes_file(".*.csv")
 def calibrate_optics(
     frames: Path, sensor: SensorSpec, out: Path, *, limit: int = FRAMES, no_contact: Path | None = None, progress: Progress = silent
 ) -> OpticsCalibration:
@@ -158,10 +159,11 @@ def calibrate_optics(
         The renderer, or its differentiation, does not work on this machine.
     """
     folder = folder_beside(out, "calibration")
-    found = fit_optics(frames, sensor, folder, limit=limit, no_contact=no_contact, progress=progress)
-    said = [f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.", *found.warnings]
-    write_sensor(out, found.spec, "\n".join(said))
-    return OpticsCalibration(found, [out, write_page(folder, sensor, found, frames.name)])
+    with output(folder, "index.html", "pictures", KEPT):
+        found = fit_optics(frames, sensor, folder, limit=limit, no_contact=no_contact, progress=progress)
+        said = [f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.", *found.warnings]
+        write_sensor(out, found.spec, "\n".join(said))
+        return OpticsCalibration(found, [out, write_page(folder, sensor, found, frames.name)])
 
 
 def fit_optics(
@@ -349,7 +351,7 @@ def _shown(value: object) -> str:
 
 
 def folder_beside(out: Path, kind: str) -> Path:
-    """The folder for further files of a specification that will be written; made if missing.
+    """The folder for further files of a specification that will be written.
 
     Raises
     ------
@@ -358,6 +360,4 @@ def folder_beside(out: Path, kind: str) -> Path:
     """
     if out.suffix != ".toml":
         raise OptionError(f"--out {out}: give the name of a .toml file")
-    folder = out.with_name(f"{out.stem}-{kind}")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    return out.with_name(f"{out.stem}-{kind}")

@@ -21,6 +21,7 @@ from twin.optics.surfaces import SkinSurface, Surface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
 from twin.optics.variant import DrJit, VariantChoice, choose_variant, use_variant
 from twin.optics.window import Window
+from twin.store import write_bytes
 from twin.types import FloatArray, IntArray, PinState
 
 Quality = Literal["preview", "standard", "high"]
@@ -212,4 +213,6 @@ def write_exr(path: Path, linear: FloatArray, choice: VariantChoice) -> None:
     """
     mi = use_variant(choice)
     pixels = np.ascontiguousarray(linear if linear.ndim == 3 else linear[..., None])
-    mi.Bitmap(pixels).convert(component_format=mi.Struct.Type.Float16).write(str(path))
+    content = mi.MemoryStream()
+    mi.Bitmap(pixels).convert(component_format=mi.Struct.Type.Float16).write(content, mi.Bitmap.FileFormat.OpenEXR)
+    write_bytes(path, content.raw_buffer())

@@ -15,7 +15,7 @@ from twin.frames.images import write_image
 from twin.frames.recording import BadFrame
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.pins.reference import Reference, nominal_reference
-from twin.store import made_by, unwritten, write_json, write_npz
+from twin.store import made_by, write_json, write_npz, writes
 from twin.types import Form, Frame, Observation
 
 EDGE_RGB = (90, 110, 160)
@@ -32,6 +32,7 @@ UNMEASURED = "specification"
 """Text instead of the name of a no-contact frame if the reference is the specification's layout."""
 
 
+@writes("pins.npz", "summary.json", "overlay", to="out_dir")
 def preprocess_recording(
     path: str | Path,
     spec: SensorSpec,
@@ -65,15 +66,13 @@ def preprocess_recording(
     FrameError
         No frame was readable, or none was valid. In the second case the files are written nevertheless.
     StoreError
-        The folder can't be written to.
+        The folder can't be written to, another run is at work in it, or it holds files of these names that this program did not write.
     """
     recording = open_recording(path, spec, form)
     out_dir = Path(out_dir)
     pictures_dir = out_dir / "overlay" if overlay else None
-    try:
-        (pictures_dir or out_dir).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritten(out_dir, error) from error
+    if pictures_dir is not None:
+        pictures_dir.mkdir(exist_ok=True)
     notes: list[str] = []
     reference, reference_name = recording_reference(spec, recording, notes)
     pipeline = Pipeline(spec, recording.form, reference)

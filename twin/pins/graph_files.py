@@ -17,9 +17,9 @@ from twin.pins.graph import GraphKind, make_graph
 from twin.pins.legacy import LegacyPipeline
 from twin.pins.pipeline import Pipeline
 from twin.pins.reference import Reference, nominal_reference, spread_out
-from twin.report.charts import new_figure
+from twin.report.charts import new_figure, save_figure
 from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
-from twin.store import write_npz
+from twin.store import write_npz, writes
 from twin.types import Form, PinGraph
 
 PINS = ".npz"
@@ -61,10 +61,11 @@ class Graphs:
         return [*(f"note: {note}" for note in self.notes), *(f"skipped {reason}" for reason in self.left_out), counted]
 
 
+@writes("graph.npz", "graph.png", "surface.png")
 def write_graphs_of(
     path: Path, sensor: SensorSpec, out: Path, *, kind: GraphKind = "voronoi", form: Form | None = None, legacy: bool = False
 ) -> Graphs:
-    """Build the graphs of the frames or pins at a path, and write them to an existing folder.
+    """Build the graphs of the frames or pins at a path, and write them to a folder.
 
     Parameters
     ----------
@@ -239,12 +240,10 @@ def draw_graph_pictures(
     draw_frame(ax, image, f"{title}: {graph.kind}, {len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
     draw_graph(ax, graph)
     draw_nodes(ax, graph)
-    written = [out / "graph.png"]
-    figure.savefig(written[0], dpi=PICTURE_DPI)
+    written = [save_figure(out / "graph.png", figure, dpi=PICTURE_DPI)]
     if graph.kind == "voronoi":
         rest = make_graph("voronoi", reference.pins_px, outmost=reference.outmost)
-        written.append(out / "surface.png")
-        area_surface_figure(rest, graph).savefig(written[1], dpi=PICTURE_DPI)
+        written.append(save_figure(out / "surface.png", area_surface_figure(rest, graph), dpi=PICTURE_DPI))
     return written
 
 
@@ -256,6 +255,4 @@ def draw_bare_graph(out: Path, graph: PinGraph) -> list[Path]:
     draw_nodes(ax, graph)
     ax.set(aspect="equal", title=f"{len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
     ax.invert_yaxis()
-    path = out / "graph.png"
-    figure.savefig(path, dpi=PICTURE_DPI)
-    return [path]
+    return [save_figure(out / "graph.png", figure, dpi=PICTURE_DPI)]

@@ -9,6 +9,7 @@ from twin.frames import evenly_read, open_recording
 from twin.pins.detector_spec import Evidence, Method, write_detector
 from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
+from twin.store import writes_file
 from twin.types import Form
 
 # Most frames that are used if no other number is given.
@@ -57,6 +58,7 @@ class TunedOnFrames:
         return [*lines, *(f"note: {note}" for note in [*self.tuned.notes, *self.odd])]
 
 
+@writes_file()
 def tune_on_frames(
     path: Path,
     sensor: SensorSpec,

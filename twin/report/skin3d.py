@@ -19,6 +19,8 @@ from matplotlib.figure import Figure
 from scenes.sensor import PinsSpec
 from twin.geometry.mesh import SensorMesh, skin_surface
 from twin.objects import ObjectField
+from twin.report.charts import save_figure
+from twin.store import write_bytes
 from twin.types import ContactState
 
 # Box of the sensor frame that the picture shows: x0, x1, y0, y1, z0, z1, mm.
@@ -71,9 +73,12 @@ def draw_skin(skin: pv.PolyData, pins: pv.PolyData, touched: pv.PolyData, path: 
     with tempfile.TemporaryDirectory() as folder:
         for name, surface in (("skin", skin), ("pins", pins), ("object", touched)):
             surface.save(Path(folder) / f"{name}.vtp")
-        reason = _run_child(folder, str(path))
+        drawn = Path(folder) / "drawn.png"
+        reason = _run_child(folder, str(drawn))
+        if not reason:
+            write_bytes(path, drawn.read_bytes())
     if reason:
-        _draw_plain(skin, touched, path)
+        save_figure(path, _plain_figure(skin, touched), dpi=100)
     return reason
 
 
@@ -154,7 +159,7 @@ def _glow() -> ListedColormap:
     return ListedColormap(colormaps["inferno"](np.linspace(0.22, 0.97, 256)))
 
 
-def _draw_plain(skin: pv.PolyData, touched: pv.PolyData, path: Path) -> None:
+def _plain_figure(skin: pv.PolyData, touched: pv.PolyData) -> Figure:
     figure = Figure(figsize=(WINDOW_PX[0] / 100, WINDOW_PX[1] / 100), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     half = _cut(skin).triangulate()
@@ -168,7 +173,7 @@ def _draw_plain(skin: pv.PolyData, touched: pv.PolyData, path: Path) -> None:
         axes.plot_trisurf(*touched.points.T, triangles=touched.triangulate().regular_faces, color="#7aa7d9", alpha=0.3)
     axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm", aspect="equal")
     axes.view_init(elev=15, azim=-75)
-    figure.savefig(path, dpi=100)
+    return figure
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Storage of results: files that are written whole or not at all, a cache, resumable work, and records of the code that made them."""
+"""Storage of results: files written whole or not at all, safe outputs, a cache, resumable work, and records of the code that made them."""
 
 from twin.store.atomic import (
     locked,
@@ -6,6 +6,7 @@ from twin.store.atomic import (
     replace_folder,
     text_file,
     unwritten,
+    write_by,
     write_bytes,
     write_json,
     write_npz,
@@ -15,13 +16,16 @@ from twin.store.atomic import (
 from twin.store.cache import cache_folder, cached_arrays
 from twin.store.fingerprint import code_of, fingerprint
 from twin.store.made import inputs_digest, made_by
-from twin.store.resume import Item, find_arrays, find_json, keep_arrays, keep_json, kept_arrays, kept_json, require_same_code
+from twin.store.output import contents, output, output_file, overwriting, writes, writes_file, written_by_us
+from twin.store.resume import KEPT, Item, find_arrays, find_json, keep_arrays, keep_json, kept_arrays, kept_json, require_same_code
 
 __all__ = [
+    "KEPT",
     "Item",
     "cache_folder",
     "cached_arrays",
     "code_of",
+    "contents",
     "find_arrays",
     "find_json",
     "fingerprint",
@@ -32,14 +36,21 @@ __all__ = [
     "kept_json",
     "locked",
     "made_by",
+    "output",
+    "output_file",
+    "overwriting",
     "remove_parts",
     "replace_folder",
     "require_same_code",
     "text_file",
     "unwritten",
+    "write_by",
     "write_bytes",
     "write_json",
     "write_npz",
     "write_text",
     "write_with",
+    "writes",
+    "writes_file",
+    "written_by_us",
 ]

@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 import numpy as np
@@ -35,6 +36,9 @@ _REMEDIES = {
     errno.EPERM: "give a folder that may be written to",
     errno.ENOENT: "make its folder first, or give another one",
     errno.ENOTDIR: "give another folder: a file is in the way",
+    errno.EEXIST: "give another folder: a file is in the way",
+    errno.ENAMETOOLONG: "give a shorter name",
+    errno.EFBIG: "files can't be larger there; give another folder",
     errno.EISDIR: "give another name: a folder is in the way",
 }
 _ANY_REMEDY = "give another folder or free some space"
@@ -96,6 +100,20 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool 
     return write_with(path, lambda file: save(file, **arrays))
 
 
+def write_by(path: Path, save: Callable[[Path], object]) -> Path:
+    """Write a file by a function that takes a path and no open file; errors as of ``write_with``."""
+    try:
+        with TemporaryDirectory(prefix=".", suffix=PART, dir=path.parent) as folder:
+            part = Path(folder) / path.name
+            save(part)
+            if not part.is_file():  # VTK prints its errors and raises none
+                raise StoreError(f"{path}: can't be written; {_ANY_REMEDY}")
+            os.replace(part, path)
+    except OSError as error:
+        raise unwritten(path, error) from error
+    return path
+
+
 def replace_folder(part: Path, path: Path) -> Path:
     """Rename a finished folder, which replaces an existing folder of that name. Returns the path.
 
@@ -134,8 +152,14 @@ def unwritten(path: Path, error: OSError) -> StoreError:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     """Context that reserves a folder, made if missing, for this run. The lock of a killed run is released.
+
+    Parameters
+    ----------
+    folder : Path
+    wait_s : float
+        How long to wait for another run that holds it.
 
     Raises
     ------
@@ -145,7 +169,7 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / LOCK)
-        lock.acquire(blocking=False)
+        lock.acquire(timeout=wait_s)
     except Timeout as error:
         raise StoreError(f"{folder}: another run is at work there; wait until it has ended, or give another --out") from error
     except OSError as error:

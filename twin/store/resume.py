@@ -25,6 +25,7 @@ _RECORD = "made_by"  # key of the record in the file of an item
 _CONTENT = "content"  # key of the content in the file of an item
 _STRANGE = re.compile(r"[^-+.=\w]")  # characters that a file's name should not have
 _DIGITS = 16  # hexadecimal digits of the digest in a file's name: 64 bits
+KEPT = f"*-{'?' * _DIGITS}.*"  # pattern of the names of the files of items
 _MOST_CHANGES = 3  # most changes of the code that a message names
 
 

@@ -21,6 +21,7 @@ from training.studies.sim_to_real.steps import train_in_twin
 from training.studies.sim_to_real.twins import contact_of
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
+from twin.store import writes
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Result:
         return lines + self.verdicts
 
 
+@writes("objects.csv", "index.html", "errors*.png")
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     """Simulate contacts of all objects, train both models, and judge them on contacts of every object.
 
@@ -64,7 +66,6 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     TrainingError
         A folder holds another run, or no contact of an object lies within the ranges that are judged.
     """
-    out.mkdir(parents=True, exist_ok=True)
     sets = {folder: _simulated(plan, out / folder, folder, config, count, progress) for folder, config, count in plan.sets()}
     runs = {}
     for name, data in plan.trained_on(sets).items():

@@ -27,7 +27,7 @@ from twin.frames import open_recording
 from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Step
 from twin.rig.labels import ArmLabel, read_arm_labels
-from twin.store import write_text
+from twin.store import output, overwriting, write_text, writes
 
 # Epochs of a training on thousands of simulated states. More epochs do not change the errors.
 TWIN_EPOCHS = 60
@@ -179,6 +179,7 @@ class Beside:
     intervals: dict[str, np.ndarray]
 
 
+@writes(TENSORS, CONFIG)
 def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> Beside:
     """Average a run of ``vgnn`` with a Gaussian process of labelled frames, and write the result as a run to ``out``.
 
@@ -224,7 +225,6 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     missed = [intervals(made, truth, raw, scale, executed) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
     content |= intervals((mean + alone) / 2, truth, raw, scale, executed) | {"beside": process.arrays()}
-    out.mkdir(parents=True, exist_ok=True)
     write_tensors(out / TENSORS, content)
     about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}
     write_text(out / CONFIG, json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
@@ -236,8 +236,9 @@ def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
 
     A second call with the same intervals has no effect.
     """
-    content = read_tensors(run / TENSORS)
-    write_tensors(run / TENSORS, content | wider)
+    with overwriting(), output(run, TENSORS):  # what is there is kept, whoever wrote it
+        content = read_tensors(run / TENSORS)
+        write_tensors(run / TENSORS, content | wider)
 
 
 def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict[str, Any]:

@@ -36,6 +36,7 @@ from twin.fit.contact.simulate import Setup
 from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
+from twin.store import writes
 from twin.types import FINE
 
 SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
@@ -182,6 +183,7 @@ class _Ground:
     twins: list[Twin]
 
 
+@writes("study.csv", "index.html", "errors*.png", "ingredients*.png", "calibration", "labelled")
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     """Train in the twin, in the twin with labelled frames, and without the twin; judge all models on the same real frames.
 
@@ -218,7 +220,6 @@ def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
     with stage(progress, "frames") as step:
         real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
     chosen = choose_frames(len(real), plan.labels, plan.seed)
-    out.mkdir(parents=True, exist_ok=True)
     few = real.rows(chosen.few)
     measured, sensor = measured_of(few), plan.sensor
     if plan.calibrate:

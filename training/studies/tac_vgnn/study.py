@@ -17,11 +17,17 @@ from training.studies.tac_vgnn.page import draw_contacts, draw_curves, draw_effi
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
+from twin.store import writes
 from twin.types import Form
 
 MODELS = ("gnn", "tac-vgnn", "vgnn", "cnn-v2", "cnn-v1")
 # Batch sizes of the efficiency figure.
 BATCHES = (64, 256, 512)
+
+FILES = (
+    "index.html",
+    *(f"{name}{ending}" for name in ("models", "graphs", "curves", "efficiency", "contacts") for ending in (".csv", ".png", "-dark.png")),
+)
 
 
 @dataclass(frozen=True)
@@ -122,6 +128,7 @@ class Result:
         return ", " + "; ".join(f"{name} {row[f'{name}_raw']:.4g} raw, {row[f'{name}_corrected']:.4g} corrected" for name in self.names)
 
 
+@writes(*FILES)
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     """Compare graphs, models and training efficiency, and show the Voronoi areas of contacts.
 
@@ -139,7 +146,6 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     with stage(progress, "frames") as step:
         data = load_dataset(plan.data, plan.sensor, plan.target, form=plan.form, progress=step)
     folder = out / "runs"
-    folder.mkdir(parents=True, exist_ok=True)
     graphs = compare_graphs(data.pins)
     spent = train_all(runs, data, folder, max_minutes=plan.max_minutes, device=device, progress=progress)
     rows = [table_row(each, data, folder, spent.get(each.folder)) for each in runs]

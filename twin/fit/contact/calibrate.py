@@ -21,6 +21,7 @@ from twin.fit.sensor_file import write_sensor
 from twin.judge.labelled.model import MeasuredFrames, measure_frames
 from twin.progress import Progress, Step, silent, stage
 from twin.rig.kinematics import rig_of
+from twin.store import output, writes_file
 from twin.types import FINE, Form
 
 LABELS = 20
@@ -109,6 +110,7 @@ class ContactCalibration:
         return lines
 
 
+@writes_file(".*.csv")
 def calibrate_to_file(
     frames: Path,
     sensor: SensorSpec,
@@ -154,7 +156,7 @@ def calibrate_to_file(
         raise OptionError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = folder_beside(out, "contact")
     parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
-    with stage(progress, "contacts") as step:
+    with output(folder, "index.html", "calibration.json", "*.png", "contacts"), stage(progress, "contacts") as step:
         thing = touched or load_object(experiment.object)
         fitted, summary, page = calibrate_contact(
             folder,

@@ -30,6 +30,9 @@ TWICE = 2.0
 CASE_DPI = 90
 """Resolution of a condition's chart, dots per inch. It is low, because a page has dozens of them."""
 
+REPORT_FILES = ("index.html", "plots", "envelope.json", "envelope.csv", "curves.csv", "frames.csv", "real-on-rendered.csv")
+"""What a report consists of."""
+
 
 def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str], rendered: Judgement | None = None) -> list[Path]:
     """Write index.html, its plots, and the tables. Returns their paths, the page first.

@@ -1,7 +1,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-OUT ?= out/demo
+DEMO := out/demo
+OUT ?= $(DEMO)
 export TACTIP_REAL ?= ../shared/real
 SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
@@ -19,8 +20,9 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
 	@touch $@
 
-demo: setup      ## the main job: press, render, detect, graph; pictures and a page in out/demo
-	@$(BIN)/twin demo --out $(OUT)
+# out/demo is the program's own folder: a demo of an earlier version there is replaced. In another folder only own files are.
+demo: setup      ## the main job: press, render, detect, graph; pictures and a page in out/demo, or in OUT=DIR
+	@$(BIN)/twin demo --out $(OUT) $(if $(filter $(DEMO),$(OUT)),--force)
 
 test: setup      ## run the tests; at the end which took longest
 	@$(BIN)/python -m pytest -n auto --dist loadfile --durations=15 --durations-min=1

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import io
+import subprocess
 from collections.abc import Iterator
 from importlib import import_module, metadata
 from pathlib import Path
@@ -103,6 +104,14 @@ def _behind(source, name):
     """What a command imports; of a study its function ``run``."""
     found = getattr(import_module(source), name, None) or import_module(f"{source}.{name}")
     return found.run if inspect.ismodule(found) else found
+
+
+@pytest.mark.parametrize(("folder", "forced"), [((), True), (("OUT=out/demo",), True), (("OUT=mine",), False)])
+def test_make_demo_replaces_a_demo_of_an_earlier_version_in_its_own_folder_alone(folder, forced):
+    told = subprocess.run(["make", "-n", "demo", *folder], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    call = told.splitlines()[-1].split()
+    assert call[:2] == [".venv/bin/twin", "demo"]
+    assert ("--force" in call) == forced
 
 
 @pytest.mark.parametrize("path", sorted(CLI.glob("*.py")), ids=lambda path: path.stem)

@@ -6,7 +6,7 @@ OUT ?= $(DEMO)
 export TACTIP_REAL ?= ../shared/real
 SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
-.PHONY: help setup demo test golden bench figures tables validate lint types wheel clean
+.PHONY: help setup demo test golden bench figures film tables validate lint types wheel clean
 help:            ## what can be made
 	@sed -n 's/^\([a-z]*\): .*## /\1\t/p' $(MAKEFILE_LIST)
 
@@ -43,6 +43,10 @@ validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, Calculi
 
 figures: setup   ## every figure that a document states, into figures.json; goes on where it was; ONLY=pins,render for some of them
 	@$(SCRIPT) -m figures $(if $(ONLY),--only $(ONLY))
+
+film: setup      ## the studio's film and three pictures, in out/film; needs Debian's chromium
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,browser]'
+	@$(SCRIPT) tests/browser/film.py --out out/film
 
 tables: setup    ## make the documents' tables from figures.json
 	@$(SCRIPT) -m figures --tables

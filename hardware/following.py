@@ -14,11 +14,12 @@ from hardware.last_axis import LastAxis, turns_back_mm
 from hardware.loop import ServoLoop
 from hardware.rig import Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
 from hardware.session import SessionWriter, plain
-from hardware.step import Estimate, LoopSettings, SensorModel, StepRecord
+from hardware.step import LoopSettings, StepRecord
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from twin.errors import TwinError
+from twin.estimate import Estimate, SensorModel
 from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import save_figure
 from twin.store import write_json, writes

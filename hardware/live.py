@@ -19,12 +19,12 @@ from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.rig import counting_from_first, given_frame
 from hardware.session import SESSION_FILES, SessionSource, SessionWriter
-from hardware.step import Estimate, Estimator, SensorModel
 from hardware.timing import Spread, Timing
 from hardware.view.draw import WindowView, draw_view, has_window
 from hardware.view.rerun import RerunView
 from hardware.view.server import BrowserView
 from twin.errors import FrameError, OptionError
+from twin.estimate import Estimate, Estimator, SensorModel
 from twin.pins import Pipeline
 from twin.store import output
 from twin.types import FIRST, NONE, Frame

@@ -21,10 +21,11 @@ from hardware.rig_geometry import matrix_of, moved
 from hardware.safe_arm import RefusedMoveError, try_each
 from hardware.safety import Code
 from hardware.servo import Memory, Reading, servo_step, tangent_of
-from hardware.step import Estimate, Estimator, Guard, LoopSettings, StepRecord
+from hardware.step import Guard, LoopSettings, StepRecord
 from hardware.timing import Spread, Timing
 from hardware.watch import ArmWatch
 from scenes.servo import ServoSpec
+from twin.estimate import Estimate, Estimator
 from twin.rig.mounting import Mounting
 from twin.types import Frame
 

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal
 
 import numpy as np
 
@@ -26,22 +25,19 @@ from hardware.loop import ServoLoop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
 from hardware.safety import SHIPPED_LIMITS, load_limits
-from hardware.step import Estimate, Estimator, LoopSettings, SensorModel, StepRecord
+from hardware.step import LoopSettings, StepRecord
 from scenes import ObjectSpec, PlacementSpec, SensorSpec, ServoSpec
 from scenes.experiment import ExperimentSpec
 from twin.errors import FrameError, RenderError
+from twin.estimate import Estimate, Estimator, SensorModel
 from twin.frames import open_recording
-from twin.optics.preview import Preview, Shading
-from twin.optics.render import Renderer
+from twin.optics.preview import Preview, traced_shading
 from twin.pins import require_untouched
 from twin.rig.mounting import Mounting
-from twin.store import cached_arrays
 from twin.types import FIRST, NONE, Form, Frame
 
 # What a user writes after --camera for the twin.
 TWIN = "twin"
-# Samples per pixel of the path-traced frame that sets the shading of the twin's frames.
-SHADING_QUALITY: Literal["standard"] = "standard"
 # Longest wait in s for a frame of an arm that stands still.
 FRAME_S = 5.0
 # The same for the twin, which may take longer to draw a frame.
@@ -213,13 +209,8 @@ def drawn(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     if plain_light:
         return preview
 
-    def trace() -> dict[str, np.ndarray]:
-        shading = preview.calibrate(Renderer(sensor, quality=SHADING_QUALITY, window_px=preview.window_px))
-        return {"gain": shading.gain, "offset": shading.offset, "skin": shading.skin}
-
-    key = {"sensor": sensor.model_dump(mode="json"), "window_px": list(preview.window_px), "quality": SHADING_QUALITY}
     try:
-        preview.shading = Shading(**cached_arrays("shading", key, trace, code=(Preview, Renderer)))
+        preview.shading = traced_shading(preview)
     except RenderError as error:
         raise RenderError(f"{error}; or draw with --plain-light, which needs no path tracing") from error
     return preview

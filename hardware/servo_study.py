@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from hardware.following import Followed, FollowPlan, follow
-from hardware.step import SensorModel
 from hardware.trajectory import comparison_figure
 from scenes import ObjectSpec, ServoSpec
 from twin.errors import StoreError, TwinError
+from twin.estimate import SensorModel
 from twin.progress import Progress, silent
 from twin.report.charts import save_figure
 from twin.store import text_file, writes

@@ -2,60 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 
 from hardware.arms.arm import ArmState
-from scenes.sensor import SensorSpec
-from twin.pins.pipeline import Pipeline
-from twin.types import Form, Frame
-
-
-class Estimate(Protocol):
-    """An estimator's result on a frame (``training.estimator.PoseEstimate``)."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def value(self) -> np.ndarray: ...
-
-    @property
-    def low(self) -> np.ndarray: ...
-
-    @property
-    def high(self) -> np.ndarray: ...
-
-    @property
-    def valid(self) -> bool: ...
-
-    @property
-    def reason(self) -> str: ...
-
-
-Estimator = Callable[[Frame], Estimate]
-
-
-class SensorModel(Protocol):
-    """A trained model with its sensor and its pipeline: frame in, estimate out (``training.estimator.PoseEstimator``)."""
-
-    sensor: SensorSpec
-    form: Form
-    pipeline: Pipeline
-
-    @property
-    def counts_from_rest(self) -> bool:
-        """Whether the model can count pins from a frame without contact."""
-
-    def __call__(self, frame: Frame) -> Estimate: ...
-
-    def at_rest(self, frame: Frame) -> Self:
-        """The same model, counting pins from a frame without contact."""
-
-    def check(self, sensor: SensorSpec, form: Form) -> None:
-        """Raise an error if the model was not trained on frames of this sensor and form."""
-
 
 Guard = Callable[[ArmState, np.ndarray], np.ndarray]
 """From the arm's state and a target (6,) to the pose (6,) that may be sent. It raises an error to refuse the move."""

@@ -1,7 +1,7 @@
 """A trained model with its sensor and its pipeline: a frame goes in, a pose comes out. This is what a live loop calls."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -221,6 +221,27 @@ def _instead_of(run: Path) -> str:
 def folder_of(run: str | Path) -> Path:
     """The folder of a run: the given one, or that of the shipped weights if there is no such folder and ``run`` is a sensor's name."""
     return SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
+
+
+def models_by_sensor(run: str | Path | None = None) -> Callable[[str], PoseEstimator | None]:
+    """A function from a sensor's name to a trained model of it: that of a run, else the weights that go with the package, else None.
+
+    From the first model on the networks of this process run in one thread: at their size more threads cost more than they bring.
+
+    Raises
+    ------
+    TrainingError
+        The run holds no trained model.
+    """
+    given = None if run is None else PoseEstimator.load(run)
+
+    def model_of(sensor: str) -> PoseEstimator | None:
+        torch.set_num_threads(1)
+        if given is not None and given.sensor.name == sensor:
+            return given
+        return PoseEstimator.load(sensor) if sensor in shipped_names() else None
+
+    return model_of
 
 
 def digest_of(run: str | Path) -> str:

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, ClassVar, Protocol
 
 from scenes import SensorSpec
 from scenes.object import ObjectSpec
@@ -20,6 +21,16 @@ from twin.types import ContactState, FloatArray, Form
 
 FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
 """Files of a contact, in the order in which they are written."""
+
+
+class Pose(Protocol):
+    """Numbers that tell how an object was pressed (a dataclass), the indentation among them."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def indent_mm(self) -> float:
+        """Beyond first touch."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +96,7 @@ def render_contact(
     return RenderedContact(state, shot, written)
 
 
-def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> list[Path]:
+def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, shot: Shot) -> list[Path]:
     """Write everything about one contact into a folder.
 
     Returns
@@ -123,7 +134,7 @@ def look_at(simulator: Simulator, shot: Shot) -> Look:
     return Look(shot.frame, pipeline(shot.frame), rest)
 
 
-def contact_record(simulator: Simulator, touched: ObjectSpec, pose: ContactPose, state: ContactState, shot: Shot) -> dict[str, object]:
+def contact_record(simulator: Simulator, touched: ObjectSpec, pose: Pose, state: ContactState, shot: Shot) -> dict[str, object]:
     """The content of ``truth.json``: forces on the object in the sensor frame, the pose, and all resolved specifications."""
     return {
         "force_n": state.force_n.tolist(),

@@ -10,16 +10,14 @@ import re
 import cv2
 import numpy as np
 
-from twin.pins.batch import draw_overlay
+from twin.pins.batch import GRAY, draw_overlay, voronoi_map
 from twin.types import Frame, Observation
 
 # Keys that close the window: q and Esc.
 QUIT = {ord("q"), 27}
 # Height of a line of text, and the margin around the text, in px.
 TEXT_PX, MARGIN_PX = 18, 8
-# Relative change of a cell's area at both ends of the colour scale.
-FULL_CHANGE = 0.3
-WHITE, GRAY = (255, 255, 255), (28, 32, 38)
+WHITE = (255, 255, 255)
 
 
 def has_window() -> bool:
@@ -67,19 +65,3 @@ def draw_view(frame: Frame, seen: Observation, rest_area_px2: np.ndarray | None,
         place = (MARGIN_PX, MARGIN_PX + TEXT_PX * k + TEXT_PX - 5)
         cv2.putText(text, line.encode("ascii", "replace").decode(), place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, WHITE, 1, cv2.LINE_AA)
     return np.vstack([picture, text])
-
-
-def voronoi_map(shape: tuple[int, int], seen: Observation, rest_area_px2: np.ndarray | None) -> np.ndarray:
-    """Cells (H, W, 3) coloured by their relative change of area: blue smaller, red larger than without contact."""
-    canvas = np.full((*shape, 3), GRAY, np.uint8)
-    if seen.graph is None or rest_area_px2 is None or not seen.graph.cells:
-        return canvas
-    change = np.clip((seen.graph.area_px2 / rest_area_px2 - 1) / FULL_CHANGE, -1, 1)
-    levels = np.nan_to_num(127.5 * (1 + change), nan=127.5).astype(np.uint8)
-    colors = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_JET)[:, 0, ::-1]
-    for cell, color in zip(seen.graph.cells, colors, strict=True):
-        if len(cell) > 2:
-            corners = np.round(np.asarray(cell)).astype(np.int32)
-            cv2.fillPoly(canvas, [corners], color.tolist(), cv2.LINE_AA)
-            cv2.polylines(canvas, [corners], True, GRAY, 1, cv2.LINE_AA)
-    return canvas

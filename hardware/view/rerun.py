@@ -11,8 +11,8 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from hardware.errors import DeviceError
-from hardware.step import Estimate
 from twin.errors import OptionError
+from twin.estimate import Estimate
 from twin.types import Frame, Observation
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from hardware.live import LiveSession, Shower
 from hardware.rig import build_rig, steps_round
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource
-from hardware.view.draw import draw_view, voronoi_map
+from hardware.view.draw import draw_view
 from hardware.view.server import BrowserView
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimator import PoseEstimator
@@ -39,6 +39,7 @@ from twin.errors import OptionError, TwinError
 from twin.frames import open_recording
 from twin.frames.images import write_image
 from twin.pins import Pipeline
+from twin.pins.batch import voronoi_map
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 

@@ -38,11 +38,13 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "rig",
     "optics",
     "pins",
+    "estimate",
     "simulator",
     "one_contact",
     "judge",
     "fit",
     "demo",
+    "studio",
     "cli",
 )
 BY_HAND = {"pyoidn"}  # installed by hand for the one measurement that needs it, as its head says
@@ -221,7 +223,9 @@ def declared(*extras: str) -> set[str]:
     return {re.split(r"[><=!\[ ]", line)[0].lower() for line in asked}
 
 
-@pytest.mark.parametrize(("folders", "extras"), [(tuple(MAY_IMPORT), ("rerun",)), (("tests",), ("rerun", "dev"))], ids=["product", "tests"])
+@pytest.mark.parametrize(
+    ("folders", "extras"), [(tuple(MAY_IMPORT), ("rerun",)), (("tests",), ("rerun", "dev", "browser"))], ids=["product", "tests"]
+)
 def test_what_is_imported_is_asked_for(folders, extras):
     """A library that only happens to be installed is missing on the next machine."""
     of_import = metadata.packages_distributions()

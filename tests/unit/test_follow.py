@@ -51,6 +51,13 @@ def test_the_way_there_is_remembered(solver):
     assert abs(other.force_n[0]) < SAME_N
 
 
+def test_an_object_that_just_touches_presses_nothing(solver):
+    follower = Follower(solver, load_object("plane"), OWN)
+    follower.move(plate(-1.0), 0.0)
+    assert not follower.move(plate(0.0), 1.0).force_n.any()
+    assert follower.move(plate(1.0), 2.0).force_n[2] > 0.1
+
+
 def test_it_lets_go_and_begins_again(solver):
     follower = Follower(solver, load_object("plane"), OWN)
     follower.move(plate(-1.0), 0.0)

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from plain_sensor import changed, plain
 
+from scenes import load_sensor
 from twin.camera.capture import expose
 from twin.camera.projection import project
 from twin.errors import TwinError
 from twin.geometry.pins import rest_pins
 from twin.judge.degradation.condition import Case, View
 from twin.judge.degradation.conditions import CONDITIONS, condition
+from twin.judge.degradation.shots import CONTACTS, RenderedSource, degraded_state, pins_under
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Preview
 from twin.pins import shipped_detector
@@ -199,3 +201,22 @@ def test_px_per_mm_is_the_projection_s_scale():
     apart_mm = np.linalg.norm(caps - caps[0], axis=1)[1:7]
     apart_px = np.linalg.norm(reference.pins_px - reference.pins_px[0], axis=1)[1:7]
     assert view().px_per_mm == pytest.approx((apart_px / apart_mm).mean(), rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["defocus", "caps-missing", "camera-rolled", "noise"])
+def test_a_state_is_degraded_as_a_contact_of_a_sweep(name):
+    spec, contact, case = load_sensor("mg400-127"), CONTACTS[0], Case((condition(name),))
+    swept = RenderedSource(spec, (contact,)).shoot(case, 0.5)[0]
+    alone = degraded_state(spec, pins_under(spec, contact), [(case, 0.5)], touched=False)
+    assert np.array_equal(alone.frame.image, swept.frame.image) and np.array_equal(alone.visible, swept.visible)
+    np.testing.assert_array_equal(alone.caps_px, swept.caps_px)
+
+
+def test_two_cases_act_each_at_its_own_severity():
+    spec, contact = load_sensor("mg400-127"), CONTACTS[0]
+    one, other = (Case((condition(name),)) for name in ("defocus", "noise"))
+    state = pins_under(spec, contact)
+    both = degraded_state(spec, state, [(one, 0.3), (other, 0.0)])
+    assert np.array_equal(both.frame.image, degraded_state(spec, state, [(one, 0.3)]).frame.image)
+    with pytest.raises(TwinError, match="changes the mechanics.*use 'twin robustness'"):
+        degraded_state(spec, state, [(Case((next(c for c in CONDITIONS.values() if c.solves),)), 0.1)])

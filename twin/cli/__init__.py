@@ -19,7 +19,7 @@ from typer.core import TyperGroup
 from twin.errors import OptionError, TwinError
 
 # Modules of commands, in the order in which 'twin --help' lists them.
-COMMANDS = ("start", "frames", "calibration", "learning", "studies", "live")
+COMMANDS = ("start", "studio", "frames", "calibration", "learning", "studies", "live")
 
 # Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as shells count).
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130

@@ -63,7 +63,7 @@ class Follower:
             Too deep, or no convergence even when begun anew; the follower has then let go of the contact.
         """
         gap = self.gap_mm(T)
-        if gap > 0:
+        if gap >= 0:
             self._contact, self._state = None, self._free(T)
         elif self._T is None or not np.array_equal(T, self._T) or self._relaxes:
             try:
@@ -84,7 +84,17 @@ class Follower:
 
     def gap_mm(self, T: np.ndarray) -> float:
         """Smallest distance of the object at ``T`` to the undeformed dome, negative inside."""
-        return float(self._gaps(T).min())
+        return self.nearest(T)[0]
+
+    def nearest(self, T: np.ndarray) -> tuple[float, np.ndarray]:
+        """Smallest distance of the object at ``T`` to the undeformed dome (negative inside), and the dome's place (3,) of it."""
+        gaps = self._gaps(T)
+        place = int(gaps.argmin())
+        return float(gaps[place]), self._dome_mm[place]
+
+    def pressed_mm(self, T: np.ndarray) -> np.ndarray:
+        """Places (k, 3) of the undeformed dome that lie inside the object at ``T``."""
+        return self._dome_mm[self._gaps(T) < 0]
 
     @property
     def _relaxes(self) -> bool:
@@ -103,7 +113,7 @@ class Follower:
             raise ContactError(f"the object is {deep:.1f} mm inside the dome, more than {limit:.1f} (half the gel's depth); move away")
         last = self._T
         near = last is not None and np.linalg.norm(carried(self._dome_mm, last, T), axis=1).max() < LARGEST_MOVE_MM
-        if last is not None and near and (self._contact is not None or self.gap_mm(last) > 0):
+        if last is not None and near and (self._contact is not None or self.gap_mm(last) >= 0):
             try:
                 self._go(last, T, self._time_s, time_s)
                 return

@@ -22,11 +22,12 @@ from twin.optics.direct_light import DirectLight
 from twin.optics.lens import ray_table
 from twin.optics.lights import lights
 from twin.optics.raster import PinOutlines, draw_polygons, draw_triangles
-from twin.optics.render import Renderer
+from twin.optics.render import Quality, Renderer
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import cap_albedo
 from twin.optics.tracer import luminance
 from twin.optics.window import Window
+from twin.store import cached_arrays
 from twin.types import FloatArray, IntArray, PinState
 
 Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
@@ -46,6 +47,8 @@ NEAR_PX = 4.0
 """Standard deviation, px, of the Gaussian neighbourhood in which traced and drawn light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
 """Largest gain of one corner of the skin."""
+SHADING_QUALITY: Quality = "standard"
+"""Samples per pixel of the path-traced frame to which a kept shading is fitted."""
 
 
 @dataclass(frozen=True)
@@ -248,6 +251,23 @@ class Preview:
     def _on_film(self, rgb: FloatArray) -> FloatArray:
         """RGB (..., 3) as the film's channels (..., C)."""
         return np.asarray(rgb if self._color else luminance(rgb)[..., None], np.float32)
+
+
+def traced_shading(preview: Preview) -> Shading:
+    """The shading that ``Preview.calibrate`` fits to a path-traced frame at rest. It is kept between runs.
+
+    Raises
+    ------
+    RenderError
+        Nothing can be path-traced here.
+    """
+
+    def trace() -> dict[str, np.ndarray]:
+        shading = preview.calibrate(Renderer(preview.spec, quality=SHADING_QUALITY, window_px=preview.window_px))
+        return {"gain": shading.gain, "offset": shading.offset, "skin": shading.skin}
+
+    key = {"sensor": preview.spec.model_dump(mode="json"), "window_px": list(preview.window_px), "quality": SHADING_QUALITY}
+    return Shading(**cached_arrays("shading", key, trace, code=(Preview, Renderer)))
 
 
 def _fit(parts: FloatArray, target: FloatArray) -> FloatArray:

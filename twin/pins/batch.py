@@ -26,6 +26,10 @@ LOST_RGB = (255, 60, 60)
 """Colour of the predicted places of lost pins."""
 EXTRA_RGB = (255, 210, 0)
 """Colour of rejected blobs."""
+GRAY = (28, 32, 38)
+"""Background of a cell map."""
+FULL_CHANGE = 0.3
+"""Relative change of a cell's area at both ends of the colour scale."""
 FARTHEST_PX = 1e4
 """Largest distance from the frame's origin, px, at which something is drawn. At larger ones OpenCV's integers would overflow."""
 UNMEASURED = "specification"
@@ -165,6 +169,22 @@ def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> n
     name = frame.name.encode("ascii", "replace").decode()  # OpenCV's font has no other letters, and some end the process
     text = f"{name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
     cv2.putText(canvas, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
+    return canvas
+
+
+def voronoi_map(shape: tuple[int, int], seen: Observation, rest_area_px2: np.ndarray | None) -> np.ndarray:
+    """Cells (H, W, 3) coloured by their relative change of area: blue smaller, red larger than without contact."""
+    canvas = np.full((*shape, 3), GRAY, np.uint8)
+    if seen.graph is None or rest_area_px2 is None or not seen.graph.cells:
+        return canvas
+    change = np.clip((seen.graph.area_px2 / rest_area_px2 - 1) / FULL_CHANGE, -1, 1)
+    levels = np.nan_to_num(127.5 * (1 + change), nan=127.5).astype(np.uint8)
+    colors = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_JET)[:, 0, ::-1]
+    for cell, color in zip(seen.graph.cells, colors, strict=True):
+        if len(cell) > 2:
+            corners = np.round(np.asarray(cell)).astype(np.int32)
+            cv2.fillPoly(canvas, [corners], color.tolist(), cv2.LINE_AA)
+            cv2.polylines(canvas, [corners], True, GRAY, 1, cv2.LINE_AA)
     return canvas
 
 

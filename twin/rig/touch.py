@@ -10,9 +10,11 @@ centre from the tool point along the axis and across it,
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
+from scenes.rig import RigSpec
 from twin.objects import build_field
 from twin.rig.mounting import Mounting
 
@@ -92,3 +94,37 @@ def surface_labels(experiment: ExperimentSpec, mounting: Mounting, surface: Surf
     touch = surface.touched(mounting, T_sensor_object)
     depth, angle = mounting.labels(touch.depth_mm, touch.angle_deg)
     return {mounting.depth_label: depth, mounting.angle_label: angle}
+
+
+def tilted_labels(
+    rig: RigSpec, experiment: ExperimentSpec, surface: Surface, radius_mm: float, T_sensor_object: np.ndarray
+) -> dict[str, float]:
+    """Depth and both tilts, as an arm would have them that touches a flat plate alike: the inverse of ``object_pose`` for one pose (4, 4).
+
+    The arm's other three labels count as zero.
+
+    Returns
+    -------
+    dict of str to float
+        ``pose_3`` in mm, ``pose_4`` and ``pose_5`` in deg. Empty if the experiment does not approach along z.
+    """
+    if experiment.approach != "z":
+        return {}
+    turn_of_object, centre_mm = T_sensor_object[:3, :3], -T_sensor_object[:3, :3].T @ T_sensor_object[:3, 3]
+    distance_mm, outward, _ = surface.field.probe(centre_mm[None])
+    in_image = Rotation.from_euler("z", -rig.image_turn_deg, degrees=True)
+    seen = in_image.apply(
+        -turn_of_object @ outward[0]
+    )  # the plate's normal, into the object, seen from the sensor without its image's turn
+    plate = Rotation.from_euler("y", -rig.plate_tilt_deg, degrees=True).apply([0.0, 0.0, 1.0])
+    about_z = Rotation.from_euler("z", rig.turn_sign * rig.turn_offset_deg[2], degrees=True)
+    unspun = about_z.inv().apply(plate)
+    tilt_x = np.arctan2(seen[1], seen[2]) - np.arcsin(np.clip(unspun[1] / np.hypot(seen[1], seen[2]), -1, 1))
+    leaned = Rotation.from_euler("x", tilt_x).apply(seen)
+    tilt_y = np.arctan2(unspun[0], unspun[2]) - np.arctan2(leaned[0], leaned[2])
+    turn = about_z * Rotation.from_euler("xy", [tilt_x, tilt_y])
+    arm_mm = turn.apply([rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm])
+    stands_mm = (radius_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * plate[2]
+    depth_mm = (stands_mm - plate @ arm_mm - (distance_mm[0] - surface.raised_mm)) / plate[2]
+    tilts = rig.turn_sign * np.degrees([tilt_x, tilt_y]) - np.array(rig.turn_offset_deg[:2])
+    return {"pose_3": float(depth_mm), "pose_4": float(tilts[0]), "pose_5": float(tilts[1])}

@@ -3,6 +3,7 @@
 The contacts of rendered frames are solved once and stored. All conditions that do not change the mechanics use the same contacts.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -12,16 +13,17 @@ from scenes import load_object
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose
 from twin.camera.truth import CapTruth, cap_truth
-from twin.errors import ContactError
+from twin.errors import ContactError, TwinError
 from twin.geometry.pins import rest_pins
 from twin.judge.degradation.condition import Case, View, altered
 from twin.judge.pictures.aligned import to_light
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.optics.preview import Preview
+from twin.optics.preview import Preview, Shading
 from twin.optics.static_layer import static_layer
 from twin.store import cached_arrays
 from twin.types import Form, Frame
+from twin.types import PinState as AnyPinState
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class RenderedSource:
             view = replace(view, caps_px=film.truth.caps_px)
             light = case.on_light(film.light, severity, view, film.draw)
             image = case.on_frame(expose(light, spec.capture, np.random.default_rng(film.draw)), severity, view, film.draw)
-            shot = _degraded(film.contact.name, image, self.form, case, severity, view, film.truth.visible)
+            shot = _degraded(film.contact.name, image, self.form, [(case, severity)], view, film.truth.visible)
             shots.append(replace(shot, touched=film.contact.pose.indent_mm > 0))
         return shots
 
@@ -156,8 +158,47 @@ class RealSource:
                 light = to_light(image, neutral.response).astype(np.float32)
                 image = expose(case.on_light(light, severity, view, draw), spec.capture, np.random.default_rng(draw))
             image = case.on_frame(image, severity, view, draw)
-            shots.append(_degraded(frame.name, image, self.form, case, severity, view, np.isfinite(caps_px[:, 0])))
+            shots.append(_degraded(frame.name, image, self.form, [(case, severity)], view, np.isfinite(caps_px[:, 0])))
         return shots
+
+
+def degraded_state(
+    spec: SensorSpec, state: AnyPinState, cases: Sequence[tuple[Case, float]], *, shading: Shading | None = None, touched: bool = True
+) -> DegradedShot:
+    """One contact under several cases, each at a severity of its own; they act one after the other at every stage.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    state : ContactState or PinRest
+        The contact of the sensor as it is.
+    cases : sequence of (Case, float)
+    shading : Shading, optional
+        Of the preview that draws the frame; direct light alone by default.
+    touched : bool
+        Something is in contact.
+
+    Raises
+    ------
+    TwinError
+        A case changes the mechanics: its contacts have to be solved anew, with `RenderedSource`.
+    """
+    if solved := [case.name for case, _ in cases if case.solves]:
+        raise TwinError(f"{', '.join(solved)}: changes the mechanics, so this contact would be another one; use 'twin robustness'")
+    degraded = spec
+    for case, severity in cases:
+        degraded = case.on_spec(degraded, severity)
+    geometry = _with_light_of(spec, degraded)
+    lit = degraded.model_copy(update={"response": spec.response})
+    truth = cap_truth(geometry, rest_pins(spec.geometry), state, Form.RAW)
+    view = replace(View.of(degraded, truth.caps_px), caps_px=truth.caps_px)
+    light = Preview(lit, static=_static(lit), shading=shading).render(state)
+    for case, severity in cases:
+        light = case.on_light(light, severity, view, 0)
+    image = expose(light, degraded.capture, np.random.default_rng(0))
+    for case, severity in cases:
+        image = case.on_frame(image, severity, view, 0)
+    return replace(_degraded("contact", image, Form.RAW, cases, view, truth.visible), touched=touched)
 
 
 def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
@@ -182,11 +223,15 @@ def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
     return PinState(**cached_arrays("pins-under-contact", key, solve))
 
 
-def _degraded(name: str, image: np.ndarray, form: Form, case: Case, severity: float, view: View, visible: np.ndarray) -> DegradedShot:
-    """A shot with the places and the visibility of the pins after the case has moved and hidden them."""
-    caps_px = case.on_points(view.caps_px, severity, view)
+def _degraded(
+    name: str, image: np.ndarray, form: Form, cases: Sequence[tuple[Case, float]], view: View, visible: np.ndarray
+) -> DegradedShot:
+    """A shot whose pins lie and are visible as the cases, each at its severity, leave them."""
+    caps_px, gone = view.caps_px, np.zeros(len(view.caps_px), bool)
+    for case, severity in cases:
+        caps_px, gone = case.on_points(caps_px, severity, view), gone | case.gone(severity, view)
     inside = np.all((caps_px >= 0) & (caps_px <= np.array(image.shape[1::-1]) - 1), axis=1)
-    return DegradedShot(name, Frame(image, form, name), caps_px, visible & inside & ~case.gone(severity, view))
+    return DegradedShot(name, Frame(image, form, name), caps_px, visible & inside & ~gone)
 
 
 def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:

@@ -1,0 +1,218 @@
+"""What the studio's mode 'Live' takes: a camera with its estimates, and an arm that is read only until it is armed."""
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from hardware.arms.open_arm import open_arm
+from hardware.cameras.choose import open_camera
+from hardware.errors import DeviceError
+from hardware.live import LiveSession, estimate_line
+from hardware.safe_arm import SafeArm, try_each
+from hardware.safety import SHIPPED_LIMITS, load_limits
+from hardware.session import SessionWriter
+from twin.errors import TwinError
+from twin.estimate import Estimate, SensorModel
+from twin.studio.live_mode import LiveShot
+from twin.types import Frame
+
+# Speed of an arm that the page moves, in mm/s and deg/s: slow enough to be watched.
+SLOW_MM_S, SLOW_DEG_S = 10.0, 10.0
+# Longest time in s that the end of a feed waits for its last frame.
+END_S = 10.0
+
+
+class WatchedArm:
+    """An arm that is watched. It moves only while it is armed, within its limits, and slowly.
+
+    Parameters
+    ----------
+    text : str
+        As ``open_arm`` takes it.
+
+    Raises
+    ------
+    DeviceError
+        There is no such arm, or no limits are known for its kind.
+    """
+
+    def __init__(self, text: str) -> None:
+        kind = text.partition(":")[0]
+        if not (SHIPPED_LIMITS / f"{kind}.toml").is_file():
+            raise DeviceError(f"--arm {text}: no limits are known for '{kind}', so the page may not move it; write {kind}.toml")
+        self._arm = SafeArm(open_arm(text), load_limits(kind))
+        self.name = self._arm.name
+        self._armed = False
+        self._moves = threading.Lock()
+
+    @property
+    def armed(self) -> bool:
+        """Whether the page may move it."""
+        return self._armed
+
+    def connect(self) -> None:
+        """Open the connection. Nothing moves."""
+        self._arm.connect()
+
+    def words(self) -> str:
+        """Where it is and how it is."""
+        try:
+            state = self._arm.state()
+        except DeviceError as error:
+            return str(error)
+        pose = " ".join(f"{value:+.1f}" for value in state.pose)
+        kind = state.error or ("moving" if state.moving else "enabled" if state.enabled else "disabled")
+        return f"{self.name}: {kind}, at {pose} (mm, deg)"
+
+    def limits(self) -> str:
+        """What it may do once it is armed."""
+        limits = self._arm.limits
+        box = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", limits.box_mm, strict=True))
+        slow = min(SLOW_MM_S, limits.linear_mm_s)
+        return f"tool within {box} mm, {slow:g} mm/s, one step at a time; it is disabled when the studio ends"
+
+    def arm(self) -> None:
+        """Enable it, and make it slow."""
+        self._arm.enable()
+        self._arm.set_speed(SLOW_MM_S, SLOW_DEG_S)
+        self._armed = True
+
+    def disarm(self) -> None:
+        """Stop and disable it; both are tried."""
+        self._armed = False
+        if failed := try_each(stop=self._arm.stop, disable=self._arm.disable):
+            raise DeviceError(f"{self.name}: {'; '.join(failed)}; use its own stop button")
+
+    def nudge(self, axis: int, by_mm: float) -> None:
+        """Move the tool along an axis of the base frame.
+
+        Raises
+        ------
+        DeviceError
+            It is not armed, it moves already, or its limits forbid the move.
+        """
+        if not self._armed:
+            raise DeviceError(f"{self.name}: read only; arm it first")
+        if not self._moves.acquire(blocking=False):
+            raise DeviceError(f"{self.name}: moves already; wait for its end")
+        try:
+            target = np.array(self._arm.state().pose, float)
+            target[axis] += by_mm
+            self._arm.move_linear(target)
+        finally:
+            self._moves.release()
+
+    def emergency_stop(self) -> None:
+        """Stop it and cut its power."""
+        self._armed = False
+        self._arm.emergency_stop()
+
+    def close(self) -> None:
+        """Disarm it if it is armed, and close the connection."""
+        if self._armed:
+            with suppress(DeviceError):
+                self.disarm()
+        self._arm.disconnect()
+
+
+class CameraFeed:
+    """A camera, its estimates, and an arm; a ``twin.studio.live_mode.LiveFeed``.
+
+    Parameters
+    ----------
+    camera : str
+        As ``open_camera`` takes it.
+    arm : str
+        As ``open_arm`` takes it, "" for none.
+    model : SensorModel
+
+    Raises
+    ------
+    TwinError
+        There is no such camera or arm, or the frames are not the model's.
+    """
+
+    def __init__(self, camera: str, arm: str, model: SensorModel) -> None:
+        self.model = model
+        self._source = open_camera(camera, model.sensor, model.form)
+        model.check(model.sensor, self._source.form)
+        self.robot = WatchedArm(arm) if arm else None
+        self.name = self._source.name + (f" and {self.robot.name}" if self.robot else "")
+        self._session = LiveSession(self._source, model)
+        self._writer: SessionWriter | None = None
+        self._writing = threading.Lock()
+        self._end = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self, on_shot: Callable[[LiveShot], None], on_end: Callable[[str], None]) -> None:
+        """Connect camera and arm, and deliver frames from a thread.
+
+        Raises
+        ------
+        TwinError
+            The camera or the arm can't be connected; then neither stays connected.
+        """
+        if self.robot is not None:
+            self.robot.connect()
+        try:
+            self._source.connect()
+        except BaseException:
+            self._close_arm()
+            raise
+
+        def deliver(frame: Frame, estimate: Estimate) -> None:
+            with self._writing:
+                if self._writer is not None:
+                    self._writer.append(frame, estimate_line(estimate) | {"time_s": time.monotonic()})
+            on_shot(LiveShot(frame, estimate, tuple(self._session.lines(estimate)[1:])))
+
+        def run() -> None:
+            try:
+                self._session.on_estimate = deliver
+                self._session.run(going=lambda: not self._end.is_set())
+                if not self._end.is_set():
+                    on_end(f"{self.name}: at its end")
+            except TwinError as error:
+                on_end(str(error))
+
+        self._thread = threading.Thread(target=run, name="studio-camera", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End; the arm is let go of even if the camera fails."""
+        self._end.set()
+        if self._thread is not None:
+            self._thread.join(END_S)
+        self.end_record()
+        failed = try_each(arm=self._close_arm, camera=self._source.disconnect)
+        if failed:
+            raise DeviceError(f"{self.name}: {'; '.join(failed)}")
+
+    def record(self, folder: Path) -> None:
+        """Keep every frame and estimate from now on, as ``twin live --record`` does.
+
+        Raises
+        ------
+        DeviceError
+            The folder is not empty.
+        """
+        about = {"sensor": self.model.sensor.name, "form": str(self._source.form), "camera": self._source.name, "model": "studio"}
+        with self._writing:
+            self._writer = SessionWriter(folder, about)
+
+    def end_record(self) -> str:
+        """End the recording; what was written."""
+        with self._writing:
+            writer, self._writer = self._writer, None
+        if writer is None:
+            return "nothing was recorded"
+        writer.__exit__(None, None, None)
+        return f"wrote {writer.folder} ({writer.count} frames)"
+
+    def _close_arm(self) -> None:
+        if self.robot is not None:
+            self.robot.close()

@@ -1,0 +1,229 @@
+"""The studio's page over its own protocol, without a browser: drag, sliders, each mode, two clients, and what is refused."""
+
+import json
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_frames import drawn_frame, smooth_warp
+from studio_client import StudioClient
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+
+from hardware.live_feed import CameraFeed
+from scenes import load_sensor
+from training.estimator import models_by_sensor
+from twin.errors import TwinError
+from twin.frames.images import write_image
+from twin.pins import nominal_reference
+from twin.studio.state import StudioState, first_state
+from twin.studio.studio import Studio, StudioPlan
+from twin.types import Form
+
+SENSOR = "mg400-127"
+RADIUS_MM = load_sensor(SENSOR).skin.outer_radius_mm
+WAIT_S = 40.0
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory):
+    out = tmp_path_factory.mktemp("studio")
+    plan = StudioPlan(first_state(None, SENSOR, "sphere"), out, port=18090, traces=False)
+    with Studio(plan, models_by_sensor(None), CameraFeed) as made:
+        yield made
+
+
+@pytest.fixture()
+def client(studio):
+    with StudioClient(studio.page.url) as made:
+        made.wait(lambda u: bool(made.gui), WAIT_S)
+        studio.page.choose("Twin")
+        made.wait(lambda u: u.number > 0, WAIT_S)
+        yield made
+
+
+def write_recording(folder, spec, count):
+    """A labelled recording of drawn frames; its first label can't be right."""
+    reference, rng = nominal_reference(spec, Form.RECORDING), np.random.default_rng(0)
+    (folder / "frames_bw").mkdir(parents=True)
+    write_image(folder / "init_0.png", drawn_frame(spec, Form.RECORDING, reference.pins_px).image)
+    rows = ["image_name,pose_2,pose_6,move_1,move_6"]
+    for k in range(count):
+        frame = drawn_frame(spec, Form.RECORDING, smooth_warp(reference.pins_px, 3.0, rng))
+        write_image(folder / "frames_bw" / f"frame_{k}_0.png", frame.image)
+        rows.append(f"frame_{k}_0.png,{40.0 if k == 0 else -3.0},0.0,0.0,0.0")
+    (folder / "targets.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def drag(client, depth, x=0.0, *, to=None):
+    """Drag the gizmo and wait for the answer at a depth, by default that of the gizmo."""
+    since, to = len(client.updates), depth if to is None else to
+    client.drag((x, 0.0, RADIUS_MM - depth))
+    return client.wait(lambda u: u.number > 0 and abs(u.depth_mm - to) < 1e-4, WAIT_S, since=since)
+
+
+def test_a_drag_moves_skin_picture_numbers_and_estimate_together(client):
+    drag(client, 1.0)
+    client.wait(lambda u: "90 % interval" in u.html, WAIT_S)
+    update = drag(client, 2.5)
+    assert update.pictures >= 2 and {"/sensor/skin", "/sensor/pins", "/object"} <= update.nodes
+    assert "127 of 127" in update.html and "usual mesh" in update.html and "drawn" in update.html
+
+
+def test_answers_come_in_order_and_each_shows_its_own_pose(client):
+    since = len(client.updates)
+    for depth in np.linspace(0.5, 2.5, 15):
+        client.drag((0.0, 0.0, RADIUS_MM - depth))
+        time.sleep(0.02)
+    client.wait(lambda u: abs(u.depth_mm - 2.5) < 1e-4, WAIT_S, since=since)
+    shown = [u for u in client.updates[since:] if u.number > 0]
+    assert [u.number for u in shown] == sorted({u.number for u in shown})
+
+
+def test_an_impossible_place_stops_the_object_and_says_why(client):
+    since = len(client.updates)
+    client.set("object", "plane")
+    client.wait(lambda u: u.number > 0, WAIT_S, since=since)
+    since = len(client.updates)
+    client.set("depth, mm", 19.5)
+    update = client.wait(lambda u: "half the gel" in u.html or "stays here" in u.html, 3 * WAIT_S, since=since)
+    assert update.depth_mm < 19.5
+    client.set("object", "sphere")
+    drag(client, 1.0)
+
+
+def test_nonsense_from_a_browser_is_told_and_changes_nothing(client):
+    drag(client, 1.0)
+    client.drag((float("nan"), 0.0, 19.0))
+    assert "no finite number" in wait_html(client, "no finite number")
+    client.drag((0.0, 0.0, 19.0), (0.0, 0.0, 0.0, 0.0))
+    client.set("mode", "No such mode")
+    drag(client, 1.5)
+
+
+def test_two_browsers_see_the_same_and_one_that_returns_finds_it(studio, client):
+    with StudioClient(studio.page.url) as other:
+        other.wait(lambda u: u.number > 0, WAIT_S)
+        since = len(other.updates)
+        drag(client, 1.75)
+        other.wait(lambda u: abs(u.depth_mm - 1.75) < 1e-4, WAIT_S, since=since)
+    with StudioClient(studio.page.url) as again:
+        assert abs(again.wait(lambda u: u.number > 0, WAIT_S).depth_mm - 1.75) < 1e-4
+
+
+def test_sliders_undo_and_what_is_shown(client):
+    drag(client, 1.0)
+    time.sleep(1.0)
+    since = len(client.updates)
+    client.set("depth, mm", 2.0)
+    client.wait(lambda u: abs(u.depth_mm - 2.0) < 1e-4, WAIT_S, since=since)
+    since = len(client.updates)
+    client.set("Undo", True)
+    client.wait(lambda u: abs(u.depth_mm - 1.0) < 1e-4, WAIT_S, since=since)
+    for label, value, word in (("pins by", "pressure", "MPa"), ("frame", "recording", "mm"), ("frame", "raw", "mm")):
+        since = len(client.updates)
+        client.set(label, value)
+        client.wait(lambda u, word=word: word in u.html, WAIT_S, since=since)
+
+
+def test_picture_and_state_are_saved_and_open_again(studio, client, tmp_path):
+    out = Path(studio.twin._out)
+    drag(client, 1.25, 0.5)
+    client.set("Save picture", True)
+    client.set("Save state", True)
+    end = time.monotonic() + WAIT_S
+    while len(list(out.glob("*-1.*"))) < 2 and time.monotonic() < end:
+        time.sleep(0.05)
+    state = StudioState.load(out / "state-1.json")
+    assert state.pose["depth_mm"] == pytest.approx(1.25) and state.pose["x_mm"] == pytest.approx(0.5)
+    studio.twin.open(state)
+    since = len(client.updates)
+    client.wait(lambda u: abs(u.depth_mm - 1.25) < 1e-4, WAIT_S, since=since)
+
+
+def test_degrade_shows_the_same_contact_with_its_limits(client):
+    drag(client, 2.0)
+    since = len(client.updates)
+    client.set("mode", "Degrade")
+    html = wait_html(client, "<th>limit</th>")
+    assert "as it is" in html
+    client.set("severity 1", 1.0)
+    html = wait_html(client, "class='bad'")
+    assert since < len(client.updates)
+    client.set("Find the edge", True)
+    assert re.search(r"Edge for this contact: .* is borne up to", wait_html(client, "Edge for this contact"))
+    client.set("Nothing is wrong", True)
+    client.set("mode", "Twin")
+
+
+def wait_html(client, text):
+    """The page's HTML once it holds a text."""
+    end = time.monotonic() + 2 * WAIT_S
+    while text not in client.html():
+        assert time.monotonic() < end, client.html()[-1500:]
+        time.sleep(0.05)
+    return client.html()
+
+
+def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(client, tmp_path):
+    folder = write_recording(tmp_path / "recording", load_sensor(SENSOR), 3)
+    client.set("mode", "Recording")
+    client.set("folder or video", str(tmp_path / "nothing"))
+    client.set("Open", True)
+    assert "nothing" in wait_html(client, "class='stop'")
+    client.set("folder or video", str(folder))
+    client.set("Open", True)
+    html = wait_html(client, "1 of 3")
+    assert "pose_2 is outside the 90 % interval" in html or "No estimate" in html
+    client.set("frame number", 2)
+    wait_html(client, "3 of 3")
+    client.set("mode", "Twin")
+
+
+def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_path):
+    folder = write_recording(tmp_path / "recording", load_sensor(SENSOR), 3)
+    client.set("mode", "Live")
+    client.set("camera", str(folder))
+    client.set("arm", "simulated")
+    client.set("Connect", True)
+    html = wait_html(client, "arm: read only")
+    assert "tool within x 150 to 450" in html
+    robot = studio.modes[-1]._feed.robot
+    before = robot._arm.state().pose.copy()
+    with pytest.raises(TwinError, match="read only; arm it first"):
+        robot.nudge(2, 1.0)
+    assert np.array_equal(robot._arm.state().pose, before)
+    client.set("armed: the page may move the arm", True)
+    end = time.monotonic() + WAIT_S
+    while not robot.armed and time.monotonic() < end:
+        time.sleep(0.02)
+    robot.nudge(2, 1.0)
+    assert robot._arm.state().pose[2] == pytest.approx(before[2] + 1.0, abs=0.1)
+    client.set("EMERGENCY STOP", True)
+    while robot.armed and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not robot.armed and not robot._arm.state().enabled
+    client.set("Disconnect", True)
+    client.set("mode", "Twin")
+
+
+def test_a_page_of_another_site_is_refused(studio):
+    with (
+        pytest.raises((ConnectionClosed, InvalidHandshake, AssertionError)),
+        StudioClient(studio.page.url, origin="http://elsewhere.example") as foreign,
+    ):
+        foreign.wait(lambda u: u.number > 0, 5)
+
+
+def test_no_tunnel_is_ever_opened(studio):
+    assert studio.page.server.request_share_url() is None
+
+
+def test_another_host_is_warned_of(tmp_path):
+    state = first_state(None, SENSOR, "sphere")
+    assert not StudioPlan(state, tmp_path).warnings
+    (warning,) = StudioPlan(state, tmp_path, host="0.0.0.0").warnings
+    assert "no password" in warning
+    assert json.loads(state.model_dump_json())["sensor"] == SENSOR

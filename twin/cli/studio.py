@@ -1,0 +1,78 @@
+"""``twin studio``: the page on which one moves the contact and sees everything that follows."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin.cli import app
+from twin.cli.options import say
+
+if TYPE_CHECKING:
+    from training.estimator import PoseEstimator
+
+HELP_STUDIO = """Serve a page on which you move an object against the sensor and see what follows.
+
+Drag the object with the arrows and rings of the gizmo, or use sliders, typed numbers or keys (shift and arrows, page up and page down;
+with ctrl they turn it; 'ctrl + K' lists all). At once the page shows the skin with its pins, the camera's picture, the pins found and
+their Voronoi cells, force and torque, and the model's estimate with its 90 % interval beside the truth.
+
+While the object moves, contacts are solved on the usual mesh and pictures are drawn. When it stands still, the picture is path-traced
+and the contact is solved again on a fine mesh. The page says which of them it shows. Where the object may not go, it stops, and the
+page says why.
+
+The page is served for this machine alone, loads nothing from elsewhere, and several browsers see the same state. Ctrl-C ends it.
+
+\b
+  twin studio
+  twin studio --sensor ur5-331 --object edge
+  twin studio --state out/studio/state-1.json
+"""
+
+
+@app.command("studio", help=HELP_STUDIO)
+def studio(
+    sensor: Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")] = "mg400-331",
+    object_name: Annotated[
+        str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")
+    ] = "sphere",
+    state: Annotated[Path | None, typer.Option("--state", metavar="FILE", help="a state that the page has saved, instead of both")] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", metavar="RUN", help="folder of a run for its sensor; shipped weights if not given")
+    ] = None,
+    recording: Annotated[str, typer.Option("--recording", metavar="DIR", help="recording for the mode 'Recording'")] = "",
+    camera: Annotated[str, typer.Option("--camera", metavar="C", help="camera for the mode 'Live', as 'twin live' takes it")] = "",
+    arm: Annotated[str, typer.Option("--arm", metavar="A", help="arm for the mode 'Live'; read only until the page arms it")] = "",
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for what the page saves")] = Path("out/studio"),
+    host: Annotated[str, typer.Option("--host", help="address to listen on; another one than this machine's is warned of")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="port of the page; the next free one if it is taken")] = 8090,
+    plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay drawn")] = False,
+    seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="end after this time")] = None,
+) -> None:
+    from hardware.live_feed import CameraFeed
+    from hardware.rig import signals_as_ctrl_c
+    from twin.studio.state import first_state
+    from twin.studio.studio import StudioPlan, run_studio
+
+    first = first_state(state, sensor, object_name)
+    plan = StudioPlan(first, out, host=host, port=port, traces=not plain, recording=recording, camera=camera, arm=arm, seconds=seconds)
+    say(plan.warnings)
+    with signals_as_ctrl_c():
+        run_studio(plan, models_when_asked(model), CameraFeed, on_open=tell_page)
+
+
+def tell_page(url: str) -> None:
+    """Say where the page is."""
+    print(f"open {url} in a browser; Ctrl-C ends it", flush=True)
+
+
+def models_when_asked(run: Path | None) -> Callable[[str], "PoseEstimator | None"]:
+    """``models_by_sensor`` of a run, loaded when the first model is asked for: the page does not wait for PyTorch."""
+
+    def model_of(sensor: str) -> "PoseEstimator | None":
+        from training.estimator import models_by_sensor
+
+        return models_by_sensor(run)(sensor)
+
+    return model_of

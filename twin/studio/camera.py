@@ -1,0 +1,113 @@
+"""The studio's camera: the picture of the dome alone is drawn or traced, and put into a frame whose rest no contact changes."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from twin.camera.capture import expose, record
+from twin.errors import FrameError
+from twin.optics.preview import Preview, Shading, traced_shading
+from twin.optics.render import Quality, Renderer
+from twin.optics.static_layer import static_layer
+from twin.optics.tracer import luminance
+from twin.store import cached_arrays
+from twin.types import FloatArray, Form, Frame, ImageArray, PinState
+
+MARGIN_PX = 8
+"""Width of the border around the pipeline's mask that is drawn as well. Blur and thresholds look that far."""
+QUALITY: Quality = "standard"
+"""Samples of a path-traced picture."""
+
+
+def dome_window(spec: SensorSpec) -> tuple[int, int, int, int]:
+    """The part (x0, y0, x1, y1) of the raw frame, end exclusive, in which contact changes anything that the pipeline looks at."""
+    mask = spec.pipeline.raw
+    x, y, reach = *mask.mask_center_px, mask.mask_radius_px + MARGIN_PX
+    box = [x - reach, y - reach, x + reach, y + reach]
+    if spec.recording is not None:
+        crop = spec.recording.crop_px
+        box = [min(box[0], crop[0]), min(box[1], crop[1]), max(box[2], crop[2]), max(box[3], crop[3])]
+    width, height = spec.camera.width_px, spec.camera.height_px
+    return max(0, int(box[0])), max(0, int(box[1])), min(width, int(np.ceil(box[2]))), min(height, int(np.ceil(box[3])))
+
+
+def static_light(spec: SensorSpec) -> tuple[FloatArray, FloatArray]:
+    """Light and cover of the whole raw frame that no contact changes (``static_layer``), kept between runs."""
+
+    def compute() -> dict[str, np.ndarray]:
+        light, cover = static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))
+        return {"light": light, "cover": cover}
+
+    kept = cached_arrays("static-light", {"sensor": spec.model_dump(mode="json")}, compute, code=(static_layer,))
+    return kept["light"], kept["cover"]
+
+
+def dome_shading(spec: SensorSpec) -> Shading:
+    """The preview's shading by a path-traced frame at rest, kept between runs.
+
+    Raises
+    ------
+    RenderError
+        Nothing can be path-traced here.
+    """
+    return traced_shading(Preview(spec, window_px=dome_window(spec), static=in_window(static_light(spec), dome_window(spec))))
+
+
+def dome_renderer(spec: SensorSpec) -> Renderer:
+    """A path tracer of the dome's part of the frame."""
+    return Renderer(spec, quality=QUALITY, window_px=dome_window(spec))
+
+
+def in_window(planes: tuple[FloatArray, FloatArray], window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:
+    """The window's part of planes of the whole frame."""
+    x0, y0, x1, y1 = window_px
+    return planes[0][y0:y1, x0:x1], planes[1][y0:y1, x0:x1]
+
+
+class DomeCamera:
+    """Draws the dome, and makes frames of drawn or traced light.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    """
+
+    def __init__(self, spec: SensorSpec) -> None:
+        self.spec, self.window_px = spec, dome_window(spec)
+        static = static_light(spec)
+        self.preview = Preview(spec, window_px=self.window_px, static=in_window(static, self.window_px))
+        around = static[0].copy() if spec.camera.channels == "color" else luminance(static[0]).astype(np.float32)
+        x0, y0, x1, y1 = self.window_px
+        around[y0:y1, x0:x1] = self.preview.render()
+        self._around = expose(around, spec.capture)
+
+    def draw(self, state: PinState) -> FloatArray:
+        """Linear light of the window for a state, drawn."""
+        return self.preview.render(state)
+
+    def raw(self, light: FloatArray, *, seed: int) -> Frame:
+        """The whole raw frame of the window's light (h, w) or (h, w, 3), with the camera's noise."""
+        x0, y0, x1, y1 = self.window_px
+        image = self._around.copy()
+        image[y0:y1, x0:x1] = expose(light, self.spec.capture, np.random.default_rng(seed), origin_px=(x0, y0))
+        return Frame(image, Form.RAW)
+
+    def recorded(self, raw: Frame) -> Frame:
+        """A raw frame in the form of the sensor's recordings.
+
+        Raises
+        ------
+        FrameError
+            The sensor has no recordings' form.
+        """
+        if self.spec.recording is None:
+            raise FrameError(f"{self.spec.name} has no recordings' form; show raw frames")
+        return replace(raw, image=record(raw.image, self.spec.recording), form=Form.RECORDING)
+
+    def crop(self, image: ImageArray, form: Form) -> ImageArray:
+        """The dome's part of a frame, for the page."""
+        if form is Form.RECORDING:
+            return image
+        x0, y0, x1, y1 = self.window_px
+        return image[y0:y1, x0:x1]

@@ -1,0 +1,238 @@
+"""The mode 'Degrade': the contact of the mode 'Twin', seen by a sensor that something is wrong with."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.errors import TwinError
+from twin.estimate import Estimate
+from twin.judge.degradation.condition import Case, Condition
+from twin.judge.degradation.conditions import CONDITIONS, condition
+from twin.judge.degradation.measures import MEASURES, judge_shot
+from twin.judge.degradation.shots import DegradedShot, degraded_state
+from twin.judge.degradation.sweep import SEVERITIES
+from twin.optics.preview import Shading
+from twin.pins import make_detector, nominal_reference, shipped_detector
+from twin.pins.pipeline import Pipeline
+from twin.studio.contact import Answer
+from twin.studio.page import Page, put
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.studio.pose import ObjectPose
+from twin.studio.twin_mode import TwinMode
+from twin.studio.worker import Newest
+from twin.types import Form, Frame, Observation
+
+SLIDERS = 3
+"""Conditions that can act at once, each at a severity of its own."""
+NO_CONDITION = "nothing"
+"""Choice of a slider that does nothing."""
+FIRST = ("defocus", "caps-missing", "camera-rolled")
+"""Conditions that are offered at first, where they exist."""
+
+
+def offered() -> dict[str, Condition]:
+    """The conditions that can act on a contact as it is, by their titles: not those of the mechanics and of the pipeline's settings."""
+    return {f"{c.title} ({c.family})": c for c in CONDITIONS.values() if not c.solves and c.setting is None}
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A degraded frame, and what pipeline and model make of it.
+
+    Attributes
+    ----------
+    shot : DegradedShot
+    seen : Observation
+    figures : dict of str to float
+        By the names of ``MEASURES``.
+    failed : tuple of str
+        Titles of the measures beyond their limits.
+    estimate : Estimate or None
+    """
+
+    shot: DegradedShot
+    seen: Observation
+    figures: dict[str, float]
+    failed: tuple[str, ...]
+    estimate: Estimate | None
+
+
+class Judge:
+    """Degrades contacts of one sensor and judges what is found, as ``twin robustness`` does.
+
+    Parameters
+    ----------
+    mode : TwinMode
+        Whose contact it is.
+    """
+
+    def __init__(self, mode: TwinMode) -> None:
+        self.contact = mode.contact
+        spec = mode.contact.setup.sensor
+        self.spec, self.reference = spec, nominal_reference(spec, Form.RAW)
+        self._pipeline = Pipeline(spec, Form.RAW)
+        self._detector = make_detector(spec, shipped_detector(spec, Form.RAW))
+        pitch_px = float(np.mean(self.reference.spacing_px))
+        self.limits = {m.name: m.limit * (pitch_px if m.in_pitches else 1.0) for m in MEASURES}
+
+    def __call__(self, answer: Answer, cases: list[tuple[Case, float]], shading: Shading) -> Judged:
+        """A contact under cases, each at its severity."""
+        touched = bool(len(answer.state.contact_mm))
+        shot = degraded_state(self.spec, answer.state, cases, shading=shading, touched=touched)
+        figures = judge_shot(self._detector, self._detector(shot.frame), shot)
+        failed = tuple(m.title for m in MEASURES if m.failed(figures[m.name], self.limits[m.name]))
+        model = self.contact.model
+        estimate = None if model is None else model(self._in_form(shot.frame, model.form))
+        return Judged(shot, self._pipeline(shot.frame), figures, failed, estimate)
+
+    def _in_form(self, raw: Frame, form: Form) -> Frame:
+        return raw if form is Form.RAW else self.contact.camera.recorded(raw)
+
+
+class DegradeMode:
+    """The mode 'Degrade'.
+
+    Parameters
+    ----------
+    page : Page
+    twin : TwinMode
+    """
+
+    title = "Degrade"
+
+    def __init__(self, page: Page, twin: TwinMode) -> None:
+        self._page, self._twin = page, twin
+        self._judge: Judge | None = None
+        self._active = False
+        self._edge, self._finding = "", False
+        self._pose: ObjectPose | None = None
+        self._wanted: Newest[None] = Newest(self._show, "studio-degrade", lambda text: page.say(text, bad=True))
+        conditions = offered()
+        titles = (NO_CONDITION, *conditions)
+        by_name = {c.name: title for title, c in conditions.items()}
+        self._conditions, self._choices, self._severities = conditions, [], []
+        self.folder = page.gui.add_folder("Degrade", visible=False)
+        with self.folder:
+            for k in range(SLIDERS):
+                first = by_name.get(FIRST[k], NO_CONDITION)
+                choice = page.gui.add_dropdown(f"condition {k + 1}", titles, initial_value=first)
+                slider = page.gui.add_slider(f"severity {k + 1}", 0.0, 1.0, 0.01, 0.0, hint="1: so severe that nobody would use the sensor")
+                for control in (choice, slider):
+                    control.on_update(lambda event: self._changed())
+                self._choices.append(choice)
+                self._severities.append(slider)
+            edge = page.gui.add_button("Find the edge", hint="raise the severity of condition 1 until something fails; the others stay")
+            none = page.gui.add_button("Nothing is wrong")
+        edge.on_click(lambda event: self._find())
+        none.on_click(lambda event: self._reset())
+
+    def start(self) -> None:
+        """Begin."""
+        self._wanted.start()
+
+    def stop(self) -> None:
+        """End."""
+        self._wanted.stop()
+
+    def enter(self) -> None:
+        """Show the twin's contact, degraded."""
+        self._active = True
+        self._page.show_nothing("The contact is drawn as a sensor sees it that something is wrong with ...")
+        self._wanted.give(None)
+
+    def leave(self) -> None:
+        """Leave the pictures to another mode."""
+        self._active = False
+
+    def follow(self, answer: Answer) -> None:
+        """The twin's contact has changed."""
+        if self._active:
+            if answer.pose != self._pose:
+                self._edge = ""
+            self._wanted.give(None)
+
+    def _changed(self) -> None:
+        self._edge, self._finding = "", False
+        self._wanted.give(None)
+
+    def _find(self) -> None:
+        self._finding = True
+        self._wanted.give(None)
+
+    def _reset(self) -> None:
+        for slider in self._severities:
+            put(slider, 0.0)
+        self._changed()
+
+    def cases(self) -> list[tuple[Case, float]]:
+        """The chosen conditions with their severities."""
+        chosen = [(choice.value, float(slider.value)) for choice, slider in zip(self._choices, self._severities, strict=True)]
+        return [(Case((condition(self._conditions[title].name),)), severity) for title, severity in chosen if title != NO_CONDITION]
+
+    def _show(self, _: None) -> None:
+        answer = self._twin.worker.newest
+        if answer is None or not self._active:
+            return
+        if self._judge is None or self._judge.contact is not self._twin.contact:
+            self._judge = Judge(self._twin)
+        judge, shading, started = self._judge, self._twin.contact.camera.preview.shading, time.perf_counter()
+        self._pose = answer.pose
+        if self._finding:
+            self._edge = self._edge_of(judge, answer, shading)
+            self._finding = not self._edge  # something newer came: again for that
+        cases = self.cases()
+        judged = judge(answer, cases, shading)
+        ms = 1e3 * (time.perf_counter() - started)
+        frame = judged.shot.frame
+        crop = self._twin.contact.camera.crop
+        camera = crop(camera_picture(frame, judged.seen, judge.reference.pins_px, Drawn.GRAPH), Form.RAW)
+        cells = crop(cell_picture(frame, judged.seen, judge.reference.area_px2), Form.RAW)
+        words = "; ".join(f"{case.title} {case.label(severity)}" for case, severity in cases if severity) or "nothing is wrong"
+        numbers = [
+            badge("degraded" if any(severity for _, severity in cases) else "as it is") + badge("drawn"),
+            paragraph(words, "note"),
+            _measures(judged, judge.limits),
+            paragraph("" if judged.seen.valid else f"The pipeline refuses the frame: {judged.seen.reason}", "stop"),
+            estimate_table(judged.estimate, answer.labels) if judged.shot.touched else "",
+            paragraph(self._edge, "said"),
+            paragraph(f"{ms:.0f} ms for this answer", "note"),
+        ]
+
+        def change() -> None:
+            if self._active:
+                self._page.show_pictures(camera, cells, "camera, raw frame, degraded")
+                self._page.show_numbers(*numbers)
+
+        self._page.together(change)
+
+    def _edge_of(self, judge: Judge, answer: Answer, shading: Shading) -> str:
+        """Where this contact leaves the envelope as the first chosen condition grows, in words."""
+        cases = self.cases()
+        if not cases:
+            self._finding = False
+            raise TwinError("choose a condition first; its severity is then raised until something fails")
+        (case, _), others = cases[0], cases[1:]
+        borne = 0.0
+        for severity in SEVERITIES:
+            if self._wanted.overtaken:
+                return ""
+            failed = judge(answer, [(case, severity), *others], shading).failed
+            if failed and severity == 0.0:
+                return f"Already without {case.title} this frame fails: {', '.join(failed)}."
+            if failed:
+                fails = f"at {case.label(severity)} (severity {severity:g}) it fails: {', '.join(failed)}"
+                return f"Edge for this contact: {case.title} is borne up to {case.label(borne)} (severity {borne:g}); {fails}."
+            borne = severity
+        return f"Edge for this contact: {case.title} is borne up to its most severe value, {case.label(1.0)}."
+
+
+def _measures(judged: Judged, limits: dict[str, float]) -> str:
+    """HTML of the measures with their limits."""
+    rows = []
+    for m in MEASURES:
+        value, kind = judged.figures[m.name], "bad" if m.title in judged.failed else "good"
+        limit = f"{'at least' if m.least else 'at most'} {limits[m.name]:.3g} {m.unit}"
+        shown = "-" if np.isnan(value) else f"{value:.3f}"
+        rows.append(f"<tr><td>{m.title}</td><td class='{kind}'>{shown}</td><td>{limit}</td></tr>")
+    return f"<table><tr><th>pipeline</th><th>value</th><th>limit</th></tr>{''.join(rows)}</table>"

@@ -1,0 +1,278 @@
+"""The mode 'Live': a real camera, and an arm if there is one, on the same page.
+
+Camera and arm are handed in (``LiveFeed``, ``LiveArm``); this package knows no device.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from twin.errors import TwinError
+from twin.estimate import Estimate, SensorModel
+from twin.pins.check import Grade, examine
+from twin.pins.pipeline import Pipeline
+from twin.studio.page import Chart, Page, put
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.studio.twin_mode import TwinMode
+from twin.studio.worker import Newest
+from twin.types import Form, Frame
+
+NUDGES = ("x -1", "x +1", "y -1", "y +1", "z -1", "z +1")
+"""Moves of an armed arm, mm in its base frame."""
+
+
+@dataclass(frozen=True)
+class LiveShot:
+    """A live frame, what the model makes of it, and lines about rates and losses."""
+
+    frame: Frame
+    estimate: Estimate
+    lines: tuple[str, ...]
+
+
+class LiveArm(Protocol):
+    """An arm that is watched, and moved only while it is armed."""
+
+    name: str
+
+    @property
+    def armed(self) -> bool:
+        """Whether the user has armed it."""
+
+    def words(self) -> str:
+        """Where it is and how it is, for people."""
+
+    def limits(self) -> str:
+        """What it may do once it is armed, for people."""
+
+    def arm(self) -> None:
+        """Enable it. Raises ``TwinError`` if it refuses."""
+
+    def disarm(self) -> None:
+        """Stop and disable it."""
+
+    def nudge(self, axis: int, by_mm: float) -> None:
+        """Move the tool along an axis of the base frame. Raises ``TwinError`` if it is not armed or the limits forbid it."""
+
+    def emergency_stop(self) -> None:
+        """Stop it and cut its power, whatever else happens."""
+
+
+class LiveFeed(Protocol):
+    """A camera that delivers, with the model that looks at its frames."""
+
+    name: str
+    model: SensorModel
+
+    @property
+    def robot(self) -> LiveArm | None:
+        """The arm, if there is one."""
+
+    def start(self, on_shot: Callable[[LiveShot], None], on_end: Callable[[str], None]) -> None:
+        """Connect and deliver from a thread; ``on_end`` is told why it ended."""
+
+    def stop(self) -> None:
+        """End, and let go of camera and arm."""
+
+    def record(self, folder: Path) -> None:
+        """Keep every frame and estimate from now on in a new folder."""
+
+    def end_record(self) -> str:
+        """End that; what was written, in words."""
+
+
+FeedOpener = Callable[[str, str, SensorModel], LiveFeed]
+"""From what a user writes for camera and arm ("" for none), and a model, to a feed that is not started yet."""
+
+
+class LiveMode:
+    """The mode 'Live'.
+
+    Parameters
+    ----------
+    page : Page
+    twin : TwinMode
+        Whose model is used.
+    open_feed : callable
+    out : Path
+        Folder for sessions.
+    camera, arm : str
+        What to offer at first.
+    """
+
+    title = "Live"
+
+    def __init__(self, page: Page, twin: TwinMode, open_feed: FeedOpener, out: Path, *, camera: str = "", arm: str = "") -> None:
+        self._page, self._twin, self._open_feed, self._out = page, twin, open_feed, out
+        self._feed: LiveFeed | None = None
+        self._pipeline: Pipeline | None = None
+        self._active = False
+        self._health: list[str] = []
+        self._last: LiveShot | None = None
+        self._newest: Newest[LiveShot] = Newest(self._show, "studio-live", self._failed)
+        gui = page.gui
+        self.folder = gui.add_folder("Live", visible=False)
+        with self.folder:
+            self._camera = gui.add_text("camera", camera, hint="a number, /dev/videoN, http://..., a folder or a video")
+            self._arm = gui.add_text("arm", arm, hint="simulated, mg400:ADDRESS, magician:PORT, or empty")
+            connect = gui.add_button("Connect")
+            disconnect = gui.add_button("Disconnect")
+            self._record = gui.add_checkbox("record", False)
+            health = gui.add_button("Check the sensor's health")
+            stop = gui.add_button("EMERGENCY STOP", color="red", hint="stops the arm and cuts its power, armed or not")
+            self._armed = gui.add_checkbox("armed: the page may move the arm", False)
+            self._limits = gui.add_html("")
+            nudges = gui.add_button_group("move, mm", NUDGES, visible=False)
+        self._nudges = nudges
+        connect.on_click(self._guarded(self.connect))
+        disconnect.on_click(self._guarded(self.disconnect))
+        health.on_click(self._guarded(self.check_health))
+        stop.on_click(self._guarded(self.emergency_stop))
+        self._record.on_update(self._guarded(self._toggle_record))
+        self._armed.on_update(self._guarded(self._toggle_armed))
+        nudges.on_click(self._guarded(lambda: self._nudge(nudges.value)))
+        gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(self._guarded(self.emergency_stop))
+        with page.charts_tab:
+            self._chart = Chart(gui, "live estimates", ("1", "2", "3"))
+
+    def _guarded(self, action: Callable[[], None]) -> Callable[[object], None]:
+        def called(event: object) -> None:
+            if getattr(event, "client", self) is None:
+                return
+            try:
+                action()
+            except TwinError as error:
+                self._failed(str(error))
+
+        return called
+
+    def _failed(self, text: str) -> None:
+        self._page.say(text, bad=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._newest.start()
+
+    def stop(self) -> None:
+        """End; camera and arm are let go of."""
+        self.disconnect()
+        self._newest.stop()
+
+    def enter(self) -> None:
+        """Show the camera, which is connected now if the command named it."""
+        self._active = True
+        self._page.show_nothing("Give a camera and press 'Connect'.")
+        if self._feed is None and self._camera.value:
+            self._guarded(self.connect)(self)
+
+    def leave(self) -> None:
+        """Leave the pictures to another mode. The camera goes on, and a recording too."""
+        self._active = False
+
+    def connect(self) -> None:
+        """Connect what the user has written.
+
+        Raises
+        ------
+        TwinError
+            There is no model, camera or arm of that name.
+        """
+        self.disconnect()
+        model = self._twin.contact.model
+        if model is None:
+            raise TwinError("there is no model of this sensor yet; wait until it is loaded, or give one with --model")
+        if not self._camera.value.strip():
+            raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")
+        feed = self._open_feed(self._camera.value.strip(), self._arm.value.strip(), model)
+        self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
+        self._feed = feed
+        feed.start(self._newest.give, self._failed)
+        self._limits.content = "" if feed.robot is None else paragraph(f"{feed.robot.name}: {feed.robot.limits()}", "note")
+
+    def disconnect(self) -> None:
+        """Let go of camera and arm."""
+        feed, self._feed = self._feed, None
+        if feed is not None:
+            if self._record.value:
+                self._page.say(feed.end_record())
+            feed.stop()
+        for control in (self._record, self._armed):
+            put(control, False)
+        self._nudges.visible = False
+
+    def emergency_stop(self) -> None:
+        """Stop the arm. It is never refused."""
+        if self._feed is None or self._feed.robot is None:
+            raise TwinError("no arm is connected")
+        self._feed.robot.emergency_stop()
+        put(self._armed, False)
+        self._nudges.visible = False
+        self._page.say("The arm was stopped and its power cut. Look at it, then arm it again.", bad=True)
+
+    def check_health(self) -> None:
+        """Say how the sensor is, from the newest frame."""
+        if self._last is None or self._feed is None:
+            raise TwinError("there is no frame yet; connect a camera first")
+        findings = examine([self._last.frame], self._feed.model.sensor)
+        ill = [f"{finding.text} {finding.remedy}".strip() for finding in findings if finding.verdict is not Grade.GOOD]
+        self._health = ill or [f"All {len(findings)} checks are good."]
+
+    def _toggle_record(self) -> None:
+        if self._feed is None:
+            put(self._record, False)
+            raise TwinError("connect a camera first")
+        if self._record.value:
+            self._feed.record(self._out / time.strftime("session-%Y%m%d-%H%M%S"))
+        else:
+            self._page.say(self._feed.end_record())
+
+    def _robot(self) -> LiveArm:
+        if self._feed is None or self._feed.robot is None:
+            put(self._armed, False)
+            raise TwinError("no arm is connected")
+        return self._feed.robot
+
+    def _toggle_armed(self) -> None:
+        robot = self._robot()
+        try:
+            robot.arm() if self._armed.value else robot.disarm()
+        finally:
+            put(self._armed, robot.armed)
+            self._nudges.visible = robot.armed
+
+    def _nudge(self, text: str) -> None:
+        axis, _, by = text.partition(" ")
+        self._robot().nudge("xyz".index(axis), float(by))
+
+    def _show(self, shot: LiveShot) -> None:
+        feed, pipeline = self._feed, self._pipeline
+        self._last = shot
+        if feed is None or pipeline is None or not self._active:
+            return
+        seen = pipeline(shot.frame)
+        camera = camera_picture(shot.frame, seen, pipeline.reference.pins_px, Drawn.GRAPH)
+        cells = cell_picture(shot.frame, seen, pipeline.reference.area_px2)
+        if shot.frame.form is Form.RAW:
+            camera, cells = (self._twin.contact.camera.crop(picture, Form.RAW) for picture in (camera, cells))
+        robot = feed.robot
+        numbers = [
+            badge("live", "moving") + (badge("recording", "moving") if self._record.value else ""),
+            paragraph(feed.name, "note"),
+            estimate_table(shot.estimate, {}),
+            paragraph(f"pins found: {seen.found} of {len(seen.pins_px)}", "note"),
+            *(paragraph(line, "note") for line in shot.lines),
+            "" if robot is None else badge("ARMED" if robot.armed else "arm: read only", "moving" if robot.armed else ""),
+            "" if robot is None else paragraph(robot.words(), "note"),
+            *(paragraph(line, "said") for line in self._health),
+        ]
+        values = list(shot.estimate.value[:3]) if shot.estimate.valid else []
+
+        def change() -> None:
+            if self._active:
+                self._page.show_pictures(camera, cells, f"live {shot.frame.form} frame {shot.frame.sequence}")
+                self._page.show_numbers(*numbers)
+                self._chart.add([*map(float, values), *[float("nan")] * (3 - len(values))])
+
+        self._page.together(change)

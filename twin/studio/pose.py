@@ -1,0 +1,113 @@
+"""Where the object stands before the sensor, in six numbers that a person can type."""
+
+from dataclasses import asdict, dataclass, fields
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from twin.errors import ContactError
+from twin.mechanics.path import carried
+from twin.types import FloatArray
+
+LIMITS: dict[str, tuple[float, float, str]] = {
+    "x_mm": (-20.0, 20.0, "farther aside nothing would touch the dome"),
+    "y_mm": (-20.0, 20.0, "farther aside nothing would touch the dome"),
+    "depth_mm": (-10.0, 20.0, "the object's place above or below the tip"),
+    "tilt_x_deg": (-60.0, 60.0, "the dome reaches no farther"),
+    "tilt_y_deg": (-60.0, 60.0, "the dome reaches no farther"),
+    "twist_deg": (-90.0, 90.0, "a quarter turn"),
+}
+"""Lowest and highest value of each number, and why it ends there."""
+STRAIGHT_POINTS_MM = 8.0 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
+"""Points (5, 3) of the object frame, about as far apart as a contact is wide, by whose ways two motions are compared."""
+
+
+@dataclass(frozen=True)
+class ObjectPose:
+    """The object's pose relative to the sensor.
+
+    The object's origin (where a sensor that comes straight touches it first) stands at ``x_mm``, ``y_mm`` and ``depth_mm`` below the
+    dome's tip, so that positive depths press. The object is turned about the sensor's x by ``tilt_x_deg``, then about its y by
+    ``tilt_y_deg``, then about its z by ``twist_deg`` (right-handed).
+    """
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    depth_mm: float = -2.0
+    tilt_x_deg: float = 0.0
+    tilt_y_deg: float = 0.0
+    twist_deg: float = 0.0
+
+    def matrix(self, radius_mm: float) -> FloatArray:
+        """``T_sensor_object`` (4, 4) before a dome of a radius."""
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xyz", [self.tilt_x_deg, self.tilt_y_deg, self.twist_deg], degrees=True).as_matrix()
+        T[:3, 3] = self.x_mm, self.y_mm, radius_mm - self.depth_mm
+        return T
+
+    @classmethod
+    def of(cls, T: FloatArray, radius_mm: float) -> "ObjectPose":
+        """The numbers of a pose ``T_sensor_object`` (4, 4)."""
+        tilt_x, tilt_y, twist = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
+        return cls(*map(float, (T[0, 3], T[1, 3], radius_mm - T[2, 3], tilt_x, tilt_y, twist)))
+
+    def within_limits(self) -> tuple["ObjectPose", str]:
+        """The nearest pose whose numbers are within ``LIMITS``, and why it is another one ("" if it is not).
+
+        Raises
+        ------
+        ContactError
+            A number is not finite.
+        """
+        reasons, kept = [], {}
+        for name, value in asdict(self).items():
+            low, high, why = LIMITS[name]
+            if not np.isfinite(value):
+                raise ContactError(f"{name}: {value} is no finite number; give one between {low:g} and {high:g}")
+            kept[name] = min(max(value, low), high)
+            if kept[name] != value:
+                reasons.append(f"{spoken(name)} ends at {kept[name]:g} {unit_of(name)}: {why}")
+        return ObjectPose(**kept), "; ".join(reasons)
+
+    def words(self) -> str:
+        """All six numbers with their units."""
+        return ", ".join(f"{spoken(name)} {value:+.2f} {unit_of(name)}" for name, value in asdict(self).items())
+
+
+@dataclass(frozen=True)
+class PressedPose(ObjectPose):
+    """A pose with how deep the rigid object is in it inside the undeformed dome, as a saved contact keeps it."""
+
+    indent_mm: float = 0.0
+
+
+NAMES = tuple(field.name for field in fields(ObjectPose))
+"""The six numbers, in their order."""
+
+
+def spoken(name: str) -> str:
+    """A number's name for people: ``tilt_x_deg`` is 'tilt x'."""
+    return name.rpartition("_")[0].replace("_", " ")
+
+
+def unit_of(name: str) -> str:
+    """A number's unit, which ends its name."""
+    return name.rpartition("_")[2]
+
+
+def bend_mm(way: list[FloatArray]) -> float:
+    """How far the poses (4, 4) of a way lie from the straight motion between its ends, at ``STRAIGHT_POINTS_MM``."""
+    start, stop = (points @ T[:3, :3].T + T[:3, 3] for points, T in ((STRAIGHT_POINTS_MM, way[0]), (STRAIGHT_POINTS_MM, way[-1])))
+    along = stop - start
+    length2 = np.maximum((along**2).sum(axis=1, keepdims=True), 1e-12)
+    worst = 0.0
+    for T in way[1:-1]:
+        off = STRAIGHT_POINTS_MM @ T[:3, :3].T + T[:3, 3] - start
+        share = np.clip((off * along).sum(axis=1, keepdims=True) / length2, 0, 1)
+        worst = max(worst, float(np.linalg.norm(off - share * along, axis=1).max()))
+    return worst
+
+
+def motion_mm(places_mm: FloatArray, start: FloatArray, stop: FloatArray) -> float:
+    """Largest way of places (k, 3) that move with an object from one pose (4, 4) to another; 0 for no places."""
+    return float(np.linalg.norm(carried(places_mm, start, stop), axis=1).max(initial=0.0))

@@ -1,0 +1,303 @@
+"""The mode 'Recording': frames of a real sensor, their labels against the estimates, and the twin's own picture of each contact."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from scenes import load_object
+from scenes.experiment import ExperimentSpec
+from twin.errors import ContactError, FrameError, TwinError
+from twin.estimate import Estimate, SensorModel
+from twin.frames import Recording, open_recording
+from twin.pins.batch import recording_reference
+from twin.pins.pipeline import Pipeline
+from twin.rig.contact import RigContact
+from twin.rig.labels import ArmLabel, read_arm_labels
+from twin.studio.contact import MovingContact, experiment_of
+from twin.studio.page import CELLS, Page, put
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
+from twin.studio.twin_mode import TwinMode
+from twin.studio.worker import Newest
+from twin.types import FloatArray, Form, Frame, Observation
+
+UNSURE = 0.5
+"""A move is doubted if the model gives its execution a smaller probability than this."""
+
+
+@dataclass(frozen=True)
+class Looked:
+    """One frame of a recording.
+
+    Attributes
+    ----------
+    index : int
+    frame : Frame
+    seen : Observation
+    estimate : Estimate or None
+    label : ArmLabel or None
+        None where the recording has no labels.
+    told : dict of str to float
+        The labels' values by the names that the model estimates.
+    doubts : tuple of str
+        What speaks against the label.
+    """
+
+    index: int
+    frame: Frame
+    seen: Observation
+    estimate: Estimate | None
+    label: ArmLabel | None
+    told: dict[str, float]
+    doubts: tuple[str, ...]
+
+
+class RecordingView:
+    """Frames of one recording, looked at one by one.
+
+    Parameters
+    ----------
+    path : path
+        As ``open_recording`` takes it.
+    contact : MovingContact
+        Whose sensor, solver and camera are used.
+
+    Raises
+    ------
+    FrameError
+        There is no such recording, or it is another sensor's.
+    """
+
+    def __init__(self, path: str | Path, contact: MovingContact) -> None:
+        sensor = contact.setup.sensor
+        self.contact = contact
+        self.recording: Recording = open_recording(path, sensor)
+        self.notes: list[str] = []
+        self.reference, name = recording_reference(sensor, self.recording, self.notes)
+        self._pipeline = Pipeline(sensor, self.recording.form, self.reference)
+        self.notes.append(f"pins are counted from {name}")
+        self._labels: list[ArmLabel] = []
+        try:
+            self._labels = read_arm_labels(self.recording)
+        except FrameError as error:
+            self.notes.append(str(error))
+        self._model = self._fitting(contact.model)
+        self._experiment: ExperimentSpec | None = None if self._model is None else experiment_of(self._model)
+        self._rig: RigContact | None = None
+
+    def __len__(self) -> int:
+        return len(self.recording)
+
+    def _fitting(self, model: SensorModel | None) -> SensorModel | None:
+        """The model for this recording's frames, counting pins from its frame without contact where both allow that."""
+        if model is None:
+            self.notes.append("no estimates: there is no model of this sensor")
+            return None
+        if model.form != self.recording.form:
+            self.notes.append(f"no estimates: the model is for {model.form} frames, these are {self.recording.form} ones")
+            return None
+        if model.counts_from_rest and self.recording.reference is not None:
+            try:
+                return model.at_rest(self.recording.reference)
+            except FrameError as error:
+                self.notes.append(str(error))
+        return model
+
+    def look(self, index: int) -> Looked:
+        """A frame, what is found in it, and what its label says.
+
+        Raises
+        ------
+        FrameError
+            It can't be read, or is another sensor's.
+        """
+        frame = self.recording.read(index)
+        seen = self._pipeline(frame)
+        estimate = None if self._model is None else self._model(frame)
+        label = self._labels[index] if self._labels else None
+        told = {} if label is None else _told(label)
+        doubts = [] if label is None or label.executed else ["the audit says that the move was not executed"]
+        executed = float(getattr(estimate, "executed", np.nan))
+        if label is not None and np.abs(label.move).max() > 0 and executed < UNSURE:
+            doubts.append(f"the model gives the move's execution {100 * executed:.0f} %")
+        if estimate is not None and estimate.valid:
+            values = zip(estimate.names, estimate.low, estimate.high, strict=True)
+            outside = [name for name, low, high in values if name in told and not low <= told[name] <= high]
+            doubts += [f"{name} is outside the 90 % interval" for name in outside]
+        return Looked(index, frame, seen, estimate, label, told, tuple(doubts))
+
+    def twin_light(self, looked: Looked) -> FloatArray | None:
+        """The twin's linear light of a frame's labelled contact; None without labels, or without an experiment that tells their axes.
+
+        Raises
+        ------
+        ContactError
+            The contact can't be solved.
+        """
+        if looked.label is None or self._experiment is None:
+            return None
+        if self._rig is None:
+            self._rig = RigContact(self.contact.solver, self._experiment, load_object(self._experiment.object))
+        return self.contact.camera.draw(self._rig.end(looked.label))
+
+    def twin_frame(self, light: FloatArray) -> Frame:
+        """A frame of such light in the recording's form."""
+        raw = self.contact.camera.raw(light, seed=0)
+        return raw if self.recording.form is Form.RAW else self.contact.camera.recorded(raw)
+
+    def crop(self, image: np.ndarray) -> np.ndarray:
+        """The dome's part of a picture in the recording's form."""
+        return self.contact.camera.crop(image, self.recording.form)
+
+
+def _told(label: ArmLabel) -> dict[str, float]:
+    """A label's values by the tables' names: the pose that the arm had, which is another one where the move was not executed."""
+    pose = label.pose if label.executed else label.pose - label.move
+    return {f"pose_{axis + 1}": float(value) for axis, value in enumerate(pose)} | {
+        f"move_{axis + 1}": float(value) for axis, value in enumerate(label.move)
+    }
+
+
+class RecordingMode:
+    """The mode 'Recording'.
+
+    Parameters
+    ----------
+    page : Page
+    twin : TwinMode
+    first : str
+        Recording to offer at first.
+    """
+
+    title = "Recording"
+
+    def __init__(self, page: Page, twin: TwinMode, first: str = "") -> None:
+        self._page, self._twin, self._first = page, twin, first
+        self._view: RecordingView | None = None
+        self._active = False
+        self._wanted: Newest[int] = Newest(self._show, "studio-recording", lambda text: page.say(text, bad=True))
+        gui = page.gui
+        self.folder = gui.add_folder("Recording", visible=False)
+        with self.folder:
+            self._path = gui.add_text("folder or video", first, hint="any recording that 'twin preprocess' reads, on the studio's machine")
+            opened = gui.add_button("Open")
+            self._number = gui.add_slider("frame number", 0, 1, 1, 0, disabled=True)
+            steps = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
+            doubt = gui.add_button("Next doubt", hint="the next frame whose label is doubted")
+            self._against = gui.add_checkbox("the twin's picture beside it", True)
+        opened.on_click(lambda event: self.open(self._path.value))
+        self._number.on_update(self._slid)
+        steps.on_click(lambda event: self._go(int(self._number.value) + int(event.target.value)))
+        doubt.on_click(lambda event: self._wanted.give(-1))
+        self._against.on_update(lambda event: self._wanted.give(int(self._number.value)))
+
+    def start(self) -> None:
+        """Begin."""
+        self._wanted.start()
+
+    def stop(self) -> None:
+        """End."""
+        self._wanted.stop()
+
+    def enter(self) -> None:
+        """Show the recording; the one given to the command is opened now."""
+        self._active = True
+        self._page.show_nothing("Give a recording's folder or video and press 'Open'.")
+        if self._view is None and self._first:
+            self.open(self._first)
+        elif self._view is not None and self._view.contact is not self._twin.contact:  # the sensor has been changed
+            self.open(self._path.value)
+        elif self._view is not None:
+            self._wanted.give(int(self._number.value))
+
+    def leave(self) -> None:
+        """Leave the pictures to another mode."""
+        self._active = False
+
+    def open(self, path: str) -> None:
+        """Show another recording; what is wrong with it is said on the page."""
+        try:
+            if not path.strip():
+                raise TwinError("give a recording's folder or video first")
+            self._view = RecordingView(path.strip(), self._twin.contact)
+        except TwinError as error:
+            self._page.say(str(error), bad=True)
+            return
+        self._number.max = max(1, len(self._view) - 1)
+        self._number.disabled = False
+        self._go(0)
+
+    def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
+        if event.client is not None:  # else it is this program that moves the slider
+            self._wanted.give(int(event.target.value))
+
+    def _go(self, index: int) -> None:
+        if self._view is not None:
+            put(self._number, int(np.clip(index, 0, len(self._view) - 1)))
+            self._wanted.give(int(self._number.value))
+
+    def _show(self, index: int) -> None:
+        view = self._view
+        if view is None or not self._active:
+            return
+        looked = self._next_doubt(view) if index < 0 else view.look(index)
+        if looked is None:
+            return
+        beside = cell_picture(looked.frame, looked.seen, view.reference.area_px2)
+        self._put(view, looked, beside)
+        if not self._against.value or looked.label is None or self._wanted.overtaken:
+            return
+        try:
+            light = view.twin_light(looked)
+        except ContactError as error:
+            self._put(view, looked, beside, note=f"The twin has no picture of this contact: {error}")
+            return
+        if light is not None and not self._wanted.overtaken:
+            made = view.twin_frame(light).image
+            self._put(
+                view, looked, made if made.ndim == 3 else np.repeat(made[..., None], 3, axis=2), label="the twin's picture of this contact"
+            )
+
+    def _next_doubt(self, view: RecordingView) -> Looked | None:
+        """The next frame whose label is doubted, after the shown one and then from the beginning."""
+        at = int(self._number.value)
+        for step in range(1, len(view) + 1):
+            if self._wanted.overtaken:
+                return None
+            looked = view.look((at + step) % len(view))
+            if looked.doubts:
+                put(self._number, looked.index)
+                return looked
+        self._page.say("No label of this recording is doubted.")
+        return None
+
+    def _put(self, view: RecordingView, looked: Looked, beside: np.ndarray, *, label: str = CELLS, note: str = "") -> None:
+        told = looked.label
+        found = f"{looked.seen.found} of {len(looked.seen.pins_px)}"
+        rows = {"frame": f"{looked.frame.name} ({looked.index + 1} of {len(view)})", "pins found": found}
+        if told is not None:
+            rows |= {"label, pose": _six(told.pose), "label, move": _six(told.move)}
+        camera = view.crop(camera_picture(looked.frame, looked.seen, view.reference.pins_px, Drawn.GRAPH))
+        numbers = [
+            badge("recorded") + badge(str(view.recording.form)),
+            paragraph("; ".join(looked.doubts), "stop"),
+            paragraph("" if looked.seen.valid else f"The pipeline refuses the frame: {looked.seen.reason}", "stop"),
+            number_table(rows),
+            estimate_table(looked.estimate, looked.told, missing=next((n for n in view.notes if n.startswith("no estimates")), "")),
+            paragraph("Here the truth is the label." if looked.told else "", "note"),
+            paragraph(note, "said"),
+            *(paragraph(text, "note") for text in [*view.recording.problems, *view.notes][:4]),
+        ]
+
+        def change() -> None:
+            if self._active:
+                self._page.show_pictures(camera, view.crop(beside), f"recorded frame {looked.frame.name}", label)
+                self._page.show_numbers(*numbers)
+
+        self._page.together(change)
+
+
+def _six(values: np.ndarray) -> str:
+    """Six coordinates, mm and deg."""
+    return " ".join(f"{value:+.1f}" for value in values)

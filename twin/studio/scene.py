@@ -1,0 +1,260 @@
+"""The 3D scene of the page: skin, pins, object, force, and the gizmo that moves the object."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import viser
+from matplotlib import colormaps
+from scipy.interpolate import make_interp_spline
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from scenes.object import ObjectSpec
+from scenes.sensor import PinsSpec, SensorSpec
+from twin.geometry.mesh import SensorMesh
+from twin.objects import build_field
+from twin.report.skin3d import object_surface
+from twin.types import ContactState, FloatArray, IntArray
+
+FINER = 2
+"""The drawn skin has this many pieces along each side of an element of the mesh."""
+OBJECT_BOX_MM = (-22.0, 22.0, -22.0, 22.0, -1.0, 20.0)
+"""Box of the object's frame whose part of the object is shown: many objects have no end."""
+OBJECT_SAMPLES = 44
+"""Samples along each side of that box. Its surface then has some thousand corners."""
+SIDES = 8
+"""Sides of a drawn pin."""
+FORCE_MM_PER_N = 4.0
+"""Length of the force arrow."""
+LEAST_FORCE_N = 0.01
+"""A smaller force has no arrow."""
+NEAR_FOOT_MM = 2.5
+"""A place in contact belongs to the nearest pin's foot within this distance; the foot is on the skin's inside."""
+HOLDER_MM = 14.0
+"""Height of the drawn holder."""
+SKIN_RGB, OBJECT_RGB, HOLDER_RGB, FORCE_RGB = (82, 96, 124), (120, 168, 232), (52, 57, 66), (255, 176, 32)
+GIZMO_MM = 16.0
+"""Size of the gizmo."""
+GLOW = (colormaps["inferno"](np.linspace(0.22, 0.97, 256))[:, :3] * 255).astype(np.uint8)
+"""Colours (256, 3) of pins, the smallest value first."""
+
+
+class Shown(StrEnum):
+    """What the colours of the pins tell."""
+
+    DISPLACEMENT = "displacement"
+    PRESSURE = "pressure"
+    SLIP = "slip"
+
+
+FULL_SCALE = {Shown.DISPLACEMENT: (4.0, "mm"), Shown.PRESSURE: (0.05, "MPa"), Shown.SLIP: (1.0, "slipping share")}
+"""Value with the brightest colour, and its unit."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh: corners (v, 3) in mm and faces (f, 3)."""
+
+    corners_mm: FloatArray
+    faces: IntArray
+
+
+class SkinShape:
+    """The outer skin's surface from the nodes of the mesh, smooth between them.
+
+    Parameters
+    ----------
+    mesh : SensorMesh
+    """
+
+    def __init__(self, mesh: SensorMesh) -> None:
+        _, rows, columns = mesh.grid
+        self._grid = rows, columns
+        self._down, self._right = _finer(rows), _finer(columns)
+        high, wide = len(self._down), len(self._right)
+        index = np.arange(high * wide).reshape(high, wide)
+        quads = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
+        faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+        self.rest = Surface(self.corners(mesh.nodes_mm), faces)
+        corners = self.rest.corners_mm[faces]
+        outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        if np.median((outward * corners.mean(axis=1)).sum(axis=1)) < 0:
+            self.rest = Surface(self.rest.corners_mm, faces[:, ::-1])
+
+    def corners(self, nodes_mm: FloatArray) -> FloatArray:
+        """Corners (v, 3) float32 for nodes (n, 3) of the mesh."""
+        rows, columns = self._grid
+        outer = nodes_mm[: rows * columns].reshape(rows, columns, 3)
+        return np.einsum("ai,ijk,bj->abk", self._down, outer, self._right, optimize=True).reshape(-1, 3).astype(np.float32)
+
+
+def _finer(count: int) -> FloatArray:
+    """Matrix (FINER (count - 1) + 1, count) from values at nodes to a cubic spline through them, at the nodes and between."""
+    at = np.arange(count)
+    return np.asarray(make_interp_spline(at, np.eye(count), k=3)(np.linspace(0, count - 1, FINER * (count - 1) + 1)))
+
+
+def pin_values(state: ContactState, rest: ContactState, shown: Shown) -> FloatArray:
+    """What is shown of each pin, (N,): way of its cap in mm, mean pressure in MPa or slipping share of the skin at its foot."""
+    if shown is Shown.DISPLACEMENT:
+        return np.linalg.norm(state.caps_mm - rest.caps_mm, axis=1)
+    count = len(state.base_mm)
+    if not len(state.contact_mm):
+        return np.zeros(count)
+    away, pin = cKDTree(state.base_mm).query(state.contact_mm)
+    near = away < NEAR_FOOT_MM
+    weight = np.bincount(pin[near], state.point_area_mm2[near], minlength=count)
+    amount = state.normal_n if shown is Shown.PRESSURE else state.slipping * state.point_area_mm2
+    return np.asarray(np.bincount(pin[near], amount[near], minlength=count) / np.maximum(weight, 1e-9))
+
+
+def colours(values: FloatArray, shown: Shown) -> np.ndarray:
+    """Colours (N, 3) uint8 of values (N,)."""
+    return GLOW[np.clip(255 * values / FULL_SCALE[shown][0], 0, 255).astype(int)]
+
+
+def turned(axis: FloatArray) -> FloatArray:
+    """Quaternions (N, 4), w first, that turn -z to unit vectors (N, 3)."""
+    turn = np.stack([1 - axis[:, 2], axis[:, 1], -axis[:, 0], np.zeros(len(axis))], axis=1)
+    straight = turn[:, 0] < 1e-9
+    turn[straight] = 0, 1, 0, 0
+    return np.asarray(turn / np.linalg.norm(turn, axis=1, keepdims=True), np.float32)
+
+
+def quaternion(T: FloatArray) -> FloatArray:
+    """Quaternion (4,), w first, of a pose (4, 4)."""
+    return np.asarray(Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True))
+
+
+def matrix(wxyz: FloatArray, position: FloatArray) -> FloatArray:
+    """Pose (4, 4) of a quaternion (4,), w first, and a position (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
+    T[:3, 3] = position
+    return T
+
+
+def pin_shape(pins: PinsSpec) -> Surface:
+    """A pin that points along -z, its cap's centre at the origin; stem and cap are tubes."""
+    half, length = pins.cap_height_mm / 2, pins.length_mm + pins.cap_height_mm / 2
+    around = np.arange(SIDES) * 2 * np.pi / SIDES
+    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
+    rings = [
+        (pins.diameter_mm / 2, length),
+        (pins.diameter_mm / 2, half),
+        (pins.cap_diameter_mm / 2, half),
+        (pins.cap_diameter_mm / 2, -half),
+    ]
+    corners = np.concatenate([np.column_stack([radius * circle, np.full(SIDES, z)]) for radius, z in rings] + [[[0.0, 0.0, -half]]])
+    place = np.arange(SIDES)
+    ahead = (place + 1) % SIDES
+    faces = []
+    for ring in range(len(rings) - 1):
+        a, b = ring * SIDES, (ring + 1) * SIDES
+        faces += [np.stack([a + place, b + place, b + ahead], axis=1), np.stack([a + place, b + ahead, a + ahead], axis=1)]
+    last = (len(rings) - 1) * SIDES
+    faces.append(np.stack([last + place, np.full(SIDES, len(corners) - 1), last + ahead], axis=1))
+    return Surface(corners, np.concatenate(faces))
+
+
+class Scene:
+    """The nodes of the scene, shared by all browsers.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    sensor : SensorSpec
+    mesh : SensorMesh
+    rest : ContactState
+    """
+
+    def __init__(self, server: viser.ViserServer, sensor: SensorSpec, mesh: SensorMesh, rest: ContactState) -> None:
+        self._scene, self._rest = server.scene, rest
+        radius_mm = sensor.skin.outer_radius_mm
+        self._scene.configure_environment_map(None)
+        self._scene.configure_default_lights(enabled=True, cast_shadow=False)
+        self._scene.add_light_ambient("/light", intensity=1.2)
+        server.initial_camera.position = (1.2 * radius_mm, -3.4 * radius_mm, 1.7 * radius_mm)
+        server.initial_camera.look_at = (0.0, 0.0, 0.7 * radius_mm)
+        self._skin_shape = SkinShape(mesh)
+        skin, pin = self._skin_shape.rest, pin_shape(sensor.pins)
+        self._skin = self._scene.add_mesh_simple(
+            "/sensor/skin",
+            skin.corners_mm,
+            skin.faces,
+            color=SKIN_RGB,
+            opacity=0.45,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._pins = self._scene.add_batched_meshes_simple(
+            "/sensor/pins",
+            pin.corners_mm,
+            pin.faces,
+            turned(rest.axis),
+            rest.caps_mm.astype(np.float32),
+            batched_colors=colours(np.zeros(len(rest.caps_mm)), Shown.DISPLACEMENT),
+            lod="off",
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._scene.add_cylinder(
+            "/sensor/holder",
+            radius=1.02 * radius_mm,
+            height=HOLDER_MM,
+            color=HOLDER_RGB,
+            position=(0.0, 0.0, sensor.skin.rim_z_mm - HOLDER_MM / 2 - 0.05),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._scene.add_frame("/sensor/axes", axes_length=6.0, axes_radius=0.15, position=(-1.6 * radius_mm, 0.0, 0.0))
+        self._force = self._scene.add_arrows(
+            "/force", np.zeros((1, 2, 3)), FORCE_RGB, shaft_radius=0.35, head_radius=0.9, head_length=1.8, visible=False
+        )
+        self._object: viser.MeshHandle | None = None
+        self.gizmo = self._scene.add_transform_controls("/wish", scale=GIZMO_MM, depth_test=False, line_width=3.0)
+        self.dragging = False
+
+    def on_drag(self, moved: Callable[[FloatArray, bool], None]) -> None:
+        """Call a function with each pose (4, 4) of the gizmo that a user drags, and whether this is the drag's end.
+
+        It is called in the server's event loop, in order, so it must return at once.
+        """
+
+        @self.gizmo.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            self.dragging = event.phase != "end"
+            with suppress(ValueError):  # a quaternion without length, which no gizmo sends
+                moved(matrix(event.target.wxyz, event.target.position), event.phase == "end")
+
+    def put_object(self, touched: ObjectSpec) -> None:
+        """Show another object."""
+        surface = object_surface(build_field(touched).distance, np.eye(4), bounds_mm=OBJECT_BOX_MM, samples=OBJECT_SAMPLES).triangulate()
+        corners, faces = np.asarray(surface.points, np.float32), np.asarray(surface.regular_faces)
+        self._object = self._scene.add_mesh_simple(
+            "/object", corners, faces, color=OBJECT_RGB, opacity=0.35, side="double", cast_shadow=False, receive_shadow=False
+        )
+
+    def place_gizmo(self, T: FloatArray) -> None:
+        """Put the gizmo to a pose (4, 4), unless a user drags it."""
+        if not self.dragging:
+            self.gizmo.position, self.gizmo.wxyz = T[:3, 3], quaternion(T)
+
+    def show(self, state: ContactState, shown: Shown) -> None:
+        """Show a state of the sensor and its object."""
+        self._skin.vertices = self._skin_shape.corners(state.nodes_mm)
+        self._pins.batched_positions = state.caps_mm.astype(np.float32)
+        self._pins.batched_wxyzs = turned(state.axis)
+        self._pins.batched_colors = colours(pin_values(state, self._rest, shown), shown)
+        if self._object is not None:
+            self._object.position, self._object.wxyz = state.T_sensor_object[:3, 3], quaternion(state.T_sensor_object)
+        size_n = float(np.linalg.norm(state.force_n))
+        self._force.visible = size_n > LEAST_FORCE_N
+        if size_n > LEAST_FORCE_N:
+            foot = np.average(state.contact_mm, axis=0, weights=state.normal_n)
+            self._force.points = np.stack([foot, foot + FORCE_MM_PER_N * state.force_n])[None].astype(np.float32)

@@ -1,0 +1,175 @@
+"""What the studio keeps in files: its whole state, and a way of the object."""
+
+import csv
+import io
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from scenes import load_object, load_sensor
+from scenes.base import NonNegative, Section
+from twin.errors import TwinError
+from twin.store import write_json, write_text
+from twin.studio.pictures import Drawn
+from twin.studio.pose import NAMES, ObjectPose
+from twin.studio.scene import Shown
+from twin.types import Form
+
+MOST_BYTES = 4_000_000
+"""A larger file is none of the studio's."""
+MOST_ROWS = 20_000
+"""Most poses of a way."""
+FIRST_DEPTH_MM = 2.0
+"""How deep the object is at first, so that there is something to see."""
+COLUMNS = ("time_s", *NAMES)
+"""Columns of a way's file."""
+
+
+class StudioState(Section):
+    """Everything that makes the page what it is; opened again, the page shows the same.
+
+    Attributes
+    ----------
+    studio : int
+        Version of this format.
+    sensor, object : str
+        Names or files, as the command line takes them.
+    friction : float or None
+        In place of the object's own.
+    pose : dict of str to float
+        The object's six numbers (``ObjectPose``).
+    form, colour, drawn : str
+        What is shown: the frame's form, what the pins' colours tell, and what is drawn over the picture.
+    """
+
+    studio: int = 1
+    sensor: str
+    object: str
+    friction: NonNegative | None = None
+    pose: dict[str, float] = {}
+    form: str = str(Form.RAW)
+    colour: str = str(Shown.DISPLACEMENT)
+    drawn: str = str(Drawn.GRAPH)
+
+    def object_pose(self) -> ObjectPose:
+        """Where the object is."""
+        return ObjectPose(**self.pose)
+
+    @classmethod
+    def read(cls, content: bytes, name: str) -> "StudioState":
+        """Read a state.
+
+        Raises
+        ------
+        TwinError
+            It is no state of this version's studio.
+        """
+        remedy = "open a file that 'Save state' wrote"
+        if len(content) > MOST_BYTES:
+            raise TwinError(f"{name}: {len(content)} bytes are no state of the studio; {remedy}")
+        try:
+            state = cls.model_validate(json.loads(content))
+            Form(state.form), Shown(state.colour), Drawn(state.drawn)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise TwinError(f"{name}: {'.'.join(map(str, first['loc']))}: {first['msg']}; {remedy}") from error
+        except (ValueError, RecursionError) as error:
+            raise TwinError(f"{name}: no state of the studio ({error}); {remedy}") from error
+        if state.studio != 1 or not set(state.pose) <= set(NAMES):
+            raise TwinError(f"{name}: a state of another version; {remedy}")
+        return state
+
+    @classmethod
+    def load(cls, path: Path) -> "StudioState":
+        """Read a state's file; errors as ``read``."""
+        try:
+            with path.open("rb") as file:
+                return cls.read(file.read(MOST_BYTES + 1), str(path))
+        except OSError as error:
+            raise TwinError(f"{path}: can't be read ({error.strerror}); give a file that 'Save state' wrote") from error
+
+    def save(self, path: Path) -> Path:
+        """Write the state."""
+        return write_json(path, self.model_dump(mode="json"))
+
+
+def first_state(file: Path | None, sensor: str, touched: str) -> StudioState:
+    """The state of a file, else a sensor that is pressed a little.
+
+    Raises
+    ------
+    TwinError, SpecError
+        The file holds no state, or there is no such sensor or object.
+    """
+    state = StudioState(sensor=sensor, object=touched, pose={"depth_mm": FIRST_DEPTH_MM}) if file is None else StudioState.load(file)
+    load_sensor(state.sensor), load_object(state.object)
+    return state
+
+
+Way = list[tuple[float, ObjectPose]]
+"""Poses with their times in s, rising from 0."""
+
+
+def way_text(way: Way) -> str:
+    """A way as a CSV table (``COLUMNS``)."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({"time_s": f"{at:.3f}", **{name: f"{value:.4f}" for name, value in asdict(pose).items()}} for at, pose in way)
+    return out.getvalue()
+
+
+def save_way(path: Path, way: Way) -> Path:
+    """Write a way."""
+    return write_text(path, way_text(way))
+
+
+def read_way(content: bytes, name: str) -> Way:
+    """Read a way from a CSV table with ``time_s`` and any of the object's six numbers; those that are missing are zero.
+
+    Raises
+    ------
+    TwinError
+        It is no such table, or its times do not rise.
+    """
+    if len(content) > MOST_BYTES:
+        raise TwinError(f"{name}: {len(content)} bytes; a way has at most {MOST_ROWS} rows")
+    try:
+        table = csv.DictReader(io.StringIO(content.decode("utf-8-sig")), strict=True)
+        columns = set(table.fieldnames or ())
+        if "time_s" not in columns or not columns <= set(COLUMNS):
+            raise TwinError(f"{name}: expected the columns {', '.join(COLUMNS)}, found {', '.join(table.fieldnames or ['none'])}")
+        rows = [{key: float(cell) for key, cell in row.items()} for row in table]
+    except (UnicodeDecodeError, ValueError, TypeError, csv.Error) as error:
+        raise TwinError(f"{name}: not readable as a way ({error}); expected a CSV table of numbers with {', '.join(COLUMNS)}") from error
+    if not 0 < len(rows) <= MOST_ROWS:
+        raise TwinError(f"{name}: {len(rows)} rows; a way has 1 to {MOST_ROWS}")
+    times = [row.pop("time_s") for row in rows]
+    if any(not later > earlier for earlier, later in zip(times, times[1:], strict=False)):
+        raise TwinError(f"{name}: time_s does not rise; sort the rows by time")
+    poses = [ObjectPose(**({"depth_mm": 0.0} | row)) for row in rows]
+    for pose in poses:
+        pose.within_limits()  # refuses what is no finite number
+    return [(at - times[0], pose) for at, pose in zip(times, poses, strict=True)]
+
+
+def tap_and_shear(pose: ObjectPose, *, depth_mm: float = 3.0, shear_mm: float = 3.0) -> Way:
+    """A tap from 2 mm above the tip down to a depth, a shear along x and back, and the way up; tilts and twist stay as they are."""
+    knots = [
+        (0.0, -2.0, 0.0),
+        (1.5, depth_mm, 0.0),
+        (3.0, depth_mm, shear_mm),
+        (5.0, depth_mm, -shear_mm),
+        (6.5, depth_mm, 0.0),
+        (8.0, -2.0, 0.0),
+    ]
+    way: Way = []
+    for (t0, d0, x0), (t1, d1, x1) in zip(knots, knots[1:], strict=False):
+        steps = round((t1 - t0) / 0.1)
+        for k in range(steps):
+            s = k / steps
+            turned = asdict(pose) | {"x_mm": x0 + s * (x1 - x0), "y_mm": 0.0, "depth_mm": d0 + s * (d1 - d0)}
+            way.append((t0 + s * (t1 - t0), ObjectPose(**turned)))
+    return [*way, (knots[-1][0], ObjectPose(**(asdict(pose) | {"x_mm": 0.0, "y_mm": 0.0, "depth_mm": knots[-1][1]})))]

@@ -1,0 +1,119 @@
+"""``run_studio``: from a plan to a page that is served until it is ended."""
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from twin.studio.degrade_mode import DegradeMode
+from twin.studio.live_mode import FeedOpener, LiveMode
+from twin.studio.page import LOCAL, Mode, Page
+from twin.studio.recording_mode import RecordingMode
+from twin.studio.state import StudioState
+from twin.studio.twin_mode import ModelOf, TwinMode
+
+PORT = 8090
+"""Port of the page."""
+LOOK_S = 0.2
+"""Interval in s at which it is looked whether the studio shall end."""
+
+
+@dataclass(frozen=True)
+class StudioPlan:
+    """What the studio shows at first, and where it listens.
+
+    Attributes
+    ----------
+    state : StudioState
+    out : Path
+        Folder for what is saved; made when it is needed.
+    host, port : str, int
+    traces : bool
+        Whether pictures are path-traced when the object stands still.
+    recording : str
+        Recording that the mode 'Recording' opens first.
+    camera, arm : str
+        What the mode 'Live' connects first.
+    seconds : float or None
+        End after this time in s.
+    """
+
+    state: StudioState
+    out: Path
+    host: str = "127.0.0.1"
+    port: int = PORT
+    traces: bool = True
+    recording: str = ""
+    camera: str = ""
+    arm: str = ""
+    seconds: float | None = None
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user must know of the host; nothing for this machine."""
+        if self.host in LOCAL:
+            return []
+        return [
+            f"warning: the page listens on {self.host}. Everyone who reaches this address can use it, move an armed arm and write to "
+            f"{self.out}; there is no password. Give no --host to serve this machine alone"
+        ]
+
+
+class Studio:
+    """The page with its modes. A context manager.
+
+    Parameters
+    ----------
+    plan : StudioPlan
+    model_of : callable
+        From a sensor's name to a trained model, or None.
+    open_feed : callable
+        Opens a camera, and an arm, for the mode 'Live'.
+    """
+
+    def __init__(self, plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener) -> None:
+        self.page = Page(f"TacTip studio: {plan.state.sensor}", host=plan.host, port=plan.port)
+        self.page.add_mode_choice([mode.title for mode in (TwinMode, DegradeMode, RecordingMode, LiveMode)])
+        self.twin = TwinMode(self.page, plan.state, plan.out, model_of, traces=plan.traces)
+        degrade = DegradeMode(self.page, self.twin)
+        self.twin.followers.append(degrade.follow)
+        live = LiveMode(self.page, self.twin, open_feed, plan.out, camera=plan.camera, arm=plan.arm)
+        self.modes: list[Mode] = [self.twin, degrade, RecordingMode(self.page, self.twin, plan.recording), live]
+        self.page.set_modes(self.modes)
+
+    def __enter__(self) -> "Studio":
+        self._open = ExitStack()
+        self._open.enter_context(self.page)
+        for mode in self.modes:
+            self._open.callback(mode.stop)
+            mode.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.close()  # all of them, even if one fails: an arm is let go of in any case
+
+
+def run_studio(plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener, *, on_open: Callable[[str], None] = lambda url: None) -> None:
+    """Serve the studio until Ctrl-C, or for the plan's time.
+
+    Parameters
+    ----------
+    plan, model_of, open_feed
+        As ``Studio`` takes them.
+    on_open : callable
+        Called with the page's address once it can be opened.
+
+    Raises
+    ------
+    TwinError
+        Nothing can listen at the plan's host and port.
+    """
+    with Studio(plan, model_of, open_feed) as studio:
+        on_open(studio.page.url)
+        begun = time.monotonic()
+        try:
+            while plan.seconds is None or time.monotonic() - begun < plan.seconds:
+                time.sleep(LOOK_S)
+        except KeyboardInterrupt:
+            return

@@ -1,0 +1,513 @@
+"""The mode 'Twin': the user moves the object, and everything that follows from it is shown."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from scenes import list_objects, list_sensors, load_object, load_sensor
+from scenes.base import SpecError
+from twin.errors import TwinError
+from twin.estimate import SensorModel
+from twin.frames.images import write_image
+from twin.pins import nominal_reference
+from twin.store import unwritten
+from twin.studio.contact import Answer, Light, MovingContact, Setup
+from twin.studio.page import Chart, Page, put
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
+from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, spoken, unit_of
+from twin.studio.scene import FULL_SCALE, Scene, Shown
+from twin.studio.state import StudioState, Way, read_way, save_way, tap_and_shear
+from twin.studio.tracing import Tracer
+from twin.studio.video import FilmWriter
+from twin.studio.worker import Newest, Worker
+from twin.types import Form
+
+ModelOf = Callable[[str], SensorModel | None]
+"""From a sensor's name to a trained model of it, None where there is none."""
+
+STEPS = {"mm": 0.25, "deg": 1.0}
+"""How far a key moves the object."""
+KEYS = {
+    "arrowleft": ("x_mm", -1),
+    "arrowright": ("x_mm", +1),
+    "arrowup": ("y_mm", -1),
+    "arrowdown": ("y_mm", +1),
+    "pageup": ("depth_mm", -1),
+    "pagedown": ("depth_mm", +1),
+}
+"""What a key with shift moves, and in which direction."""
+TURN_KEYS = {
+    "arrowleft": ("tilt_y_deg", -1),
+    "arrowright": ("tilt_y_deg", +1),
+    "arrowup": ("tilt_x_deg", -1),
+    "arrowdown": ("tilt_x_deg", +1),
+    "pageup": ("twist_deg", -1),
+    "pagedown": ("twist_deg", +1),
+}
+"""What a key with ctrl (or cmd) and shift turns, and in which direction."""
+ONE_GESTURE_S = 0.8
+"""Wishes that follow one another faster are one gesture: 'Undo' takes them back together."""
+MOST_UNDO = 100
+"""Gestures that can be taken back."""
+MOST_FRICTION = 2.0
+"""End of the friction's slider."""
+
+
+class TwinMode:
+    """The mode 'Twin'.
+
+    Parameters
+    ----------
+    page : Page
+    state : StudioState
+        What to begin with.
+    out : Path
+        Folder for what is saved.
+    model_of : callable
+    traces : bool
+        Whether pictures are path-traced when the object stands still.
+
+    Attributes
+    ----------
+    followers : list of callable
+        Called with each answer once it has been shown: modes that look at the same contact.
+    """
+
+    title = "Twin"
+
+    def __init__(self, page: Page, state: StudioState, out: Path, model_of: ModelOf, *, traces: bool = True) -> None:
+        self._page, self._out, self._model_of, self._traces = page, out, model_of, traces
+        self._state = state
+        self._shown, self._drawn = Shown(state.colour), Drawn(state.drawn)
+        self._wish, self._wished_s = state.object_pose(), 0.0
+        self._undo: list[ObjectPose] = []
+        self._model_note, self._loading = "the model is being loaded", False
+        self._path: Way | None = None
+        self._path_s = 0.0
+        self._film: FilmWriter | None = None
+        self.followers: list[Callable[[Answer], None]] = []
+        self._active = False
+        self._rebuilding = threading.Lock()
+        self.folder = page.gui.add_folder("Twin", visible=False)
+        self.contact, self.worker, self._tracer, self._scene = self._build(state)
+        self._publisher = Newest(self._publish, "studio-page")
+        self._build_controls()
+        with page.charts_tab:
+            self._forces = Chart(page.gui, "force on the object, N", ("x", "y", "z"))
+            self._estimates = Chart(page.gui, "estimates less truth", ("1", "2", "3"))
+            self._depths = Chart(page.gui, "indentation, mm", ("indentation",))
+
+    # life
+
+    def _build(self, state: StudioState) -> tuple[MovingContact, Worker, Tracer | None, Scene]:
+        """Everything that belongs to one sensor."""
+        sensor = load_sensor(state.sensor)
+        contact = MovingContact(Setup(sensor, load_object(state.object), state.friction, Form(state.form)))
+        tracer = Tracer(sensor) if self._traces else None
+        self._rest = nominal_reference(sensor, contact.setup.form)
+        scene = Scene(self._page.server, sensor, contact.solver.mesh, contact.solver.rest())
+        scene.put_object(contact.setup.touched)
+        scene.on_drag(self._dragged)
+        return contact, Worker(contact, tracer, self._answered, self._said), tracer, scene
+
+    def start(self) -> None:
+        """Begin to answer. The first wish is the state's pose; the model is loaded beside it."""
+        self._publisher.start()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._loading = False
+        self.worker.__enter__()
+        self.worker.do(self.contact.warm_up)
+        self.worker.ask(self._wish)
+
+    def stop(self) -> None:
+        """End threads and processes."""
+        self._end_film()
+        self.worker.__exit__(None, None, None)
+        if self._tracer is not None:
+            self._tracer.__exit__(None, None, None)
+        self._publisher.stop()
+
+    def _load_model(self, name: str) -> None:
+        try:
+            model = self._model_of(name)
+        except TwinError as error:
+            self._model_note = str(error)
+            return
+
+        def use() -> None:
+            if model is not None and name == self._state.sensor:
+                self.contact.use(model)
+                self.worker.show_again()
+
+        self._model_note = "no model goes with this sensor; give one with --model"
+        self.worker.do(use)
+
+    def enter(self) -> None:
+        """Show the twin's newest answer."""
+        self._active = True
+        if self.worker.newest is not None:
+            self._publisher.give(self.worker.newest)
+
+    def leave(self) -> None:
+        """Leave pictures and numbers to another mode. The 3D scene stays the twin's."""
+        self._active = False
+
+    @property
+    def state(self) -> StudioState:
+        """The whole state."""
+        return self._state.model_copy(
+            update={
+                "friction": self.contact.setup.friction,
+                "pose": asdict(self._wish),
+                "form": str(self.contact.setup.form),
+                "colour": str(self._shown),
+                "drawn": str(self._drawn),
+            }
+        )
+
+    # wishes
+
+    def ask(self, wished: ObjectPose, *, gesture: bool = True) -> None:
+        """Wish the object to be somewhere. With ``gesture``, 'Undo' can take it back."""
+        now = time.monotonic()
+        if gesture and now - self._wished_s > ONE_GESTURE_S:
+            self._undo = [*self._undo[-MOST_UNDO:], self._wish]
+        self._wish, self._wished_s = wished, now
+        self.worker.ask(wished)
+
+    def undo(self) -> None:
+        """Take the last gesture back."""
+        if self._undo:
+            self._wish = self._undo.pop()
+            self.worker.ask(self._wish)
+        else:
+            self._page.say("There is nothing to undo.")
+
+    def nudge(self, name: str, sign: int) -> None:
+        """Move the object by one step along one of its numbers."""
+        value = getattr(self._wish, name) + sign * STEPS[unit_of(name)]
+        self.ask(replace(self._wish, **{name: value}).within_limits()[0])
+
+    def play(self, way: Way) -> None:
+        """Let the object go a way; the contact begins anew in the free."""
+        self._undo = [*self._undo[-MOST_UNDO:], self._wish]
+        self._wish = way[-1][1]
+        self.worker.play(way)
+
+    def _dragged(self, T: np.ndarray, ended: bool) -> None:
+        self.ask(ObjectPose.of(T, self.contact.setup.sensor.skin.outer_radius_mm))
+        if ended and self.worker.newest is not None:
+            self._publisher.give(self.worker.newest)
+
+    # controls
+
+    def _build_controls(self) -> None:
+        gui, setup = self._page.gui, self.contact.setup
+        with self.folder:
+            self._sliders = {}
+            for name in NAMES:
+                low, high, why = LIMITS[name]
+                self._sliders[name] = slider = gui.add_slider(
+                    f"{spoken(name)}, {unit_of(name)}", low, high, 0.05, getattr(self._wish, name), hint=f"{low:g} to {high:g}: {why}"
+                )
+                slider.on_update(self._slid(name))
+            with gui.add_folder("Contact"):
+                sensors, objects = (tuple(sorted({*names(), chosen})) for names, chosen in (
+                    (list_sensors, self._state.sensor), (list_objects, self._state.object)))  # fmt: skip
+                self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
+                self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
+                self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
+                anew = gui.add_button("Begin the contact anew", hint="forget the friction's history and press straight down")
+            with gui.add_folder("Show"):
+                forms = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
+                self._form = gui.add_dropdown("frame", forms, initial_value=str(setup.form))
+                self._drawing = gui.add_dropdown("over it", tuple(map(str, Drawn)), initial_value=str(self._drawn))
+                self._colour = gui.add_dropdown("pins by", tuple(map(str, Shown)), initial_value=str(self._shown))
+            with gui.add_folder("Move", expand_by_default=False):
+                tap = gui.add_button("Tap and shear")
+                upload = gui.add_upload_button("Play a way (CSV)", mime_type=".csv", hint="columns time_s, x_mm, y_mm, depth_mm, ...")
+                self._record_way = gui.add_checkbox("record the way", False)
+                undo = gui.add_button("Undo")
+            with gui.add_folder("Save", expand_by_default=False):
+                buttons = {
+                    "Save picture": self.save_picture,
+                    "Save contact files": self.save_contact,
+                    "Save state": self.save_state,
+                }
+                for label, save in buttons.items():
+                    gui.add_button(label).on_click(self._guarded(save))
+                opened = gui.add_upload_button("Open a state", mime_type=".json")
+                self._filming = gui.add_checkbox("record a video", False)
+        self._form.on_update(self._guarded(self._change_form))
+        self._drawing.on_update(self._guarded(self._change_look))
+        self._colour.on_update(self._guarded(self._change_look))
+        self._friction.on_update(self._guarded(self._change_friction))
+        self._object.on_update(self._guarded(self._change_object))
+        self._sensor.on_update(self._guarded(self._change_sensor))
+        anew.on_click(self._guarded(self.begin_anew))
+        tap.on_click(self._guarded(lambda: self.play(tap_and_shear(self._wish))))
+        undo.on_click(self._guarded(self.undo))
+        upload.on_upload(self._guarded(lambda: self.play(read_way(upload.value.content, upload.value.name))))
+        opened.on_upload(self._guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
+        self._record_way.on_update(self._guarded(self._toggle_way))
+        self._filming.on_update(self._guarded(self._toggle_film))
+        for modifier, keys in (("shift", KEYS), ("cmd/ctrl+shift", TURN_KEYS)):
+            for key, (name, sign) in keys.items():
+                label = f"{spoken(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
+                command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # a literal of viser's
+                command.on_trigger(self._key(name, sign))
+        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(self._guarded(self.undo))
+        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(
+            self._guarded(lambda: self.play(tap_and_shear(self._wish)))
+        )
+
+    def _slid(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
+        def moved(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+            if event.client is not None:  # else it is this program that moves the slider
+                self.ask(replace(self._wish, **{name: float(event.target.value)}))
+
+        return moved
+
+    def _key(self, name: str, sign: int) -> Callable[[object], None]:
+        return lambda event: self.nudge(name, sign)
+
+    def _guarded(self, action: Callable[[], None]) -> Callable[[object], None]:
+        """A callback of a control that does an action, and says what the user did wrong. Changes by this program do nothing."""
+
+        def called(event: object) -> None:
+            if getattr(event, "client", self) is None:
+                return
+            try:
+                action()
+            except (TwinError, SpecError) as error:
+                self._page.say(str(error), bad=True)
+
+        return called
+
+    def _own_friction(self) -> float:
+        setup = self.contact.setup
+        return min(MOST_FRICTION, setup.touched.friction if setup.friction is None else setup.friction)
+
+    def begin_anew(self) -> None:
+        """Press the object straight down to where it is, its friction's history forgotten."""
+        self.worker.do(self.contact.begin_anew)
+        self.worker.ask(self._wish)
+
+    def _change_form(self) -> None:
+        form = Form(self._form.value)
+
+        def change() -> None:
+            self.contact.change(form=form)
+            self._rest = nominal_reference(self.contact.setup.sensor, form)
+            self.worker.show_again()
+
+        self.worker.do(change)
+
+    def _change_look(self) -> None:
+        self._shown, self._drawn = Shown(self._colour.value), Drawn(self._drawing.value)
+        if self.worker.newest is not None:
+            self._publisher.give(self.worker.newest)
+
+    def _change_friction(self) -> None:
+        friction = float(self._friction.value)
+        self.worker.do(lambda: self.contact.change(friction=friction))
+        self.worker.ask(self._wish)
+
+    def _change_object(self) -> None:
+        touched = load_object(self._object.value)
+        self._state = self._state.model_copy(update={"object": self._object.value})
+
+        def change() -> None:
+            self.contact.change(touched=touched)
+            self._scene.put_object(touched)
+            put(self._friction, self._own_friction())
+
+        self.worker.do(change)
+        self.worker.ask(self._wish)
+
+    def _change_sensor(self) -> None:
+        self.open(self.state.model_copy(update={"sensor": self._sensor.value, "form": str(Form.RAW)}))
+
+    def open(self, state: StudioState) -> None:
+        """Show another state. With another sensor everything is built anew, which takes some seconds.
+
+        Raises
+        ------
+        TwinError, SpecError
+            There is no such sensor or object; the page then stays as it is.
+        """
+        with self._rebuilding:
+            self._page.say(f"opening {state.sensor} against {state.object} ...")
+            built = self._build(state)
+            self.worker.__exit__(None, None, None)
+            if self._tracer is not None:
+                self._tracer.__exit__(None, None, None)
+            self._state, self._wish = state, state.object_pose()
+            self._shown, self._drawn = Shown(state.colour), Drawn(state.drawn)
+            self._model_note = "the model is being loaded"
+            self.contact, self.worker, self._tracer, self._scene = built
+            setup = self.contact.setup
+            self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
+            chosen = [(self._form, setup.form), (self._drawing, self._drawn), (self._colour, self._shown)]
+            for control, value in [*chosen, (self._sensor, state.sensor), (self._object, state.object)]:
+                if str(value) in control.options:
+                    put(control, str(value))
+            put(self._friction, self._own_friction())
+            self._begin()
+
+    # answers
+
+    def _said(self, text: str) -> None:
+        self._page.say(text)
+
+    def _answered(self, answer: Answer) -> None:
+        if self._path is not None:
+            self._path.append((time.monotonic() - self._path_s, answer.pose))
+        self._publisher.give(answer)
+        if not self._loading:  # only now, so that the first picture does not wait for it
+            self._loading = True
+            threading.Thread(target=self._load_model, args=(self._state.sensor,), name="studio-model", daemon=True).start()
+
+    def _publish(self, answer: Answer) -> None:
+        """Show an answer: scene, pictures and numbers belong to one pose, and browsers get them together."""
+        contact = self.contact
+        if self._active:
+            camera = camera_picture(answer.frame, answer.seen, self._rest.pins_px, self._drawn)
+            cells = cell_picture(answer.frame, answer.seen, self._rest.area_px2)
+            camera, cells = (contact.camera.crop(picture, answer.frame.form) for picture in (camera, cells))
+            if self._film is not None:
+                self._film.add(np.hstack([camera, cells]))
+        numbers = self._numbers(answer)
+
+        def change() -> None:
+            self._scene.show(answer.state, self._shown)
+            if answer.arrived:
+                self._scene.place_gizmo(self._gizmo_pose(answer))
+                self._follow_sliders(answer)
+            if self._active:
+                self._page.show_pictures(camera, cells, f"camera, {answer.frame.form} frame, {answer.lit}")
+                self._page.show_numbers(*numbers)
+            self._draw_charts(answer)
+
+        self._page.together(change)
+        for follow in self.followers:
+            follow(answer)
+
+    def _gizmo_pose(self, answer: Answer) -> np.ndarray:
+        return answer.pose.matrix(self.contact.setup.sensor.skin.outer_radius_mm)
+
+    def _follow_sliders(self, answer: Answer) -> None:
+        """Put the sliders to where the object came to stand, unless the user has wished on meanwhile."""
+        wishing = self.worker.newest is not answer or time.monotonic() - self._wished_s < ONE_GESTURE_S
+        if wishing and not self._scene.dragging and not answer.stopped:
+            return
+        for name, slider in self._sliders.items():
+            value = round(getattr(answer.pose, name), 2)
+            if abs(slider.value - value) > 0.02:
+                put(slider, value)
+
+    def _numbers(self, answer: Answer) -> list[str]:
+        state, seen = answer.state, answer.seen
+        moving = "moving" if not answer.arrived else "still"
+        mesh = str(answer.mesh) if len(state.contact_mm) else "no contact"
+        force = state.force_n + 0.0
+        across = float(np.hypot(force[0], force[1]))
+        slipping = 100 * float(state.slipping.mean()) if len(state.slipping) else 0.0
+        rows = {
+            "force x, y, z": f"{force[0]:+.2f}  {force[1]:+.2f}  {force[2]:+.2f} N",
+            "across, friction used": f"{across:.2f} N, {across / force[2]:.2f}" if force[2] > 0.01 else "-",
+            "torque about z": f"{state.torque_nmm[2]:+.1f} N mm",
+            "indentation": f"{answer.indent_mm:+.2f} mm",
+            "contact area, slipping": f"{state.area_mm2:.0f} mm2, {slipping:.0f} %",
+            "pins found": f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}"),
+        }
+        full, unit = FULL_SCALE[self._shown]
+        return [
+            f"<span data-number='{answer.number}' data-depth='{answer.pose.depth_mm:.6f}'></span>",
+            badge(moving, moving) + badge(answer.lit, "still" if answer.lit is Light.TRACED else "") + badge(mesh),
+            paragraph(answer.stopped, "stop"),
+            number_table(rows),
+            estimate_table(answer.estimate, answer.labels, missing=self._model_note)
+            if len(state.contact_mm)
+            else paragraph("No contact: an estimate would mean nothing.", "note"),
+            paragraph(self.contact.fine_lost, "note"),
+            paragraph(f"pins by {self._shown}: dark 0, bright {full:g} {unit}; {sum(answer.ms.values()):.0f} ms for this answer", "note"),
+        ]
+
+    def _draw_charts(self, answer: Answer) -> None:
+        self._forces.add(answer.state.force_n.tolist())
+        self._depths.add([answer.indent_mm])
+        errors = [np.nan] * 3
+        if answer.estimate is not None and answer.estimate.valid:
+            for k, (name, value) in enumerate(zip(answer.estimate.names[:3], answer.estimate.value, strict=False)):
+                errors[k] = float(value) - answer.labels.get(name, np.nan)
+        self._estimates.add(errors)
+
+    # saving
+
+    def _next_path(self, stem: str, suffix: str) -> Path:
+        """A path in the folder that does not exist yet."""
+        try:
+            self._out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise unwritten(self._out, error) from error
+        number = 1
+        while (path := self._out / f"{stem}-{number}{suffix}").exists():
+            number += 1
+        return path
+
+    def _require_answer(self) -> Answer:
+        if self.worker.newest is None:
+            raise TwinError("there is no picture yet; wait for the first one")
+        return self.worker.newest
+
+    def save_picture(self) -> None:
+        """Write the frame that is shown."""
+        answer = self._require_answer()
+        path = self._next_path("picture", ".png")
+        write_image(path, answer.frame.image)
+        self._page.say(f"saved {path} ({answer.lit})")
+
+    def save_contact(self) -> None:
+        """Write the contact as ``twin render`` does."""
+        answer = self._require_answer()
+        if self._tracer is None:
+            raise TwinError("without path tracing no contact can be saved; start the studio without --plain")
+        out = self._next_path("contact", "")
+        out.mkdir()
+        pose = PressedPose(**asdict(answer.pose), indent_mm=answer.indent_mm)
+        self._tracer.save(out, self.contact.setup.touched, pose, answer.state, answer.frame.form)
+        self._page.say(f"writing {out} ...")
+
+    def save_state(self) -> None:
+        """Write the whole state, and offer it to the browsers."""
+        path = self.state.save(self._next_path("state", ".json"))
+        self._page.server.send_file_download(path.name, path.read_bytes())
+        self._page.say(f"saved {path}; open it here or with: twin studio --state {path}")
+
+    def _toggle_way(self) -> None:
+        if self._record_way.value:
+            self._path, self._path_s = [], time.monotonic()
+            return
+        way, self._path = self._path, None
+        if way:
+            kept = [pair for k, pair in enumerate(way) if k == 0 or pair[0] > way[k - 1][0]]
+            self._page.say(f"saved {save_way(self._next_path('way', '.csv'), kept)} ({len(kept)} poses)")
+
+    def _toggle_film(self) -> None:
+        if self._filming.value:
+            self._film = FilmWriter(self._next_path("video", ".mp4"))
+        else:
+            self._end_film()
+
+    def _end_film(self) -> None:
+        film, self._film = self._film, None
+        if film is not None:
+            self._page.say(film.close())

@@ -85,7 +85,7 @@ def main() -> None:
             late = [u.time_s - times[u.depth_mm] for u in answers if u.depth_mm in times]
             gaps = np.diff([u.time_s for u in answers])
             moved = [u for before, u in zip(answers, answers[1:], strict=False) if u.depth_mm != before.depth_mm]
-            together = np.mean([u.pictures >= 2 and "/sensor/skin" in u.nodes for u in moved])
+            together = np.mean([u.pictures >= 2 and "/object" in u.nodes for u in moved])
             numbers = [u.number for u in answers]
             traced = client.wait(lambda u: "path-traced" in u.html and u.number > numbers[-1], 60, since=len(client.updates) - 5)
             memory.append(memory_mb(process))

@@ -18,10 +18,12 @@ from twin.workers import in_processes, outcomes
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
 MAIN = """
+import signal
 import sys
 from test_workers import sleeping
 from twin.workers import in_processes
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background of a script begins with SIGINT ignored
     try:
         list(in_processes(sleeping, (sys.argv[1],), [1, 2, 3], processes=2))
     except KeyboardInterrupt:

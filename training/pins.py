@@ -112,7 +112,7 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
 
     found = cached_arrays("recorded-pins", _key(recording, spec), compute)
     problems += found.pop("notes").tolist()
-    reference = make_reference(found.pop("rest_px"), spec.pins.rings)
+    reference = make_reference(found.pop("rest_px"), spec.pins)
     return PinTable(spec, recording.form, reference, measured=bool(found.pop("measured")), **found)
 
 

@@ -102,7 +102,9 @@ class CameraReport:
     held: dict[str, str]
 
 
-def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] = FREE) -> tuple[SensorSpec, CameraReport]:
+def fit_camera(
+    spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] = FREE, named: bool = False
+) -> tuple[SensorSpec, CameraReport]:
     """Least squares of camera and pin pattern on the caps' projections through the window.
 
     Parameters
@@ -113,6 +115,8 @@ def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] =
         Raw-frame px of a no-contact frame, in any order; NaN where not found.
     free : tuple of str
         Of ``PARAMETERS``.
+    named : bool
+        The pins are in the specification's order: they keep it.
 
     Returns
     -------
@@ -127,17 +131,19 @@ def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] =
     if unknown := set(free) - set(PARAMETERS):
         raise FrameError(f"{sorted(unknown)[0]} is not a parameter of the camera's fit; choose of {', '.join(PARAMETERS)}")
     pins_px = np.asarray(pins_px, float).reshape(-1, 2)
-    pins_px = pins_px[np.isfinite(pins_px).all(axis=1)]
+    seen = np.flatnonzero(np.isfinite(pins_px).all(axis=1))
+    pins_px = pins_px[seen]
     if not LEAST_PINS <= len(pins_px) <= spec.pins.count:
         raise FrameError(
             f"{len(pins_px)} pins found of {spec.pins.count}; between {LEAST_PINS} and all are needed: give another no-contact frame"
         )
     names, held = [name for name in PARAMETERS if name in free], {}
-    order = nearest_order(spec, pins_px)
+    order = seen if named else nearest_order(spec, pins_px)
     for _ in range(len(free) + 1):
-        found, order, residual, slopes = _fit(spec, pins_px, order, names)
+        found, order, residual, slopes = _fit(spec, pins_px, order, names, rematch=not named)
         sd, correlation = _certainty(residual, slopes)
-        alike = np.sqrt(len(pins_px) / spec.pins.rings)  # the pins of a ring share one error
+        rings = spec.pins.rings or np.sqrt(len(pins_px) / 3)  # as many as rings of so many pins
+        alike = np.sqrt(len(pins_px) / rings)  # the pins of a ring share one error
         doubtful = _undetermined(_values(spec, names), sd * alike * max(MODEL_PX / _rms(residual), 1), correlation)
         if not doubtful:
             break
@@ -193,7 +199,7 @@ def _range(name: str, value: float) -> float:
 
 
 def _fit(
-    spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str]
+    spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str], *, rematch: bool = True
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Values (p,), order (n,), residual (2 n,) px and its slopes (2 n, p) by the values, after matching and fitting in turn."""
     known = _values(spec, names)
@@ -229,7 +235,8 @@ def _fit(
             args=(order,),
         )
         values = fit.x
-        order = _assigned(pins_px, caps_px(values))
+        if rematch:
+            order = _assigned(pins_px, caps_px(values))
         if np.array_equal(order, before):
             break
     return values, order, residual(values, before), slopes(values, before)

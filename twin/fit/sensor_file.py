@@ -1,5 +1,6 @@
 """A sensor's specification as files."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from scenes.sensor import SensorSpec
@@ -7,8 +8,8 @@ from scenes.write import sensor_files
 from twin.store import write_text
 
 
-def write_sensor(path: Path, spec: SensorSpec, comment: str = "") -> Path:
-    """Write a specification, its tables beside it, and return the path.
+def write_sensor(path: Path, spec: SensorSpec, comment: str = "", notes: Mapping[str, str] | None = None) -> Path:
+    """Write a specification, its tables beside it, and return the path; ``comment`` and ``notes`` as ``sensor_files`` takes them.
 
     Each file is written whole or not at all; the TOML file comes last.
 
@@ -17,6 +18,6 @@ def write_sensor(path: Path, spec: SensorSpec, comment: str = "") -> Path:
     StoreError
         It can't be written.
     """
-    for name, text in sensor_files(spec, path.stem, comment).items():
+    for name, text in sensor_files(spec, path.stem, comment, notes).items():
         write_text(path.with_name(name), text)
     return path

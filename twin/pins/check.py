@@ -18,9 +18,9 @@ from twin.frames.forms import gray_levels
 from twin.optics.preview import Preview
 from twin.pins.blobs import Mask
 from twin.pins.caps import Caps, measure_caps
-from twin.pins.detector_spec import DetectorSpec, shipped_detector
+from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import Reference, make_reference, nominal_reference
+from twin.pins.reference import Reference, nominal_reference
 from twin.progress import Step
 from twin.types import Form, Frame, Observation
 
@@ -100,10 +100,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     """
     form = frames[0].form
     detector = detector or shipped_detector(spec, form)
-    section = spec.pipeline.model_copy(update={str(form): detector.blob})
-    tuned = spec.model_copy(update={"pipeline": section})
-    reference = make_reference(np.array(detector.pins_px), spec.pins.rings) if detector.pins_px else None
-    pipeline = Pipeline(tuned, form, reference)
+    pipeline = Pipeline(with_detector(spec, detector), form)
     seen = []
     for k, frame in enumerate(frames):
         seen.append(pipeline(frame))

@@ -11,7 +11,7 @@ import numpy as np
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec, frame_size, gray_levels
-from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, own_threshold
+from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.matching import Match, match, predict_all, rematch
 from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
@@ -20,6 +20,10 @@ from twin.types import Form, Frame, Observation
 
 MIN_FOUND = 0.8
 """Least share of the pins that must be found."""
+AT_BORDER = 1.0
+"""A pin is near the frame's border if it is less than this many spacings inside it at rest."""
+CUT = 0.35
+"""A cap is cut off by the border if its middle is less than this many spacings inside it."""
 MAX_EXTRA = 0.35
 """Most blobs among the pins that are no pins, as a share of the number of pins, in a frame in which pins are missing."""
 NEARLY_ALL = 0.97
@@ -88,6 +92,7 @@ class Pipeline:
         self._max_area_px2 = MAX_BLOB_PITCHES2 * pitch**2
         self._center_px = np.median(self.reference.pins_px, axis=0)
         self._radius_px = float(np.linalg.norm(self.reference.pins_px - self._center_px, axis=1).max())
+        self._at_border = self._inside_px(self.reference.pins_px) < AT_BORDER * self.reference.spacing_px
 
     def __call__(self, frame: Frame) -> Observation:
         """Observe one frame; a frame without (enough) pins gives ``valid=False`` and why.
@@ -102,7 +107,7 @@ class Pipeline:
         ms: dict[str, float] = {}
         blobs, found = self._look(frame, self.blob_spec, ms)
         now = perf_counter()
-        if self.second_look and self.blob_spec.threshold_block_px and not self._clear(blobs, found):
+        if self.second_look and self.blob_spec.threshold_block_px and not self.blob_spec.spot_sigma_px and not self._clear(blobs, found):
             blobs, found = self._with_own_threshold(frame, blobs, found)
         ms["look again"], now = _since(now)
         paired = found.blob >= 0
@@ -112,13 +117,14 @@ class Pipeline:
         predicted_px = np.where(paired[:, None], np.nan, nodes_px)
         extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
         ms["complete"], now = _since(now)
-        reason = self._reason(blobs, int(paired.sum()), nodes_px, extra_px)
+        expected = int((paired | ~self._cut_off(nodes_px)).sum())
+        reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px)
         graph = None
         if not reason:
             graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost)
         ms["graph"], now = _since(now)
         ms["total"], _ = _since(started)
-        return Observation(pins_px, predicted_px, int(paired.sum()), not reason, reason, graph, extra_px, ms)
+        return Observation(pins_px, predicted_px, int(paired.sum()), expected, not reason, reason, graph, extra_px, ms)
 
     def check(self, frame: Frame) -> None:
         """Raise ``FrameError`` where a frame is not of this sensor and form: size, type, form."""
@@ -169,7 +175,9 @@ class Pipeline:
         return despeckled(window) if self.blob_spec.threshold_block_px else window
 
     def _detect(self, frame: Frame, mask: Mask, blob: BlobSpec) -> Blobs:
-        """Blobs in the mask's window, those that are several caps in a row split."""
+        """Blobs in the mask's window, those that are several caps in a row split; or spots."""
+        if blob.spot_sigma_px:
+            return find_spots(gray_levels(np.ascontiguousarray(frame.image[mask.window])), mask, blob)
         return split_chains(find_blobs(self._window(frame, mask), mask, blob, max_area_px2=self._max_area_px2))
 
     def _plausible(self, found: Match) -> bool:
@@ -222,9 +230,16 @@ class Pipeline:
             known[new] = PREDICTED_WEIGHT
         return nodes_px
 
-    def _reason(self, blobs: Blobs, found: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
-        """Why a frame is no valid observation; "" if it is one."""
-        n = len(nodes_px)
+    def _inside_px(self, px: np.ndarray) -> np.ndarray:
+        """How far inside the frame places (n, 2) are, px; negative outside."""
+        return np.minimum(px, np.array(self.size_px) - 1 - px).min(axis=1)
+
+    def _cut_off(self, nodes_px: np.ndarray) -> np.ndarray:
+        """Which pins (N,) the frame's border cuts off: they are near it at rest, and not whole in this frame."""
+        return self._at_border & (self._inside_px(nodes_px) < CUT * self.reference.spacing_px)
+
+    def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
+        """Why a frame, with ``n`` pins in view, is no valid observation; "" if it is one."""
         if len(blobs.px) < MIN_FOUND * n / 2:
             return f"no pins: {len(blobs.px)} blobs seen, {n} pins expected"
         if found < MIN_FOUND * n:
@@ -276,7 +291,7 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
         raise FrameError(
             f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout"
         )
-    return make_reference(observation.graph.nodes_px, spec.pins.rings)
+    return make_reference(observation.graph.nodes_px, spec.pins)
 
 
 def dent_of(pins_px: np.ndarray, reference: Reference) -> float:

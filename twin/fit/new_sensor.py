@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from scenes.pins import PinsSpec
@@ -14,7 +13,7 @@ from twin.fit.rest import Rest, rest_of, turn_of
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.frames import evenly_read, open_recording
 from twin.frames.forms import gray_levels
-from twin.frames.images import read_image, write_image
+from twin.frames.images import write_image
 from twin.pins.batch import draw_overlay
 from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, with_detector
 from twin.pins.identify import Candidate, Identified, identify, judge_layout
@@ -36,6 +35,8 @@ PINHOLE_MM, FISHEYE_MM = 45.0, 7.5
 FITTED_PINHOLE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
 """Parameters that pins at rest may tell (see ``twin.fit.camera_pose``)."""
 FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
+UNTUNED_OFFSET = -12.0
+"""Threshold, gray levels above the local mean, for raw frames of a sensor of which only thresholded ones were seen."""
 BETTER = 0.9
 """A camera model is taken instead of a simpler one if its error is smaller by this factor."""
 GOOD_SHARE = 0.99
@@ -79,7 +80,9 @@ class Health:
             f"{100 * self.valid:.0f} % of the frames can be used"
         ]
         if self.steadily_lost:
-            lines.append(f"lost in most frames: pin {', '.join(map(str, self.steadily_lost))}; look for dirt, reflections or missing caps there")
+            lines.append(
+                f"lost in most frames: pin {', '.join(map(str, self.steadily_lost))}; look for dirt, reflections or missing caps there"
+            )
         return lines + [f"not usable, for example: {reason}" for reason in self.reasons]
 
 
@@ -204,7 +207,14 @@ def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -
     turned = pins.model_copy(update={"phase_deg": round(turn_of(pins, rest.pins_px), 2)})
     focal = radius * PINHOLE_MM / 17.0  # the outermost caps of a TacTip are about 17 mm from the axis
     camera = CameraSpec(
-        width_px=width, height_px=height, channels="color" if color else "mono", fx_px=focal, fy_px=focal, cx_px=x, cy_px=y, distance_mm=PINHOLE_MM
+        width_px=width,
+        height_px=height,
+        channels="color" if color else "mono",
+        fx_px=focal,
+        fy_px=focal,
+        cx_px=x,
+        cy_px=y,
+        distance_mm=PINHOLE_MM,
     )
     anywhere = BlobSpec(threshold=UNKNOWN_OFFSET, threshold_block_px=UNKNOWN_BLOCK_PX, mask_center_px=(x, y), mask_radius_px=1.1 * radius)
     thresholded = frame.form == Form.RECORDING
@@ -222,7 +232,11 @@ def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -
 def _whole(width: int, height: int) -> RecordingSpec:
     """A recorder that keeps the whole frame; how frames were thresholded is not known from them."""
     return RecordingSpec(
-        crop_px=(0, 0, width, height), width_px=width, height_px=height, threshold_block_px=UNKNOWN_BLOCK_PX, threshold_offset=UNKNOWN_OFFSET
+        crop_px=(0, 0, width, height),
+        width_px=width,
+        height_px=height,
+        threshold_block_px=UNKNOWN_BLOCK_PX,
+        threshold_offset=UNKNOWN_OFFSET,
     )
 
 
@@ -256,7 +270,9 @@ def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     tuned = with_detector(sensor, detector)
     if detector.form == Form.RAW:
         return tuned
-    usual = detector.blob.model_copy(update={"threshold": -12.0, "threshold_block_px": UNKNOWN_BLOCK_PX, "rest_px": (), "spot_sigma_px": 0.0})
+    usual = detector.blob.model_copy(
+        update={"threshold": -12.0, "threshold_block_px": UNKNOWN_BLOCK_PX, "rest_px": (), "spot_sigma_px": 0.0}
+    )
     return tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={"raw": usual})})
 
 
@@ -302,8 +318,8 @@ def _told(
     known = (
         f"Layout: {found.best.line()}",
         rest.line(),
-        f"camera: {lens}, focal length {sensor.camera.fx_px:.0f} px, middle ({sensor.camera.cx_px:.0f}, {sensor.camera.cy_px:.0f}) px; it sees the "
-        f"{camera.pins} pins at rest within {camera.rms_px:.2f} px (rms)",
+        f"camera: {lens}, focal length {sensor.camera.fx_px:.0f} px, middle ({sensor.camera.cx_px:.0f}, {sensor.camera.cy_px:.0f}) px; "
+        f"it sees the {camera.pins} pins at rest within {camera.rms_px:.2f} px (rms)",
         f"pin detection: {evidence.sure if evidence else 'unsure'}; "
         + (
             f"spots of {sensor_blob(sensor, tuned).spot_sigma_px:g} px"
@@ -312,22 +328,27 @@ def _told(
         ),
     )
     assumed = [
-        f"Dome: radius {sensor.skin.outer_radius_mm:g} mm, skin {sensor.skin.thickness_mm:g} mm, of a printed TacTip. Frames do not tell lengths in mm.",
-        f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: pins at "
-        "rest fit many pairs of them.",
+        f"Dome: radius {sensor.skin.outer_radius_mm:g} mm, skin {sensor.skin.thickness_mm:g} mm, of a printed TacTip. Frames do not tell "
+        "lengths in mm.",
+        f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: "
+        "pins at rest fit many pairs of them.",
         "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",
         "Light, colours, noise: those of another TacTip, until 'twin calibrate optics' has found this sensor's.",
         *camera.held.values(),
     ]
     steps = []
     if not found.sure and len(found.candidates) > 1:
-        steps.append(f"decide between the layouts: {found.best.pins.in_words()}, or {found.candidates[1].pins.in_words()}; count them in the overlay")
+        steps.append(
+            f"decide between the layouts: {found.best.pins.in_words()}, or {found.candidates[1].pins.in_words()}; count them in the overlay"
+        )
     if rest.source != "given":
         steps.append("record a frame without contact and run this again with --no-contact FRAME")
     if health.all_pins < FAIR_SHARE:
         steps.append("look at the overlay pictures: better light, focus or exposure helps most; then run this again")
     if any(name.startswith("pose_") for name in labels):
-        steps.append(f"fit the contact to the labels: twin calibrate contact --sensor {sensor.name}.toml --frames FRAMES --out {sensor.name}-2.toml")
+        steps.append(
+            f"fit the contact to the labels: twin calibrate contact --sensor {sensor.name}.toml --frames FRAMES --out {sensor.name}-2.toml"
+        )
     else:
         steps.append("record labelled contacts (a table targets.csv beside the frames), then 'twin calibrate contact' and 'twin train'")
     if sensor.camera.channels == "color":
@@ -406,7 +427,7 @@ def _page(
             for candidate in found.candidates
         ],
         ["layout", "explained", "agreeing", "not_seen", "left_over", "misfit"],
-        caption="Explained: share of pins in view and pin-like spots that are one another's (median). Misfit: distance of the pins at rest from "
-        "a smooth view of the layout, in spacings.",
+        caption="Explained: share of pins in view and pin-like spots that are one another's (median). Misfit: distance of the pins at "
+        "rest from a smooth view of the layout, in spacings.",
     )
     return page.write(folder / "index.html")

@@ -20,7 +20,7 @@ from twin.fit.caps import fit_caps
 from twin.fit.photometry import fit_photometry
 from twin.fit.response import fit_blur, fit_focus, fit_noise, fit_response, sharpness
 from twin.fit.rim import fit_rim
-from twin.fit.sensor_file import write_sensor
+from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.fit.surroundings import fit_surroundings
 from twin.frames.images import read_image, write_image
 from twin.judge.pictures.aligned import Aligned, read_frames, revised
@@ -331,18 +331,3 @@ def _shown(value: object) -> str:
             return f"{len(value)} entries"
         return ", ".join(_shown(each) for each in value)
     return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
-def folder_beside(out: Path, kind: str) -> Path:
-    """The folder for what belongs to a specification that is to be written; made if missing.
-
-    Raises
-    ------
-    FrameError
-        ``out`` is no name of a ``.toml`` file.
-    """
-    if out.suffix != ".toml":
-        raise FrameError(f"--out {out}: give the name of a .toml file")
-    folder = out.with_name(f"{out.stem}-{kind}")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

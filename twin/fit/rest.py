@@ -45,7 +45,7 @@ class Rest:
         if self.source == "found":
             return f"no contact: no frame is named as such; {self.frame} shows no contact as far as its pins tell"
         return (
-            "no contact: no frame shows it. The pins' rest places were made from the contacts; expect errors of some tenths of a pin spacing. "
+            "no contact: no frame shows it. The pins' rest places were made from the contacts; expect errors of a tenth of a spacing or two. "
             "Record one frame without contact and give it with --no-contact"
         )
 
@@ -62,7 +62,8 @@ def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None
         shown = judge_layout(layout.pins, [given])
         if shown is None or shown.explained < SHOWN:
             raise FrameError(
-                f"{given_name}: no use as no-contact frame, it does not show {layout.pins.in_words()} as the other frames do; give another one"
+                f"{given_name}: no use as no-contact frame, it does not show {layout.pins.in_words()} as the other frames do; "
+                "give another one"
             )
         return Rest(_alike(layout, shown.seen[0].pins_px), "given", given_name)
     places = pin_lattice(layout.pins).places

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from scenes.sensor import SensorSpec
 from scenes.write import sensor_files
+from twin.errors import FrameError
 from twin.store import write_text
 
 
@@ -21,3 +22,18 @@ def write_sensor(path: Path, spec: SensorSpec, comment: str = "", notes: Mapping
     for name, text in sensor_files(spec, path.stem, comment, notes).items():
         write_text(path.with_name(name), text)
     return path
+
+
+def folder_beside(out: Path, kind: str) -> Path:
+    """The folder for what belongs to a specification that is to be written; made if missing.
+
+    Raises
+    ------
+    FrameError
+        ``out`` is no name of a ``.toml`` file.
+    """
+    if out.suffix != ".toml":
+        raise FrameError(f"--out {out}: give the name of a .toml file")
+    folder = out.with_name(f"{out.stem}-{kind}")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -21,6 +21,35 @@ from twin.types import Form, Frame
 MOST_NAMED = 20  # columns that a message names; the widest tables in use have about 40
 
 
+@dataclass(frozen=True)
+class FramesAt:
+    """Frames, and the files that belong to them but do not lie beside them under a usual name. It stands wherever a path to frames does.
+
+    Attributes
+    ----------
+    path : Path
+        What ``open_recording`` takes.
+    table : Path, optional
+        Table of labels, in the place of the recording's own.
+    no_contact : Path, optional
+        Frame without contact, in the place of the recording's own.
+    """
+
+    path: Path
+    table: Path | None = None
+    no_contact: Path | None = None
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+
 class BadFrame(TypedDict):
     """A frame that could not be used, and why."""
 
@@ -145,6 +174,22 @@ class Recording:
                 return
             self.problems.append(f"no-contact frame {candidate.name}: {times(got)}, the frames are {times(self.size_px)}; ignored")
 
+    def must_take_reference(self, file: Path) -> None:
+        """Take a picture that was given as the no-contact frame.
+
+        Raises
+        ------
+        FrameError
+            It cannot be read, or has another size than the frames.
+        """
+        if not file.is_file():
+            raise FrameError(f"{file}: no such no-contact frame; give the path of a picture with --no-contact")
+        before = len(self.problems)
+        self.reference = None
+        self.take_reference([file])
+        if self.reference is None:
+            raise FrameError(f"{'; '.join(self.problems[before:])}; give another one with --no-contact")
+
     def take_metadata(self, homes: list[Path]) -> None:
         """Read the JSON files of folders."""
         for file in (file for home in homes for file in sorted(home.glob("*.json"))):
@@ -242,7 +287,7 @@ def _choose_folder(
     raise FrameError(f"{first}: {reason}")
 
 
-def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
+def _open_folder(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
     if not any(path.iterdir()):
         raise FrameError(f"{path}: the folder is empty; give a folder of frames")
     problems: list[str] = []
@@ -253,8 +298,10 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Re
         # given the inner folder of a recording, its table and no-contact frame lie beside it
         inner = folder == path and path.name in IMAGE_FOLDERS
         homes = list(dict.fromkeys([path, folder] + ([path.parent] if inner else [])))
-        tables = [home / table for home in homes for table in TABLES if (home / table).is_file()]
+        tables = [home / name for home in homes for name in TABLES if (home / name).is_file()] if table is None else [table]
         files, labels = order_by_table(tables, files, problems)
+        if table is not None and not labels:
+            raise FrameError(f"{'; '.join(problems)}; give a table of these frames with --table")
         names = [p.name for p in files]
         recording = Recording(path, kind.form, names, kind.size_px, labels, problems=problems, _files=files, _bits=kind.bits)
     else:
@@ -265,32 +312,55 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Re
     return recording
 
 
-def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> Recording:
+def open_recording(
+    path: str | Path | FramesAt,
+    spec: SensorSpec | None = None,
+    form: Form | None = None,
+    *,
+    table: Path | None = None,
+    no_contact: Path | None = None,
+) -> Recording:
     """Open recorded frames.
 
     Parameters
     ----------
     path : path
-        A picture, a folder of pictures, a recording's folder, or a video or a folder with one.
+        A picture, a folder of pictures, a recording's folder, or a video or a folder with one; or any of them with the files that belong
+        to it.
     spec : SensorSpec, optional
         The sensor; frames must have the size of one of its forms. The size of most frames is the recording's.
     form : Form, optional
         The frames' form; told by size and content if not given.
+    table, no_contact : Path, optional
+        As ``FramesAt`` holds them.
 
     Raises
     ------
     FrameError
         Nothing there, or no usable frame.
     """
+    if isinstance(path, FramesAt):
+        table, no_contact = table or path.table, no_contact or path.no_contact
     path = Path(path)
+    if table is not None and not table.is_file():
+        raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file with --table")
+    recording = _opened(path, None if spec is None else known_frames(spec), form, table)
+    if no_contact is not None:
+        recording.must_take_reference(no_contact)
+    return recording
+
+
+def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
+    """A recording with what lies beside it."""
     if not os.path.exists(path):  # unlike ``Path.exists`` also False for what is no path at all
         link = "a link to nothing" if os.path.islink(path) else "no such file or folder"
         raise FrameError(f"{shown(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
-    known = None if spec is None else known_frames(spec)
     if path.is_dir():
-        return _open_folder(path, known, form)
+        return _open_folder(path, known, form, table)
     if not path.is_file():
         raise FrameError(f"{path}: a named pipe or a device, not a file; give a picture, a folder of frames, a recording or a video")
+    if table is not None:
+        raise FrameError(f"{path}: a table needs a folder of frames; give the folder, or leave out --table")
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _open_video(path, known, form)
     kind = common_kind([path], known, form)

@@ -1,7 +1,7 @@
 """Parameters of a detector, found from frames and the pins' layout alone."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypedDict
 
 import numpy as np
@@ -103,11 +103,12 @@ def tune(
     FrameError
         No frame shows the layout.
     """
-    frames = [frames[k] for k in spread(len(frames), TUNED_ON)]
+    chosen = spread(len(frames), TUNED_ON)
+    frames = [frames[k] for k in chosen]
     form = frames[0].form
     images = [gray_levels(frame.image) for frame in frames]
     doubts: list[str] = []
-    layout = known or judge_layout(sensor.pins, images)
+    layout = judge_layout(sensor.pins, images) if known is None else replace(known, seen=tuple(known.seen[k] for k in chosen))
     if layout is None or layout.explained < LEAST_SHOWN:
         raise FrameError(
             f"none of {len(frames)} frames shows {sensor.pins.in_words()}{_shown_instead(images)}; "

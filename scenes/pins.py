@@ -1,10 +1,11 @@
 """The pins of a TacTip: their layout as data, and their size."""
 
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from scenes.base import Positive, Section
+from scenes.base import Positive, Section, SpecError
 
 MOST_PINS = 5000
 """Largest number of pins. The finest printed sensors have about 3000."""
@@ -122,3 +123,48 @@ class PinsSpec(Section):
         far_x, far_y = max(((x - x0, y - y0) for x, y in others), key=lambda d: d[0] ** 2 + d[1] ** 2)
         length2 = far_x**2 + far_y**2
         return all(abs(far_x * (y - y0) - far_y * (x - x0)) <= LEAST_WIDTH * length2 for x, y in others)
+
+
+def layout_from(text: str) -> PinsSpec:
+    """A layout as people write it: ``rings:10``, ``hexagon:6``, ``grid:9x7`` (columns, rows) or ``positions:FILE.csv``.
+
+    Raises
+    ------
+    SpecError
+        It is none of these, or impossible.
+    """
+    kind, _, size = text.partition(":")
+    try:
+        if kind in ("rings", "hexagon"):
+            return PinsSpec(layout="rings" if kind == "rings" else "hexagon", rings=int(size))
+        if kind == "grid":
+            columns, _, rows = size.partition("x")
+            return PinsSpec(layout="grid", columns=int(columns), rows=int(rows))
+        if kind == "positions":
+            return PinsSpec(layout="positions", positions=_places_in(Path(size)))
+    except ValidationError as error:
+        raise SpecError(f"layout {text}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+    except ValueError as error:
+        raise SpecError(f"layout {text}: {error}; give rings:10, hexagon:6, grid:9x7 or positions:FILE.csv") from error
+    raise SpecError(f"layout {text}: not known; give rings:10, hexagon:6, grid:9x7 or positions:FILE.csv")
+
+
+def _places_in(path: Path) -> tuple[tuple[float, float], ...]:
+    """x and y in each line of a CSV file; lines that begin with # or hold no numbers (a header) are passed over."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpecError(f"{path}: not readable as text ({error}); give a CSV file with x,y of one pin in each line") from error
+    places: list[tuple[float, float]] = []
+    for number, line in enumerate(lines, 1):
+        cells = [cell.strip() for cell in line.replace(";", ",").split(",")]
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            x, y = map(float, cells)
+        except ValueError:
+            if places or number > 1:
+                raise SpecError(f"{path}, line {number}: expected two numbers, x,y, got {line[:40]!r}") from None
+            continue
+        places.append((x, y))
+    return tuple(places)

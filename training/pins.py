@@ -124,6 +124,7 @@ def _key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
         "path": str(recording.path.resolve()),
         "names": recording.names,
         "files": json.dumps(states),
+        "reference": b"" if recording.reference is None else recording.reference.image.tobytes(),
         "form": str(recording.form),
         "sensor": spec.model_dump(mode="json"),
     }

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import FormOrAuto, Out, Sensor, if_given, say, tell, writable_folder
+from twin.cli.options import FormOrAuto, NoContact, Out, Sensor, Table, Tuning, if_given, say, sensor_with, tell, writable_folder
 
 HELP_PREPROCESS = """Find the pins in every frame.
 
@@ -42,15 +42,20 @@ def preprocess(
     out: Out,
     form: FormOrAuto = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="also write a picture of every frame with its pins and graph")] = False,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
 ) -> None:
-    from scenes import load_sensor
     from twin.cli.progress import shown
+    from twin.frames import frames_at
     from twin.pins.batch import preprocess_recording
     from twin.progress import stage
 
-    spec = load_sensor(sensor)
+    spec = sensor_with(sensor, pipeline)
     with shown() as progress, stage(progress, "frames") as step:
-        summary = preprocess_recording(path, spec, writable_folder(out), form=form, overlay=overlay, progress=step)
+        summary = preprocess_recording(
+            frames_at(path, table, no_contact), spec, writable_folder(out), form=form, overlay=overlay, progress=step
+        )
     say(_lines(summary, spec.pins.count))
     say(f"wrote {out / name}" for name in ("pins.npz", "summary.json") + (("overlay",) if overlay else ()))
 
@@ -106,11 +111,16 @@ def graph(
     out: Out = Path("out/graph"),
     form: FormOrAuto = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
 ) -> None:
-    from scenes import load_sensor
+    from twin.frames import frames_at
     from twin.pins.graph_files import write_graphs_of
 
-    made = write_graphs_of(path, load_sensor(sensor), writable_folder(out), kind=kind.value, form=form, legacy=legacy)
+    made = write_graphs_of(
+        frames_at(path, table, no_contact), sensor_with(sensor, pipeline), writable_folder(out), kind=kind.value, form=form, legacy=legacy
+    )
     tell(made)
 
 

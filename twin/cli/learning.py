@@ -14,7 +14,26 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, Device, FormOrAuto, Out, Quality, Sensor, Target, Workers, if_given, say, tell, writable_folder
+from twin.cli.options import (
+    CORES,
+    Across,
+    Device,
+    FormOrAuto,
+    NoContact,
+    Out,
+    Quality,
+    Sensor,
+    Table,
+    Target,
+    Tuning,
+    Workers,
+    if_given,
+    one_recording,
+    say,
+    sensor_with,
+    tell,
+    writable_folder,
+)
 from twin.types import FINE
 
 HELP_DATASET = """Simulate a labelled data set with ground truth.
@@ -163,16 +182,18 @@ def train(
     threads: Annotated[int | None, typer.Option("--threads", help="CPU threads")] = None,
     device: Device = "auto",
     form: FormOrAuto = None,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
 ) -> None:
-    from scenes import load_sensor
     from training.train import train_model
     from twin.cli.progress import shown
 
     with shown() as progress:
         made = train_model(
             model,
-            load_sensor(sensor),
-            data,
+            sensor_with(sensor, pipeline),
+            one_recording(data, table, no_contact),
             out,
             target=target,
             labels=labels,
@@ -220,12 +241,15 @@ def evaluate(
     rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
     labels: Annotated[str, typer.Option("--labels", help="truth in predictions.csv and errors.png: corrected or raw")] = "corrected",
     robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
+    table: Table = None,
+    no_contact: NoContact = None,
 ) -> None:
     from training.studies.evaluation import evaluate_run
     from twin.cli.progress import shown
 
     with shown() as progress:
-        found = evaluate_run(run, data, writable_folder(out), rows=rows, labels=labels, robustness=robustness, progress=progress)
+        recordings = one_recording(data, table, no_contact)
+        found = evaluate_run(run, recordings, writable_folder(out), rows=rows, labels=labels, robustness=robustness, progress=progress)
     tell(found)
 
 
@@ -240,10 +264,13 @@ The model contains its sensor and pipeline, and a frame of another sensor is ref
 def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
+    table: Table = None,
+    no_contact: NoContact = None,
 ) -> None:
     from training.studies.evaluation import predict_frames
+    from twin.frames import frames_at
 
-    say(predict_frames(run, frame).lines())
+    say(predict_frames(run, frames_at(frame, table, no_contact)).lines())
 
 
 HELP_PACK = """Write a small copy of a finished training run.

@@ -150,6 +150,11 @@ def fit_camera(
         name = next(name for name in names if name in doubtful)
         held[name] = doubtful[name]
         names.remove(name)
+        if not names:
+            raise FrameError(
+                f"these {len(pins_px)} pins determine nothing of the camera: the specification misses them by {_rms(residual):.0f} px; "
+                "check the layout, or give a no-contact frame"
+            )
     fitted = _with(spec, dict(zip(names, found.tolist(), strict=True)))
     spec = revised(spec, camera=fitted.camera.model_dump(), pins=fitted.pins.model_dump())
     return spec, CameraReport(_rms(residual), len(pins_px), dict(zip(names, sd.tolist(), strict=True)), held)

@@ -11,12 +11,12 @@ from twin.errors import FrameError
 from twin.fit.camera_pose import CameraReport, fit_camera
 from twin.fit.rest import Rest, rest_of, turn_of
 from twin.fit.sensor_file import folder_beside, write_sensor
-from twin.frames import evenly_read, open_recording
+from twin.frames import evenly_read, frames_at, open_recording
 from twin.frames.forms import gray_levels
 from twin.frames.images import write_image
 from twin.pins.batch import draw_overlay
-from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, with_detector
-from twin.pins.identify import Candidate, Identified, identify, judge_layout
+from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
+from twin.pins.identify import STEADY, Candidate, Identified, identify, judge_layout
 from twin.pins.pipeline import Pipeline
 from twin.pins.tune import Tuned, tune, turned_as
 from twin.progress import Progress, silent, stage
@@ -37,7 +37,7 @@ FITTED_PINHOLE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "
 FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
 UNTUNED_OFFSET = -12.0
 """Threshold, gray levels above the local mean, for raw frames of a sensor of which only thresholded ones were seen."""
-BETTER = 0.9
+BETTER = 0.85
 """A camera model is taken instead of a simpler one if its error is smaller by this factor."""
 GOOD_SHARE = 0.99
 """From this share of frames with all pins on, a sensor is well seen."""
@@ -163,7 +163,7 @@ def new_sensor(
         No frames, no layout in them, or ``out`` is no name of a ``.toml`` file.
     """
     folder = folder_beside(out, "new")
-    recording = open_recording(frames, None, form, table=table, no_contact=no_contact)
+    recording = open_recording(frames_at(frames, table, no_contact), None, form)
     looked = evenly_read(recording, limit)
     images = [gray_levels(frame.image) for frame in looked]
     with stage(progress, "layout") as step:
@@ -173,7 +173,7 @@ def new_sensor(
     rest = rest_of(best, [frame.name for frame in looked], None if given is None else gray_levels(given.image), given.name if given else "")
     start = _started(out.stem, looked[0], best.pins, rest, frames.name)
     with stage(progress, "camera"):
-        fitted, camera = _camera(start, np.where((best.there > 0)[:, None], rest.pins_px, np.nan))
+        fitted, camera = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan))
     with stage(progress, "pins") as step:
         tuned = tune(looked, fitted, known=best, progress=step)
     detector = _at_rest(tuned.detector, fitted, rest, best)
@@ -191,7 +191,7 @@ def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
     shown = judge_layout(layout, images)
     if shown is None:
         raise FrameError(f"none of {len(images)} frames shows {layout.in_words()}; leave the layout out to have it identified")
-    doubts = ()
+    doubts: tuple[str, ...] = ()
     if shown.explained < 0.9:
         doubts = (f"{layout.in_words()} were given, but {shown.line()}",)
     return Identified((shown,), not doubts, doubts, 0.0)
@@ -249,12 +249,18 @@ def _camera(start: SensorSpec, pins_px: np.ndarray) -> tuple[SensorSpec, CameraR
         if projection == "fisheye":
             focal = camera.fx_px * FISHEYE_MM / PINHOLE_MM
             camera = camera.model_copy(update={"projection": projection, "fx_px": focal, "fy_px": focal, "distance_mm": FISHEYE_MM})
-        trial = start.model_copy(update={"pins": pins, "camera": camera})
+        trial = _scaled(start.model_copy(update={"pins": pins, "camera": camera}), pins_px)
         fitted = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
         if best is None or fitted[1].rms_px < BETTER * best[1].rms_px:
             best = fitted
     assert best is not None
     return best
+
+
+def _scaled(sensor: SensorSpec, pins_px: np.ndarray) -> SensorSpec:
+    """The sensor with a camera whose view of the pins has the size and place of pins (N, 2), NaN where unknown."""
+    known = np.flatnonzero(np.isfinite(pins_px[:, 0]))
+    return sensor.model_copy(update={"camera": camera_seeing(sensor, pins_px, known)})
 
 
 def _at_rest(detector: DetectorSpec, sensor: SensorSpec, rest: Rest, best: Candidate) -> DetectorSpec:
@@ -296,7 +302,7 @@ def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -
     )
     worst = np.argsort([o.found / max(o.expected, 1) for o in seen], kind="stable")
     chosen = dict.fromkeys([int(worst[-1]), int(worst[0]), *worst[:: max(len(worst) // SHOWN_FRAMES, 1)].tolist()])
-    pictures = []
+    pictures: list[Path] = []
     for k in list(chosen)[:SHOWN_FRAMES]:
         path = folder / f"overlay-{len(pictures) + 1}.png"
         write_image(path, draw_overlay(frames[k], seen[k], scale=_enlarged(pipeline.size_px)))

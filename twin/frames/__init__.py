@@ -7,6 +7,6 @@ read.
 
 from twin.frames.folders import natural_key
 from twin.frames.images import read_image
-from twin.frames.recording import FramesAt, Recording, evenly_read, open_recording
+from twin.frames.recording import Recording, evenly_read, frames_at, open_recording
 
-__all__ = ["FramesAt", "Recording", "evenly_read", "natural_key", "open_recording", "read_image"]
+__all__ = ["Recording", "evenly_read", "frames_at", "natural_key", "open_recording", "read_image"]

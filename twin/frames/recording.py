@@ -19,35 +19,31 @@ from twin.frames.tables import TABLES, order_by_table, read_metadata
 from twin.types import Form, Frame
 
 MOST_NAMED = 20  # columns that a message names; the widest tables in use have about 40
+_ConcretePath: type[Path] = type(Path())
 
 
-@dataclass(frozen=True)
-class FramesAt:
-    """Frames, and the files that belong to them but do not lie beside them under a usual name. It stands wherever a path to frames does.
+class FramesAt(_ConcretePath):  # type: ignore[misc, valid-type]
+    """A path to frames, with the files that belong to them but do not lie beside them under a usual name. ``frames_at`` makes it.
 
     Attributes
     ----------
-    path : Path
-        What ``open_recording`` takes.
-    table : Path, optional
+    table : Path or None
         Table of labels, in the place of the recording's own.
-    no_contact : Path, optional
+    no_contact : Path or None
         Frame without contact, in the place of the recording's own.
     """
 
-    path: Path
     table: Path | None = None
     no_contact: Path | None = None
 
-    def __fspath__(self) -> str:
-        return str(self.path)
 
-    def __str__(self) -> str:
-        return str(self.path)
-
-    @property
-    def name(self) -> str:
-        return self.path.name
+def frames_at(path: str | Path, table: Path | None = None, no_contact: Path | None = None) -> Path:
+    """A path to frames with a table and a no-contact frame from elsewhere. It stands wherever a path to frames does."""
+    if table is None and no_contact is None:
+        return Path(path)
+    at = FramesAt(path)
+    at.table, at.no_contact = table, no_contact
+    return at
 
 
 class BadFrame(TypedDict):
@@ -313,34 +309,28 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None, table
 
 
 def open_recording(
-    path: str | Path | FramesAt,
+    path: str | Path,
     spec: SensorSpec | None = None,
     form: Form | None = None,
-    *,
-    table: Path | None = None,
-    no_contact: Path | None = None,
 ) -> Recording:
     """Open recorded frames.
 
     Parameters
     ----------
     path : path
-        A picture, a folder of pictures, a recording's folder, or a video or a folder with one; or any of them with the files that belong
-        to it.
+        A picture, a folder of pictures, a recording's folder, or a video or a folder with one. ``frames_at`` adds
+        a table and a no-contact frame from elsewhere.
     spec : SensorSpec, optional
         The sensor; frames must have the size of one of its forms. The size of most frames is the recording's.
     form : Form, optional
         The frames' form; told by size and content if not given.
-    table, no_contact : Path, optional
-        As ``FramesAt`` holds them.
 
     Raises
     ------
     FrameError
         Nothing there, or no usable frame.
     """
-    if isinstance(path, FramesAt):
-        table, no_contact = table or path.table, no_contact or path.no_contact
+    table, no_contact = (path.table, path.no_contact) if isinstance(path, FramesAt) else (None, None)
     path = Path(path)
     if table is not None and not table.is_file():
         raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file with --table")

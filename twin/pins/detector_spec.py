@@ -109,7 +109,10 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     if size is not None and size != known_frames(spec).size_px.get(detector.form):
         width, height = size
         if detector.form == Form.RAW:
-            changed["camera"] = _seen_as(spec, detector.pins_px).model_copy(update={"width_px": width, "height_px": height})
+            seen_px = np.array(detector.pins_px).reshape(-1, 2)
+            changed["camera"] = camera_seeing(spec, seen_px, np.arange(len(seen_px))).model_copy(
+                update={"width_px": width, "height_px": height}
+            )
         elif spec.recording is not None:
             changed["recording"] = spec.recording.model_copy(update={"width_px": width, "height_px": height})
         else:
@@ -120,12 +123,12 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
     return spec.model_copy(update=changed)
 
 
-def _seen_as(spec: SensorSpec, pins_px: tuple[tuple[float, float], ...]) -> CameraSpec:
-    """The camera, scaled and shifted so that it sees the pins at rest where they are measured, by least squares."""
+def camera_seeing(spec: SensorSpec, pins_px: np.ndarray, known: np.ndarray) -> CameraSpec:
+    """The camera, scaled and shifted so that it sees the ``known`` (n,) of the pins at rest where pins (N, 2) are, by least squares."""
     camera = spec.camera
-    if not pins_px:
+    if not len(known):
         return camera
-    ours, seen = project(spec.view, rest_pins(spec.geometry).caps_mm), np.array(pins_px)
+    ours, seen = project(spec.view, rest_pins(spec.geometry).caps_mm[known]), pins_px[known]
     middle, seen_middle = ours.mean(axis=0), seen.mean(axis=0)
     scale = float(np.sqrt(np.sum((seen - seen_middle) ** 2) / np.sum((ours - middle) ** 2)))
     cx, cy = (seen_middle + scale * (np.array([camera.cx_px, camera.cy_px]) - middle)).tolist()

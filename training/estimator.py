@@ -18,11 +18,12 @@ from training.assemble import Ensemble
 from training.dataset import Dataset
 from training.models import model_named
 from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
-from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
+from training.packed import KNOWN_REST, SHIPPED, WEIGHTS, shipped_names, unpack
 from training.pins import PinTable
 from training.recipes import TrainingError
 from twin.errors import FrameError
-from twin.pins import Pipeline, make_reference, measure_reference
+from twin.frames.forms import blob_spec
+from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
 from twin.store import fingerprint
 from twin.types import Form, Frame
 
@@ -83,6 +84,7 @@ class PoseEstimator:
         reference = make_reference(content["reference_px"].numpy(), self.sensor.pins)
         self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
         self.ensemble = Ensemble(self.part, reference, content, config["size"])
+        self._known_rest_px = content.get("known_rest_px")
         learnt = {group: {key: value.numpy() for key, value in arrays.items()} for group, arrays in content["aside"].items()}
         self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
 
@@ -108,6 +110,8 @@ class PoseEstimator:
         try:
             config = json.loads((run / "config.json").read_text())
             content = unpack(config, run / WEIGHTS) if packed else torch.load(run / "weights.pt", weights_only=True)
+            if (run / KNOWN_REST).is_file():
+                content["known_rest_px"] = np.loadtxt(run / KNOWN_REST, delimiter=",", ndmin=2)
             if "correction" in content:
                 raise ValueError("it is corrected by a regression")
             return cls(config, content)
@@ -129,8 +133,25 @@ class PoseEstimator:
         """
         if not self.counts_from_rest:
             raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
+        return self._counted_from(measure_reference(self.sensor, self.form, frame))
+
+    @property
+    def recorded_sensor(self) -> SensorSpec:
+        """The sensor, its pins at rest where they were measured on the unit that the weights are for, if they were.
+
+        A recording without a no-contact frame is counted from there.
+        """
+        if self._known_rest_px is None:
+            return self.sensor
+        blob = blob_spec(self.sensor.pipeline, self.form).model_copy(update={"rest_px": tuple(map(tuple, self._known_rest_px.tolist()))})
+        return self.sensor.model_copy(update={"pipeline": self.sensor.pipeline.model_copy(update={str(self.form): blob})})
+
+    def at_known_rest(self) -> "PoseEstimator":
+        """The same model for frames of the unit that its weights are for, where there is no frame without contact."""
+        return self._counted_from(nominal_reference(self.recorded_sensor, self.form)) if self._known_rest_px is not None else self
+
+    def _counted_from(self, reference: Reference) -> "PoseEstimator":
         found = copy(self)
-        reference = measure_reference(self.sensor, self.form, frame)
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         found._trained = replace(self._trained, pipeline=found.pipeline)
         return found
@@ -226,7 +247,7 @@ def folder_of(run: str | Path) -> Path:
 def digest_of(run: str | Path) -> str:
     """Digest of everything that a model's answers depend on: its weights, its configuration, and the code that runs it."""
     folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
-    for name in ("config.json", WEIGHTS, "weights.pt"):
+    for name in ("config.json", WEIGHTS, "weights.pt", KNOWN_REST):
         if (folder / name).is_file():
             digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())
     return digest.hexdigest()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 WORKING_SIGMA_PX = (2.4, 6.0)
 """Smallest and largest sd, px, with which a frame is looked at. For others it is enlarged by a whole number, or made smaller."""
@@ -26,6 +27,8 @@ LEAST_LEVELS = 0.02
 """Least difference at a spot, in the logarithm of the level: less is noise."""
 LEAST_ROUNDNESS = 0.2
 """Least ratio of the smaller curvature at a spot to the larger one. A foreshortened cap at the rim has 0.3, an arc less than 0.1."""
+NEAREST, USUAL, FAR_BELOW = 12, 75, 0.3
+"""A spot that is lower than this share (the third) of this percentile of its nearest spots is noise between caps."""
 APART = 1.3
 """Spots are at least this far apart, in sds of the narrower Gaussian."""
 
@@ -73,8 +76,17 @@ def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
     peak[[0, -1]] = peak[:, [0, -1]] = False
     rows, columns = np.nonzero(peak)
     px, round_enough = _refined(response, rows, columns)
-    px = (px[round_enough] + 0.5) / scale - 0.5
-    return Bumps(px, response[rows, columns][round_enough].astype(float), sigma_px, (gray.shape[1], gray.shape[0]))
+    px, height = (px[round_enough] + 0.5) / scale - 0.5, response[rows, columns][round_enough].astype(float)
+    high = _not_far_below(px, height)
+    return Bumps(px[high], height[high], sigma_px, (gray.shape[1], gray.shape[0]))
+
+
+def _not_far_below(px: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Which spots (K,) are not far below those around them: between caps noise makes spots too, but low ones."""
+    if len(px) <= NEAREST:
+        return np.ones(len(px), bool)
+    around = cKDTree(px).query(px, k=NEAREST)[1]
+    return height > FAR_BELOW * np.percentile(height[around], USUAL, axis=1)
 
 
 def _refined(field: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

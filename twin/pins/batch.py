@@ -27,7 +27,7 @@ LOST_RGB = (255, 60, 60)
 EXTRA_RGB = (255, 210, 0)
 """Colour of rejected blobs."""
 NO_REFERENCE = (
-    "no no-contact frame was used: the pins at rest are those of the specification, which makes errors of a pose up to three times as large; "
+    "no no-contact frame was used: the pins at rest are those of the specification, which makes errors of a pose up to three times larger; "
     "record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
 """What is said where a recording has no usable no-contact frame."""

@@ -19,8 +19,10 @@ from twin.optics.preview import Preview
 from twin.pins.blobs import Mask
 from twin.pins.caps import Caps, measure_caps
 from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
+from twin.pins.identify import judge_layout, spread
 from twin.pins.pipeline import Pipeline
 from twin.pins.reference import Reference, nominal_reference
+from twin.pins.tune import other_layout
 from twin.progress import Step
 from twin.types import Form, Frame, Observation
 
@@ -41,6 +43,8 @@ LEAST_DEFORMED = 0.3
 """The camera's place is told from this share of the frames: those with the least contact."""
 TOLD_BULGE = 0.002
 """A contact that changes the rim's size by less than this share is not mentioned."""
+LAYOUT_JUDGED = 4
+"""Most frames on which the layout is judged, evenly spread."""
 LISTED = 8
 """Most pins that a sentence lists by number."""
 BRIGHT_PERCENTILE = 99
@@ -106,7 +110,7 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
         seen.append(pipeline(frame))
         if progress:
             progress(k + 1, len(frames))
-    findings = [_pins(seen), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
+    findings = [_layout(frames, spec), _pins(seen), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
     return findings if form == Form.RECORDING else [*_light(frames, seen, promised_caps(spec), pipeline.mask), *findings]
 
 
@@ -166,6 +170,18 @@ def _finding(name: str, value: float, limits: tuple[float, float], text: str, re
     """A finding with its verdict by the limits (watch, bad); the remedy is left out where all is good."""
     verdict = _verdict(value, *limits)
     return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
+
+
+def _layout(frames: list[Frame], spec: SensorSpec) -> Finding:
+    """Whether the frames show the sensor's layout of pins, wherever its camera is: only the layout of the specification is used."""
+    images = [gray_levels(frames[k].image) for k in spread(len(frames), LAYOUT_JUDGED)]
+    layout = judge_layout(spec.pins, images)
+    share = 0.0 if layout is None else layout.explained
+    doubts = [f"the frames do not show {spec.pins.in_words()}"] if layout is None else other_layout(layout, images)
+    text = f"{100 * share:.1f} % of pins in view and pin-like spots are one another's" + (f"; {doubts[0]}" if doubts else "")
+    wrong = bool(doubts) and "rather than" in doubts[0]
+    remedy = "give the --sensor that these frames are of, or make one with 'twin new'; look for stray light"
+    return _finding("layout", 0.0 if wrong else share, (0.9, 0.75), text, remedy)
 
 
 def _pins(seen: list[Observation]) -> Finding:

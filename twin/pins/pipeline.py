@@ -6,6 +6,7 @@ no camera could make (`require_untouched`).
 
 from time import perf_counter
 
+import cv2
 import numpy as np
 
 from scenes.sensor import BlobSpec, SensorSpec
@@ -51,6 +52,13 @@ MASK_MARGIN = 0.5
 """A pin this close to the mask's edge, in spacings, may be cut off."""
 PLAUSIBLE = 0.5
 """Share of the pins above which a labelling is taken as a basis for further steps."""
+NEAREST, DARKER, BRIGHT, LEAST_ABOVE = 6, 35, 75, 0.15
+"""A pin stands on a cap if it is brighter than this percentile (the second) of the middles between it and this many nearest pins, by at
+least the last share of what this percentile (the third) of the pins is."""
+MOST_BETWEEN = 0.2
+"""Largest share of pins that may stand between caps: caps that touch have bright middles."""
+LEAST_COMPARED = 12
+"""Fewest pins of which that is asked."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one: pins in a gap are predicted from the gap's edge inwards."""
 MOST_DENT = 0.008
@@ -116,9 +124,12 @@ class Pipeline:
         nodes_px = self._complete(pins_px)
         predicted_px = np.where(paired[:, None], np.nan, nodes_px)
         extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
+        between = self._between_caps(frame, pins_px)
         ms["complete"], now = _since(now)
         expected = int((paired | ~self._cut_off(nodes_px)).sum())
         reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px)
+        if not reason and between > MOST_BETWEEN:
+            reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
         graph = None
         if not reason:
             graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost)
@@ -238,6 +249,19 @@ class Pipeline:
         """Which pins (N,) the frame's border cuts off: they are near it at rest, and not whole in this frame."""
         return self._at_border & (self._inside_px(nodes_px) < CUT * self.reference.spacing_px)
 
+    def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
+        """Share of the found pins (N, 2), NaN where lost, that are no brighter than the places between them and their neighbours."""
+        found = np.flatnonzero(np.isfinite(pins_px[:, 0]))
+        if len(found) < LEAST_COMPARED:
+            return 0.0
+        gray = cv2.blur(gray_levels(np.ascontiguousarray(frame.image)), (3, 3))
+        near = self.reference.neighbours[found, :NEAREST]
+        middle = (pins_px[found, None] + pins_px[near]) / 2
+        known = np.isfinite(middle[..., 0])
+        between = np.where(known, _levels(gray, np.where(known[..., None], middle, 0.0)), np.nan)[known.any(axis=1)]
+        above = _levels(gray, pins_px[found])[known.any(axis=1)] - np.nanpercentile(between, DARKER, axis=1)
+        return float(np.mean(above <= LEAST_ABOVE * np.percentile(above, BRIGHT))) if len(above) else 0.0
+
     def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
         """Why a frame, with ``n`` pins in view, is no valid observation; "" if it is one."""
         if len(blobs.px) < MIN_FOUND * n / 2:
@@ -260,6 +284,13 @@ class Pipeline:
         if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         return ""
+
+
+def _levels(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """Gray levels (...,) of the pixels nearest to places (..., 2)."""
+    column, row = np.moveaxis(np.clip(np.round(px), 0, np.array(gray.shape[::-1]) - 1).astype(int), -1, 0)
+    levels: np.ndarray = gray[row, column].astype(float)
+    return levels
 
 
 def _extra(blobs: Blobs, found: Match) -> int:

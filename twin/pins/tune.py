@@ -115,7 +115,7 @@ def tune(
             "check --sensor, focus and light, or give frames with less contact"
         )
     if known is None:
-        doubts = _other_layout(layout, images)
+        doubts = other_layout(layout, images)
     shape = frames[0].image.shape
     size_px = (shape[1], shape[0])
     rest_px = turned_as(sensor.pins, layout.rest_px)
@@ -154,7 +154,7 @@ def _shown_instead(images: list[np.ndarray]) -> str:
         return ""
 
 
-def _other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
+def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
     """Why a layout that was given may be wrong: what it leaves unexplained, and which other one explains more."""
     try:
         other = identify(images).best

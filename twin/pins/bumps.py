@@ -76,9 +76,10 @@ def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
     peak[[0, -1]] = peak[:, [0, -1]] = False
     rows, columns = np.nonzero(peak)
     px, round_enough = _refined(response, rows, columns)
-    px, height = (px[round_enough] + 0.5) / scale - 0.5, response[rows, columns][round_enough].astype(float)
-    high = _not_far_below(px, height)
-    return Bumps(px[high], height[high], sigma_px, (gray.shape[1], gray.shape[0]))
+    px = (px[round_enough] + 0.5) / scale - 0.5
+    height: np.ndarray = response[rows, columns][round_enough].astype(float)
+    kept = _not_far_below(px, height)
+    return Bumps(px[kept], height[kept], sigma_px, (gray.shape[1], gray.shape[0]))
 
 
 def _not_far_below(px: np.ndarray, height: np.ndarray) -> np.ndarray:

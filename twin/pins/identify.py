@@ -6,10 +6,12 @@ seen, and pin-like spots that are none of its pins, at its rim or just beyond to
 explains less than the right one, and is never taken for it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
 from scenes.pins import PinsSpec
 from twin.errors import FrameError
@@ -153,6 +155,10 @@ class Identified:
         return self.candidates[0]
 
 
+Look = Callable[[Bumps], Seen | None]
+"""What a frame's spots show."""
+
+
 def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Identified:
     """The layout that gray frames (H, W) uint8 of one sensor show, in contact or not.
 
@@ -164,7 +170,8 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
     FrameError
         No frame shows a layout.
     """
-    sizes = [_best_size(images[k], [family(name) for name in FAMILIES]) for k in spread(len(images), SIZED_ON)]
+    looks: list[Look] = [partial(_family_look, family(name)) for name in FAMILIES]
+    sizes = [_best_size(images[k], looks) for k in spread(len(images), SIZED_ON)]
     if not any(sizes):
         raise FrameError(f"none of {len(images)} frames shows pins in rings, a hexagon or a grid; {NO_LAYOUT}")
     sigma = float(np.median([size for size in sizes if size]))
@@ -191,12 +198,12 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
 def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
     """How well a given layout explains gray frames (H, W) uint8; None where no frame shows it. Missing pins are taken as given."""
     by = family_of_positions(pins) if pins.layout == "positions" or pins.missing else family(pins.layout)
-    sizes = [size for k in spread(len(images), SIZED_ON) if (size := _best_size(images[k], [by]))]
+    look = partial(_layout_look, pins, by)
+    sizes = [size for k in spread(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
     if not sizes:
         return None
     spots = [find_bumps(image, float(np.median(sizes))) for image in images]
-    labelled = [(one, label_spots(one, by)) for one in spots]
-    seen = [shown for one, spot in labelled if spot is not None and (shown := _as_layout(pins, by, one, spot)) is not None]
+    seen = [shown for one in spots if (shown := look(one)) is not None]
     return _candidate(pins, seen, spots, may_miss=False) if seen else None
 
 
@@ -205,30 +212,31 @@ def spread(count: int, wanted: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int)).tolist()
 
 
-def _best_size(image: np.ndarray, families: list[Family]) -> float | None:
-    """The size of spots of which most are labelled and fewest are left over among them; None where nothing is labelled."""
+def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:
+    """The size of spots by which most pins are seen, and fewest are missed or left over; None where nothing is seen."""
     best, most = None, 0
     for size in (share * max(image.shape) for share in SIZES):
         spots = find_bumps(image, size)
-        for by in families:
-            spot = label_spots(spots, by)
-            if spot is None:
-                continue
-            taken = spot[spot >= 0]
-            score = len(taken) - _inside(spots.px[taken], np.delete(spots.px, taken, axis=0))
-            if score > most:
-                best, most = size, score
+        for look in looks:
+            seen = look(spots)
+            if seen is not None:
+                score = int(np.isfinite(seen.pins_px[:, 0]).sum()) - seen.not_seen - len(seen.left_over_px)
+                if score > most:
+                    best, most = size, score
     return best
 
 
-def _inside(px: np.ndarray, others_px: np.ndarray) -> int:
-    """How many of others (k, 2) lie in the hull of points (n, 2)."""
-    if not len(others_px):
-        return 0
-    try:
-        return int((Delaunay(px).find_simplex(others_px) >= 0).sum())
-    except QhullError:
-        return 0
+def _family_look(by: Family, spots: Bumps) -> Seen | None:
+    """The part of a family's lattice that a frame shows by itself; None if it shows none."""
+    spot = label_spots(spots, by)
+    part = None if spot is None else _part(by, spots, spot)
+    return None if part is None else part[1]
+
+
+def _layout_look(pins: PinsSpec, by: Family, spots: Bumps) -> Seen | None:
+    """A given layout in a frame by itself; None where it is not seen."""
+    spot = label_spots(spots, by)
+    return None if spot is None else _as_layout(pins, by, spots, spot)
 
 
 def _seen(spots: Bumps, spot: np.ndarray, by: Family, nodes: np.ndarray) -> Seen:

@@ -18,7 +18,7 @@ from training.assemble import Ensemble
 from training.dataset import Dataset
 from training.models import model_named
 from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
-from training.packed import KNOWN_REST, SHIPPED, WEIGHTS, shipped_names, unpack
+from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.pins import PinTable
 from training.recipes import TrainingError
 from twin.errors import FrameError
@@ -84,7 +84,8 @@ class PoseEstimator:
         reference = make_reference(content["reference_px"].numpy(), self.sensor.pins)
         self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
         self.ensemble = Ensemble(self.part, reference, content, config["size"])
-        self._known_rest_px = content.get("known_rest_px")
+        known = config.get("known_rest_px")  # of each pin without contact, measured on the unit that the weights are for
+        self._known_rest_px = None if known is None else np.array(known, float)
         learnt = {group: {key: value.numpy() for key, value in arrays.items()} for group, arrays in content["aside"].items()}
         self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
 
@@ -110,8 +111,6 @@ class PoseEstimator:
         try:
             config = json.loads((run / "config.json").read_text())
             content = unpack(config, run / WEIGHTS) if packed else torch.load(run / "weights.pt", weights_only=True)
-            if (run / KNOWN_REST).is_file():
-                content["known_rest_px"] = np.loadtxt(run / KNOWN_REST, delimiter=",", ndmin=2)
             if "correction" in content:
                 raise ValueError("it is corrected by a regression")
             return cls(config, content)
@@ -247,7 +246,7 @@ def folder_of(run: str | Path) -> Path:
 def digest_of(run: str | Path) -> str:
     """Digest of everything that a model's answers depend on: its weights, its configuration, and the code that runs it."""
     folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
-    for name in ("config.json", WEIGHTS, "weights.pt", KNOWN_REST):
+    for name in ("config.json", WEIGHTS, "weights.pt"):
         if (folder / name).is_file():
             digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())
     return digest.hexdigest()

@@ -20,7 +20,6 @@ from training.recipes import TrainingError
 from twin.pins import make_reference
 from twin.store import write_bytes, write_text
 
-KNOWN_REST = "rest_px.csv"  # x,y (px) of each pin without contact, measured on the unit that the weights are for
 WEIGHTS = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "weights"
 LARGE = 1000  # numbers; a larger array is kept in half precision

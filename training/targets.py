@@ -106,7 +106,7 @@ def choose_targets(
         near = [n for name in missing for n in difflib.get_close_matches(name, recording.labels, n=2)]
         nearest = f"nearest: {', '.join(dict.fromkeys(near))}; " if near else ""
         raise FrameError(
-            f"{recording.path}: column {', '.join(missing)} is missing; {nearest}{recording.labels_found()}; "
+            f"{recording.path}: column {', '.join(missing)} is missing; {recording.labels_found()}; {nearest}"
             f"choose columns of these, or one of {', '.join(PRESETS)}"
         )
     raw = np.column_stack([_numbers(recording.labels[name], name, problems) for name in names])[rows]

@@ -78,6 +78,7 @@ def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():
         away = rest - rest.mean(axis=0)
         fade = np.clip(1 - (np.linalg.norm(away, axis=1, keepdims=True) / 180) ** 2, 0, None)
         contacts.append(rest + depth * fade * (0.25 * away + rng.normal(0, 3, 2)))
+    contacts = [px + rng.normal(0, 1.5, px.shape) for px in contacts]  # none looks like a frame without contact
     nothing = np.zeros((0, 2))
     seen = tuple(Seen(px, px, 0, nothing) for px in contacts)
     layout = Candidate(PINS, 1.0, 1.0, 0, 0, 0.0, np.median(contacts, axis=0), np.ones(61), seen)
@@ -85,7 +86,7 @@ def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():
     error = np.sqrt(np.mean(np.sum((found.pins_px - rest) ** 2, axis=1)))
     median = np.sqrt(np.mean(np.sum((layout.rest_px - rest) ** 2, axis=1)))
     assert found.source == "made" and "--no-contact" in found.line()
-    assert error < 0.5 * median
+    assert error < 0.6 * median
 
 
 def test_frames_of_another_size_are_tuned_and_then_observed():

@@ -25,6 +25,8 @@ MODEL_PX = 0.4
 UNSURE = 1 / 3
 # Only one of two parameters is determined if their correlation is larger than this.
 CORRELATED = 0.99
+# A parameter is not held if the rms distance without it is this many times as large, or this many times MODEL_PX.
+WORSE = 2.0
 # Residual, px, beyond which a pin counts less (soft L1).
 ROBUST_PX = 1.0
 # Step for slopes, as a share of the plausible range.
@@ -139,22 +141,23 @@ def fit_camera(
         )
     names, held = [name for name in PARAMETERS if name in free], {}
     order = seen if named else nearest_order(spec, pins_px)
-    for _ in range(len(free) + 1):
-        found, order, residual, slopes = _fit(spec, pins_px, order, names, rematch=not named)
+    found, order, residual, slopes = _fit(spec, pins_px, order, names, rematch=not named)
+    needed: set[str] = set()
+    while True:
         sd, correlation = _certainty(residual, slopes)
         rings = spec.pins.rings or np.sqrt(len(pins_px) / 3)  # as many as rings of so many pins
         alike = np.sqrt(len(pins_px) / rings)  # the pins of a ring share one error
         doubtful = _undetermined(_values(spec, names), sd * alike * max(MODEL_PX / _rms(residual), 1), correlation)
-        if not doubtful:
+        name = next((name for name in names if name in doubtful and name not in needed), None)
+        if name is None:
             break
-        name = next(name for name in names if name in doubtful)
+        others = [other for other in names if other != name]
+        without = _fit(spec, pins_px, order, others, rematch=not named) if others else None
+        if without is None or _rms(without[2]) > WORSE * max(_rms(residual), MODEL_PX):
+            needed.add(name)  # its value is uncertain, but the specification's is far off
+            continue
         held[name] = doubtful[name]
-        names.remove(name)
-        if not names:
-            raise FrameError(
-                f"these {len(pins_px)} pins determine nothing of the camera: the specification misses them by {_rms(residual):.0f} px; "
-                "check the layout, or give a no-contact frame"
-            )
+        names, (found, order, residual, slopes) = others, without
     fitted = _with(spec, dict(zip(names, found.tolist(), strict=True)))
     spec = revised(spec, camera=fitted.camera.model_dump(), pins=fitted.pins.model_dump())
     return spec, CameraReport(_rms(residual), len(pins_px), dict(zip(names, sd.tolist(), strict=True)), held)

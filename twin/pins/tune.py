@@ -13,7 +13,7 @@ from twin.frames.forms import gray_levels
 from twin.geometry.pins import pin_lattice
 from twin.pins.detector import Found, make_detector
 from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
-from twin.pins.identify import SHOWN, SURE_EXPLAINED, Candidate, identify, judge_layout, spread, symmetries
+from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, identify, judge_layout, spread, symmetries
 from twin.pins.legacy import legacy_parameters
 from twin.pins.reference import Reference, make_reference
 from twin.progress import Step
@@ -161,7 +161,9 @@ def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
     except FrameError:
         return []
     same = (other.pins.layout, other.pins.complete_count) == (layout.pins.layout, layout.pins.complete_count)
-    if not same and other.explained > layout.explained + MORE_EXPLAINED:
+    more = other.explained > layout.explained + MORE_EXPLAINED
+    smoother = other.explained > layout.explained - MORE_EXPLAINED and other.misfit < SAME_SHAPE * layout.misfit
+    if not same and (more or smoother):
         return [
             f"these frames show {other.pins.in_words()} rather than {layout.pins.in_words()}: {layout.left_over:g} pin-like spots of a "
             f"frame are none of these pins, and {layout.not_seen:g} of the pins are not seen; give the right --sensor, or make one with "

@@ -6,10 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from drawn_frames import drawn_frame
 from test_identify import frames_of, rest_of
 
 from scenes import load_sensor
 from scenes.pins import PinsSpec
+from training.estimator import PoseEstimator
+from training.studies.evaluation import predict_frames
 from twin.errors import FrameError, TwinError
 from twin.fit.new_sensor import new_sensor
 from twin.fit.rest import rest_of as rest_found
@@ -172,3 +175,18 @@ def test_strange_frames_give_a_right_answer_or_an_error_in_words(tmp_path, chang
     else:
         right = (found.sensor.pins.layout, found.sensor.pins.rings) == ("rings", 4)
         assert right or not found.identified.sure
+
+
+@pytest.mark.parametrize("name", ["mg400-127", "mg400-331"])
+def test_without_a_no_contact_frame_shipped_weights_count_from_their_units_pins(tmp_path, name):
+    """The frames show contacts of a unit whose pins stand a little beside the specification's, as the weights know."""
+    model = PoseEstimator.load(name)
+    known = np.array(model.recorded_sensor.pipeline.recording.rest_px)
+    image = drawn_frame(model.sensor, Form.RECORDING, known).image
+    cv2.imwrite(str(tmp_path / "f_0.png"), image)
+    predictions = predict_frames(name, tmp_path)
+    assert np.allclose(predictions.estimator.pipeline.reference.pins_px, known)
+    assert any("no no-contact frame was used" in problem for problem in predictions.recording.problems)
+    cv2.imwrite(str(tmp_path / "init_0.png"), image)
+    again = predict_frames(name, tmp_path)
+    assert not any("no-contact" in problem for problem in again.recording.problems)

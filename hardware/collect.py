@@ -110,7 +110,7 @@ class Collection:
         for lines in (table, log):
             if lines.is_file():
                 self._drop_torn_line(lines)
-        if not table.is_file() or not table.read_text():
+        if not table.is_file() or not table.read_text(encoding="utf-8"):
             write_text(table, ",".join(COLUMNS) + "\n")
 
     @property
@@ -150,10 +150,10 @@ class Collection:
         """Write a contact in this order: its picture, its line of the log, its row of the table. So the picture of every row exists."""
         name = f"frame_{index}_0.png"
         write_image(self.pictures / name, frame.image)
-        with (self.folder / LOG).open("a") as file:
+        with (self.folder / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps({"image_name": name, **log}) + "\n")
         row = [name, f"frame_{index}", 1, index + 1, *(f"{value:.9g}" for value in (*label, *move))]
-        with (self.folder / TABLE).open("a", newline="") as file:
+        with (self.folder / TABLE).open("a", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerow(row)
             file.flush()
             os.fsync(file.fileno())

@@ -36,7 +36,7 @@ def cameras(sysfs: Path = SYSFS_CAMERAS) -> list[Device]:
     found = []
     for entry in sorted(sysfs.glob("video*")):
         name = entry / "name"
-        found.append(Device(f"/dev/{entry.name}", name.read_text().strip() if name.is_file() else "camera"))
+        found.append(Device(f"/dev/{entry.name}", name.read_text(encoding="utf-8").strip() if name.is_file() else "camera"))
     return found
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from hardware.errors import DeviceError
 from hardware.loop import ServoLoop
-from hardware.rig import FIRST, Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
+from hardware.rig import Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
 from hardware.session import SessionWriter, plain
 from hardware.step import Estimate, LoopSettings, SensorModel, StepRecord
 from hardware.timing import Timing
@@ -20,7 +20,7 @@ from scenes import ObjectSpec, ServoSpec, load_experiment
 from twin.errors import TwinError
 from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import save_figure
-from twin.types import Frame
+from twin.types import FIRST, Frame
 
 # Following ends after this time in s without a usable frame.
 GIVE_UP_S = 5.0
@@ -235,5 +235,5 @@ def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, 
         "notes": followed.notes,
     }
     measures = out / "measures.json"
-    measures.write_text(json.dumps(plain(content), indent=1) + "\n")
+    measures.write_text(json.dumps(plain(content), indent=1) + "\n", encoding="utf-8")
     return [write_csv(out / "trajectory.csv", followed.path), save_figure(out / "trajectory.png", figure), measures]

@@ -17,16 +17,16 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.recorded import SequentialSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
-from hardware.rig import FIRST, NONE, counting_from_first, given_frame
+from hardware.rig import counting_from_first, given_frame
 from hardware.session import SessionSource, SessionWriter
 from hardware.step import Estimate, Estimator, SensorModel
 from hardware.timing import Spread, Timing
 from hardware.view.draw import WindowView, draw_view, has_window
 from hardware.view.rerun import RerunView
 from hardware.view.server import BrowserView
-from twin.errors import FrameError
+from twin.errors import FrameError, OptionError
 from twin.pins import Pipeline
-from twin.types import Frame
+from twin.types import FIRST, NONE, Frame
 
 # Newest times of each kind that the figures are computed from.
 KEPT_TIMES = 10_000
@@ -257,9 +257,9 @@ class WatchPlan:
 
     def __post_init__(self) -> None:
         if bool(self.camera) == (self.replay is not None):
-            raise DeviceError("give either --camera or --replay")
+            raise OptionError("give either --camera or --replay")
         if self.replay is not None and self.at_rest != NONE:
-            raise DeviceError(
+            raise OptionError(
                 "--at-rest goes with --camera: a replay counts pins from the frame that was kept with its session; leave --at-rest out"
             )
 

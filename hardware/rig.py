@@ -35,10 +35,8 @@ from twin.optics.render import Renderer
 from twin.pins import require_untouched
 from twin.rig.mounting import Mounting
 from twin.store import cached_arrays
-from twin.types import Form, Frame
+from twin.types import FIRST, NONE, Form, Frame
 
-# What a user may write after --at-rest besides a file.
-FIRST, NONE = "first", "none"
 # What a user writes after --camera for the twin.
 TWIN = "twin"
 # Samples per pixel of the path-traced frame that sets the shading of the twin's frames.

@@ -1,4 +1,4 @@
-"""What an arm may do: a pure decision with a code before every move. Limits are data."""
+"""Safety limits of an arm, and the decision, made before every move, whether it is allowed. A decision has a code and no side effects."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -28,7 +28,7 @@ Range = Annotated[tuple[float, float], AfterValidator(_rising)]
 
 
 class SafetyLimits(Section):
-    """What a loop may do with an arm. None means no limit."""
+    """Limits of an arm's moves in a loop. None means no limit."""
 
     box_mm: tuple[Range, Range, Range]  # range of the tool's x, y and z in the base frame
     annulus_mm: tuple[NonNegative, Positive] | None = None  # distance from the base's axis
@@ -51,7 +51,7 @@ def load_limits(name_or_path: str | Path) -> SafetyLimits:
     Raises
     ------
     DeviceError
-        There is no such file, or it is wrong.
+        The file does not exist, or its content is not valid.
     """
     path = Path(name_or_path)
     if path.suffix != ".toml":
@@ -87,7 +87,7 @@ class Code(StrEnum):
 
 
 class Action(StrEnum):
-    """What follows from a decision."""
+    """Action that follows from a decision."""
 
     MOVE = "move"
     REFUSE = "refuse"  # do not send it; a move in progress may go on
@@ -97,7 +97,7 @@ class Action(StrEnum):
 
 @dataclass(frozen=True)
 class Decision:
-    """What was decided about a move. ``pose`` (6,) is what may be sent, None if nothing."""
+    """The decision about a move. ``pose`` (6,) is the pose that may be sent; None if none may be sent."""
 
     action: Action
     code: Code
@@ -106,7 +106,7 @@ class Decision:
 
     @property
     def allowed(self) -> np.ndarray:
-        """The pose (6,) that may be sent; ``ValueError`` where the decision allows none."""
+        """The pose (6,) that may be sent; raises ``ValueError`` if the decision allows none."""
         if self.pose is None:
             raise ValueError(f"nothing may be sent: {self.reason}")
         return self.pose
@@ -114,7 +114,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class Sensed:
-    """What the loop knows of the contact: how deep (mm, NaN if not known) and when the frame was exposed (``time.monotonic()``)."""
+    """The sensor's estimate of the contact: depth (mm, NaN if unknown), and time of the frame's exposure (``time.monotonic()``)."""
 
     depth_mm: float
     frame_time_s: float
@@ -129,7 +129,7 @@ def decide(
     kinematics: Kinematics | None = None,
     sensed: Sensed | None = None,
 ) -> Decision:
-    """Whether the tool may move straight to a pose.
+    """Decide whether the tool may move straight to a pose.
 
     Parameters
     ----------
@@ -140,9 +140,9 @@ def decide(
     now_s : float
         ``time.monotonic()``.
     kinematics : Kinematics or None
-        Without, joints, linkage and reach are not checked.
+        None: joints, linkage and reach are not checked.
     sensed : Sensed or None
-        Without, neither the frame's age nor the depth is checked.
+        None: neither the frame's age nor the depth is checked.
     """
     if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
         return halted
@@ -165,7 +165,7 @@ def decide(
 def decide_joints(
     joints_deg: np.ndarray, state: ArmState, limits: SafetyLimits, *, now_s: float, kinematics: Kinematics, sensed: Sensed | None = None
 ) -> Decision:
-    """Whether the joints may move there, checked at every degree of the way. A move that is too long is refused, not shortened."""
+    """Decide whether the joints may move to angles. Every degree of the way is checked. Too long a move is refused, not shortened."""
     if halted := _halt(state, limits, now_s=now_s, sensed=sensed):
         return halted
     end = np.asarray(joints_deg, float)
@@ -185,9 +185,9 @@ def decide_joints(
 
 
 def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwrapped: bool = False) -> tuple[np.ndarray, bool]:
-    """The target, or a point as far on the way to it as a step may be; and whether it was shortened.
+    """Shorten a move to the longest allowed step. Returns the target, or a point on the way to it, and whether the move was shortened.
 
-    A turn takes the shorter way, unless it is ``unwrapped`` (R of an arm of four axes): then it is executed as given.
+    A turn goes the shorter way. If it is ``unwrapped`` (R of an arm of four axes), it is executed as given.
     """
     way = target - start
     if not unwrapped:
@@ -229,7 +229,7 @@ def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decisio
 
 
 def distance_to_axis(a: np.ndarray, b: np.ndarray) -> float:
-    """Smallest distance of the line from a to b (in the plane) from the origin."""
+    """Smallest distance from the origin to the line segment from a to b in the plane."""
     along = b - a
     length = float(along @ along)
     share = 0.0 if length == 0 else float(np.clip(-(a @ along) / length, 0.0, 1.0))

@@ -117,7 +117,7 @@ def folder_name(label: str) -> str:
 
 def _write_rows(path: Path, rows: list[dict[str, Any]]) -> Path:
     names = list(rows[0]) if rows else ["model", "object", "failure"]
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(names)
         writer.writerows(row.values() for row in rows)

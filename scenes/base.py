@@ -1,4 +1,4 @@
-"""What every section of a specification shares: frozen, strict, no unknown key, no NaN; and the error that a specification raises."""
+"""The base of every section of a specification (frozen, strict, no unknown key, no NaN), and the error that specifications raise."""
 
 import unicodedata
 from typing import Annotated
@@ -13,7 +13,8 @@ class SpecError(ValueError):
     """
 
 
-LONGEST_NAME = 100  # characters; file systems take 255 bytes, and a name in UTF-8 has up to 4 in each character
+# Most characters of a name. File systems allow 255 bytes, a character has up to 4 bytes in UTF-8, and names get prefixes and suffixes.
+LONGEST_NAME = 100
 
 
 def _plain_name(name: str) -> str:
@@ -31,7 +32,8 @@ def _no_truth(value: object) -> object:
 
 
 Name = Annotated[str, AfterValidator(_plain_name)]
-NotTruth = BeforeValidator(_no_truth)  # for a choice of numbers: to Python, and so to ``Literal``, true is 1
+# For a choice of numbers: refuses true and false, which Python (and therefore ``Literal``) takes for 1 and 0.
+NotTruth = BeforeValidator(_no_truth)
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -41,14 +43,14 @@ Rgb = tuple[Fraction, Fraction, Fraction]
 
 
 class Section(BaseModel):
-    """A frozen section of a specification file; unknown keys are errors, and so are truths and texts in the place of numbers."""
+    """A frozen section of a specification file. Unknown keys are errors, and so are booleans and texts in the place of numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
     @model_validator(mode="before")
     @classmethod
     def _lists_as_tuples(cls, data: object) -> object:
-        """Files have lists, where a frozen section has tuples."""
+        """Turn the lists of a file into tuples, because a section is frozen."""
         return _as_tuples(data)
 
 

@@ -1,4 +1,4 @@
-"""What specifications there are: shipped ones, and a user's own."""
+"""Lists of all specifications: shipped ones, and a user's own."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -33,8 +33,9 @@ class Entry:
     name : str
     path : Path
     description : str
-        With the detail that tells those of its kind apart; why it can't be read where ``broken``.
+        The specification's description and a detail of its kind. If it is ``broken``: the reason.
     broken : bool
+        Whether the file can't be read.
     """
 
     name: str
@@ -44,11 +45,11 @@ class Entry:
 
     @property
     def own(self) -> bool:
-        """Whether it is a user's own."""
+        """Whether it is a user's own specification."""
         return not self.path.is_relative_to(SHIPPED)
 
     def line(self) -> str:
-        """For people."""
+        """The entry as a line of text."""
         if self.broken:
             return f"{self.name:16} BROKEN: {self.description}"
         return f"{self.name:16} {self.description}{f'  [{self.path}]' if self.own else ''}"
@@ -56,13 +57,13 @@ class Entry:
 
 @dataclass(frozen=True)
 class Catalog:
-    """All specifications of one kind; ``kind`` is also the name of the folders that they lie in."""
+    """All specifications of one kind; ``kind`` is also the name of their folders."""
 
     kind: str
     entries: list[Entry]
 
     def lines(self) -> list[str]:
-        """For people: each one, where they lie, and where one's own go."""
+        """The catalog as lines of text: each entry, the folder of the shipped files, and the folder for own files."""
         return [
             *(entry.line() for entry in self.entries),
             "",
@@ -77,17 +78,17 @@ def sensors() -> Catalog:
 
 
 def objects() -> Catalog:
-    """All objects; any STL, OBJ or PLY file is one, too."""
+    """All objects. Any STL, OBJ or PLY file can also be used as an object."""
     return _catalog("objects", list_objects(), load_object, lambda spec: spec.shape.kind)
 
 
 def experiments() -> Catalog:
-    """All experiments: which contacts are made, in the robot's coordinates."""
+    """All experiments (contacts in the robot's coordinates)."""
     return _catalog("experiments", list_experiments(), load_experiment, lambda spec: ", ".join(spec.targets))
 
 
 def randomisations() -> Catalog:
-    """All randomisations: what can differ from one simulated frame to the next."""
+    """All randomisations (what is drawn at random for each simulated contact)."""
     return _catalog("randomisations", list_randomisations(), load_randomisation, lambda spec: f"{len(spec.sensor)} numbers of the sensor")
 
 

@@ -1,4 +1,4 @@
-"""The specification of an experiment: which contacts are made, and how, in the robot's coordinates.
+"""The specification of an experiment: which contacts the robot makes, and how, in the robot's coordinates.
 
 Labels are those of the recordings: ``pose_1..6`` and ``move_1..6`` are x, y, z (mm) and Rx, Ry, Rz (deg) of the tool in
 the work frame. For each contact a pose and a move are drawn evenly from their ranges. The arm goes to
@@ -19,7 +19,7 @@ Six = tuple[float, float, float, float, float, float]
 
 
 class PoseRanges(Section):
-    """Lowest and highest value of each coordinate of the pose; equal: held there."""
+    """Lowest and highest value of each coordinate of the pose. If both are equal, the coordinate is fixed."""
 
     pose_1: Range = (0.0, 0.0)
     pose_2: Range = (0.0, 0.0)
@@ -30,7 +30,7 @@ class PoseRanges(Section):
 
 
 class MoveRanges(Section):
-    """Lowest and highest value of each coordinate of the move that follows the tap; equal: held there."""
+    """Lowest and highest value of each coordinate of the move that follows the tap. If both are equal, the coordinate is fixed."""
 
     move_1: Range = (0.0, 0.0)
     move_2: Range = (0.0, 0.0)
@@ -46,19 +46,19 @@ class ExperimentSpec(Section):
     Attributes
     ----------
     object : str
-        What is touched by default: a name of ``twin objects`` or a file.
+        The object that is touched by default: a name of ``twin objects`` or a file.
     approach : {"x", "y", "z"}
-        Axis of the work frame along which the sensor looks at the object (an arm of four axes holds it level: "y").
+        Axis of the work frame along which the sensor approaches the object. An arm of four axes holds the sensor level: "y".
     zero_mm : float
         Indentation of an unturned sensor at ``pose + clear + tap`` if the approach's coordinate of the pose is 0.
     clear, tap : six numbers
         ``clear`` is added to the pose before the tap, ``tap`` is the tap itself; mm and deg.
     targets : tuple of str
-        The labels a model is to learn.
+        The labels that a model learns.
     seed : int
         Seed of the random draws.
     wider : str
-        Name of an experiment whose ranges go a little beyond this one's. Models for this experiment are trained on it in the twin.
+        Name of an experiment with slightly larger ranges. In the twin, models for this experiment are trained on that one.
     """
 
     name: Name
@@ -86,7 +86,7 @@ class ExperimentSpec(Section):
 
     @property
     def highest_mm(self) -> float:
-        """The approach's largest coordinate before the move, which is where the tap goes deepest."""
+        """Largest coordinate along the approach before the move, mm. The tap is deepest there."""
         return self.ranges()[f"pose_{self.axis + 1}"][1] - self.ranges()[f"move_{self.axis + 1}"][0]
 
     @model_validator(mode="after")

@@ -1,6 +1,7 @@
-"""Reading specification files: where they lie, and errors that help."""
+"""Reading specification files: finding them, and errors that name the key and the remedy."""
 
 import difflib
+import hashlib
 import os
 from pathlib import Path
 from typing import TypeVar
@@ -18,12 +19,13 @@ from scenes.tables import fill_in_tables
 
 SHIPPED = Path(__file__).parent
 MESH_SUFFIXES = (".stl", ".obj", ".ply")
-MOST_PROBLEMS = 5  # that a message names; the others are counted
+# Most problems that a message names; of further ones it states the number.
+MOST_PROBLEMS = 5
 Spec = TypeVar("Spec", bound=BaseModel)
 
 
 def user_spec_dir() -> Path:
-    """Where a user's own ``sensors/*.toml``, ``objects/``, ``experiments/``, ``randomisations/`` and ``servos/`` lie.
+    """Folder of a user's own specifications: ``sensors/*.toml``, ``objects/``, ``experiments/``, ``randomisations/``, ``servos/``.
 
     ``TACTIP_SPECS`` if set, else ``$XDG_CONFIG_HOME/tactip-twin`` (``~/.config``).
     """
@@ -33,22 +35,22 @@ def user_spec_dir() -> Path:
 
 
 def list_sensors() -> dict[str, Path]:
-    """Sensor names and their files; a user's own file of the same name wins."""
+    """Sensor names and their files. A user's own file takes precedence over a shipped one of the same name."""
     return _list("sensors")
 
 
 def list_objects() -> dict[str, Path]:
-    """Object names and their files; a user's own file of the same name wins."""
+    """Object names and their files. A user's own file takes precedence over a shipped one of the same name."""
     return _list("objects")
 
 
 def list_experiments() -> dict[str, Path]:
-    """Experiment names and their files; a user's own file of the same name wins."""
+    """Experiment names and their files. A user's own file takes precedence over a shipped one of the same name."""
     return _list("experiments")
 
 
 def list_randomisations() -> dict[str, Path]:
-    """Names of randomisations and their files; a user's own file of the same name wins."""
+    """Names of randomisations and their files. A user's own file takes precedence over a shipped one of the same name."""
     return _list("randomisations")
 
 
@@ -58,7 +60,7 @@ def load_sensor(name_or_path: str | Path) -> SensorSpec:
     Raises
     ------
     SpecError
-        If there is no such sensor, or its file is wrong: names file, key and remedy.
+        There is no such sensor, or its file is not valid. The message names the file, the key and the remedy.
     """
     return read_section(_find(name_or_path, "sensors"), SensorSpec)
 
@@ -69,13 +71,13 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
     Raises
     ------
     SpecError
-        If there is no such object, or its file is wrong: names file, key and remedy.
+        There is no such object, or its file is not valid. The message names the file, the key and the remedy.
     """
     path = Path(name_or_path)
     if path.suffix.lower() in MESH_SUFFIXES:
         if not os.path.isfile(path):  # unlike ``Path.is_file`` also False for what is no path at all
             raise SpecError(f"{shown(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
-        mesh = MeshShape(kind="mesh", file=str(path.resolve()))
+        mesh = MeshShape(kind="mesh", file=str(path.resolve()), sha256=_digest(path))
         return _checked({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
     spec_path = _find(name_or_path, "objects")
     spec = read_section(spec_path, ObjectSpec)
@@ -85,8 +87,22 @@ def load_object(name_or_path: str | Path) -> ObjectSpec:
             raise SpecError(
                 f"{spec_path}: shape.file: no such mesh file '{shown(spec.shape.file)}'; the path is relative to the specification"
             )
-        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update={"file": str(file.resolve())})})
+        digest = _digest(file)
+        if spec.shape.sha256 not in ("", digest):
+            raise SpecError(
+                f"{spec_path}: shape.sha256: {file} has another content ({digest}); put the right file there, or leave the key out"
+            )
+        found = {"file": str(file.resolve()), "sha256": digest}
+        spec = spec.model_copy(update={"shape": spec.shape.model_copy(update=found)})
     return spec
+
+
+def _digest(mesh: Path) -> str:
+    try:
+        with mesh.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise SpecError(f"{mesh}: can't be read ({error.strerror}); give a mesh file that may be read") from error
 
 
 def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
@@ -95,7 +111,7 @@ def load_experiment(name_or_path: str | Path) -> ExperimentSpec:
     Raises
     ------
     SpecError
-        If there is no such experiment, or its file is wrong: names file, key and remedy.
+        There is no such experiment, or its file is not valid. The message names the file, the key and the remedy.
     """
     return read_section(_find(name_or_path, "experiments"), ExperimentSpec)
 
@@ -106,7 +122,7 @@ def load_randomisation(name_or_path: str | Path) -> RandomisationSpec:
     Raises
     ------
     SpecError
-        If there is no such randomisation, or its file is wrong: names file, key and remedy.
+        There is no such randomisation, or its file is not valid. The message names the file, the key and the remedy.
     """
     return read_section(_find(name_or_path, "randomisations"), RandomisationSpec)
 

@@ -1,7 +1,7 @@
 """The specification of an object that the sensor is pressed against.
 
-Object frame: origin on the surface where the sensor touches first, z into the object. At
-rest the axes are parallel to the sensor's, so the sensor comes from -z.
+Object frame: the origin is the point of the surface that the sensor touches first, z points into the object. Before any turn the axes
+are parallel to the sensor's, so the sensor comes from -z.
 """
 
 from typing import Annotated, Literal, Self
@@ -32,7 +32,7 @@ class CylinderShape(Section):
 
 
 class EdgeShape(Section):
-    """Quarter space x >= 0, z >= 0. Its edge along y through the origin is rounded, which sets it back from there."""
+    """Quarter space x >= 0, z >= 0. Its edge along y would pass through the origin, but it is rounded and so lies a little behind it."""
 
     kind: Literal["edge"]
     fillet_mm: NonNegative = 0.0
@@ -56,12 +56,16 @@ class MeshShape(Section):
 
     The mesh is turned by ``rotation_deg`` (intrinsic x, y, z), then moved so that the line through its bounding box's
     centre along z first meets it at the origin (where the mesh has a hole there: its lowest vertex has z = 0).
+
+    ``sha256`` is the digest of the file's content. It is found when the object is loaded; a specification that gives it takes no other
+    content.
     """
 
     kind: Literal["mesh"]
     file: str
     unit: Literal["mm", "cm", "m", "inch"] = "mm"
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sha256: str = ""
 
 
 Shape = Annotated[
@@ -81,11 +85,11 @@ class TextureSpec(Section):
 class ObjectSpec(Section):
     """An object, complete. ``name`` is the file's stem.
 
-    ``friction`` is the static coefficient; ``kinetic_friction`` (default: the same) is what it falls to once a
-    point has slid by some ``slip_weakening_mm``. ``shear_strength_mpa`` bounds the friction stress (default: no bound).
-    All four count for contacts that no arm makes and for sensors without a rig; where a sensor has a rig, that rig's
-    friction counts instead (see ``RigSpec``). ``compliance_mm_per_n`` is how far the object gives way along the sensor's axis; it adds
-    to the rig's.
+    ``friction`` is the static coefficient of friction. When a point has slid by about ``slip_weakening_mm``, the coefficient has fallen
+    to ``kinetic_friction`` (default: the static one). ``shear_strength_mpa`` is the largest friction stress (default: no bound).
+    These four apply to contacts that no arm makes and to sensors without a rig. If a sensor has a rig, the rig's friction applies
+    instead (see ``RigSpec``). ``compliance_mm_per_n`` is the object's displacement along the sensor's axis for each N; it is added to
+    the rig's.
     """
 
     name: Name

@@ -1,4 +1,4 @@
-"""The specification of what differs from one simulated frame to the next."""
+"""The specification of what is drawn at random for each simulated contact."""
 
 from typing import Annotated, Self
 
@@ -11,10 +11,11 @@ Ends = tuple[float, float]
 
 
 class Spread(Section):
-    """How a number is drawn around a specification's own, by exactly one of these.
+    """How a number of a specification is drawn; exactly one of three ways.
 
-    ``scale``: times a factor, even in its logarithm between the two ends; ``add``: plus a number drawn evenly between
-    them; ``value``: instead of it a number drawn evenly between them (rounded where the specification wants an integer).
+    ``scale``: the specification's number is multiplied by a factor whose logarithm is uniform between those of the two ends. ``add``: a
+    number that is uniform between the ends is added. ``value``: a number that is uniform between the ends replaces it (rounded if the
+    specification needs an integer).
     """
 
     scale: tuple[Positive, Positive] | None = None
@@ -37,7 +38,7 @@ class Spread(Section):
 
 
 class FrictionSpread(Section):
-    """Friction of a contact: none in ``free_share`` of the contacts, ``stick`` in ``stick_share``, otherwise even in its logarithm."""
+    """Friction of a contact: 0 in ``free_share`` of the contacts, ``stick`` in ``stick_share``, else uniform in its logarithm."""
 
     low: Positive
     high: Positive
@@ -62,11 +63,11 @@ class RandomisationSpec(Section):
     executed_share : float
         Share of the contacts in which the move is executed before the frame is taken.
     pin_noise_px : float
-        Sd of the noise that is added to the stored pins (not to pictures: those have the camera's own noise).
-    friction : FrictionSpread, optional
-        Without it every contact has the friction of the rig or of the object.
-    sensor : dict of str to Spread
-        By the dotted key in the sensor's specification: material, geometry, camera, light, rig.
+        Standard deviation of the noise that is added to the stored pins. Pictures have the camera's noise instead.
+        friction : FrictionSpread, optional
+            Without it every contact has the friction of the rig or of the object.
+        sensor : dict of str to Spread
+            The numbers of the sensor's specification that are drawn, by dotted key: material, geometry, camera, light, rig.
     """
 
     name: Name

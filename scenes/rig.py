@@ -1,4 +1,4 @@
-"""How a robot holds a sensor, and where its object is: what turns a label in robot coordinates into a contact."""
+"""How a robot holds a sensor, and where its object is. This decides which contact a label in robot coordinates means."""
 
 from typing import Annotated, Literal
 
@@ -17,41 +17,42 @@ class RigSpec(Section):
     contact_offset_mm : float
         Indentation of an unturned sensor beyond what the label says.
     tcp_to_dome_mm : float
-        From the tool point, about which the arm turns, along the approach to the dome's centre. It is negative where the tool point lies
-        in front of the centre. Minus the dome's radius is a tool point at the tip.
+        Distance along the approach from the tool point, about which the arm turns, to the dome's centre. It is negative if the tool point
+        lies in front of the centre; for a tool point at the tip it is minus the dome's radius.
     tcp_lateral_mm : float
-        From the tool point to the dome's centre along the direction across.
-    tcp_aside_mm : float
-        From the tool point to the dome's centre along approach x across (the cross product). It matters only where the sensor is turned
-        out of the plane of approach and across.
+        Distance from the tool point to the dome's centre along the direction across.
+        tcp_aside_mm : float
+            Distance from the tool point to the dome's centre along approach x across (the cross product). It matters only if the sensor is
+            turned out of the plane of approach and across.
     turn_offset_deg : three numbers
         Added to ``pose_4..6``.
     turn_sign : 1 or -1
-        -1 where the robot's angles turn left-handed about its axes.
+        -1 if the robot's angles turn left-handed about its axes.
     plate_tilt_deg : float
-        Rise of the object's surface towards the sensor's far side, along the direction across. It says where the twin has its
-        contacts, and so what the labels of simulated contacts are.
+        Rise of the object's surface towards the sensor's far side, along the direction across. The twin's contacts, and therefore the
+        labels of simulated contacts, are computed with it.
     label_depth_per_move : float or None
-        Depth in mm that a recording's contact gains for each mm of a move across that its label has but the arm had not made, as
-        ``twin audit`` finds it in the recording. Corrected labels of recordings go by it. None: the tangent of ``plate_tilt_deg``.
+        Change of a contact's depth in mm for each mm of a move across that the label has but the arm had not made yet, as
+        ``twin audit`` finds it in the recording. Labels of recordings are corrected with it. None: the tangent of ``plate_tilt_deg``.
 
-        Both numbers tell of the same plate, and on a straight, stiff arm they would agree. They are separate because they are
-        fitted to different things. ``plate_tilt_deg`` is one of many numbers by which the twin's mechanics meet the pins of tapped
-        and moved contacts, and takes on a part of what the mechanics miss. This one is read from the labels and pins of frames
-        without a move, with no mechanics, so it has all that makes the depth change along the arm's way. Every model of a
-        recording was trained and judged by labels that it corrected: change it only together with the figures.
+        Both numbers describe the same plate, and with a straight, stiff arm they would agree. They are separate because they are
+        fitted to different data. ``plate_tilt_deg`` is one of many parameters by which the twin's mechanics are fitted to the pins of
+        tapped and moved contacts, and compensates part of the error of the mechanics. ``label_depth_per_move`` is fitted to the labels
+        and pins of frames whose move was not made, without mechanics, so it includes everything that changes the depth along the
+        arm's way. All models of a recording were trained and judged with labels that it corrected: if it changes, the models' figures
+        must be measured again.
     image_turn_deg : float
         Azimuth of the direction across in the sensor frame, from image x towards image y.
     friction : float
-        One coefficient, static and kinetic, for all contacts that this rig's arm makes, whatever the object: it was fitted to
-        frames of this sensor's skin. An object's own friction counts for sensors without a rig and for contacts that no arm makes
-        (``twin render``, ``SkinSolver.press``). A friction that a user gives counts before either.
+        Coefficient of static and kinetic friction of all contacts that this rig's arm makes, with any object: it was fitted to frames of
+        this sensor's skin. An object's own friction applies to sensors without a rig and to contacts that no arm makes (``twin render``,
+        ``SkinSolver.press``). A friction that a user gives takes precedence over both.
     compliance_mm_per_n : float
-        How far the arm and its mount give way along the sensor's axis. Labels tell where the arm was sent, not where it ended. An
-        object's own compliance adds to it.
+        Displacement of the arm and its mount along the sensor's axis for each N. It is needed because labels are the poses that the arm
+        was sent to, not those that it reached. An object's own compliance is added to it.
     turn_compliance_deg_per_n : float
-        How far the arm turns about its tool point for each N with which the sensor pushes the object across, in the sensor's own
-        frame. It is positive as the label in the plane of approach and across counts.
+        Turn of the arm about its tool point for each N with which the sensor pushes the object across, in the sensor's own frame. Its
+        sign is that of the label in the plane of approach and across.
     """
 
     contact_offset_mm: float = 0.0

@@ -1,4 +1,4 @@
-"""The specification of following a surface in a plane, and of where the object stands."""
+"""The specification of following a surface in a plane, and of the object's place."""
 
 from typing import Annotated
 
@@ -10,7 +10,7 @@ Three = tuple[float, float, float]
 
 
 class PlacementSpec(Section):
-    """Where an object stands in the arm's base frame: its origin, and its turn about the base's z.
+    """An object's place in the arm's base frame: its origin, and its turn about the base's z.
 
     Without a turn the object's outward side looks to -y of the base, its section lies level and its y axis points down.
     """
@@ -31,7 +31,7 @@ class ServoSpec(Section):
     feed_mm : float
         Way along the surface in each step.
     kp_*, ki_* : float
-        Share of the error (p), and of its sum over the steps (i), by which a step corrects.
+        Gains: shares of the error (p) and of its sum over the steps (i) that a step corrects.
     integral_mm, integral_deg : float
         Bounds of the sums.
     largest_move_mm, largest_turn_deg : float
@@ -39,16 +39,16 @@ class ServoSpec(Section):
     clear_mm : float
         Distance from which the surface is approached, and to which the arm retreats.
     linear_mm_s, angular_deg_s : float
-        Of every move, to follow and to collect. Much slower than the sensor group's practice with an MG400, whose speed factor is 20 %
-        to follow and 50 % to collect.
+        Speeds of every move in following and collecting. They are much slower than the sensor group's practice with an MG400, which is a
+        speed factor of 20 % in following and 50 % in collecting.
     plausible_mm, plausible_deg : (lowest, highest)
         Depths and angles that a sensor in contact can have. An estimate outside of them is not used, and the arm holds still.
     blind_mm : float
-        Without a newer frame the tool goes no farther than this from the place where the newest one was exposed.
-    max_frame_age_s : float
-        An older frame is not used: the arm stops and holds.
-    placement : PlacementSpec
-        Where the object stands.
+        Largest distance of the tool from the place at which the newest frame was exposed.
+        max_frame_age_s : float
+            Largest age of a frame that is used. If there is none so new, the arm stops and holds.
+        placement : PlacementSpec
+            The object's place.
     """
 
     name: Name

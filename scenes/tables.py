@@ -1,12 +1,12 @@
-"""Measured arrays of a specification, kept as CSV files beside its TOML file.
+"""Measured arrays of a specification, stored as CSV files beside its TOML file.
 
-In the TOML file a reference stands where the array would::
+The TOML file has a reference in the place of the array::
 
     light = { csv = "ur5-331.housing.rim.light.csv", shape = [120, 32, 3] }
 
-The CSV file has one line for each index of the first dimension; the further dimensions follow one another in the line, the last one
-fastest. Lines that begin with ``#`` are comments. Whole numbers stay whole numbers. A specification that was loaded holds the numbers,
-not the reference: its dump and its digest cover them.
+The CSV file has one line for each index of the first dimension. Within a line the numbers are in C order (the last dimension varies
+fastest). Lines that begin with ``#`` are comments. Whole numbers stay whole numbers. A loaded specification holds the numbers, not the
+reference, so they are part of its dump and of its digest.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,13 +17,13 @@ from typing import TypeAlias
 from scenes.files import INT64, LARGEST_BYTES, read_regular, shown
 
 Nested: TypeAlias = "int | float | list[Nested] | tuple[Nested, ...]"
-"""A number, or evenly nested lists of numbers."""
+"""A number, or nested lists of numbers, with the same length at each level."""
 
 MOST_INLINE = 120
-"""A list of more numbers than this leaves the TOML file when a specification is written: about ten lines of an editor."""
+"""Most numbers of a list that is written to the TOML file itself, about ten lines. A longer list is written to a CSV file."""
 
 DIGITS = 6
-"""Significant digits of a number that is written: no length or light of a sensor is known better."""
+"""Significant digits of a written number: no length or light of a sensor is known more precisely."""
 
 _REFERENCE = {"csv", "shape"}
 
@@ -36,14 +36,14 @@ def fill_in_tables(section: Mapping[str, object], folder: Path, key: str = "") -
     section : mapping
         Keys and values; sections within it are filled in, too.
     folder : Path
-        Where the TOML file lies. A table lies in the same folder.
+        Folder of the TOML file and its tables.
     key : str
         Dotted name of the section, for errors.
 
     Raises
     ------
     ValueError
-        A table is missing, lies elsewhere, holds something else than numbers, or has another shape than its reference says.
+        A table is missing, is in another folder, holds something other than numbers, or has another shape than its reference states.
     """
     filled: dict[str, object] = {}
     for name, value in section.items():
@@ -56,7 +56,7 @@ def fill_in_tables(section: Mapping[str, object], folder: Path, key: str = "") -
 
 
 def take_out_tables(section: Mapping[str, object], stem: str, key: str = "") -> tuple[dict[str, object], dict[str, str]]:
-    """A section with a reference in the place of every long list of numbers, and the tables' texts by file name.
+    """Replace every long list of numbers by a reference. Returns the section, and the texts of the tables by file name.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def _number(word: str) -> int | float:
 
 
 def _folded(values: Sequence[int | float], shape: Sequence[int]) -> Nested:
-    """Numbers (last index fastest) as nested lists of a shape; the only number itself for no dimension."""
+    """Numbers in C order as nested lists of a shape; for an empty shape the only number itself."""
     if not shape:
         return values[0]
     each = prod(shape[1:])
@@ -146,7 +146,7 @@ def _flat(value: Nested) -> list[int | float]:
 
 
 def _shape(value: object) -> tuple[int, ...] | None:
-    """Shape of evenly nested lists of numbers, () of a number, None of anything else."""
+    """Shape of nested lists of numbers; () for a number, None for anything else."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return ()
     if not isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""The text of a sensor's specification: a TOML file that a person can read and edit, its long arrays as tables beside it."""
+"""The text of a sensor's specification: a TOML file that a person can read and edit, and tables of its long arrays."""
 
 from collections.abc import Mapping
 
@@ -48,7 +48,7 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[
 
 
 def _item(value: object) -> object:
-    """A value as tomlkit writes it: sections as tables, references to tables and lists of sections inline, lists in even lines."""
+    """A value in the form that tomlkit writes: sections as tables, references and lists of sections inline, lists in lines."""
     if isinstance(value, dict) and set(value) == {"csv", "shape"}:
         reference = tomlkit.inline_table()
         reference.update(value)
@@ -82,5 +82,5 @@ def _item(value: object) -> object:
 
 
 def _numbers(value: object) -> int:
-    """How many numbers a value holds."""
+    """Number of numbers in a value."""
     return sum(map(_numbers, value)) if isinstance(value, list | tuple) else 1

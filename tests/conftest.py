@@ -20,7 +20,7 @@ def pytest_sessionstart(session):
         from twin.geometry.solid import Resolution
         from twin.mechanics import ContactPose, SkinSolver
 
-        SkinSolver(load_sensor("mg400-127"), resolution=Resolution(8), keep=False).press(load_object("plane"), ContactPose(1.0))
+        SkinSolver(load_sensor("mg400-127"), resolution=Resolution(8)).press(load_object("plane"), ContactPose(1.0))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,12 +1,12 @@
-"""From trained networks to a predictor: the Gaussian process beside them, how they are averaged, and honest intervals.
+"""From trained networks to a predictor: the ensemble's average, the Gaussian process averaged with it, and calibrated intervals.
 
 Intervals are conformal (Vovk et al. 2005; Barber et al. 2021 for ensembles). Every training row that a network held out is predicted
 without itself. The 90 % quantile of the errors, each divided by its expected scale, then widens or narrows the stated intervals. Such a
 prediction is made by one network and not by the whole ensemble, so the intervals are too wide rather than too narrow.
 
-The raw labels of the same rows have intervals of their own, because a raw label errs by the whole move where the move was not executed.
-Frames that look executed and frames that do not have separate quantiles (Mondrian conformal prediction, Vovk et al. 2005, 4.5): one
-narrow and one wide interval, instead of one that is wrong for both.
+The intervals for raw labels are calibrated separately, because a raw label is wrong by the whole move if the move was not executed.
+Frames whose move looks executed, and frames whose move does not, have separate quantiles (Mondrian conformal prediction, Vovk et al.
+2005, section 4.5). This gives one narrow and one wide interval instead of a common one that fits neither group.
 """
 
 from collections.abc import Mapping
@@ -20,24 +20,27 @@ from training.models.part import Inputs, Model, Modes, Prediction, Prepared
 from training.networks import predict_rows
 from twin.pins.reference import Reference
 
-COVERAGE = 0.9  # part of the labels that lie inside their intervals
-SMALL_GROUP = 30  # rows; a smaller group takes the quantile of all rows, because its own says little
-BLENDS = np.linspace(0, 1, 21)  # weights of the Gaussian process in the average, of which the best is taken
-# Weight of the process ``beside`` in its average with the networks. The labelled frames taught both, so they can't tell a better one.
+# Share of the labels that should lie inside their intervals.
+COVERAGE = 0.9
+# Rows of a group below which the quantile of all rows is used, because so few rows give no reliable quantile of their own.
+SMALL_GROUP = 30
+# Weights of the Gaussian process in its average with the networks that are tried; the one with the smallest error is used.
+BLENDS = np.linspace(0, 1, 21)
+# Weight of the process ``beside`` in its average with the networks. It is not fitted, because both were trained on the labelled frames.
 PROCESS_SHARE = 0.5
 
 
 class Ensemble:
-    """Networks, the Gaussian processes beside them, and what turns their outputs into labels and intervals.
+    """Networks and Gaussian processes, and the parameters that turn their outputs into labels and intervals.
 
     Parameters
     ----------
     model : Model
     reference : Reference
         The pins at rest in training.
-    content : dict
-        As ``calibrate`` gives it and ``weights.pt`` holds it. With ``beside``, the arrays of a process of two fidelities,
-        which is averaged with the labels of frames as they are.
+        content : dict
+            As ``calibrate`` returns it and ``weights.pt`` holds it. If it has the key ``beside``, the arrays of a process of two
+            fidelities, this process is averaged with the labels in view 0.
     size : dict
         Sizes of the networks that differ from the model's own.
     """
@@ -50,7 +53,7 @@ class Ensemble:
             network = model.build(reference, len(self.shift), size)
             network.load_state_dict(weights)
             self.networks.append(network.eval())
-        self.kernels = [Processes.of_arrays(SMOOTH_AND_LINEAR, arrays) for arrays in content["kernels"]]  # one of each view
+        self.kernels = [Processes.of_arrays(SMOOTH_AND_LINEAR, arrays) for arrays in content["kernels"]]  # one for each view
         self.kernel_labels = list(content["kernel_labels"])
         self.blend, self.quantile = np.asarray(content["blend"]), np.asarray(content["quantile"])
         self.raw_quantile = np.asarray(content["raw_quantile"])
@@ -71,7 +74,7 @@ class Ensemble:
         return self.model.modes(self.networks[0], inputs, rows)
 
     def _kernels_say(self, modes: Modes) -> np.ndarray:
-        """(B, k) standardised labels; the views of a row are weighted by how much of the row is seen in each."""
+        """(B, k) standardised labels: the mean over the views of a row, weighted by the row's share in each view."""
         share = modes.share[:, None]
         said = np.zeros((len(modes.inputs), len(self.kernel_labels)))
         for kernel, part in zip(self.kernels, (1 - share, share), strict=False):
@@ -84,7 +87,7 @@ class Ensemble:
         mean, scale, executed = self.outputs(inputs, rows)
         if self.beside is not None:
             modes = self.modes(inputs, rows)
-            share = PROCESS_SHARE * (1 - modes.share[:, None])  # nothing to the process, which knows no displaced camera
+            share = PROCESS_SHARE * (1 - modes.share[:, None])  # 0 in view 1, because the process has not seen a displaced camera
             mean = (1 - share) * mean + share * self.beside(Points.of(modes.inputs, second=True))
         scale = self.scale * scale
         raw = self.raw_quantile[undone(executed)]
@@ -116,14 +119,14 @@ def calibrate(
     size: Mapping[str, int],
     seed: int,
 ) -> dict:
-    """Fit the Gaussian processes if the recipe has them, the average's weights, and the intervals.
+    """Fit the Gaussian processes if the recipe has them, the weights of the average, and the intervals.
 
     Parameters
     ----------
     train : (m,) int
         Training rows.
     networks : list of dict
-        Each with ``weights`` and ``held``, the rows that it did not learn from.
+        Each with ``weights``, and ``held``: the rows that it was not trained on.
     scaling : (K,) float, (K,) float
         Shift and scale of the labels.
     labels, helpers, kernel, size, seed
@@ -137,7 +140,7 @@ def calibrate(
     shift, scale = scaling
     y = ((data.targets.corrected if labels == "corrected" else data.targets.raw) - shift) / scale
     k = y.shape[1]
-    main = np.array([j for j, name in enumerate(data.targets.names) if name not in helpers], int)  # the processes' labels
+    main = np.array([j for j, name in enumerate(data.targets.names) if name not in helpers], int)  # labels that the processes estimate
     content: dict = {"networks": [network["weights"] for network in networks], "kernels": [], "shift": shift, "scale": scale}
     content |= {"blend": np.zeros(k), "quantile": np.ones(k), "raw_quantile": np.ones((2, k)), "kernel_labels": main.tolist()}
     raw = (data.targets.raw - shift) / scale
@@ -165,7 +168,7 @@ def calibrate(
 
 
 def intervals(made: np.ndarray, truth: np.ndarray, published: np.ndarray, scale: np.ndarray, executed: np.ndarray) -> dict[str, np.ndarray]:
-    """Quantiles of both kinds of labels (n, K), given predictions and their expected scales (n, K) and the probability of a move (n,)."""
+    """Quantiles for corrected and for raw labels (n, K), from predictions and error scales (n, K) and the probability of a move (n,)."""
     return {
         "quantile": conformal_quantile(np.abs(made - truth) / scale),
         "raw_quantile": group_quantiles(np.abs(made - published) / scale, undone(executed)),
@@ -173,18 +176,18 @@ def intervals(made: np.ndarray, truth: np.ndarray, published: np.ndarray, scale:
 
 
 def undone(executed: np.ndarray) -> np.ndarray:
-    """1 where a move was more likely not executed than executed, else 0; 0 where the model doesn't tell (NaN)."""
+    """1 for moves that were more likely not executed than executed, else 0; also 0 if the model gives no probability (NaN)."""
     return (np.nan_to_num(executed, nan=1.0) < 0.5).astype(int)
 
 
 def group_quantiles(scores: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Conformal quantiles (2, K) of scores (n, K), for each group (n,) of 0 and 1 its own; of all where a group is small."""
+    """Conformal quantiles (2, K) of scores (n, K), for each group (n,) of 0 and 1; a small group has the quantile of all rows."""
     parts = [scores[group == k] for k in (0, 1)]
     return np.stack([conformal_quantile(part if len(part) >= SMALL_GROUP else scores) for part in parts])
 
 
 def conformal_quantile(scores: np.ndarray, coverage: float = COVERAGE) -> np.ndarray:
-    """The (n + 1) ``coverage``-th smallest of scores (n, K), for each column; the largest where n is too small for it."""
+    """For each column the (n + 1) ``coverage``-th smallest of scores (n, K); the largest if n is too small for that."""
     n = len(scores)
     place = min(int(np.ceil((n + 1) * coverage)), n) - 1
     return np.sort(scores, axis=0)[place]

@@ -10,14 +10,16 @@ from training.pins import PIN_COLUMNS, PinTable, pin_table, voronoi_areas
 from training.simulated import is_pins_only, is_simulated, open_simulated, touched_labels
 from training.targets import Targets, choose_targets, joined_targets
 from twin.errors import FrameError
-from twin.frames import Recording, open_recording
+from twin.frames import Recording, natural_key, open_recording
 from twin.pins import nominal_reference
 from twin.progress import Step
 from twin.rig.labels import label_slope, plate_slope
 from twin.types import Form
 
-HELD_OUT = 5  # one row in so many is held out for validation
-GROUP_COLUMN = "path_id"  # column of a simulated data set's table that numbers the contacts
+# One row in this many is held out for validation.
+HELD_OUT = 5
+# Column of a simulated data set's table that holds the number of the contact.
+GROUP_COLUMN = "path_id"
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,12 @@ class Dataset:
     targets : Targets
         M rows of labels, raw and corrected.
     folders : tuple of Path
-        Folders that it was read from.
+        Folders that the data set was read from.
     group : (M,) array or None
-        Rows of one value belong together (the states of one simulated contact): they are never split.
+        Rows with the same value form a group (the states of one simulated contact). A group is never divided between training and
+        validation.
     problems : list of str
-        What is odd about the recording, and what was left out because of it; one line each.
+        One line for each irregularity of the recording, and what was left out because of it.
     """
 
     pins: PinTable
@@ -49,7 +52,7 @@ class Dataset:
 
     @property
     def folder(self) -> Path:
-        """The one folder that it was read from, for callers that read its pictures.
+        """The only folder that the data set was read from, for callers that read its pictures.
 
         Raises
         ------
@@ -61,12 +64,29 @@ class Dataset:
         return self.folders[0]
 
     def rows(self, index: np.ndarray) -> "Dataset":
-        """The same data set with only some rows."""
+        """The data set of the rows with these indices."""
         group = None if self.group is None else self.group[index]
         return replace(self, pins=self.pins.rows(index), targets=self.targets.rows(index), group=group)
 
+    def natural_order(self) -> np.ndarray:
+        """(M,) int: its rows in the natural order of their frames' names; of copies first the first ones, then the second ones."""
+        copies: dict[str, int] = {}
+        keys = []
+        for name in self.pins.image_name.tolist():
+            copies[name] = copies.get(name, -1) + 1
+            keys.append((copies[name], natural_key(name), name))
+        return np.array(sorted(range(len(keys)), key=keys.__getitem__), int)
+
+    def in_order(self) -> "Dataset":
+        """The same data set in the natural order of its frames' names, whatever order the table has; its groups numbered as they come."""
+        ordered = self.rows(self.natural_order())
+        if ordered.group is None:
+            return ordered
+        _, first, of_row = np.unique(ordered.group, return_index=True, return_inverse=True)
+        return replace(ordered, group=np.argsort(np.argsort(first))[of_row.ravel()])
+
     def beside(self, pins: "list[PinTable]") -> "Dataset":
-        """This data set once with its own pins and once more with each of ``pins``; all copies of a row belong together."""
+        """This data set, followed by copies with each of ``pins`` instead of its own. All copies of a row form a group."""
         copies = np.tile(np.arange(len(self)), 1 + len(pins))
         every = self.rows(copies)
         tables = {key: np.concatenate([getattr(table, key) for table in (self.pins, *pins)]) for key in PIN_COLUMNS}
@@ -88,7 +108,7 @@ def load_dataset(
     folder : path
         Anything ``open_recording`` takes that has a table of labels, or a simulated data set without pictures.
     columns : str or tuple of str
-        A name of ``training.targets.PRESETS``, or the table's columns themselves.
+        Key of ``training.targets.PRESETS``, or names of columns of the table.
     progress : callable, optional
         Called with (done, total) while the pipeline runs.
 
@@ -99,7 +119,7 @@ def load_dataset(
 
     Notes
     -----
-    The corrected labels of a simulated data set are depth and angle of the surface that was touched: see ``touched_labels``.
+    The corrected labels of a simulated data set are depth and angle of the touched surface: see ``touched_labels``.
     """
     problems: list[str] = []
     simulated = is_simulated(Path(folder))
@@ -130,10 +150,10 @@ def load_dataset(
 
 
 def joined(parts: list[Dataset]) -> Dataset:
-    """Several data sets of one sensor as one; rows that form a group in one of them form the same group in the whole.
+    """Join several data sets of one sensor. Rows that form a group in one of them form a group in the result.
 
-    They are put in the order of their folders' names, so that the order in which they are given does not matter. Displacements are
-    counted from the no-contact layout of the first one.
+    The data sets are joined in the order of their folders' names, whatever the order in which they are given. Displacements are counted
+    from the first one's layout without contact.
 
     Raises
     ------
@@ -156,11 +176,14 @@ def joined(parts: list[Dataset]) -> Dataset:
                 raise FrameError(f"{part.folder}: its {what} ({mine}) differs from that of {first.folder} ({others}); train on one kind")
     tables = [part.pins.seen_from(first.pins.reference) for part in parts]
     columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in PIN_COLUMNS}
-    columns["image_name"] = np.concatenate([np.char.add(f"{part.folder.name}/", part.pins.image_name) for part in parts])
+    called = _told_apart([part.folder.resolve() for part in parts])
+    columns["image_name"] = np.concatenate(
+        [np.char.add(f"{name}/", part.pins.image_name) for name, part in zip(called, parts, strict=True)]
+    )
     pins = replace(first.pins.with_columns(columns), measured=all(table.measured for table in tables))
     targets = joined_targets([part.targets for part in parts])
     groups: list[np.ndarray] = []
-    taken = 0  # numbers of groups that the parts before have used
+    taken = 0  # number of groups in the parts before
     for part in parts:
         own = np.arange(len(part)) if part.group is None else np.unique(part.group, return_inverse=True)[1]
         groups.append(taken + own)
@@ -169,10 +192,18 @@ def joined(parts: list[Dataset]) -> Dataset:
     return Dataset(pins, targets, tuple(part.folder for part in parts), np.concatenate(groups), problems)
 
 
-def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Training and validation rows: a random fifth is held out. The rows of recordings are sorted by label, so no block of rows would do.
+def _told_apart(folders: list[Path]) -> list[str]:
+    """The ends of paths, as short as all can be while no two are the same: mostly the folders' names."""
+    longest = max(len(folder.parts) for folder in folders)
+    ends = (["/".join(folder.parts[-count:]) for folder in folders] for count in range(1, longest + 1))
+    return next(names for names in ends if len(set(names)) == len(names))
 
-    With ``group`` (count,) a fifth of the groups is held out, with all their rows.
+
+def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Training and validation rows: a random fifth of the rows is held out.
+
+    Rows are chosen by their number, so number them in the order of their names (``Dataset.in_order``). With ``group`` (count,) a fifth of
+    the groups is held out, with all their rows.
     """
     if group is not None:
         names, of_row = np.unique(group, return_inverse=True)
@@ -191,10 +222,10 @@ def simulated_table(
     *,
     progress: Step | None = None,
 ) -> PinTable:
-    """The table that a perfect pipeline would make of simulated frames, from their known pins; hidden caps count as lost.
+    """The pin table that a perfect pipeline would make of simulated frames. The pins are known; hidden caps count as lost.
 
-    Each contact may have a sensor of its own (longer pins, a thinner skin). Its displacements are counted from this sensor's pins at rest,
-    as those of a real sensor are counted from its own no-contact frame.
+    Each contact may have another sensor (longer pins, a thinner skin). Its displacements are counted from that sensor's pins at rest, as
+    those of a real sensor are counted from its own frame without contact.
     """
     reference = nominal_reference(spec, recording.form)
     nodes = reference.pins_px + (truth["pins_px"].astype(float) - truth["rest_px"])

@@ -1,13 +1,11 @@
 """A trained model with its sensor and its pipeline: a frame goes in, a pose comes out. This is what a live loop calls."""
 
 import hashlib
-import json
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from pickle import UnpicklingError
 from time import perf_counter
 
 import numpy as np
@@ -21,6 +19,7 @@ from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.pins import PinTable
 from training.recipes import TrainingError
+from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec
 from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
@@ -30,23 +29,23 @@ from twin.types import Form, Frame
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """What a model makes of one frame.
+    """A model's estimate of one frame.
 
     Attributes
     ----------
     names, units : tuple of str
-        Of the K labels.
+        Name and unit of each of the K labels.
     value : (K,) float
-        mm and deg; NaN where ``valid`` is false.
-    low, high : (K,) float
-        The 90 % interval.
-    executed : float
-        Probability that the shear move was executed (NaN where the model doesn't tell).
+        Estimates in mm and deg; NaN if ``valid`` is false.
+        low, high : (K,) float
+            Ends of the 90 % intervals.
+        executed : float
+            Probability that the shear move was executed; NaN if the model does not estimate it.
     valid : bool
     reason : str
-        Why it is not valid ("" if it is).
-    ms : float
-        Frame to pose.
+        Why the estimate is not valid; empty if it is.
+        ms : float
+            Time from the frame to the estimate.
     """
 
     names: tuple[str, ...]
@@ -66,12 +65,12 @@ class PoseEstimator:
     Parameters
     ----------
     config, content : dict
-        What a run's ``config.json`` and ``weights.pt`` hold.
+        Content of a run's ``config.json`` and ``weights.pt``.
 
     Raises
     ------
     TrainingError
-        The run is of a model that does not exist here.
+        This version of the program does not have the run's model.
     """
 
     def __init__(self, config: dict, content: dict) -> None:
@@ -96,7 +95,7 @@ class PoseEstimator:
         Parameters
         ----------
         run : path
-            A folder, or the name of a sensor whose weights go with the package.
+            A folder, or the name of a sensor whose weights are shipped with the package.
 
         Raises
         ------
@@ -105,25 +104,26 @@ class PoseEstimator:
         """
         run = folder_of(run)
         packed = (run / WEIGHTS).is_file()
-        if not packed and not (run / "weights.pt").is_file():
-            hint = "it was begun and not finished; continue it with 'twin train'" if (run / "checkpoint.pt").is_file() else _instead_of(run)
+        if not packed and not (run / TENSORS).is_file():
+            hint = "it was begun and not finished; continue it with 'twin train'" if (run / CHECKPOINT).is_file() else _instead_of(run)
             raise TrainingError(f"{run}: holds no trained model: {hint}")
+        config = read_config(run)
         try:
-            config = json.loads((run / "config.json").read_text())
-            content = unpack(config, run / WEIGHTS) if packed else torch.load(run / "weights.pt", weights_only=True)
+            content = unpack(config, run / WEIGHTS) if packed else read_tensors(run / TENSORS)
+            require_together(run, config, content)
             if "correction" in content:
-                raise ValueError("it is corrected by a regression")
+                raise TrainingError(f"{run}: corrected by a regression, which this version does not know; train again")
             return cls(config, content)
-        except (OSError, ValueError, KeyError, RuntimeError, UnpicklingError) as error:
-            raise TrainingError(f"{run}: not a run of this version, or a damaged one ({error}); train again") from error
+        except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, IndexError) as error:
+            raise damaged(run / (WEIGHTS if packed else TENSORS), f"its weights do not fit {CONFIG}") from error
 
     @property
     def counts_from_rest(self) -> bool:
-        """Whether a no-contact frame of the sensor in hand serves the model."""
+        """Whether the model can use a frame without contact of the sensor in use."""
         return self.part.counts_from_rest
 
     def at_rest(self, frame: Frame) -> "PoseEstimator":
-        """The same model for the sensor in hand: displacements are counted from the pins in its frame without contact.
+        """The model for the sensor that took ``frame``: displacements are counted from the pins in this frame without contact.
 
         Raises
         ------
@@ -169,7 +169,7 @@ class PoseEstimator:
             )
 
     def __call__(self, frame: Frame) -> PoseEstimate:
-        """Estimate the pose in one frame. Where too few pins are found, the result is not valid and says why.
+        """Estimate the pose in one frame. If too few pins are found, the result is not valid and states the reason.
 
         Raises
         ------
@@ -185,7 +185,7 @@ class PoseEstimator:
         return PoseEstimate(self.names, self.units, value, value - half, value + half, float(made.executed[0]), True, "", _ms(started))
 
     def predict_rows(self, data: Dataset, rows: np.ndarray) -> Prediction:
-        """Labels of some rows (B,) of a data set, whose frames are of one camera.
+        """Estimate the labels of some rows (B,) of a data set whose frames are all of one camera.
 
         Raises
         ------
@@ -196,10 +196,10 @@ class PoseEstimator:
         return self.part.estimate_rows(self._trained, data, rows)
 
     def predict_table(self, pins: PinTable) -> Prediction:
-        """Labels of many valid frames of one camera at once.
+        """Estimate the labels of many valid frames of one camera at once.
 
-        The camera may sit elsewhere than in training. The table's own no-contact frame tells where; without one the median of the
-        frames does.
+        The camera may sit elsewhere than in training. Its displacement is measured in the table's own frame without contact; if there
+        is none, it is the median over the frames.
 
         Raises
         ------
@@ -212,7 +212,7 @@ class PoseEstimator:
         return self._of_pins.estimate_pins(self._trained, pins)
 
     def inputs_of(self, pins: PinTable, *, together: bool) -> tuple[Inputs, torch.Tensor]:
-        """What the networks see of a table's frames, and the rows of all of them.
+        """The networks' inputs for a table's frames, and the indices of all rows.
 
         Raises
         ------
@@ -239,21 +239,21 @@ def _instead_of(run: Path) -> str:
 
 
 def folder_of(run: str | Path) -> Path:
-    """The folder of a run. Where there is no such folder, the name of a sensor stands for the weights that go with the package."""
+    """The folder of a run: the given one, or that of the shipped weights if there is no such folder and ``run`` is a sensor's name."""
     return SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
 
 
 def digest_of(run: str | Path) -> str:
-    """Digest of everything that a model's answers depend on: its weights, its configuration, and the code that runs it."""
+    """Digest of everything that a model's estimates depend on: its weights, its configuration, and the code that runs it."""
     folder, digest = folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
-    for name in ("config.json", WEIGHTS, "weights.pt"):
+    for name in (CONFIG, WEIGHTS, TENSORS):
         if (folder / name).is_file():
             digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())
     return digest.hexdigest()
 
 
 def load_by_name(runs: Sequence[Path]) -> dict[str, PoseEstimator]:
-    """Several trained models by the names of their folders, or by their whole paths where two folders have the same name.
+    """Load several trained models. The keys are the names of their folders, or their whole paths if two folders have the same name.
 
     Raises
     ------

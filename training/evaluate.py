@@ -1,7 +1,7 @@
-"""How good a trained model is on a recording: errors, intervals and leaks as numbers, a table and pictures.
+"""Evaluation of a trained model on a recording: errors, intervals and leaks as numbers, a table and pictures.
 
-The second part changes the images before the pipeline sees them, as nothing in the contact would: the camera sits elsewhere, or pins
-are gone. Each frame is changed in a random direction. The errors then tell what the model loses.
+The second part measures robustness: images are changed before the pipeline reads them, in ways that no contact causes. The camera is
+displaced in a random direction, or pins are removed. The result is the increase of the errors.
 """
 
 import csv
@@ -17,6 +17,7 @@ import torch
 
 from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
+from training.identity import rows_named
 from training.models.part import Prediction
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
@@ -28,41 +29,53 @@ from twin.rig.labels import EXECUTED_FILES
 from twin.store import made_by, text_file, write_json
 from twin.types import Form, Frame
 
-# Edges of the bins in which errors are given apart: depth pose_2, size of the angle pose_6, and size of the shear move_1.
+# Edges of the bins for which errors are reported separately: depth pose_2, absolute angle pose_6, and absolute shear move_1.
 DEPTH_EDGES_MM = (-4.0, -3.0, -2.0, -1.0, 0.0)
 ANGLE_EDGES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 SHEAR_EDGES_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-LARGE_MOVE = 1.0  # mm or deg; a frame shows too little of a smaller move to tell whether it was executed
-TIMED_FRAMES = 100  # frames, evenly spread, whose time to a pose is measured
-LEAK_LABEL = "pose_6"  # the label of the leak check: the angle, deg
-LEAK_MOVE = "move_6"  # the move that belongs to this label, deg
-LEAK_FRAMES = 3  # frames; a line through fewer says nothing
-SCALE_CHANGE = 0.01  # by which a changed image is larger or smaller
-SHIFT_CHANGE_PX = 2.0  # by which a changed image is shifted
-TURN_CHANGE_DEG = 1.0  # by which a changed image is turned
-ERASED_PINS = 5  # pins that are wiped out of a changed image
-ERASED_MARGIN = 1.25  # side of the square that is wiped out around a pin, in mean rest spacings: more than the pin
+# Least move in mm or deg for which it is judged whether it was executed: the frame shows too little of a smaller move.
+LARGE_MOVE = 1.0
+# Number of frames, spread evenly over the recording, whose time to a pose is measured.
+TIMED_FRAMES = 100
+# Label of the leak check: the angle in deg.
+LEAK_LABEL = "pose_6"
+# Move that belongs to this label, in deg.
+LEAK_MOVE = "move_6"
+# Least number of frames of the leak check: fewer give no reliable line.
+LEAK_FRAMES = 3
+# Share by which a changed image is larger or smaller.
+SCALE_CHANGE = 0.01
+# Shift of a changed image, px.
+SHIFT_CHANGE_PX = 2.0
+# Turn of a changed image, deg.
+TURN_CHANGE_DEG = 1.0
+# Number of pins that are erased from a changed image.
+ERASED_PINS = 5
+# Side of the square that is erased around a pin, in mean rest spacings. It is larger than the pin.
+ERASED_MARGIN = 1.25
 
 
 def rows_to_judge(estimator: PoseEstimator, data: Dataset, rows: str) -> np.ndarray:
-    """Rows of a data set: with ``validation`` those that the run kept out of its training, with ``all`` every row.
+    """Rows of a data set: with ``validation`` those that the run kept out of its training, by their names; with ``all`` every row.
 
     Raises
     ------
     TrainingError
-        The run kept no rows out, or it was trained on another recording.
+        The run kept no rows out, or the data set is not the one that it was trained on.
     """
     if rows == "all":
         return np.arange(len(data))
-    split, trained_on = estimator.config["split"], estimator.config["rows"]["usable"]
+    split, known = estimator.config["split"], estimator.config["rows"]
     if split is None:
         raise TrainingError("the run was trained on all rows; give a recording it has not seen, and --rows all")
-    if trained_on != len(data):
+    if "kept_out" in known:
+        return rows_named(data, known["kept_out"])
+    if known.get("usable") != len(data):
         raise TrainingError(
-            f"the run was trained on part of {trained_on} rows, this recording has {len(data)}; "
+            f"the run was trained on part of {known.get('usable')} rows, this recording has {len(data)}; "
             "give --rows all for a recording it has not seen"
         )
-    return split_rows(len(data), split, data.group)[1]
+    return data.natural_order()[split_rows(len(data), split, data.in_order().group)[1]]
 
 
 def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
@@ -93,15 +106,15 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
 
 @dataclass(frozen=True)
 class Leak:
-    """Whether a model reads the time at which a frame was taken instead of the contact; the rows of a recording are sorted by time.
+    """Does a model estimate from the time at which a frame was taken instead of from the contact? Recordings are sorted by time.
 
     Attributes
     ----------
     slope : float or None
         Slope of (predicted - corrected angle) on ``move_6``, over the frames whose move was not executed. A model that reads the
-        contact has 0. None where the check can't be made.
-    reason : str
-        Why it can't be made; empty where it is.
+        contact has 0. None if the check can't be made.
+        reason : str
+            Why the check can't be made; empty if it was made.
     """
 
     slope: float | None
@@ -150,7 +163,7 @@ def _bins(error: np.ndarray, targets: Targets) -> dict[str, list[dict]]:
 def time_frames(estimator: PoseEstimator, data: Dataset) -> float | None:
     """Median ms from frame to pose, one frame at a time on one thread.
 
-    None where the data set has no pictures, or comes from several recordings.
+    None if the data set has no pictures, or comes from several recordings.
     """
     if len(data.folders) > 1 or is_pins_only(data.folder):
         return None
@@ -171,7 +184,7 @@ def time_frames(estimator: PoseEstimator, data: Dataset) -> float | None:
 
 
 def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarray, metrics: dict, labels: str) -> list[Path]:
-    """``predictions.csv``, ``metrics.json`` and ``errors.png``; truth in the table is the chosen label set."""
+    """Write ``predictions.csv``, ``metrics.json`` and ``errors.png``. The truth in the table are ``labels``: corrected or raw."""
     targets = data.targets.rows(rows)
     truth = getattr(targets, labels)
     half_width = made.half_width_raw if labels == "raw" else made.half_width
@@ -192,7 +205,7 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
 
 
 def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, labels: str) -> Path:
-    """Prediction over truth, and its error, for every label: the paper's test figure."""
+    """Draw prediction and error against truth for every label, as in the paper's test figure."""
     count = len(targets.names)
     figure, axes = new_figure(count, 2, panel_inch=3.6)
     undone = np.nan_to_num(targets.executed, nan=1.0) < 0.5
@@ -209,7 +222,8 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
     return path
 
 
-Change = Callable[[np.ndarray, np.random.Generator, PoseEstimator], np.ndarray]  # an image as it is after the change
+# A change of an image: ``change(image, rng, estimator)`` returns the changed image.
+Change = Callable[[np.ndarray, np.random.Generator, PoseEstimator], np.ndarray]
 
 
 def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, shift_px: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
@@ -236,7 +250,7 @@ def turned(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator
 
 
 def erased(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
-    """The image with five of its pins wiped out, drawn from those that the pipeline finds."""
+    """The image with five pins erased, drawn at random from those that the pipeline finds."""
     seen = estimator.pipeline(Frame(image, estimator.form))
     found = np.flatnonzero(np.isfinite(seen.pins_px[:, 0]))
     half = ERASED_MARGIN * float(estimator.pipeline.reference.spacing_px.mean()) / 2
@@ -254,18 +268,18 @@ CHANGES: dict[str, Change] = {"1 % scale": scaled, "2 px shift": shifted, "1 deg
 def judge_changes(
     estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Step | None = None
 ) -> list[dict[str, Any]]:
-    """Errors against corrected labels of single frames as they are and under every change.
+    """Errors against corrected labels of single frames, unchanged and under every change.
 
     Returns
     -------
     list of dict
-        ``change``, ``frames``, ``not_valid``, and for every label ``<label>_mae`` and ``<label>_more``: by which part the mean absolute
-        error is larger than on the unchanged frames.
+        ``change``, ``frames``, ``not_valid``, and for every label ``<label>_mae`` (the mean absolute error) and ``<label>_more`` (its
+        relative increase over the unchanged frames).
 
     Raises
     ------
     TrainingError
-        If the data set has no pictures.
+        The data set has no pictures.
     """
     if is_pins_only(data.folder):
         raise TrainingError(f"{data.folder}: a data set of pins has no pictures to change; render it, or judge without --robustness")

@@ -1,17 +1,20 @@
-"""Gaussian processes: one implementation for the labels beside the networks, for two fidelities, and for what a twin misses.
+"""Gaussian process regression. One implementation serves three uses:
 
-With inputs a, b in units of the kernel's lengths (one length for every input), the covariance of two rows is a sum of terms,
+- the process whose prediction is averaged with that of the networks (``fit_processes``),
+- labels from simulated and real data together (``fit_two_fidelities``),
+- the difference between a twin's pins and real ones (``training.studies.sim_to_real.discrepancy``).
+
+Each input has a length. With inputs a, b divided by these lengths, the covariance of two rows is a sum of terms,
 
     smooth    s^2 exp(-|a - b|^2 / 2 r^2)     with r = 1 where the term has no reach of its own
     linear    s^2 a.b
     constant  s^2
 
-A row is of the first or the second kind. Some terms count only between two rows of the second kind: so two fidelities are
-described (Kennedy and O'Hagan 2000, eq. 1 with rho = 1), the first kind being simulated, the second real. Each kind has noise
-of its own.
+A row is of the first kind (simulated) or of the second kind (real). A term with ``second`` is 0 unless both rows are of the second
+kind: it describes the difference between two fidelities (Kennedy and O'Hagan 2000, eq. 1 with rho = 1). Each kind has its own noise.
 
-Lengths, sizes and noises maximise the log marginal likelihood (Rasmussen and Williams 2006, eq. 5.8), whose gradient is
-written out below (eq. 5.9). What a row is predicted as when it is left out comes in closed form (eq. 5.12).
+Lengths, sizes and noises maximise the log marginal likelihood (Rasmussen and Williams 2006, eq. 5.8); its gradient (eq. 5.9) is
+implemented in closed form, and so is the prediction of a row from all other rows (leave-one-out, eq. 5.12).
 """
 
 from collections.abc import Callable, Mapping
@@ -23,13 +26,20 @@ import torch
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 
-JITTER = 1e-6  # variance that is added to every row, of labels of about unit variance: rounding must not spoil the factorisation
-FIT_ROWS = 1000  # rows, of each kind of data, on which the likelihood is maximised: more change nothing and cost their third power
-CLIMB_STEPS = 60  # of Adam: by then the likelihood of some hundred rows has settled
-CLIMB_RATE = 0.1  # of Adam, in the parameters' logarithms: a factor of 1.1 a step at most
-ADAM_DECAYS = (0.9, 0.999)  # of the means of gradient and squared gradient (Kingma and Ba 2015)
-ADAM_LEAST = 1e-8  # added to the root mean squared gradient (Kingma and Ba 2015)
-LEAST_SPREAD = 1e-9  # of an input, in its own unit: a constant input must not divide by 0
+# Variance added to every row, so that rounding does not make the Cholesky factorisation fail. Labels have a variance of about 1.
+JITTER = 1e-6
+# Most rows of each kind on which the likelihood is maximised. The cost grows with their third power, and more rows change no result.
+FIT_ROWS = 1000
+# Steps of Adam. The likelihood of some hundred rows no longer changes after this many.
+CLIMB_STEPS = 60
+# Step size of Adam in the logarithms of the parameters: one step changes a parameter by a factor of 1.1 at most.
+CLIMB_RATE = 0.1
+# Decay rates of Adam's means of the gradient and of the squared gradient (Kingma and Ba 2015).
+ADAM_DECAYS = (0.9, 0.999)
+# Number that Adam adds to the root of the mean squared gradient (Kingma and Ba 2015).
+ADAM_LEAST = 1e-8
+# Least standard deviation of an input, in the input's unit, so that a constant input does not lead to a division by 0.
+LEAST_SPREAD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -40,7 +50,7 @@ class Term:
     ----------
     shape : {"smooth", "linear", "constant"}
     second : bool
-        Whether it counts only between two rows of the second kind.
+        The term is 0 unless both rows are of the second kind.
     reaches : bool
         Whether a smooth term has a reach r of its own, in units of the lengths.
     """
@@ -62,7 +72,7 @@ CONSTANT_AND_SMOOTH = (Term("constant"), Term("smooth"))
 
 @dataclass(frozen=True)
 class Points:
-    """Rows that a process knows or is asked about.
+    """Rows of inputs: those that a process learns from, or those that it predicts labels of.
 
     Attributes
     ----------
@@ -83,12 +93,12 @@ class Points:
         return len(self.inputs)
 
     def rows(self, index: np.ndarray) -> "Points":
-        """Only some rows."""
+        """The rows with these indices."""
         return Points(self.inputs[index], self.second[index])
 
 
 class Placed(NamedTuple):
-    """Rows in units of a kernel's lengths: ``rows`` (M, D), their squared sizes (M,), and which are of the second kind (M,)."""
+    """Rows divided by a kernel's lengths: ``rows`` (M, D), their squared norms (M,), and 1 for rows of the second kind, else 0 (M,)."""
 
     rows: np.ndarray
     squares: np.ndarray
@@ -97,20 +107,20 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class Kernel:
-    """The covariance with all its numbers.
+    """The covariance function with its parameters.
 
     Attributes
     ----------
     terms : tuple of Term
-        T of them.
+        The T terms that are added.
     lengths : (D,) float
-        In the inputs' units.
+        Length of each input, in the input's unit.
     sizes : (T,) float
-        s of each term, in the label's unit.
+        Size s of each term, in the label's unit.
     noises : (1,) or (2,) float
-        Standard deviation of the noise, of all rows or of each kind.
+        Standard deviation of the noise of all rows, or of the rows of each kind.
     reach : float
-        r of the terms that have one.
+        Reach r of the terms that have one, in units of the lengths.
     """
 
     terms: tuple[Term, ...]
@@ -124,7 +134,7 @@ class Kernel:
         return self.between(self.placed(a), self.placed(b))
 
     def placed(self, points: Points) -> Placed:
-        """Rows in units of the lengths."""
+        """Rows divided by the lengths."""
         rows = points.inputs / self.lengths
         return Placed(rows, (rows**2).sum(axis=1), points.second)
 
@@ -138,15 +148,15 @@ class Kernel:
         return found
 
     def noisy(self, points: Points) -> np.ndarray:
-        """(M, M) the covariance of the rows' labels, noise and ``JITTER`` included."""
+        """(M, M) the covariance of the rows' labels, including noise and ``JITTER``."""
         return self(points, points) + np.diag(self._noise_of(points) ** 2 + JITTER)
 
     def logs(self) -> np.ndarray:
-        """All numbers' logarithms in one row: lengths, sizes, noises, and the reach where a term has one."""
+        """Logarithms of all parameters in one row: lengths, sizes, noises, and the reach if a term has one."""
         return np.log(np.concatenate([self.lengths, self.sizes, self.noises, [self.reach] if self._reaches else []]))
 
     def with_logs(self, logs: np.ndarray) -> "Kernel":
-        """The same kernel with other numbers, in the order of ``logs``."""
+        """The kernel with other parameters, given in the order of ``logs``."""
         values = np.exp(logs)
         ends = np.cumsum([len(self.lengths), len(self.sizes), len(self.noises)])
         reach = float(values[-1]) if self._reaches else self.reach
@@ -158,16 +168,18 @@ class Kernel:
         Raises
         ------
         numpy.linalg.LinAlgError
-            The rows' covariance is not positive definite, not even with ``JITTER``.
+            The rows' covariance with ``JITTER`` is not positive definite.
         """
         factor = cholesky(self.noisy(points), lower=True)
         weight = cho_solve((factor, True), label)
         value = -0.5 * label @ weight - np.log(np.diag(factor)).sum() - 0.5 * len(label) * np.log(2 * np.pi)
-        pull = 0.5 * (np.outer(weight, weight) - cho_solve((factor, True), np.eye(len(label))))  # of the value, on the covariance
+        pull = 0.5 * (
+            np.outer(weight, weight) - cho_solve((factor, True), np.eye(len(label)))
+        )  # derivative of the likelihood by the covariance
         return float(value), self._gradient(points, pull)
 
     def _gradient(self, points: Points, pull: np.ndarray) -> np.ndarray:
-        """Derivatives with respect to ``logs`` of a number whose derivatives with respect to ``noisy(points)`` are ``pull`` (M, M)."""
+        """Derivatives by ``logs`` of a quantity whose derivatives by the elements of ``noisy(points)`` are ``pull`` (M, M)."""
         here = self.placed(points)
         a, (inner, squared) = here.rows, _products(here, here)
         of_inner, of_squared = np.zeros_like(inner), np.zeros_like(inner)
@@ -182,7 +194,8 @@ class Kernel:
                 of_squared -= 0.5 * shaped / self._reach_of(term) ** 2
                 if term.reaches:
                     reach += (shaped * squared).sum() / self.reach**2
-        # a.b and |a - b|^2 fall with the square of each length: with columns x of a, sum_ij W_ij (x_i - x_j)^2 = 2 (w.x^2 - x.W x)
+        # a.b and |a - b|^2 are inversely proportional to the square of each length. For a column x of a and w the row sums of W,
+        # sum_ij W_ij (x_i - x_j)^2 = 2 (w.x^2 - x.W x).
         twice = 2 * (of_squared.sum(axis=1) @ a**2 - (a * (of_squared @ a)).sum(axis=0))
         lengths = -2 * twice - 2 * (a * (of_inner @ a)).sum(axis=0)
         noise = 2 * self._noise_of(points) ** 2 * np.diag(pull)
@@ -206,9 +219,10 @@ class Kernel:
 
 
 def climbed(start: Kernel, points: Points, label: np.ndarray) -> Kernel:
-    """The kernel after ``CLIMB_STEPS`` steps of Adam up the likelihood of a label (M,).
+    """The kernel after ``CLIMB_STEPS`` steps of Adam that increase the likelihood of a label (M,).
 
-    It stops before the top: with many lengths and few rows the top explains the rows to the last, and others worse.
+    The search stops before the maximum, because with many lengths and few rows the maximum is overfitted: it explains these rows
+    exactly, and other rows worse.
     """
     logs, mean, square = start.logs(), np.zeros_like(start.logs()), np.zeros_like(start.logs())
     first, second = ADAM_DECAYS
@@ -222,9 +236,9 @@ def climbed(start: Kernel, points: Points, label: np.ndarray) -> Kernel:
 
 
 def likeliest(start: Kernel, points: Points, label: np.ndarray, *, least: Kernel, most: Kernel) -> Kernel:
-    """The kernel of the largest likelihood of a label (M,) whose numbers lie between those of ``least`` and ``most``.
+    """The kernel that maximises the likelihood of a label (M,), with every parameter between that of ``least`` and that of ``most``.
 
-    Sought by L-BFGS-B (Byrd et al. 1995) from ``start``, in the logarithms of lengths and variances.
+    The method is L-BFGS-B (Byrd et al. 1995) from ``start``, in the logarithms of the lengths and of the variances.
     """
     per_log = np.ones_like(start.logs())
     per_log[len(start.lengths) : len(start.lengths) + len(start.sizes) + len(start.noises)] = 2.0  # variances
@@ -239,22 +253,22 @@ def likeliest(start: Kernel, points: Points, label: np.ndarray, *, least: Kernel
 
 
 class Posterior:
-    """What a process says of one label once it knows rows.
+    """The posterior distribution of one label, given rows whose label is known.
 
     Parameters
     ----------
     kernel : Kernel
     points : Points
-        M rows.
+        The M known rows.
     label : (M,) float
-        With mean 0.
+        Their labels; the mean is 0.
 
     Attributes
     ----------
     weight : (M,) float
-        Of each row in a prediction.
+        Weight of each known row in a prediction.
     left_out : (M,) float
-        What each row is predicted as when it is left out.
+        Prediction of each known row from all others.
     """
 
     def __init__(self, kernel: Kernel, points: Points, label: np.ndarray) -> None:
@@ -269,33 +283,34 @@ class Posterior:
         return self.kernel(asked, self.points) @ self.weight
 
     def covariance(self, asked: Points) -> np.ndarray:
-        """(B, B) how uncertain the label of other rows is, without their noise."""
+        """(B, B) covariance of the labels of other rows, without their noise."""
         half = solve_triangular(self._factor, self.kernel(self.points, asked), lower=True)
         return self.kernel(asked, asked) - half.T @ half
 
     def draw(self, asked: Points, rng: np.random.Generator) -> np.ndarray:
-        """(B,) a label of other rows, drawn without their noise: one function of the posterior at all of them."""
+        """(B,) labels of other rows, without noise: one function drawn from the posterior, evaluated at all of them."""
         return rng.multivariate_normal(self.mean(asked), self.covariance(asked), method="eigh")
 
 
 class Processes:
-    """The expected values of K labels, by a process for each that knows the same rows. Small enough to go into a file.
+    """The expected values of K labels: one process for each label, all with the same known rows. Small enough to be stored in a file.
 
     Parameters
     ----------
     kernels : list of Kernel
-        K of the same terms.
+        One for each of the K labels; all have the same terms.
     points : Points
-        M rows.
+        The M known rows.
     weight : (M, K) float
+        Weight of each known row in the prediction of each label.
     """
 
     def __init__(self, kernels: list[Kernel], points: Points, weight: np.ndarray) -> None:
         self.kernels, self.points, self.weight = kernels, points, weight
-        self._placed = [kernel.placed(points) for kernel in kernels]  # once, not for every frame
+        self._placed = [kernel.placed(points) for kernel in kernels]  # computed once, because it is the same for every frame
 
     def __call__(self, asked: Points) -> np.ndarray:
-        """(B, K) for other rows."""
+        """(B, K) expected labels of other rows."""
         found = [
             kernel.between(kernel.placed(asked), placed) @ weight
             for kernel, placed, weight in zip(self.kernels, self._placed, self.weight.T, strict=True)
@@ -303,13 +318,13 @@ class Processes:
         return np.stack(found, axis=1)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that ``of_arrays`` needs beside the terms."""
+        """The arrays that ``of_arrays`` needs; the terms are not among them."""
         stacked = {key: np.stack([getattr(kernel, key) for kernel in self.kernels]) for key in ("lengths", "sizes", "noises", "reach")}
         return stacked | {"inputs": self.points.inputs, "second": self.points.second, "weight": self.weight}
 
     @classmethod
     def of_arrays(cls, terms: tuple[Term, ...], arrays: Mapping[str, np.ndarray | torch.Tensor]) -> "Processes":
-        """What ``arrays`` was taken from.
+        """The processes that ``arrays`` stored.
 
         Raises
         ------
@@ -323,12 +338,12 @@ class Processes:
 
 
 def fit_processes(inputs: np.ndarray, labels: np.ndarray, *, seed: int, progress: Callable | None = None) -> tuple[Processes, np.ndarray]:
-    """Smooth and linear processes of K standardised labels (M, K) on inputs (M, D).
+    """Processes with a smooth and a linear term, for K standardised labels (M, K) on inputs (M, D).
 
     Parameters
     ----------
     seed : int
-        Of the rows on which the likelihood is maximised; the solution then uses all.
+        Chooses the rows on which the likelihood is maximised. The predictions then use all rows.
     progress : callable, optional
         Called with (labels done, K).
 
@@ -336,7 +351,7 @@ def fit_processes(inputs: np.ndarray, labels: np.ndarray, *, seed: int, progress
     -------
     Processes
     left_out : (M, K) float
-        What each row is predicted as when it is left out; lengths, sizes and noises have seen it.
+        Prediction of each row from all others. The row itself was used to find lengths, sizes and noises.
     """
     points = Points.of(inputs)
     start = Kernel(SMOOTH_AND_LINEAR, 5.0 * _spread(inputs), np.array([1.0, 0.3]), np.array([0.05]))
@@ -346,9 +361,10 @@ def fit_processes(inputs: np.ndarray, labels: np.ndarray, *, seed: int, progress
 def fit_two_fidelities(
     simulated: np.ndarray, simulated_labels: np.ndarray, real: np.ndarray, real_labels: np.ndarray, *, seed: int
 ) -> tuple[Processes, np.ndarray]:
-    """Labels from S simulated states and n real frames together: a real label is the simulated one of such inputs plus a difference.
+    """Processes that learn from S simulated states and n real frames together (co-kriging, Kennedy and O'Hagan 2000).
 
-    Both are processes (co-kriging, Kennedy and O'Hagan 2000).
+    The label of a real frame is modelled as the label of a simulated state with the same inputs, plus a difference. Both the label
+    and the difference are Gaussian processes.
 
     Parameters
     ----------
@@ -357,13 +373,13 @@ def fit_two_fidelities(
     simulated_labels, real_labels : (S, K) and (n, K) float
         Standardised.
     seed : int
-        Of the simulated states that are used: many change nothing, some hundreds tell how labels go with inputs.
+        Chooses the simulated states that are used. Some hundreds show how labels depend on inputs, and more change no result.
 
     Returns
     -------
     Processes
     left_out : (n, K) float
-        What each real frame is predicted as when it is left out; lengths, sizes and noises have seen it.
+        Prediction of each real frame from all other rows. The frame itself was used to find lengths, sizes and noises.
     """
     chosen = drawn_rows(len(simulated), seed)
     inputs, labels = np.concatenate([simulated[chosen], real]), np.concatenate([simulated_labels[chosen], real_labels])
@@ -374,9 +390,9 @@ def fit_two_fidelities(
 
 
 def drawn_rows(count: int, seed: int) -> np.ndarray:
-    """At most ``FIT_ROWS`` of ``count`` rows, in random order.
+    """Indices of at most ``FIT_ROWS`` of ``count`` rows, in random order.
 
-    PyTorch's generator draws them, as it always has: another one would give other rows, and so other models from the same seed.
+    They are drawn by PyTorch's generator. Another generator would draw other rows, so that the same seed would give another model.
     """
     return torch.randperm(count, generator=torch.Generator().manual_seed(seed))[:FIT_ROWS].numpy()
 

@@ -13,27 +13,31 @@ from training.networks import device_of, predict_rows
 from training.recipes import Recipe
 from twin.progress import Step
 
-RISE_STEPS = 100  # steps in which the cosine schedule's rate rises to its full size
-PLATEAU_PATIENCE = 3  # epochs without a smaller loss after which the plateau schedule halves the rate, as the published code does
-SCALE_LOSS = 0.05  # weight of the error scales' loss, beside 1 of the labels' loss
-EXECUTED_LOSS = 0.05  # weight of the executed move's loss, beside 1 of the labels' loss
+# Steps at the start in which the cosine schedule's learning rate rises from 0 to its full value.
+RISE_STEPS = 100
+# Epochs without a smaller loss after which the plateau schedule halves the learning rate. The published code uses the same number.
+PLATEAU_PATIENCE = 3
+# Weight of the error scales' loss in the total loss. The labels' loss has the weight 1.
+SCALE_LOSS = 0.05
+# Weight in the total loss of the loss of the prediction that the move was executed. The labels' loss has the weight 1.
+EXECUTED_LOSS = 0.05
 
 
 @dataclass(frozen=True)
 class Rows:
-    """What a network learns from.
+    """The rows that a network is trained on and watched by.
 
     Attributes
     ----------
     inputs : Inputs
     labels : (M, K) float32
-        Scaled.
-    weight : (K,) float32
-        Of each label in the loss.
-    executed : (M,) float32
-        1, 0 or NaN.
-    train, held : (m,) int64
-        Rows to learn from, and rows to watch.
+        Scaled labels.
+        weight : (K,) float32
+            Weight of each label in the loss.
+        executed : (M,) float32
+            Whether the move was executed: 1, 0, or NaN if that is not known.
+        train, held : (m,) int64
+            Rows to train on, and rows by which the error is watched.
     """
 
     inputs: Inputs
@@ -50,7 +54,7 @@ def no_penalty(network: nn.Module) -> None:
 
 @dataclass
 class Loop:
-    """A network in training. ``epoch()`` runs one; ``state()`` and ``load()`` keep and restore everything that matters.
+    """A network in training. ``epoch()`` runs one epoch; ``state()`` and ``load()`` store and restore the whole state of the training.
 
     Parameters
     ----------
@@ -58,9 +62,9 @@ class Loop:
     recipe : Recipe
     rows : Rows
     seed : int
-        Of the rows' order.
-    penalty : callable, optional
-        Gives for the network a number that is added to the loss of every batch.
+        Seed of the order of the rows.
+        penalty : callable, optional
+            ``penalty(network)`` is added to the loss of every batch.
     """
 
     network: nn.Module
@@ -95,7 +99,7 @@ class Loop:
         return self.epochs_done >= self.recipe.epochs or bool(self.recipe.patience and self.since_best >= self.recipe.patience)
 
     def epoch(self) -> dict:
-        """Go once through the training rows; returns the new point of the learning curve."""
+        """Train once on all training rows, and return the new point of the learning curve."""
         started = perf_counter()
         self.network.train()
         total, loss = 0.0, math.nan
@@ -113,13 +117,13 @@ class Loop:
         else:
             self.since_best += 1
         if self.recipe.schedule == "plateau":
-            self.plateau.step(loss)  # of the last batch, as the published code does
+            self.plateau.step(loss)  # the last batch's loss, as in the published code
         point = {"epoch": self.epochs_done, "loss": total / len(shuffled), "held_out_error": held, "rate": rate, "seconds": seconds}
         self.curves.append(point)
         return point
 
     def result(self) -> nn.Module:
-        """The network with the weights to keep: the best on the held-out rows where the recipe has patience, else the averaged ones."""
+        """The trained network. Its weights are the best on the held-out rows if the recipe has patience, else the averaged ones."""
         if self.recipe.patience:
             self.network.load_state_dict(self.best_weights)
         elif self.recipe.average:
@@ -128,7 +132,7 @@ class Loop:
         return self.network.eval()
 
     def state(self) -> dict:
-        """Everything that continuing needs."""
+        """Everything that is needed to continue the training."""
         keys = ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves")
         return {key: getattr(self, key) for key in keys} | {
             "network": self.network.state_dict(),
@@ -180,7 +184,7 @@ class Loop:
 
 
 def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: torch.Tensor, kind: str) -> torch.Tensor:
-    """Mean over rows of the labels' weighted error, plus the losses of error scale and executed move where the network gives them.
+    """Mean over rows of the labels' weighted error, plus the losses of error scale and executed move if the network gives these.
 
     The error scale is that of a Laplace distribution around the mean. Its loss has no gradient with respect to the mean.
     """

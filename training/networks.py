@@ -1,19 +1,20 @@
-"""What holds for every network: its size, its device, its outputs for many rows."""
+"""Functions for all networks: their size, their device, their outputs for many rows."""
 
 import torch
 from torch import nn
 
 from training.models.part import Inputs
 from training.recipes import TrainingError
+from twin.errors import OptionError
 
 
 def parameter_count(network: nn.Module) -> int:
-    """Trainable numbers."""
+    """Number of trainable parameters."""
     return sum(p.numel() for p in network.parameters())
 
 
 def device_of(network: nn.Module) -> torch.device:
-    """Where a network's numbers lie."""
+    """The device that holds a network's parameters."""
     return next(network.parameters()).device
 
 
@@ -23,10 +24,10 @@ def choose_device(name: str) -> str:
     Raises
     ------
     TrainingError
-        For another name, or ``cuda`` where PyTorch finds none.
+        The name is another one, or it is ``cuda`` and PyTorch finds no GPU.
     """
     if name not in ("auto", "cpu", "cuda"):
-        raise TrainingError(f"--device must be auto, cpu or cuda, got {name!r}")
+        raise OptionError(f"--device must be auto, cpu or cuda, got {name!r}")
     if name == "cuda" and not torch.cuda.is_available():
         raise TrainingError("--device cuda: PyTorch finds no GPU here; give --device cpu, or install a PyTorch built for your GPU")
     return "cuda" if name != "cpu" and torch.cuda.is_available() else "cpu"

@@ -1,10 +1,11 @@
-"""Small copies of runs, small enough to go with the package: ``config.json`` and ``weights.safetensors``.
+"""Copies of runs that are small enough to be shipped with the package: ``config.json`` and ``weights.safetensors``.
 
-The arrays are in the safetensors format (https://github.com/huggingface/safetensors), which holds no code. Large arrays are kept in half
-precision. Those of a Gaussian process are not, because its terms nearly cancel. Each model decides itself which weights a small copy can
-do without: see ``Model.pack``.
+The arrays are in the safetensors format (https://github.com/huggingface/safetensors), which holds no code. Large arrays are stored in
+half precision, except those of a Gaussian process, because its terms nearly cancel. Each model decides which weights its small copy
+leaves out: see ``Model.pack``.
 """
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
+from safetensors.numpy import load, save
 
 from scenes.sensor import SensorSpec
+from training.identity import ASIDE
 from training.models import model_named
 from training.recipes import TrainingError
+from training.run_files import CONFIG, TENSORS, read_config, read_tensors
 from twin.pins import make_reference
 from twin.store import write_bytes, write_text
 
@@ -25,26 +28,26 @@ SHIPPED = Path(__file__).parent / "weights"
 LARGE = 1000  # numbers; a larger array is kept in half precision
 NETWORKS = "networks"  # the networks' weights, in ``weights.pt``
 BESIDE = "beside"  # the arrays of the Gaussian process beside the networks, in ``weights.pt``
+SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; the shipped copies were made before there was one
 NOT_PACKED = ("kernels", "kernel_labels", "parameters")  # entries of ``weights.pt`` that a small copy leaves out
 
 
 def shipped_names() -> list[str]:
-    """Sensors whose weights go with the package."""
+    """Names of the sensors whose weights are shipped with the package."""
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
 
 
 def pack(run: Path, out: Path) -> int:
-    """Write the small copy of a finished run without Gaussian processes beside its networks; returns its size in bytes.
+    """Write the small copy of a finished run that has no Gaussian processes of its modes, and return its size in bytes.
 
     Raises
     ------
     TrainingError
         The run is a small copy already, has such processes, or is of a model that has no small copy.
     """
-    if not (run / "weights.pt").is_file():
+    if not (run / TENSORS).is_file():
         raise TrainingError(f"{run}: a small copy already; give the run that it was made of")
-    config = json.loads((run / "config.json").read_text())
-    content = torch.load(run / "weights.pt", weights_only=True)
+    config, content = read_config(run), read_tensors(run / TENSORS)
     if content["kernels"]:
         raise TrainingError(
             f"{run}: has Gaussian processes beside its networks, which a small copy does not hold; only runs with --no-kernel can be packed"
@@ -55,11 +58,12 @@ def pack(run: Path, out: Path) -> int:
     arrays = _flat(kept)
     whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith(f"{BESIDE}.")}
     small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
-    small["reference_px"] = content["reference_px"].numpy()  # whole: the graph is made from it
+    small["reference_px"] = content["reference_px"].numpy()  # in full precision, because the graph is made from it
     out.mkdir(parents=True, exist_ok=True)
-    write_bytes(out / WEIGHTS, save({key: np.ascontiguousarray(value) for key, value in small.items()}))
-    about = {key: value for key, value in config.items() if key not in ("data", "problems")}
-    write_text(out / "config.json", json.dumps(about) + "\n")
+    weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})
+    write_bytes(out / WEIGHTS, weights)
+    about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
+    write_text(out / CONFIG, json.dumps(about) + "\n")
     return (out / WEIGHTS).stat().st_size
 
 
@@ -71,8 +75,11 @@ def unpack(config: dict, path: Path) -> dict:
     ValueError
         The file is damaged.
     """
+    weights = path.read_bytes()
+    if SHA256 in config and hashlib.sha256(weights).hexdigest() != config[SHA256]:
+        raise ValueError(f"{path.name}: changed since it was written")  # the format has no checksums
     try:
-        arrays = load_file(path)
+        arrays = load(weights)
     except SafetensorError as error:
         raise ValueError(f"{path.name}: {error}") from error
     content: dict = {"kernels": [], "kernel_labels": [], "aside": {}, NETWORKS: {}}

@@ -1,7 +1,7 @@
-"""The pins of every frame of a recording, found once by the pipeline and then kept on disk.
+"""The pins of every frame of a recording. The pipeline finds them once; they are then stored on disk.
 
-This module imports nothing of the simulation. What is kept on disk is valid for one state of the code that made it, so pins of real
-recordings stay valid when only the simulation changes.
+Stored results are valid only for the code that made them. This module imports nothing of the simulation, so that stored pins of real
+recordings stay valid if only the simulation changes.
 """
 
 import json
@@ -21,29 +21,30 @@ from twin.progress import Step
 from twin.store import cached_arrays
 from twin.types import Form
 
-PIN_COLUMNS = ("image_name", "nodes_px", "area_px2", "lost", "valid")  # the fields of a PinTable that hold a row for each frame
+# Fields of a PinTable that hold a row for each frame.
+PIN_COLUMNS = ("image_name", "nodes_px", "area_px2", "lost", "valid")
 
 
 @dataclass(frozen=True)
 class PinTable:
-    """The pipeline's view of M frames of one sensor with N pins.
+    """The pins that the pipeline found in M frames of one sensor with N pins.
 
     Attributes
     ----------
     sensor : SensorSpec
     form : Form
     reference : Reference
-        No contact, N pins.
+        The layout of the N pins without contact.
     image_name : (M,) str
     nodes_px : (M, N, 2) float
-        Every pin of the valid frames; a lost pin's is its predicted place. NaN where a frame is not valid.
-    area_px2 : (M, N) float
-        Voronoi areas; NaN where a frame is not valid.
-    lost : (M, N) bool
-        Pins without a blob of their own.
+        Places of the pins; that of a lost pin is predicted. NaN for frames that are not valid.
+        area_px2 : (M, N) float
+            Voronoi areas; NaN for frames that are not valid.
+        lost : (M, N) bool
+            Pins for which no blob was found.
     valid : (M,) bool
     measured : bool
-        Whether the reference is that of these very frames' own camera, and not only the specification's.
+        Whether the reference was measured with the camera of these frames. Otherwise it is computed from the specification.
     """
 
     sensor: SensorSpec
@@ -60,15 +61,15 @@ class PinTable:
         return len(self.image_name)
 
     def rows(self, index: np.ndarray) -> "PinTable":
-        """The same table with only some rows, or rows in another order."""
+        """The table of the rows with these indices, in their order."""
         return self.with_columns({key: getattr(self, key)[index] for key in PIN_COLUMNS})
 
     def with_columns(self, columns: Mapping[str, np.ndarray]) -> "PinTable":
-        """The same sensor, form and reference with other frames; ``columns`` holds an array for each of ``PIN_COLUMNS``."""
+        """A table of other frames with the same sensor, form and reference; ``columns`` holds an array for each of ``PIN_COLUMNS``."""
         return PinTable(self.sensor, self.form, self.reference, **columns, measured=self.measured)
 
     def seen_from(self, reference: Reference) -> "PinTable":
-        """The same motion of the pins from another no-contact layout: displacements and the areas' growth are kept."""
+        """The table with another layout without contact. Displacements and ratios of areas stay the same."""
         nodes_px = reference.pins_px + (self.nodes_px - self.reference.pins_px)
         area_px2 = reference.area_px2 * (self.area_px2 / self.reference.area_px2)
         return replace(self, reference=reference, nodes_px=nodes_px, area_px2=area_px2)
@@ -77,7 +78,7 @@ class PinTable:
 def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], progress: Step | None = None) -> PinTable:
     """Run the pipeline over a recording, or take its result from the cache.
 
-    What could not be read is appended to ``problems``.
+    Frames that can't be read are appended to ``problems``.
     """
 
     def compute() -> dict[str, np.ndarray]:
@@ -110,14 +111,14 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
         about = {"rest_px": reference.pins_px, "measured": np.array(named != UNMEASURED), "notes": np.array(notes, str)}
         return {"image_name": np.array(names, str)} | about | arrays
 
-    found = cached_arrays("recorded-pins", _key(recording, spec), compute)
+    found = cached_arrays("recorded-pins", recording_key(recording, spec), compute)
     problems += found.pop("notes").tolist()
     reference = make_reference(found.pop("rest_px"), spec.pins)
     return PinTable(spec, recording.form, reference, measured=bool(found.pop("measured")), **found)
 
 
-def _key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
-    """All that the pins depend on beside the code: files and the specification."""
+def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
+    """All that depends on a recording's frames beside the code depends on: its files and the specification."""
     root = recording.path if recording.path.is_dir() else recording.path.parent
     states = sorted((str(file.relative_to(root)), *_state(file)) for file in root.rglob("*") if file.is_file())
     return {
@@ -130,13 +131,14 @@ def _key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
     }
 
 
-def _state(file: Path) -> tuple[int, int]:
+def _state(file: Path) -> tuple[int, int, int]:
+    """Changes with every change of the file: copying tools set the time of the last change, but not when the file was put there."""
     status = file.stat()
-    return status.st_size, status.st_mtime_ns
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def voronoi_areas(nodes_px: np.ndarray, reference: Reference, *, progress: Step | None = None) -> np.ndarray:
-    """Voronoi areas (S, N), px^2, of S times N pins (S, N, 2) with this no-contact layout; computed once, then kept on disk."""
+    """Voronoi areas (S, N) in px^2 of pins (S, N, 2) with this layout without contact. They are computed once, then stored on disk."""
 
     def compute() -> dict[str, np.ndarray]:
         areas = np.empty(nodes_px.shape[:2])

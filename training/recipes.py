@@ -1,4 +1,4 @@
-"""The settings of a training run; each model has its own (``training.models``)."""
+"""The settings of a training run. Each model has its own values (``training.models``)."""
 
 from dataclasses import asdict, dataclass
 
@@ -17,23 +17,24 @@ class Recipe:
     ----------
     epochs, batch : int
     rate : float
-        Adam's learning rate at the start.
+        Adam's learning rate, before the schedule changes it.
     schedule : {"cosine", "plateau", "constant"}
-        Cosine to 0 over all epochs after a short rise; halved after three epochs in which the last training batch's loss
-        (which the published code watches) did not fall; or kept.
+        Cosine: after a short rise the rate falls to 0 over all epochs. Plateau: it is halved after three epochs in which the loss of
+        the last training batch did not fall, as in the published code. Constant: it stays the same.
     patience : int
-        Epochs without gain on the held-out fold until training stops; 0 never stops early and keeps the last, averaged weights.
-    decay : float
-        Weight decay (AdamW), 0 for Adam.
-    average : float
-        Of the weights over steps, in (0, 1); 0 without.
+        Number of epochs without a smaller error on the held-out fold after which training stops. With 0 it never stops early, and the
+        result are the last, averaged weights.
+        decay : float
+            Weight decay (AdamW); 0 for Adam.
+        average : float
+            Decay of the exponential average of the weights over steps, in (0, 1); 0: no average.
     loss : {"l1", "l2"}
     scaling : {"standard", "unit", "none"}
-        Of the labels: mean 0 and variance 1, range [-1, 1], or mm and deg as they are.
-    members : int
-        Networks of the ensemble; each holds out another fold.
-    kernel : bool
-        Whether a Gaussian process is averaged in, which needs a model that has modes.
+        Scaling of the labels: to mean 0 and variance 1, to the range [-1, 1], or none (mm and deg).
+        members : int
+            Number of networks in the ensemble; each holds out another fold.
+        kernel : bool
+            Whether a Gaussian process is averaged with the networks; the model must have modes.
     """
 
     epochs: int = 100
@@ -50,5 +51,5 @@ class Recipe:
 
 
 def as_dict(recipe: Recipe) -> dict[str, object]:
-    """The settings as JSON holds them."""
+    """The settings as a dict for JSON."""
     return asdict(recipe)

@@ -1,6 +1,7 @@
-"""Training runs: a folder with the configuration, the learning curves, the weights, and what continuing after a kill needs.
+"""Training runs. A run's folder holds the following files, so that training can be continued after it was killed:
 
-- ``config.json``: the resolved configuration (model, recipe, sensor, pipeline, labels, rows).
+- ``config.json``: the resolved configuration (model, recipe, sensor, pipeline, labels), and what the run learnt from: the names of the
+  frames that it kept out, and digests of names, labels and frames.
 - ``curves.csv``: the learning curves.
 - ``checkpoint.pt``: the state of training, while the run goes on.
 - ``weights.pt``: the trained model, when the run is done.
@@ -11,7 +12,7 @@ Every file is written whole or not at all.
 import csv
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
@@ -21,22 +22,27 @@ import torch
 
 from training.assemble import calibrate
 from training.dataset import Dataset, split_rows
+from training.identity import ASIDE, difference, identity_of
 from training.loop import Loop, Rows
 from training.models import model_named
 from training.models.part import Prepared
 from training.networks import parameter_count
 from training.recipes import Recipe, TrainingError, as_dict
+from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, write_tensors
 from twin.frames.forms import blob_spec
-from twin.store import fingerprint, write_text, write_with
+from twin.store import fingerprint, write_text
 
 FOLDS = 10  # parts of the training rows; each network of an ensemble watches another part
 KEEP_EVERY_S = 20.0  # s between two checkpoints
+FEWEST_PARTS = 3  # rows, or groups of rows, to learn from: with fewer a network that watches one learns from next to nothing
+MOST_SEED = 2**32 - 1  # PyTorch takes seeds of 64 bits, and each network has a seed of its own
+BEGIN_ANEW = "remove it to begin anew, or give another --out"  # instead of going on from a damaged checkpoint
 EXTRA_WEIGHT = 0.3  # of a helper label in the loss, beside 1 of a label that is asked for
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What a run is told.
+    """Settings of a run.
 
     Attributes
     ----------
@@ -51,8 +57,13 @@ class RunConfig:
         Label columns that are learnt only because they help the others; they have less weight.
     size : dict
         Sizes of the network that differ from the model's own.
-    labelled : tuple of str
-        Names of the real frames from which was learnt what simulated pins miss; empty for other runs.
+    labelled : dict
+        ``identity_of`` the real frames from which was learnt what simulated pins miss, and their ``image_names``; empty for other runs.
+
+    Raises
+    ------
+    TrainingError
+        A seed is out of range.
     """
 
     model: str
@@ -62,7 +73,12 @@ class RunConfig:
     split: int | None = 0
     helpers: tuple[str, ...] = ()
     size: dict[str, int] = field(default_factory=dict)
-    labelled: tuple[str, ...] = ()
+    labelled: Mapping[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, seed in (("seed", self.seed), ("split", self.split)):
+            if seed is not None and not 0 <= seed <= MOST_SEED:
+                raise TrainingError(f"--{name} {seed}: give a whole number from 0 to {MOST_SEED}")
 
 
 def train_run(
@@ -74,30 +90,40 @@ def train_run(
     device: str = "cpu",
     progress: Callable | None = None,
 ) -> bool:
-    """Train, or continue what ``out`` holds.
+    """Train, or continue what ``out`` holds. The order of the data set's rows does not matter.
 
     Parameters
     ----------
     progress : callable, optional
-        Called with (epochs done, epochs in all, the curve's last row) over all networks.
+        Called with (epochs done, epochs of all networks, last row of the learning curve).
     max_minutes : float, optional
-        Stop after the epoch in which this time has passed. The weights so far are written all the same.
+        Stop after the epoch in which this time has passed. The weights so far are written.
     device : {"cpu", "cuda"}
-        Where the networks learn; what is kept runs anywhere.
+        Device for training. The written weights can be used on any device.
 
     Returns
     -------
     bool
-        Whether training came to its end.
+        Whether training is finished.
 
     Raises
     ------
     TrainingError
-        ``out`` holds another run.
+        ``out`` holds another run, there are too few frames, or ``max_minutes`` is no time.
     """
     started = monotonic()
-    out.mkdir(parents=True, exist_ok=True)
+    if max_minutes is not None and not max_minutes >= 0:  # NaN would never stop
+        raise TrainingError(f"--max-minutes {max_minutes}: give a time of 0 or more")
+    data = data.in_order()
     train = training_rows(config, data)
+    parts = len(train if data.group is None else np.unique(data.group[train]))
+    if parts < FEWEST_PARTS:
+        what = "frames" if data.group is None else "contacts"
+        raise TrainingError(
+            f"{', '.join(map(str, data.folders))}: {len(data)} usable frames, {parts} {what} of them to learn from, are too few; "
+            f"{FEWEST_PARTS} {what} to learn from are needed{_said(data.problems)}"
+        )
+    out.mkdir(parents=True, exist_ok=True)
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     prepared = model_named(config.model).prepare(data, train)
@@ -126,38 +152,36 @@ def train_run(
         done.append(_finished(loop))
         _keep(out, resolved, done, None)
     _assemble(out, resolved, config, data, prepared, train, done, (shift, scale))
-    (out / "checkpoint.pt").unlink(missing_ok=True)
+    (out / CHECKPOINT).unlink(missing_ok=True)
     return True
 
 
 def is_finished(config: RunConfig, data: Dataset, out: Path) -> bool:
-    """Whether a folder holds this very run, and it is finished.
+    """Whether a folder holds this run (the same settings, data and code) and it is finished.
 
     Raises
     ------
     TrainingError
-        The folder holds another finished run.
+        The folder holds another run, finished or not.
     """
-    if not (out / "weights.pt").is_file() or (out / "checkpoint.pt").is_file():
+    begun = (out / CHECKPOINT).is_file()
+    if not begun and not (out / TENSORS).is_file():
         return False
-    train = training_rows(config, data)
-    wanted = json.loads(json.dumps(resolve(config, data, train)))
-    found = json.loads((out / "config.json").read_text())
-    if _identity(wanted) != _identity({key: found.get(key) for key in wanted}):
-        raise TrainingError(
-            f"{out}: holds a finished run with other settings or data, or of another version of the program; give another --out"
-        )
-    return True
+    data = data.in_order()
+    wanted = resolve(config, data, training_rows(config, data))
+    _require_same(out, wanted, read_config(out), "begun and not finished" if begun else "finished")
+    return not begun
 
 
 def training_rows(config: RunConfig, data: Dataset) -> np.ndarray:
-    """Rows (m,) of a data set that a run learns from."""
+    """Rows (m,) of a data set in order (``Dataset.in_order``) that a run learns from."""
     return np.arange(len(data)) if config.split is None else split_rows(len(data), config.split, data.group)[0]
 
 
 def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
-    """The whole configuration as ``config.json`` holds it."""
+    """The whole configuration as ``config.json`` holds it; ``data`` in order, of which the rows ``train`` (m,) are learnt from."""
     pins = data.pins
+    kept_out = np.setdiff1d(np.arange(len(data)), train)
     return {
         "model": config.model,
         "recipe": as_dict(config.recipe),
@@ -168,7 +192,9 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
         "seed": config.seed,
         "split": config.split,
         "size": config.size,
-        "rows": {"usable": len(data), "train": len(train)},
+        "rows": {"usable": len(data), "train": len(train)}
+        | identity_of(data, model_named(config.model))
+        | {"kept_out": list(dict.fromkeys(pins.image_name[kept_out].tolist()))},
         "sensor": pins.sensor.model_dump(mode="json"),
         "pipeline": {
             "form": str(pins.form),
@@ -178,7 +204,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
         "data": ", ".join(map(str, data.folders)),
         "problems": data.problems,
         "code": fingerprint(__name__),
-    } | ({"labelled": list(config.labelled)} if config.labelled else {})
+    } | ({"labelled": dict(config.labelled)} if config.labelled else {})
 
 
 def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
@@ -206,13 +232,13 @@ def _member(
     network.to(device)
     weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
     executed = torch.from_numpy(data.targets.executed.astype(np.float32))
-    learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # frames are watched as they are, in view 0 only
+    learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
     rows = Rows(prepared.inputs, scaled.repeat(views, 1), weight, executed.repeat(views), torch.from_numpy(learnt), torch.from_numpy(held))
     return Loop(network, config.recipe, rows, seed, model.penalty)
 
 
 def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The tenth of the training rows that a network watches, and the rows that it learns from; ``group`` as in ``Dataset``."""
+    """Held-out rows (a tenth) and training rows of a network, from the rows ``train``; ``group`` as in ``Dataset``."""
     parts = train if group is None else np.unique(group[train])
     held = np.random.default_rng([seed, 1]).permutation(parts)[member % FOLDS :: FOLDS]
     if group is not None:
@@ -255,45 +281,42 @@ def _assemble(
     )
     content |= {"aside": dict(prepared.learnt), "reference_px": data.pins.reference.pins_px}
     content["parameters"] = parameter_count(model.build(data.pins.reference, len(data.targets.names), config.size))
-    write_tensors(out / "weights.pt", content)
-    write_text(out / "config.json", json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
+    write_tensors(out / TENSORS, content)
+    write_text(out / CONFIG, json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
     write_curves(out, [network["curves"] for network in networks])
 
 
 def _keep(out: Path, resolved: dict, done: list, loop: Loop | None) -> None:
-    write_tensors(out / "checkpoint.pt", {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
+    write_tensors(out / CHECKPOINT, {"identity": _identity(resolved), "done": done, "loop": None if loop is None else loop.state()})
     write_curves(out, [network["curves"] for network in done] + ([] if loop is None else [loop.curves]))
 
 
 def _opened(out: Path, resolved: dict) -> dict | None:
     """The checkpoint of an interrupted run of the same configuration; None where there is nothing to continue."""
-    path = out / "checkpoint.pt"
+    path = out / CHECKPOINT
     if not path.is_file():
-        if (out / "weights.pt").is_file():
+        if (out / TENSORS).is_file():
             raise TrainingError(f"{out}: holds a finished run; give another --out")
-        write_text(out / "config.json", json.dumps(resolved, indent=1) + "\n")
+        write_text(out / CONFIG, json.dumps(resolved, indent=1) + "\n")
         return None
-    state = torch.load(path, weights_only=True, map_location="cpu")
-    if state["identity"] != _identity(resolved):
-        raise TrainingError(
-            f"{out}: holds a run with other settings or data, or of another version of the program, begun and not finished; "
-            "give another --out, or the same settings"
-        )
+    state = read_tensors(path, BEGIN_ANEW)
+    try:
+        before = dict(json.loads(state["identity"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise damaged(path, "it does not say of which run it is", BEGIN_ANEW) from error
+    _require_same(out, resolved, before, "begun and not finished")
     return state
 
 
-def write_tensors(path: Path, content: dict) -> None:
-    """Write a dict of numbers, text, lists, arrays and tensors so that ``torch.load`` reads it with ``weights_only``."""
-    write_with(path, lambda file: torch.save(_as_tensors(content), file))
+def _require_same(out: Path, wanted: dict, found: Mapping, state: str) -> None:
+    if differs := difference(json.loads(_identity(wanted)), found):
+        raise TrainingError(
+            f"{out}: holds a run with other settings or data, {state} ({differs}); give another --out, or the same settings and data"
+        )
 
 
-def _as_tensors(value: object) -> object:
-    """The same content with arrays as tensors: PyTorch reads tensors back without running code that a file may hold."""
-    if isinstance(value, np.ndarray):
-        return torch.from_numpy(value)
-    if isinstance(value, dict):
-        return {key: _as_tensors(part) for key, part in value.items()}
-    return [_as_tensors(part) for part in value] if isinstance(value, list) else value
+def _said(problems: list[str]) -> str:
+    return f" ({'; '.join(problems[:3])})" if problems else ""
 
 
 def write_curves(out: Path, curves: list[list[dict]]) -> None:
@@ -307,4 +330,4 @@ def write_curves(out: Path, curves: list[list[dict]]) -> None:
 
 
 def _identity(resolved: dict) -> str:
-    return json.dumps({key: value for key, value in resolved.items() if key not in ("problems", "data")}, sort_keys=True)
+    return json.dumps({key: value for key, value in resolved.items() if key not in ASIDE}, sort_keys=True)

@@ -1,4 +1,4 @@
-"""Simulated data sets: read like recordings where they have no pictures, and what is known of their contacts beyond the table."""
+"""Simulated data sets: reading those without pictures, and what is known of their contacts besides the table of labels."""
 
 import csv
 from collections.abc import Sequence
@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import zarr
+from pydantic import ValidationError
 
+from scenes.load import explained
 from scenes.sensor import SensorSpec
 from training.generation.config import GenerationConfig
-from training.generation.store import CONFIG, DRAWS, TRUTH
-from twin.errors import FrameError
+from training.generation.store import CONFIG, DRAWS, TRUTH, image_name, read_record
+from twin.errors import DatasetError, FrameError
 from twin.frames import Recording
 from twin.frames.folders import image_folders
 from twin.frames.forms import frame_size
@@ -21,6 +23,12 @@ from twin.rig.touch import Surface, surface_labels
 from twin.types import Form
 
 TABLE = "targets.csv"
+AGAIN = "copy the data set anew, or make it again"
+NEVER_ZERO = (
+    "pins_px",
+    "rest_px",
+    "visible",
+)  # no part of these arrays is all zeros, so zarr, which reads a missing part as zeros, has all
 
 
 def is_simulated(folder: Path) -> bool:
@@ -34,58 +42,72 @@ def is_pins_only(folder: Path) -> bool:
 
 
 def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str, np.ndarray]]:
-    """A data set without pictures: its table, and its arrays ``pins_px`` and ``rest_px`` (M, N, 2) and ``visible`` (M, N).
+    """Read a data set without pictures: its table, and its arrays ``pins_px`` and ``rest_px`` (M, N, 2) and ``visible`` (M, N).
 
     Raises
     ------
     FrameError
-        It is another sensor's, or its table and truth don't belong together.
+        The data set was simulated for another sensor, or its table and its truth have different numbers of rows.
     """
-    truth = zarr.open_group(folder / TRUTH, mode="r")
-    if truth.attrs["sensor"] != spec.name:
-        raise FrameError(f"{folder}: simulated for '{truth.attrs['sensor']}', not for '{spec.name}'; give the matching --sensor")
+    truth, sensor, form = _truth(folder)
+    if sensor != spec.name:
+        raise FrameError(f"{folder}: simulated for '{sensor}', not for '{spec.name}'; give the matching --sensor")
     problems: list[str] = []
     table = read_table(folder / TABLE, problems) if (folder / TABLE).is_file() else None
     if table is None:
         raise FrameError(f"{folder}: no {TABLE} of a finished data set; give the command that made it once more")
     _, labels = order_by_table([folder / TABLE], [folder / name for name in table.name_lists[0]], problems)
     names = table.name_lists[0]
-    arrays = _arrays(truth, ("pins_px", "rest_px", "visible"))
-    if len(names) != len(arrays["pins_px"]) or arrays["pins_px"].shape[1] != spec.pins.count:
-        raise FrameError(f"{folder}: {len(names)} rows in the table, pins {arrays['pins_px'].shape} in {TRUTH}; make the data set again")
-    form = Form(str(truth.attrs["form"]))
+    row_of = _row_of(truth)
+    strange = [name for name in names if name not in row_of]
+    if strange or len(names) != len(row_of):
+        said = f", among them {strange[0]}, which is not there" if strange else ""
+        raise FrameError(f"{folder / TABLE}: {len(names)} rows{said}; {TRUTH} has {len(row_of)}: the data set is damaged; {AGAIN}")
+    rows = [row_of[name] for name in names]
+    arrays = {key: array[rows] for key, array in _arrays(truth, ("pins_px", "rest_px", "visible")).items()}
+    if arrays["pins_px"].shape[1] != spec.pins.count:
+        raise FrameError(f"{folder}: pins {arrays['pins_px'].shape} in {TRUTH}, '{spec.name}' has {spec.pins.count}; {AGAIN}")
     return Recording(folder, form, names, frame_size(spec, form), labels, problems=problems), arrays
 
 
 def config_of(folder: Path) -> GenerationConfig:
-    """What a simulated data set was made with."""
-    return GenerationConfig.model_validate_json((folder / CONFIG).read_text())
+    """What a simulated data set was made with.
+
+    Raises
+    ------
+    DatasetError
+        Its record is missing or damaged.
+    """
+    path = folder / CONFIG
+    try:
+        return GenerationConfig.model_validate(read_record(path))
+    except ValidationError as error:
+        raise DatasetError(f"{path}: damaged ({explained(error, GenerationConfig)}); {AGAIN}") from error
 
 
 def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
-    """Depth and angle of the surface that was touched, whatever its shape, as labels: see ``twin.rig.touch.surface_labels``.
+    """Depth and angle of the touched surface, of any shape, as labels: see ``twin.rig.touch.surface_labels``.
 
-    Where the object stood is where the arm was sent, by the rig's numbers that were drawn for each contact, less what the object
-    gave way, so that the flat plate's are the table's own, with moves that were not executed taken out.
+    The object's place follows from the pose that the arm was sent to and the rig's parameters that were drawn for the contact. What
+    the object gave way is subtracted. Therefore the labels of a flat plate are those of the table, less moves that were not executed.
 
     Parameters
     ----------
     folder : Path
-        Of a simulated data set, with or without pictures.
+        A simulated data set, with or without pictures.
     names : (M,) str
-        Frames of it.
+        Names of frames.
 
     Returns
     -------
     dict of str to (M,) float
-        mm and deg by the table's columns, NaN for frames that it does not name; empty where depth and one angle do not tell how a
-        surface is touched.
+        Labels in mm and deg by the name of the table's column; NaN for frames that are not in the table. The dict is empty if depth
+        and one angle do not describe how the surface is touched.
     """
     config = config_of(folder)
-    truth = zarr.open_group(folder / TRUTH, mode="r")
-    with (folder / TABLE).open(newline="") as file:
-        row_of = {row["image_name"]: k for k, row in enumerate(csv.DictReader(file))}
-    with (folder / DRAWS).open(newline="") as file:
+    truth, _, _ = _truth(folder)
+    row_of = _row_of(truth)
+    with (folder / DRAWS).open(newline="", encoding="utf-8") as file:
         draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
     rows = np.array([row_of.get(name, -1) for name in names.tolist()], int)
     arrays = _arrays(truth, ("pose", "move", "executed", "force_n", "path_id"))
@@ -103,18 +125,42 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     return found
 
 
+def _truth(folder: Path) -> tuple[zarr.Group, str, Form]:
+    """The truth of a data set, the name of its sensor, and the form of its frames."""
+    path = folder / TRUTH
+    try:
+        truth = zarr.open_group(path, mode="r")
+        return truth, str(truth.attrs["sensor"]), Form(str(truth.attrs["form"]))
+    except Exception as error:  # damaged metadata raise whatever zarr runs into
+        raise FrameError(f"{path}: damaged, or of no finished data set; {AGAIN}") from error
+
+
+def _row_of(truth: zarr.Group) -> dict[str, int]:
+    """Row of each frame's name: the truth has the frames in the order of their contacts, whatever order the table has."""
+    found: dict[str, int] = {}
+    states: dict[int, int] = {}
+    for row, contact in enumerate(_arrays(truth, ("path_id",))["path_id"].tolist()):
+        states[contact] = states.get(contact, -1) + 1
+        found[image_name(contact, states[contact])] = row
+    return found
+
+
 def _arrays(truth: zarr.Group, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Arrays of ``truth.zarr`` by name."""
     found = {}
     for name in names:
-        array = truth.get(name)
-        if not isinstance(array, zarr.Array):
-            raise FrameError(f"{truth.store_path}: no array '{name}'; the data set is damaged or of another version: make it again")
-        found[name] = np.asarray(array[:])
+        try:
+            array = truth.get(name)
+            if isinstance(array, zarr.Array) and not (name in NEVER_ZERO and array.nchunks_initialized < array.nchunks):
+                found[name] = np.asarray(array[:])
+        except Exception as error:  # damaged bytes raise whatever zarr and its codecs run into
+            raise FrameError(f"{truth.store_path}: array '{name}' is damaged; {AGAIN}") from error
+        if name not in found:
+            raise FrameError(f"{truth.store_path}: array '{name}' is missing, or a part of it; {AGAIN}")
     return found
 
 
 def _rigged(sensor: SensorSpec, drawn: dict[str, str]) -> SensorSpec:
-    """The sensor with the rig that was drawn for a contact."""
+    """The sensor with the rig's parameters that were drawn for a contact."""
     rig = {key.removeprefix("rig."): float(value) for key, value in drawn.items() if key.startswith("rig.")}
     return sensor.model_copy(update={"rig": rig_of(sensor).model_copy(update=rig)})

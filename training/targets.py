@@ -1,8 +1,8 @@
-"""Which labels a model learns: columns of a recording's table, as published and corrected.
+"""The labels that a model learns: columns of a recording's table, as published (raw) and corrected.
 
-Why labels are corrected: in the published Tac-VGNN recordings the shear move had not been executed in about a third of the frames when
-the frame was taken. In those frames both shears are zero, and the angle is ``pose_6 - move_6``. The plate is slightly tilted, so their
-depth is ``pose_2 + c move_1``. For the same reason a tap at ``pose_1`` has the depth ``pose_2 - c pose_1``. For recordings c is the rig's
+Labels are corrected for this reason: about a third of the frames in the published Tac-VGNN recordings were taken before the shear move
+was executed. In these frames both shears are zero, and the angle is ``pose_6 - move_6``. Because the plate is slightly tilted, their
+depth is ``pose_2 + c move_1``, and the depth of a tap at ``pose_1`` is ``pose_2 - c pose_1``. For recordings c is the rig's
 ``label_depth_per_move``; for simulated contacts it is the slope of the plate.
 """
 
@@ -24,8 +24,10 @@ PRESETS = {
     "edge-2d": ("pose_1", "pose_6"),
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
 }
-TARGET_COLUMNS = ("raw", "corrected", "executed", "move")  # the fields of Targets that hold a row for each frame
-UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")  # units of pose_1 to pose_6, and of move_1 to move_6
+# Fields of Targets that hold a row for each frame.
+TARGET_COLUMNS = ("raw", "corrected", "executed", "move")
+# Units of pose_1 to pose_6, and of move_1 to move_6.
+UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 
 
 @dataclass(frozen=True)
@@ -37,14 +39,14 @@ class Targets:
     names : tuple of str
         The table's columns.
     raw : (M, K) float
-        As in the table: mm and deg; NaN where a cell holds no number.
+        Labels as in the table, mm and deg; NaN if a cell holds no number.
     corrected : (M, K) float
-        ``raw`` without the moves that were not executed; equal to ``raw`` where nothing is known. For simulated contacts the depth
-        and the angle of the surface that was touched, whatever its shape.
+        ``raw`` without moves that were not executed; equal to ``raw`` if nothing is known about the moves. For simulated contacts: the
+        depth and the angle of the touched surface, of any shape.
     executed : (M,) float
-        Whether each move had been executed: 1, 0, or NaN where that isn't known.
-    move : (M, 2) float
-        ``move_1`` (mm) and ``move_6`` (deg) as in the table; NaN without them.
+        Whether each move was executed: 1, 0, or NaN if that is not known.
+        move : (M, 2) float
+            ``move_1`` (mm) and ``move_6`` (deg) as in the table; NaN if the table does not have them.
     """
 
     names: tuple[str, ...]
@@ -54,17 +56,17 @@ class Targets:
     move: np.ndarray
 
     def rows(self, index: np.ndarray) -> "Targets":
-        """The same labels of only some frames."""
+        """The labels of the rows with these indices."""
         return Targets(self.names, **{key: getattr(self, key)[index] for key in TARGET_COLUMNS})
 
     def instead(self, known: Mapping[str, np.ndarray]) -> "Targets":
-        """The same with other corrected labels: ``known`` holds values (M,) by the names of label columns."""
+        """These targets with other corrected labels: ``known`` holds values (M,) by the names of label columns."""
         columns = [known.get(name, self.corrected[:, k]) for k, name in enumerate(self.names)]
         return replace(self, corrected=np.column_stack(columns))
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Unit of each label: mm, deg, or "" where the column's name doesn't tell."""
+        """Unit of each label: mm, deg, or "" if it does not follow from the column's name."""
         return tuple(unit_of(name) for name in self.names)
 
 
@@ -74,7 +76,7 @@ def joined_targets(parts: Sequence[Targets]) -> Targets:
 
 
 def unit_of(name: str) -> str:
-    """Unit of a column: ``pose_1..3`` and ``move_1..3`` mm, ``..4..6`` deg; tactile_data's ``pose_x`` and ``pose_Rx`` likewise."""
+    """Unit of a column: mm for ``pose_1..3``, ``move_1..3`` and tactile_data's ``pose_x``; deg for ``..4..6`` and ``pose_Rx``."""
     kind, _, axis = name.partition("_")
     if kind in ("pose", "move", "shear"):
         if axis in "123456" and len(axis) == 1:
@@ -125,7 +127,7 @@ def choose_targets(
 def corrected(
     names: tuple[str, ...], raw: np.ndarray, executed: np.ndarray, move: np.ndarray, depth_per_move: float, x_mm: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Labels (M, K) with the moves (M, 2) that were not executed taken out; an unknown ``executed`` (M,) counts as executed.
+    """Labels (M, K) without moves (M, 2) that were not executed. A move whose ``executed`` (M,) is not known counts as executed.
 
     ``x_mm`` (M,) is the table's ``pose_1``: 0 in the published recordings.
     """

@@ -1,4 +1,4 @@
-"""A trained model from labelled recordings: the data sets read, joined and learnt in one call."""
+"""Training of a model in one call: labelled recordings are read, joined and learnt from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +11,16 @@ from training.dataset import joined, load_dataset
 from training.loop import epoch_step
 from training.models import recipe_of
 from training.networks import choose_device
-from training.recipes import TrainingError
 from training.run import RunConfig, train_run
+from training.run_files import CONFIG, TENSORS
 from training.targets import PRESETS
+from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.types import Form
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helpers of its other labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = ("config.json", "curves.csv", "weights.pt")  # of a finished run
+FILES = (CONFIG, "curves.csv", TENSORS)  # of a finished run
 
 
 @dataclass(frozen=True)
@@ -31,15 +32,15 @@ class Trained:
     out : Path
         The run's folder.
     finished : bool
-        Whether training came to its end; if not, the same call continues it.
+        Whether training is finished; if not, the same call continues it.
     frames : int
         Number of usable frames.
     names : tuple of str
         The label columns.
     labels : str
-        Whether they are corrected or raw.
-    problems : list of str
-        What is odd about the recordings.
+        Kind of labels: corrected or raw.
+        problems : list of str
+            Irregularities of the recordings.
     """
 
     out: Path
@@ -55,7 +56,7 @@ class Trained:
         return [self.out / name for name in FILES]
 
     def lines(self) -> list[str]:
-        """Lines for people."""
+        """The result as lines of text."""
         lines = [f"note: {problem}" for problem in self.problems]
         lines.append(f"{self.frames} usable frames; labels {', '.join(self.names)} ({self.labels})")
         if not self.finished:
@@ -90,20 +91,20 @@ def train_model(
     model : str
         As ``recipe_of`` takes it.
     recordings : sequence of Path
-        Several are joined.
+        Several recordings are joined to one data set.
     target : str
         A preset's name, or label columns separated by commas.
     labels : {"corrected", "raw"}
     seed : int
-        Of weights and order.
-    split : int or None
-        Seed of the fifth that is kept out of training; None: train on all.
+        Seed of the weights and of the order of rows.
+        split : int or None
+            Seed of the random fifth of the rows that is kept out of training; None: train on all rows.
     epochs, batch, members, kernel : optional
         Values that replace the recipe's own.
     max_minutes : float, optional
         Stop after the epoch in which this time has passed.
     threads : int, optional
-        Of the CPU.
+        Number of CPU threads.
     device : {"auto", "cpu", "cuda"}
     form : Form, optional
         Form of the frames; recognised by size and content by default.
@@ -116,7 +117,7 @@ def train_model(
         The recordings have no such labels, or can't be joined.
     """
     if labels not in ("corrected", "raw"):
-        raise TrainingError(f"--labels must be corrected or raw, got {labels!r}")
+        raise OptionError(f"--labels must be corrected or raw, got {labels!r}")
     recipe = recipe_of(model, epochs=epochs, batch=batch, members=members, kernel=kernel)
     if threads:
         torch.set_num_threads(threads)
@@ -132,5 +133,14 @@ def train_model(
 
 
 def columns_of(target: str) -> str | tuple[str, ...]:
-    """The ``columns`` of ``load_dataset``: the name of a preset, or a tuple of column names that are separated by commas."""
-    return target if target in PRESETS else tuple(name.strip() for name in target.split(","))
+    """The ``columns`` of ``load_dataset``: the name of a preset, or a tuple of column names that are separated by commas.
+
+    Raises
+    ------
+    TrainingError
+        A name is there twice, or there is none.
+    """
+    names = tuple(name.strip() for name in target.split(",") if name.strip())
+    if not names or len(set(names)) < len(names):
+        raise OptionError(f"--target {target}: give a preset, or label columns with commas between, each once")
+    return target if target in PRESETS else names

@@ -1,8 +1,9 @@
-"""Can a small network tell two sets of frames apart? A classifier two-sample test (Lopez-Paz & Oquab 2017).
+"""A classifier two-sample test (Lopez-Paz & Oquab 2017): can a small network distinguish two sets of frames?
 
-A fixed network of four convolutions sees colour patches of the lens disc. It is trained on some frames and judged on others that it has
-never seen. Frame k of one set is always held out together with frame k of the other, so that a pair which shows the same contact can't
-give the answer away. An accuracy of 50 % means that the sets can't be told apart, 100 % that every patch can.
+The inputs of a fixed network of four convolutions are colour patches of the lens disc. It is trained on some frames and tested on the
+others. Frame k of one set is always held out together with frame k of the other, because both may show the same contact, and a network
+that knew one of them could recognise the other. An accuracy of 50 % means that the network can't distinguish the sets, 100 % that it
+assigns every patch to the right set.
 """
 
 from dataclasses import dataclass
@@ -15,29 +16,40 @@ from torch.nn import functional
 from twin.errors import FrameError
 from twin.progress import Step
 
-PATCH_PX = 64  # side of a patch
-PATCHES = 16  # patches of each frame, in each epoch and in the test
-CHANNELS = (16, 32, 64, 64)  # of the convolutions, one after the other
+# Side of a patch, px.
+PATCH_PX = 64
+# Number of patches of each frame, in each epoch and in the test.
+PATCHES = 16
+# Channels of the four convolutions.
+CHANNELS = (16, 32, 64, 64)
+# Number of epochs.
 EPOCHS = 12
-BATCH = 64  # patches
-FOLDS = 5  # parts of the frames; each is held out once
-RATE = 2e-3  # largest learning rate of AdamW
-WEIGHT_DECAY = 1e-2  # of AdamW
-INSIDE = 0.9  # least part of a patch that lies in the lens disc
-RESAMPLES = 2000  # drawings of the frame pairs, for the interval
-LEVEL_SCALE = 64.0  # gray levels that are 1 in the network's input
+# Number of patches in a batch.
+BATCH = 64
+# Number of parts of the frames; each is held out once.
+FOLDS = 5
+# Largest learning rate of AdamW.
+RATE = 2e-3
+# Weight decay of AdamW.
+WEIGHT_DECAY = 1e-2
+# Least share of a patch's area that lies in the lens disc.
+INSIDE = 0.9
+# Number of bootstrap samples of the frame pairs, from which the interval is computed.
+RESAMPLES = 2000
+# Gray levels that the value 1 of the network's input stands for.
+LEVEL_SCALE = 64.0
 
 
 @dataclass(frozen=True)
 class TwoSample:
-    """Outcome of a test.
+    """Result of a test.
 
     Attributes
     ----------
     accuracy : float
-        Share of the patches of unseen frames that are assigned to their set.
+        Share of the patches of held-out frames that are assigned to the right set.
     low, high : float
-        95 % interval by resampling the held-out pairs of frames.
+        95 % bootstrap interval over the held-out pairs of frames.
     by_pair : (M,) float
         Accuracy of each held-out pair of frames.
     """
@@ -51,7 +63,7 @@ class TwoSample:
 def two_sample(
     first: list[np.ndarray], second: list[np.ndarray], inside: np.ndarray, *, seed: int = 0, progress: Step | None = None
 ) -> TwoSample:
-    """Test two sets of as many frames.
+    """Test two sets of equally many frames.
 
     Parameters
     ----------
@@ -60,7 +72,7 @@ def two_sample(
     inside : (H, W) bool
         The lens disc.
     seed : int
-        Of patches, network and folds. The same seed gives the same outcome.
+        Seed of patches, network and folds. The same seed gives the same result.
     progress : callable, optional
         ``progress(done, total)`` after each fold.
 

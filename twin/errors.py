@@ -1,8 +1,15 @@
-"""Errors that a user can act on; the command line prints them as one line."""
+"""Errors and warnings that a user can act on; the command line prints each as one line."""
+
+import warnings
+from functools import cache
 
 
 class TwinError(Exception):
     """Base of the errors that are raised on purpose. The message says what was expected, what came, and what to do."""
+
+
+class OptionError(TwinError):
+    """An option's value, or options together, can't be meant, whatever the files hold. The message names the option."""
 
 
 class FrameError(TwinError):
@@ -27,3 +34,13 @@ class StoreError(TwinError):
 
 class DatasetError(TwinError):
     """A data set can't be made or continued."""
+
+
+class WorkersError(TwinError):
+    """Processes that share work are lost."""
+
+
+@cache
+def warn_once(message: str) -> None:
+    """Give a ``RuntimeWarning``, each message once in a process."""
+    warnings.warn(message, RuntimeWarning, stacklevel=3)

@@ -1,4 +1,4 @@
-"""One contact, from specifications to a folder: pressed, rendered, and written with its exact ground truth."""
+"""One contact: it is simulated, rendered, and written to a folder with its exact ground truth."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,15 +20,15 @@ from twin.types import ContactState, FloatArray, Form
 
 @dataclass(frozen=True)
 class RenderedContact:
-    """A contact that was pressed and rendered, and the files that were written of it."""
+    """A simulated and rendered contact, and its files."""
 
     state: ContactState
     shot: Shot
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """Force, contact area and caps in sight, for people."""
-        force = self.state.force_n.round(2) + 0.0  # no negative zeros
+        """The result as lines of text: force, contact area and number of visible caps."""
+        force = self.state.force_n.round(2) + 0.0  # 0.0 turns negative zeros into positive ones
         visible = self.shot.truth.visible
         return [
             f"force {force[0]:+.2f} {force[1]:+.2f} {force[2]:+.2f} N, contact area {self.state.area_mm2:.1f} mm2, "
@@ -47,7 +47,7 @@ def render_contact(
     seed: int = 0,
     progress: Progress = silent,
 ) -> RenderedContact:
-    """Press an object against a sensor, render what the camera sees, and write both with their ground truth.
+    """Simulate the contact of an object and a sensor, render the camera's frame, and write both with their ground truth.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def render_contact(
     ContactError
         The pose is out of reach, or the solver does not converge.
     RenderError
-        Nothing can be rendered here.
+        The renderer does not work on this machine.
     """
     simulator = Simulator(sensor, quality=quality)
     simulator.check_form(form)
@@ -86,7 +86,7 @@ def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Co
     Returns
     -------
     list of Path
-        What was written.
+        The written files.
     """
     spec = simulator.spec
     write_image(out / "frame.png", shot.frame.image)
@@ -106,16 +106,16 @@ def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Co
 
 
 def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
-    """The state's arrays on each place in contact, by their names in ``truth.npz`` (see ``ContactState``)."""
+    """The arrays of a state that have a row for each place in contact, by their names in ``truth.npz`` (see ``ContactState``)."""
     names = ("contact_mm", "point_area_mm2", "normal", "normal_n", "tangential_n", "slipping")
     return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}
 
 
 def look_at(simulator: Simulator, shot: Shot) -> Look:
-    """Run the pipeline on a shot and on the same sensor's no-contact frame."""
+    """Run the pipeline on a shot, and on the frame without contact of the same sensor."""
     form = shot.frame.form
     pipeline = Pipeline(simulator.spec, form)
-    rest = pipeline(simulator.shoot_rest(form).frame)  # first, because this loads compiled code, which must not count in the shot's times
+    rest = pipeline(simulator.shoot_rest(form).frame)  # first, because this loads compiled code, and would distort the shot's times
     return Look(shot.frame, pipeline(shot.frame), rest)
 
 

@@ -1,4 +1,4 @@
-"""The twin of one sensor: press it, look through its camera, get frames with ground truth."""
+"""The twin of one sensor: simulation of contacts, and frames of its camera with ground truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,9 +29,9 @@ class Shot:
     linear : (H, W) or (H, W, 3) float32
         Radiance before the camera's response, of the whole raw frame.
     truth : CapTruth
-        Where the caps are, in px of ``frame``.
+        Places of the caps in px of ``frame``.
     seconds : float
-        Time that rendering took, in s.
+        Time of rendering, s.
     """
 
     frame: Frame
@@ -62,7 +62,7 @@ class Simulator:
 
     @property
     def renderer(self) -> Renderer:
-        """The renderer, built when it is first needed (pressing alone needs no Mitsuba)."""
+        """The renderer. It is built when it is first needed, because a simulation without rendering needs no Mitsuba."""
         if self._renderer is None:
             self._renderer = Renderer(self.spec, quality=self._quality, mesh=self.solver.mesh)
         return self._renderer
@@ -73,19 +73,19 @@ class Simulator:
         Raises
         ------
         ContactError
-            If the pose is out of reach or the solver does not converge.
+            The pose is out of reach, or the solver does not converge.
         """
         return self.solver.press(touched, pose, progress=None if progress is None else lambda fraction, _: progress(fraction))
 
     def shoot(self, state: ContactState, *, form: Form = Form.RAW, seed: int = 0, name: str = "frame.png") -> Shot:
-        """Render what the camera sees, and capture it in the given form.
+        """Render the camera's frame in the given form.
 
         Raises
         ------
         FrameError
-            If the sensor has no recording form.
+            The sensor has no recording form.
         RenderError
-            If nothing can be rendered here.
+            The renderer does not work on this machine.
         """
         self.check_form(form)
         start = perf_counter()
@@ -96,7 +96,7 @@ class Simulator:
         return raw if form is Form.RAW else self.as_recorded(raw, state)
 
     def shoot_rest(self, form: Form) -> Shot:
-        """The frame without contact in the given form; rendered once, then kept."""
+        """The frame without contact in the given form. It is rendered once and then stored."""
         if form not in self._rest_shots:
             self._rest_shots[form] = self.shoot(self.rest, form=form)
         return self._rest_shots[form]
@@ -110,7 +110,7 @@ class Simulator:
         return replace(raw, frame=frame, truth=cap_truth(self.spec, self.rest, state, Form.RECORDING))
 
     def describe(self) -> dict[str, dict[str, object]]:
-        """What a result depends on besides sensor and object: variant and samples, mesh and tolerances."""
+        """Everything besides sensor and object that a result depends on: variant, samples, mesh and tolerances."""
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},
             "solver": {
@@ -121,5 +121,5 @@ class Simulator:
         }
 
     def check_form(self, form: Form) -> None:
-        """Raise FrameError if the sensor has no such form."""
+        """Raise FrameError if the sensor does not have this form."""
         frame_size(self.spec, form)

@@ -1,4 +1,4 @@
-"""What flows between the stages. Frozen; shapes and units in the docstrings."""
+"""The types that the stages pass to each other. They are frozen; the docstrings state shapes and units."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -15,11 +15,17 @@ ImageArray: TypeAlias = NDArray[np.uint8]
 """Gray or RGB levels of a frame."""
 
 FINE = 20
-"""Elements across the skin for calibrations and data sets. In the deepest contacts the outer pins then move as with 32 elements, to 1 %."""
+"""Number of elements across the skin for calibrations and data sets. In the deepest contacts the displacements of the outer pins differ
+from those with 32 elements by 1 %."""
+
+
+# Values of the option --at-rest besides a file with a frame without contact: use the first frame that is read, or use none, so that
+# displacements are counted from the specification's layout.
+FIRST, NONE = "first", "none"
 
 
 class Form(StrEnum):
-    """A sensor's frames come in two forms."""
+    """The two forms of a sensor's frames."""
 
     RAW = "raw"  # the camera's own frame
     RECORDING = "recording"  # cropped, thresholded and resized at capture
@@ -27,7 +33,7 @@ class Form(StrEnum):
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture of one sensor, wherever it came from (rendered, recorded, live).
+    """One picture of one sensor, which may be rendered, recorded or live.
 
     Attributes
     ----------
@@ -37,7 +43,7 @@ class Frame:
     name : str
         Base name of the file, or a label.
     time_s : float
-        Time of exposure (0 where unknown).
+        Time of exposure; 0 if unknown.
     sequence : int
     """
 
@@ -49,7 +55,7 @@ class Frame:
 
 
 class PinState(Protocol):
-    """Where the pins of a sensor are, in the sensor frame: at rest, in a contact, or as fitted to a frame.
+    """Places of the pins of a sensor in the sensor frame: at rest, in a contact, or as fitted to a frame.
 
     Attributes
     ----------
@@ -84,15 +90,15 @@ class ContactState:
     area_mm2 : float
         Area of the outer skin in contact, at rest.
     contact_mm : (c, 3) float
-        Places of the outer skin that touch the object, each standing for ``point_area_mm2 (c,)`` of the skin at rest.
+        Places of the outer skin that touch the object. Each represents an area ``point_area_mm2 (c,)`` of the skin at rest.
     normal : (c, 3) float
-        The object's outward unit normal there.
+        The object's outward unit normal at each place.
     normal_n : (c,) float
-        Size of the normal force at each place, positive; over ``point_area_mm2`` the pressure in MPa.
+        Magnitude of the normal force at each place. Divided by ``point_area_mm2`` it is the pressure in MPa.
     tangential_n : (c, 3) float
-        Friction force of the skin on the object at each place. ``tangential_n - normal_n normal`` sums to ``force_n``.
+        Friction force of the skin on the object at each place. The sum of ``tangential_n - normal_n normal`` is ``force_n``.
     slipping : (c,) bool
-        Whether the place slides (else it sticks).
+        Whether the place slides; otherwise it sticks.
     T_sensor_object : (4, 4) float
         The object's pose.
     elastic_nmm : float

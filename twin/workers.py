@@ -1,26 +1,205 @@
 """Handing out work: in this process, to processes of this machine, or to a cluster's workers (Dask)."""
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+import os
+import pickle
+import signal
+import threading
+import traceback
+import warnings
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection, wait
+from types import FrameType
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from twin.errors import DatasetError, TwinError
+from twin.errors import DatasetError, TwinError, WorkersError, warn_once
 from twin.store import fingerprint
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# Tasks that each worker has at a time. With two, a worker that ends one does not wait for the next, and an interruption loses little.
+# Tasks that each worker of a cluster has at a time. With two, a worker that ends one does not wait for the next, and an interruption
+# loses little.
 AHEAD = 2
-# Longest wait for a result, in s, before the workers are counted again.
+# How often a task is begun. If each time its process is lost, it is given up.
+TRIES = 4
+# Longest wait for a result of a cluster, in s, before its workers are counted again.
 LOOK_S = 1.0
 # Longest wait for the first worker of a scheduler, in s.
 JOIN_S = 60.0
-LOOPBACK = "127.0.0.1"
 AGAIN = "what is done is kept, and the same command goes on from there"
 
+Task = TypeVar("Task")
 Made = TypeVar("Made")
+Begin = Callable[..., Callable[[Task], Made]]
+"""Makes the function that is called for every task. It is a function of a module, so that another process can import it."""
+
+
+def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Sequence[Task], *, processes: int) -> Iterator[Made]:
+    """Yield ``begin(*given)(task)`` for each task, in the order in which the calls end.
+
+    The processes end with this one, however it ends. Ctrl-C is left to this process, which ends them at once. A process that is lost
+    is replaced, and its task is begun again after the others. A warning of several processes is given once, by this one.
+
+    Parameters
+    ----------
+    begin : callable
+        Makes the function that is called for every task. Each process calls it once.
+    given : tuple
+        Arguments of ``begin``, which can be pickled.
+    tasks : sequence
+        Arguments of the function, one for each call, which can be pickled.
+    processes : int
+        Fresh (spawned) processes of this machine. With 1 everything happens in this process.
+
+    Raises
+    ------
+    ValueError
+        ``processes`` is less than 1.
+    WorkersError
+        A task lost its process again and again. All other tasks are done.
+    """
+    if processes < 1:
+        raise ValueError(f"processes must be at least 1, got {processes}")
+    if processes == 1 and tasks:
+        yield from map(begin(*given), tasks)
+        return
+    pickled, waiting, lost = pickle.dumps((begin, given)), deque(range(len(tasks))), Counter[int]()
+    busy: list[_Process] = []
+    try:
+        while waiting or busy:
+            while waiting and len(busy) < processes:
+                busy.append(_Process(pickled))
+                busy[-1].give(waiting[0], tasks[waiting.popleft()])
+            ready = wait([process.pipe for process in busy])
+            for process in [process for process in busy if process.pipe in ready]:
+                try:
+                    made, error, where, told = process.pipe.recv()
+                except (EOFError, OSError):
+                    busy.remove(process)
+                    process.end()
+                    lost[process.number] += 1
+                    if lost[process.number] < TRIES:
+                        waiting.append(process.number)
+                    continue
+                for message in told:
+                    warn_once(message)
+                if error is not None:
+                    raise error from RuntimeError(f"in a process of its own:\n{where}")
+                if waiting:
+                    process.give(waiting[0], tasks[waiting.popleft()])
+                else:
+                    busy.remove(process)
+                    process.end()
+                yield pickle.loads(made)
+    finally:
+        for process in busy:
+            process.end()
+    if given_up := [number for number, times in lost.items() if times == TRIES]:
+        raise WorkersError(
+            f"{len(given_up)} of {len(tasks)} tasks ended their process {TRIES} times; is there enough memory for {processes}? {AGAIN}"
+        )
+
+
+class _Process:
+    """A fresh process that does one task at a time.
+
+    Parameters
+    ----------
+    pickled : bytes
+        ``begin`` and ``given`` of ``in_processes``. They are pickled here, as unpickling imports much: so the process can watch
+        its parent before.
+    """
+
+    def __init__(self, pickled: bytes) -> None:
+        context = get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.number = -1
+        self._process = context.Process(target=_serve, args=(theirs, pickled), daemon=True)
+        try:
+            with _deaf_to_ctrl_c():
+                self._process.start()
+        except BaseException:
+            if self._process.pid is not None:
+                self.end()
+            raise
+        theirs.close()
+
+    def give(self, number: int, task: object) -> None:
+        """Hand it the task of this number. If it is lost already, its pipe will tell."""
+        self.number = number
+        with suppress(OSError):
+            self.pipe.send(task)
+
+    def end(self) -> None:
+        """End it at once, whatever it does."""
+        self._process.kill()
+        self._process.join()
+        self.pipe.close()
+
+
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Context that SIGINT does not interrupt: it is heard at the end. Processes that are started in it never hear it."""
+    heard: list[tuple[int, FrameType | None]] = []
+    before = None
+    if threading.current_thread() is threading.main_thread():  # another thread may take the signal, and this one then raises it
+        before = signal.signal(signal.SIGINT, lambda number, frame: heard.append((number, frame)))
+    masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if hasattr(signal, "pthread_sigmask") else None  # not on Windows
+    try:
+        yield
+    finally:
+        if masked is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+    if heard and callable(before):
+        before(*heard[0])
+
+
+def _serve(pipe: Connection, pickled: bytes) -> None:
+    """Do tasks in a process of its own: for each, send what was made, or the error and where it arose, and the warnings."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    work: Callable[[Any], Any] | None = None
+    while True:
+        try:
+            task = pipe.recv()
+        except (EOFError, OSError):  # the process that started this one has ended
+            return
+        with warnings.catch_warnings(record=True) as caught:
+            try:
+                if work is None:
+                    begin, given = pickle.loads(pickled)
+                    work = begin(*given)
+                made, error, where = pickle.dumps(work(task)), None, ""
+            except Exception as arisen:
+                made, error, where = pickle.dumps(None), _that_can_be_sent(arisen), traceback.format_exc()
+        try:
+            pipe.send((made, error, where, [str(each.message) for each in caught]))
+        except OSError:
+            return
+
+
+def _end_with_parent() -> None:
+    """End this process as soon as the one that started it has ended."""
+    parent = parent_process()
+    assert parent is not None, "this process was not started by another"
+    wait([parent.sentinel])
+    os._exit(1)
+
+
+def _that_can_be_sent(error: Exception) -> Exception:
+    """The error, or one that says the same where it can't be pickled."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
 
 
 def outcomes(make: Callable[[str, int], Made], text: str, todo: list[int], *, workers: int, scheduler: str) -> Iterator[Made]:
@@ -35,65 +214,47 @@ def outcomes(make: Callable[[str, int], Made], text: str, todo: list[int], *, wo
     todo : list of int
         What tells the calls apart.
     workers : int
-        Processes of this machine. With 1 everything happens in this process.
+        Processes of this machine (see ``in_processes``).
     scheduler : str
         Address of a Dask scheduler whose workers do the work; "" for processes of this machine.
 
     Raises
     ------
+    WorkersError
+        Processes of this machine were lost again and again.
     DatasetError
-        The workers or the scheduler are lost, or they run another version of this program.
+        The workers of the scheduler, or the scheduler itself, are lost, or they run another version of this program.
     """
     if not todo:
         return
-    if workers == 1 and not scheduler:
-        for index in todo:
-            yield make(text, index)
+    if not scheduler:
+        yield from in_processes(partial, (make, text), todo, processes=workers)
         return
-    with _client(min(workers, len(todo)), scheduler) as client:
+    with _client(scheduler) as client:
         yield from _by_cluster(client, make, text, todo, scheduler)
 
 
 def require_scheduler(address: str) -> None:
     """Raise ``DatasetError`` where no Dask scheduler answers, before anything is written for its workers."""
-    with _client(1, address):
+    with _client(address):
         pass
 
 
 @contextmanager
-def _client(workers: int, scheduler: str) -> Iterator["Client"]:
-    """A client of a running scheduler, or of a cluster on this machine that ends with the context."""
+def _client(scheduler: str) -> Iterator["Client"]:
+    """A client of a running scheduler."""
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
     with dask.config.set({"distributed.comm.timeouts.connect": "10s"}), _silenced():
-        if scheduler:
-            try:
-                client = Client(scheduler, timeout="10s")
-            except (OSError, ValueError) as error:
-                raise DatasetError(
-                    f"--scheduler {scheduler}: no scheduler answers there ({error}); start one with 'dask scheduler'"
-                ) from error
-            try:
-                yield client
-            finally:
-                client.close(timeout=2)
-            return
-        # Dask serves HTTP even without its dashboard, and does not ask for a password. So it may listen on this machine only.
-        # Port 0 is any free port, because other clusters may run.
-        local_only = {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
-        with (
-            LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
-                host=LOOPBACK,
-                silence_logs=logging.CRITICAL + 10,
-                scheduler_kwargs=local_only,
-            ) as cluster,
-            Client(cluster) as client,
-        ):
+        try:
+            client = Client(scheduler, timeout="10s")
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"--scheduler {scheduler}: no scheduler answers there ({error}); start one with 'dask scheduler'") from error
+        try:
             yield client
+        finally:
+            client.close(timeout=2)
 
 
 @contextmanager
@@ -112,9 +273,10 @@ def _silenced() -> Iterator[None]:
 
 def _by_cluster(client: "Client", make: Callable[[str, int], Made], text: str, todo: list[int], scheduler: str) -> Iterator[Made]:
     """The outcomes of a cluster: no worker is given more than ``AHEAD`` tasks, so that new workers find some, too."""
-    from distributed import CancelledError, wait
+    from distributed import CancelledError
+    from distributed import wait as wait_for
 
-    where = f"scheduler {scheduler}" if scheduler else "the worker processes"
+    where = f"scheduler {scheduler}"
     try:
         client.wait_for_workers(1, timeout=JOIN_S)
     except TimeoutError as error:
@@ -127,7 +289,7 @@ def _by_cluster(client: "Client", make: Callable[[str, int], Made], text: str, t
             for _ in range(min(room, len(waiting))):
                 index = waiting.pop()
                 flying[client.submit(_checked, make, text, index, own, pure=False)] = index
-            done = set(wait(list(flying), timeout=LOOK_S, return_when="FIRST_COMPLETED").done)
+            done = set(wait_for(list(flying), timeout=LOOK_S, return_when="FIRST_COMPLETED").done)
         except TimeoutError:
             done = set()
         except (CancelledError, OSError) as error:

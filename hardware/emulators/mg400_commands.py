@@ -1,4 +1,4 @@
-"""The emulated MG400's commands, by port, with their parameters and replies."""
+"""The commands of the emulated MG400 for each of its ports, with their parameters and replies."""
 
 import math
 import re
@@ -11,21 +11,30 @@ from hardware.arms.motion import Speeds
 from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame
 from hardware.emulators.mg400_grammar import Parameter, RefusedError, Request, keyword_number, read_numbers
 
+# A coordinate or an angle of any size.
 NUMBER = Parameter()
+# A speed or an acceleration, percent.
 PERCENT = Parameter(integer=True, low=1, high=100)
+# Ratio of continuous-path blending, percent.
 RATIO = Parameter(integer=True, low=0, high=100)
+# Number of a user or tool frame.
 INDEX = Parameter(integer=True, low=0, high=9)
+# Mass at the tool, kg.
 LOAD_KG = Parameter(low=0.0, high=0.5)
+# Number of a digital output.
 OUTPUT = Parameter(integer=True, low=1, high=24)
+# Level of a digital output.
 BIT = Parameter(integer=True, low=0, high=1)
+# Names of the directions of a jog.
 AXES = {f"{axis}{sign}" for axis in ("j1", "j2", "j3", "j4", "x", "y", "z", "r") for sign in "+-"}
+# Number of servos. GetErrorID replies with the controller's alarms, followed by those of each servo.
 SERVOS_N = 4
 
 Command = Callable[[Request], str]
 
 
 class Mg400Commands:
-    """Commands of the dashboard and of motion, for one version of the firmware.
+    """Commands of the dashboard port and of the motion port, for one version of the firmware.
 
     Parameters
     ----------
@@ -67,7 +76,7 @@ class Mg400Commands:
             "reljointmovj": lambda request: self._to_joints(request, relative=True),
             "movejog": self._jog,
             **{f"relmov{kind}{frame}": self._relative for kind in "jl" for frame in ("user", "tool", "")},
-            "sync": self._plain(lambda: ""),  # the server answers them once the queue is empty
+            "sync": self._plain(lambda: ""),  # the server sends the reply when the queue is empty
             "syncall": self._plain(lambda: ""),
         }
 
@@ -142,7 +151,7 @@ class Mg400Commands:
         return _text(self._seen(flange, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
 
     def _inverse(self, request: Request) -> str:
-        if len(request.values) not in (6, 7, 8):  # two optional parameters select a solution near given joints; this arm has only one
+        if len(request.values) not in (6, 7, 8):  # two optional parameters select the solution near given joints; here there is only one
             raise RefusedError(ErrorId.PARAMETER_COUNT)
         *pose, user, tool = read_numbers(Request(request.name, request.values[:6], {}, request.text), (NUMBER,) * 4 + (INDEX,) * 2, (6,))
         joints = self.arm.joints_at(self._flange(pose, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
@@ -156,7 +165,7 @@ class Mg400Commands:
         return ""
 
     def _relative(self, request: Request) -> str:
-        """``RelMovLUser(dx, dy, dz, dr, user)`` and its relatives; the offset is along the axes of user or tool."""
+        """``RelMovLUser(dx, dy, dz, dr, user)`` and similar commands. The offset is along the axes of the user or tool frame."""
         values = read_numbers(request, (NUMBER,) * 4 + (INDEX,), (4, 5))
         offset, index = PlanarFrame(*values[:4]), int(values[4]) if len(values) == 5 else None
         last = self.arm.last_target()
@@ -178,7 +187,7 @@ class Mg400Commands:
         try:
             self.arm.order(Order(self.arm.joints_at(flange), False, speeds))
         except RefusedError:
-            self.arm.order(Order(flange.pose, True, speeds))  # planning raises the alarm if the target is out of reach
+            self.arm.order(Order(flange.pose, True, speeds))  # the target is out of reach, and planning raises the alarm
 
     def _to_joints(self, request: Request, *, relative: bool) -> str:
         joints = np.array(read_numbers(request, (NUMBER,) * 4, (4,)))

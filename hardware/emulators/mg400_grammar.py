@@ -1,4 +1,4 @@
-"""The MG400's requests, ``Name(p1,p2,Key=v)``: found in a stream and checked against the parameters of their command."""
+"""Parsing of the MG400's requests, ``Name(p1,p2,Key=v)``: they are found in a stream, and their parameters are checked."""
 
 import math
 import re
@@ -9,7 +9,7 @@ from hardware.arms.mg400_wire import ErrorId
 
 @dataclass(frozen=True)
 class Request:
-    """One request: its name in lower case, its parameters, its keywords in lower case, and the text as delivered."""
+    """One request: name in lower case, parameters, keywords in lower case, and the received text."""
 
     name: str
     values: tuple[str, ...]
@@ -18,7 +18,7 @@ class Request:
 
 
 class RefusedError(Exception):
-    """The request is refused with an error id."""
+    """A request is refused with an error id."""
 
     def __init__(self, error_id: int) -> None:
         super().__init__(f"refused: {error_id}")
@@ -26,7 +26,10 @@ class RefusedError(Exception):
 
 
 def take_request(buffer: str) -> tuple[Request | None, str]:
-    """The first whole request in what has arrived, and what is left. It ends at the ``)`` that closes it; no newline is needed."""
+    """The first complete request in the received text (None if there is none), and the rest of the text.
+
+    A request ends at its closing ``)``. It needs no newline.
+    """
     depth = 0
     for n, letter in enumerate(buffer):
         depth += {"(": 1, ")": -1}.get(letter, 0)
@@ -49,7 +52,7 @@ def _parse(text: str) -> Request:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Type and range of a parameter."""
+    """Type and range of a command's parameter."""
 
     integer: bool = False
     low: float = float("-inf")
@@ -62,7 +65,7 @@ def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tu
     Raises
     ------
     RefusedError
-        Their count (-20000), the type (-3000n) or range (-4000n) of the n-th is wrong.
+        The number of values is wrong (-20000), or the type (-3000n) or the range (-4000n) of the n-th value.
     """
     if len(request.values) not in counts:
         raise RefusedError(ErrorId.PARAMETER_COUNT)
@@ -70,7 +73,7 @@ def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tu
 
 
 def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:
-    """The value of a keyword. In error ids the keywords are numbered after the values."""
+    """The value of a keyword, or the default. In error ids, keywords are numbered after the values."""
     if key not in request.keywords:
         return default
     return _number(request.keywords[key], parameter, len(request.values) + 1 + list(request.keywords).index(key))

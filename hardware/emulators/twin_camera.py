@@ -12,10 +12,10 @@ from hardware.arms.mg400_link import Feedback
 from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, require_ports
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.running import run_until_told, say
-from hardware.errors import DeviceError
 from hardware.rig import twin_camera
 from hardware.rig_geometry import PlacedObject
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
+from twin.errors import OptionError
 from twin.rig.mounting import Mounting
 from twin.types import Form
 
@@ -42,7 +42,7 @@ class FeedbackPose:
         kind, _, rest = spec.partition(":")
         host, _, port = rest.partition(":")
         if kind != "mg400" or not host or (port and not port.isdecimal()):
-            raise DeviceError(f"--arm {spec}: expected mg400:ADDRESS, for example mg400:127.0.0.1 with 'twin emulate mg400' running")
+            raise OptionError(f"--arm {spec}: expected mg400:ADDRESS, for example mg400:127.0.0.1 with 'twin emulate mg400' running")
         offset = int(port) - DASHBOARD_PORT if port else 0
         require_ports(offset)
         return cls(host, tuple(number + offset for number in FEEDBACK_PERIOD_S))

@@ -12,6 +12,7 @@ import numpy as np
 
 from hardware.errors import DeviceError
 from hardware.step import Estimate
+from twin.errors import OptionError
 from twin.types import Frame, Observation
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class RerunView:
 
     def __init__(self, title: str, target: str) -> None:
         if target != VIEWER and "://" not in target and not target.endswith(SUFFIX):
-            raise DeviceError(f"--rerun {target}: expected '{VIEWER}', a file *{SUFFIX} or an address rerun+http://...")
+            raise OptionError(f"--rerun {target}: expected '{VIEWER}', a file *{SUFFIX} or an address rerun+http://...")
         if target.endswith(SUFFIX) and "://" not in target and Path(target).exists():
             raise DeviceError(f"--rerun {target}: is there already; give a new file, or remove it")
         try:

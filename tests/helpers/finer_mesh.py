@@ -5,13 +5,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.load import load_object, load_sensor
+from scenes.object import ObjectSpec
 from twin.geometry.solid import Resolution
 from twin.mechanics import ContactPose, SkinSolver
 
+
+def shaped(name: str, **shape: float) -> ObjectSpec:
+    """A shipped object with a shape of other sizes."""
+    spec = load_object(name)
+    return spec.model_copy(update={"shape": spec.shape.model_copy(update=shape)})
+
+
 CASES = {
-    "plane": ("plane", ContactPose(2.0)),
-    "sphere": ("sphere", ContactPose(2.0)),
-    "tilted cylinder": ("cylinder", ContactPose(2.0, tilt_deg=(10.0, 15.0), shear_mm=(0.8, 0.3), twist_deg=10.0)),
+    "plane": (load_object("plane"), ContactPose(2.0)),
+    "sphere": (load_object("sphere"), ContactPose(2.0)),
+    "tilted cylinder": (load_object("cylinder"), ContactPose(2.0, tilt_deg=(10.0, 15.0), shear_mm=(0.8, 0.3), twist_deg=10.0)),
+    "edge": (load_object("edge"), ContactPose(2.0)),
+    "round edge": (shaped("edge", fillet_mm=1.5), ContactPose(2.0)),
+    "sheared edge": (load_object("edge"), ContactPose(2.0, tilt_deg=(0.0, 10.0), shear_mm=(1.0, 0.0))),
+    "square rod": (load_object("square-rod"), ContactPose(2.0, tilt_deg=(0.0, 5.0))),
+    "bump": (shaped("sphere", radius_mm=2.0), ContactPose(2.0)),
 }
 
 
@@ -34,9 +47,9 @@ def make_solvers() -> list[SkinSolver]:
 
 def errors_of(solvers: list[SkinSolver], case: str) -> list[Off]:
     """Of the default and the coarser mesh."""
-    name, pose = CASES[case]
+    touched, pose = CASES[case]
     rest = solvers[0].rest().caps_mm
-    exact, *others = (solver.press(load_object(name), pose) for solver in solvers)
+    exact, *others = (solver.press(touched, pose) for solver in solvers)
     moved = np.linalg.norm(exact.caps_mm - rest, axis=1)
     found = []
     for state, solver in zip(others, solvers[1:], strict=True):

@@ -90,6 +90,7 @@ def indent(spec, *, fine: float, size: float = SIZE, steps: int = 4) -> Indented
         anchor_mm=np.zeros((count, 3)),
         held=np.zeros(count, bool),
         slid_mm=np.zeros(count),
+        limit_n=np.zeros(count),
         penalty_mpa_mm=30.0,
         T=np.eye(4),
     )

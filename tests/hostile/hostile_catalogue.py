@@ -19,6 +19,7 @@ from hostile_inputs import BAD, RAW_SENSOR, SENSOR, Maker, copied, edited, shipp
 from hostile_known import KNOWN
 
 REFUSED, USAGE, DONE = 1, 2, 0  # exit codes
+BAD_SENSOR = 3  # of 'twin check'
 ANY = (DONE, REFUSED)
 
 
@@ -175,7 +176,7 @@ READ_FRAMES = {  # with the exit codes that are right where one picture of four 
     "preprocess": (f"preprocess {{data}} {S} --out {{out}}", (DONE,)),
     "graph": (f"graph {{data}} {S} --out {{out}}", (DONE,)),
     "predict": (f"predict {SENSOR} {{data}}", (DONE,)),
-    "check": (f"check {{data}} {S}", (DONE, REFUSED, 2)),
+    "check": (f"check {{data}} {S}", (DONE, REFUSED, BAD_SENSOR)),
     "tune": (f"tune {S} --frames {{data}} --out {{out}}/mine.toml --limit 4", ANY),
     "live": (f"live --model {SENSOR} --camera {{data}} --headless", (DONE,)),
 }
@@ -201,12 +202,12 @@ def _pictures() -> list[Entry]:
             found.append(Entry("pictures", what, call, make, right, says, sample=sample))
             alone = {"data": _alone(edit)}
             ends = ANY if what in ("animated", "two pages", *NOT_TOLD) else (REFUSED,)
-            ends = (*ends, 2) if command == "check" else ends
+            ends = (*ends, BAD_SENSOR) if command == "check" else ends
             leaves = ("pins.npz", "summary.json") if command == "preprocess" and what in NOT_TOLD else ()
             found.append(Entry("a picture", what, call, alone, ends, (BAD,) if ends == (REFUSED,) else (), leaves))
         for what, edit in given.VIDEOS.items():
             partly = what.startswith(("damaged", "a picture"))  # some of it can be read
-            ends = (DONE, REFUSED, 2) if partly or what == "cut at half" else (REFUSED,)
+            ends = (DONE, REFUSED, BAD_SENSOR) if partly or what == "cut at half" else (REFUSED,)
             make, says = {"data": edited("video", "", edit)}, () if partly else ("clip", "cut") if what == "cut at half" else ("clip",)
             leaves = ("pins.npz", "summary.json") if partly else ()
             found.append(Entry("videos", what, call, make, ends, says, leaves, sample=command == "predict" and what == "text"))

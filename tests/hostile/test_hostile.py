@@ -18,7 +18,9 @@ from hostile_known import KNOWN
 
 SLOW_MACHINE = 4.0  # times the seconds of an entry, where other work shares the machine
 HANGS_S = 10.0  # for entries that are known not to end, which are not waited for longer
-PROGRESS = re.compile(r"[━╸╺⠀-⣿]|\d/\d+ .*(\d:\d\d:\d\d|-:--:--)")  # what only progress bars print
+PROGRESS = re.compile(  # what only progress prints: bars, or a line every ten seconds
+    r"[━╸╺⠀-⣿]|\d/\d+ .*(\d:\d\d:\d\d|-:--:--)|^(?!twin: )(at work|.+: (begun|\d+%|\d+ of \d+)(, .*)?)$"
+)
 ERROR = "twin: error: "
 VARYING = re.compile(r"\d+\.?\d* ms\b")
 
@@ -145,7 +147,7 @@ def how_it_ended(entry: Entry, ended: Ended) -> list[str]:
                 found.append(f"an error of {len(errors[0])} characters: {errors[0][:60]!r}")
             if "pydantic.dev" in said or "weights_only=False" in said or "allow_pickle=True" in said:
                 found.append("quotes a library's advice")
-        if ended.exit == USAGE and not (lines and lines[-1].startswith("Error: ") or "BAD" in ended.stdout):
+        if ended.exit == USAGE and not (lines and lines[-1].startswith(("Error: ", ERROR))):
             found.append("usage without a line of error")
         if entry.end[0] and len(lines) > 2:
             found.append(f"{len(lines)} lines at its end")

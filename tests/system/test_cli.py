@@ -14,8 +14,8 @@ from scenes import load_sensor
 from scenes.load import SHIPPED
 
 
-def one_line_error(done, *words):
-    assert done.returncode == 1, done.stdout + done.stderr
+def one_line_error(done, *words, code=1):
+    assert done.returncode == code, done.stdout + done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith("twin: error:")]
     assert len(lines) == 1 and "Traceback" not in done.stderr
     for word in words:
@@ -87,7 +87,9 @@ def test_the_releases_method_on_a_frame_in_the_recordings_form(tmp_path):
     assert done.returncode == 0, done.stderr
     with np.load(tmp_path / "graph" / "graph.npz") as data:
         assert len(data["edges"]) == 684
-    one_line_error(twin("graph", tmp_path / "frame.png", "--sensor", "mg400-127", "--legacy", "--kind", "knn"), "--legacy")
+    one_line_error(
+        twin("graph", tmp_path / "frame.png", "--sensor", "mg400-127", "--legacy", "--kind", "knn", "--out", tmp_path), "--legacy", code=2
+    )
 
 
 def test_good_frames_are_processed_and_bad_ones_listed(rendered, tmp_path):
@@ -115,7 +117,7 @@ def test_bad_input_is_one_line_with_the_remedy(tmp_path):
     one_line_error(twin("preprocess", tmp_path / "empty", *sensor), "empty")
     (tmp_path / "torn.avi").write_bytes(b"RIFF....AVI ")
     one_line_error(twin("preprocess", tmp_path / "torn.avi", *sensor), "torn.avi")
-    one_line_error(twin("graph", tmp_path / "nowhere.npz", "--sensor", "mg400-127"), "nowhere.npz")
+    one_line_error(twin("graph", tmp_path / "nowhere.npz", *sensor), "nowhere.npz")
     one_line_error(
         twin("render", "--sensor", "mg400-172", "--object", "plane", "--indent-mm", 1, "--out", tmp_path), "did you mean 'mg400-127'"
     )

@@ -37,7 +37,7 @@ from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimator import PoseEstimator
 from twin.camera.capture import expose, record
 from twin.cli import command_line
-from twin.errors import TwinError
+from twin.errors import OptionError, TwinError
 from twin.frames import open_recording
 from twin.frames.images import write_image
 from twin.pins import Pipeline
@@ -181,7 +181,7 @@ def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
 
 
 def test_a_replay_takes_no_other_frame_at_rest(tmp_path):
-    with pytest.raises(DeviceError, match="leave --at-rest out"):
+    with pytest.raises(OptionError, match="leave --at-rest out"):
         run("live", "--replay", tmp_path, "--at-rest", "first", "--headless")
 
 

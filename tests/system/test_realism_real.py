@@ -20,7 +20,7 @@ SLIGHT_BLUR_PX = 0.6
 @pytest.fixture(scope="module")
 def real(real_dir):
     spec = load_sensor("ur5-331")
-    disc = lens_disc(spec)
+    disc = lens_disc(spec.view, spec.housing)
     found = read_real(real_dir / "ur5-331-raw", spec, disc)
     assert not found.refused
     return disc, found.frames
@@ -35,7 +35,7 @@ def test_halves_of_the_real_frames_have_the_same_caps(real):
     assert max(worst.values()) < TARGET
 
 
-def test_halves_of_the_real_frames_are_not_told_apart(real):
+def test_two_halves_of_the_real_frames_are_not_distinguished(real):
     disc, frames = real
     images, rng, found = [frame.frame.image for frame in frames], np.random.default_rng(0), []
     half = len(images) // 2
@@ -47,7 +47,7 @@ def test_halves_of_the_real_frames_are_not_told_apart(real):
     assert np.mean(found) == pytest.approx(0.5, abs=CHANCE)
 
 
-def test_slightly_blurred_frames_are_told_apart(real):
+def test_slightly_blurred_frames_are_distinguished(real):
     disc, frames = real
     images = [frame.frame.image for frame in frames]
     outcome = two_sample(images, [cv2.GaussianBlur(image, (0, 0), SLIGHT_BLUR_PX) for image in images], disc.inside)

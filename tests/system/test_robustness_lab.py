@@ -54,7 +54,7 @@ def test_tune_check_and_robustness_from_the_command_line(tmp_path):
 
 def test_errors_are_one_line_and_say_what_to_do(tmp_path):
     unknown = run("robustness", "--sensor", "mg400-127", "--pipeline", "magic", "--frames", tmp_path, "--out", tmp_path / "out")
-    assert unknown.returncode == 1 and unknown.stderr.count("\n") <= 2 and "error" in unknown.stderr
+    assert unknown.returncode == 2 and unknown.stderr.count("\n") <= 2 and "error" in unknown.stderr
     nothing = run("robustness", "--sensor", "mg400-127", "--model", tmp_path / "none", "--out", tmp_path / "out")
     assert nothing.returncode == 1 and "holds no trained model" in nothing.stderr and "Traceback" not in nothing.stderr
     listed = run("robustness", "--sensor", "mg400-127", "--list", "--out", tmp_path / "out")

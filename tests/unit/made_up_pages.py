@@ -154,6 +154,7 @@ def contact_calibration(out: Path) -> Path:
         "fitted_px": {"before": 1.98, "after": 0.31, "frames": FRAMES},
         "held_out_px": {},
         "distrusted": [HOSTILE],
+        "warnings": [HOSTILE],
         "frames": [
             {"image_name": name, "executed": 1.0, "trust": 0.99, "before_px": 1.2, "after_px": None if k else 0.3}
             for k, name in enumerate(names)

@@ -51,7 +51,7 @@ def test_the_order_in_which_sets_are_given_changes_nothing(data):
     assert np.array_equal(one.pins.nodes_px, other.pins.nodes_px) and one.folders == other.folders
 
 
-def test_frames_without_contacts_of_their_own_are_each_their_own(data):
+def test_frames_that_belong_to_no_contact_form_groups_of_one(data):
     real = replace(named(data, "real/tap", 0, 40), group=None)
     both = joined([real, named(data, "sim/plane", 40, 45)])
     assert len(np.unique(both.group)) == 40 + 5
@@ -81,7 +81,7 @@ def plan_of(tmp_path, train=("plane", "sphere"), unseen=("edge",)):
     return Plan(config.sensor, config.experiment, randomisation, *things, count=2, tests=1, seed=4, across=config.across)
 
 
-def test_both_models_learn_from_as_many_contacts_and_are_judged_on_others(data, tmp_path):
+def test_both_models_learn_from_equally_many_contacts_and_are_judged_on_others(data, tmp_path):
     plan = plan_of(tmp_path)
     made = {folder: (config, count) for folder, config, count in plan.sets()}
     assert {folder: count for folder, (_, count) in made.items()} == {
@@ -95,7 +95,7 @@ def test_both_models_learn_from_as_many_contacts_and_are_judged_on_others(data, 
     assert list(learnt) == [MIXED, "plane"] and [len(np.unique(part.group)) for part in learnt.values()] == [4, 4]
 
 
-def test_an_object_is_learnt_or_never_seen(tmp_path):
+def test_an_object_can_not_be_both_trained_on_and_unseen(tmp_path):
     with pytest.raises(TrainingError, match="sphere: given twice"):
         plan_of(tmp_path, unseen=("edge", "sphere"))
     with pytest.raises(TrainingError, match="at least two objects"):
@@ -110,7 +110,7 @@ def test_only_labels_within_the_ranges_are_judged(data, tmp_path):
     assert 0 < inside.sum() < len(data) and np.array_equal(rows, np.flatnonzero(inside))
 
 
-def test_the_verdict_is_on_every_label_of_the_unseen(tmp_path):
+def test_the_verdict_needs_every_label_of_an_unseen_object(tmp_path):
     row = {"model": MIXED, "object": "edge", "pose_2_times": 1.2, "pose_6_times": 1.4}
     rows = [row, {**row, "model": "plane", "pose_2_times": 9.0}, {**row, "object": "sphere", "pose_2_times": 9.0}]
     (line,) = verdicts(plan_of(tmp_path), rows, ("pose_2", "pose_6"))

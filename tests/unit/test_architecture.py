@@ -28,6 +28,7 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "progress",
     "store",
     "workers",
+    "compiled",
     "geometry",
     "objects",
     "report",
@@ -122,6 +123,12 @@ def test_only_the_optics_name_mitsuba():
             assert not named, f"{path.relative_to(ROOT)} imports {named}"
 
 
+def test_one_module_names_numba():
+    """It says what happens where compiled code can't be kept, for all of them."""
+    modules = [path for package in MAY_IMPORT for path in sources(package)]
+    assert {path for path in modules if "numba" in {name.split(".")[0] for name in imports_of(path)}} == {ROOT / "twin" / "compiled.py"}
+
+
 RENAMING = {"replace", "rename", "renames"}  # functions of os
 
 
@@ -143,6 +150,46 @@ def test_renames_are_recognised(source, found):
 def test_only_the_store_gives_files_their_names():
     modules = [path for package in MAY_IMPORT for path in sorted((ROOT / package).rglob("*.py"))]
     assert {path.parent for path in modules if renames_files(path.read_text())} == {ROOT / "twin" / "store"}
+
+
+def left_to_the_locale(source: str) -> list[int]:
+    """Lines on which a text file is read or written in an encoding that the user's locale chooses."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call) or "encoding" in {keyword.arg for keyword in node.keywords}:
+            continue
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        texts = [each.value for each in node.args if isinstance(each, ast.Constant) and isinstance(each.value, str)]
+        newline = "newline" in {keyword.arg for keyword in node.keywords}
+        opened = (
+            name == "open" and not any("b" in text for text in texts) and (newline or any(set(text) <= set("rwax+t") for text in texts))
+        )
+        whole = isinstance(node.func, ast.Attribute) and (name == "read_text" and not node.args or name == "write_text")
+        found += [node.lineno] if opened or whole else []
+    return found
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("path.read_text()", True),
+        ("path.write_text(text)", True),
+        ("path.open('w', newline='')", True),
+        ("open(path, 'a')", True),
+        ("write_text(path, text)", False),  # of the store
+        ("path.read_text(encoding='utf-8')", False),
+        ("path.open('rb')", False),
+        ("arm.open()", False),
+    ],
+)
+def test_encodings_that_are_left_to_the_locale_are_recognised(source, found):
+    assert bool(left_to_the_locale(source)) is found
+
+
+def test_files_are_utf_8_whatever_the_locale():
+    for package in MAY_IMPORT:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            assert not left_to_the_locale(path.read_text(encoding="utf-8")), path.relative_to(ROOT)
 
 
 def test_no_module_is_a_drawer_for_everything():

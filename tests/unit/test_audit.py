@@ -1,13 +1,19 @@
 """The audit finds what was planted."""
 
+import json
+
 import numpy as np
 import pytest
 from drawn_recording import drawn_pins
 
 from scenes import load_sensor
 from training.audit import audit_labels
+from training.dataset import Dataset
 from training.pins import PinTable
+from training.studies.label_audit import NAMES, LabelAudit, summary_of, write_audit
+from training.targets import Targets
 from twin.pins import nominal_reference
+from twin.rig.labels import read_executed
 from twin.types import Form
 
 FRAMES = 600
@@ -73,3 +79,35 @@ def test_drift_is_seen_beyond_what_the_labels_tell(planted):
     found = audit_labels(drifting, *labels[order].T)
     assert found.drift["r2_of_row_number_beyond_labels"] > 0.5
     assert abs(found.drift["px_first_to_last"]["x"] - 2.0) < 0.6
+
+
+@pytest.mark.parametrize("frames", [1, 2, 60, 279])
+def test_too_few_frames_are_an_answer_and_not_a_clean_bill(planted, frames):
+    pins, labels, _, _, _ = planted
+    touching = np.setdiff1d(np.arange(FRAMES), [100, 300])
+    rows = touching[:frames]
+    found = audit_labels(pins.rows(rows), *labels[rows].T)
+    assert f"{frames} frames in contact are too few to tell which moves were executed" in found.untold and "280 are needed" in found.untold
+    assert np.isnan(found.executed).all() and np.isnan(found.chi2).all() and np.isnan(found.depth_per_move)
+    enough = audit_labels(pins.rows(touching[:280]), *labels[touching[:280]].T)
+    assert not enough.untold and np.isfinite(enough.executed).all()
+
+
+def test_of_too_few_frames_no_corrected_labels_are_written(planted, tmp_path):
+    pins, labels, executed, _, _ = planted
+    for count in (30, 600):
+        rows, out = np.arange(count), tmp_path / str(count)
+        out.mkdir()
+        targets = Targets(NAMES, labels[rows], labels[rows], executed[rows].astype(float), labels[rows, 2:])
+        data = Dataset(pins.rows(rows), targets, (tmp_path / "taps",))
+        found = audit_labels(data.pins, *labels[rows].T)
+        summary = summary_of(found, data)
+        written = write_audit(out, found, data, summary)
+        said = " ".join(LabelAudit(found, summary, count, written).lines())
+        page = (out / "audit.html").read_text()
+        assert all(path.is_file() for path in written) and json.loads((out / "audit.json").read_text())["frames"] == count
+        assert (out / "labels_corrected.csv").exists() == (count == 600)
+        if count == 600:  # training reads them
+            problems: list[str] = []
+            assert len(read_executed(out, data.pins.image_name.tolist(), problems)) == count and not problems
+        assert ("too few" in said) == ("too few" in page) == (count == 30)

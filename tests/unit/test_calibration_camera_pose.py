@@ -10,8 +10,8 @@ from twin.geometry.pins import rest_pins
 
 NOISE_PX = 0.05
 MOST_SD = 3.5  # some twenty parameters are looked at: one beyond 3 sd is not rare
-SAME_PX = 1e-3
-DEGENERATE_PX = 0.7  # a wrong polar angle is hidden to this: less than real pins miss any dome by
+SAME_PX = 1e-8  # rms after a fit to exact pins; measured: 5e-9
+DEGENERATE_PX = 0.51  # rms with a wrong polar angle, if the other parameters are fitted; measured: 0.46
 
 
 def changed(spec, *, camera=None, pins=None):
@@ -38,7 +38,7 @@ def test_a_known_camera_is_found_again_within_its_standard_deviations(sensor):
     pins_px = seen(sensor, np.random.default_rng(1))
     found, report = fit_camera(perturbed(sensor), pins_px)
     assert report.pins == sensor.pins.count
-    assert report.rms_px == pytest.approx(np.sqrt(2) * NOISE_PX, rel=0.15)  # two components
+    assert report.rms_px == pytest.approx(np.sqrt(2) * NOISE_PX, rel=0.107)  # two components
     assert {"fx_px", "cx_px", "cy_px", "k1", "phase_deg"} <= set(report.sd)
     for name, sd in report.sd.items():
         section = PARAMETERS[name].section
@@ -47,8 +47,8 @@ def test_a_known_camera_is_found_again_within_its_standard_deviations(sensor):
     assert found.camera.fy_px / found.camera.fx_px == pytest.approx(sensor.camera.fy_px / sensor.camera.fx_px)
 
 
-def test_a_dome_at_rest_does_not_tell_distance_nor_polar_angle(sensor):
-    """They are held at the specification's values and named with what would tell them."""
+def test_pins_at_rest_determine_neither_distance_nor_polar_angle(sensor):
+    """They are held at the specification's values, and the report names data that determine them."""
     pins_px = seen(sensor, np.random.default_rng(2))
     found, report = fit_camera(sensor, pins_px, free=tuple(PARAMETERS))
     for name in ("distance_mm", "max_polar_deg"):
@@ -58,8 +58,8 @@ def test_a_dome_at_rest_does_not_tell_distance_nor_polar_angle(sensor):
     assert found.pins.max_polar_deg == sensor.pins.max_polar_deg
 
 
-def test_what_is_held_could_not_have_been_seen(sensor):
-    """A wrong polar angle is hidden by the other parameters: so well that pins at rest cannot tell."""
+def test_a_wrong_value_of_a_held_parameter_is_compensated_by_the_others(sensor):
+    """With a wrong polar angle the other parameters still fit the pins at rest, nearly as well as any model fits real pins."""
     pins_px = seen(sensor, np.random.default_rng(3))
     wrong = changed(sensor, pins={"max_polar_deg": sensor.pins.max_polar_deg + 4})
     _, report = fit_camera(wrong, pins_px)

@@ -77,7 +77,7 @@ def test_frames_that_grow_brighter_to_their_border_have_no_ring(drawn):
     """Where the brightest place is the last one that is looked at, nothing tells where a ring begins."""
     spec, image = drawn
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-    disc = lens_disc(spec)
+    disc = lens_disc(spec.view, spec.housing)
     beyond_px = np.hypot(x - disc.center_px[0], y - disc.center_px[1]) - 1.3 * disc.radius_px
     slope = np.clip(240 * np.exp(beyond_px / 20), 1, 254).astype(np.uint8)
     pins_px = project(spec.view, rest_pins(spec.geometry).caps_mm)[None]

@@ -91,7 +91,7 @@ def test_the_discs_edge(known, found):
     assert found.housing.aperture_radius_mm == pytest.approx(known[1].housing.aperture_radius_mm, abs=PLACE_MM)
 
 
-def test_leds_are_where_their_reflections_put_them(known, found):
+def test_leds_are_found_by_their_reflections(known, found):
     """The LEDs' height is not seen: the radius is compared at the place of the reflection, by the law of the mirror."""
     ours, real, back = found.leds, known[1].leds, known[1].lens.back_mm
     assert np.allclose(ours.azimuth_deg, real.azimuth_deg, atol=AZIMUTH_DEG)
@@ -130,7 +130,7 @@ def test_specks(known, found):
     assert opacity == pytest.approx(speck["opacity"], abs=OPACITY)  # pins pass behind the last one
 
 
-def test_what_belongs_to_others_stays(known, found):
+def test_parameters_of_other_fits_do_not_change(known, found):
     start = known[0]
     for section in ("gel", "lens", "camera", "response", "pins", "skin"):
         assert getattr(found, section) == getattr(start, section)

@@ -97,7 +97,7 @@ def test_each_step_acts_in_the_chain(section, key, value):
     assert (expose(picture(), full.capture) != expose(picture(), without.capture)).any()
 
 
-def test_a_neutral_step_hands_the_very_same_light_on():
+def test_a_neutral_step_returns_its_input():
     light, frame, rng = picture(), expose(picture(), PLAIN.capture), np.random.default_rng(0)
     optics = hazed(light, PLAIN.gel), dispersed(light, PLAIN.camera), blurred(light, 0.0), vignetted(light, PLAIN.camera)
     film = amplified(light, PLAIN.response, rng), noisy(light, PLAIN.response, rng), sharpened(light, PLAIN.response)
@@ -133,10 +133,10 @@ def test_noise_is_read_and_shot_noise_through_the_curve(gray):
     frames = expose(np.full((600, 600), light), changed(CURVED, response=noise).capture, np.random.default_rng(1)).astype(float)
     slope = (251 / 2.2) * light ** (1 / 2.2 - 1)
     expected = np.hypot(slope * np.sqrt(noise["read_noise"] ** 2 + noise["shot_noise"] * light), np.sqrt(1 / 12))
-    curvature = 0.03  # relative: the curve is not straight over the noise; sampling adds 0.1 %
+    curvature = 0.0078  # relative: the curve is not straight over the noise; sampling adds 0.1 %; measured: 0.0071
     assert frames.std() == pytest.approx(expected, rel=curvature)
     real_sd = 1.0  # gray levels; 0.8 to 1.1 in real frames
-    assert frames.std() == pytest.approx(real_sd, abs=0.35)
+    assert frames.std() == pytest.approx(real_sd, abs=0.32)
 
 
 def test_a_frames_gain_varies_by_the_drift_and_is_one_for_all_pixels():
@@ -163,7 +163,7 @@ def test_blur_widens_an_edge_by_its_sigma():
     light[:, 100:] = 0.8
     row = blurred(light, 4.0)[10] / 0.8
     width = np.interp(0.9, row, np.arange(200)) - np.interp(0.1, row, np.arange(200))
-    sampling_px = 0.06  # of kernel and step
+    sampling_px = 0.052  # of kernel and step; measured: 0.047
     assert width == pytest.approx(2.563 * 4.0, abs=sampling_px)
 
 
@@ -180,7 +180,7 @@ def test_haze_takes_its_share_from_a_spot():
     """What is left of a spot much smaller than the haze's reach is 1 - haze of it."""
     light, gel = spot(80, 60, 1.0), PLAIN.gel.model_copy(update={"haze": 0.2, "haze_sigma_px": 15.0})
     spread_light = 0.2 * (1.0**2 / 15.0**2)  # the peak of what is scattered
-    np.testing.assert_allclose(hazed(light, gel)[60, 80], 1 - 0.2, atol=2 * spread_light)
+    np.testing.assert_allclose(hazed(light, gel)[60, 80], 1 - 0.2, atol=1.1 * spread_light)
 
 
 @pytest.mark.parametrize("place", [(30.3, 20.2), (120.7, 90.5), (83.0, 56.5)])
@@ -188,7 +188,7 @@ def test_red_and_blue_move_by_their_scale_times_the_distance(place):
     spec = changed(PLAIN, camera={"red_scale": 1.02, "blue_scale": 0.985})
     seen = dispersed(spot(*place), spec.camera)
     middle = np.array([spec.camera.cx_px, spec.camera.cy_px])
-    rounding_px = 1e-3
+    rounding_px = 6e-4  # measured: 5.5e-4
     for channel, scale in ((0, 1.02), (1, 1.0), (2, 0.985)):
         moved = centroid(seen[..., channel]) - centroid(spot(*place)[..., channel])
         np.testing.assert_allclose(moved, (scale - 1) * (np.array(place) - middle), atol=rounding_px)
@@ -201,10 +201,10 @@ def test_mono_light_is_not_dispersed():
 
 def test_vignetting_takes_its_share_at_the_corners_and_falls_with_the_square():
     loss = 1 - vignetted(np.ones((HEIGHT, WIDTH, 3)), changed(PLAIN, camera={"vignetting": 0.4}).camera)
-    half_pixel = 0.01  # relative: a corner pixel's centre is not the corner
-    np.testing.assert_allclose(loss[[0, 0, -1, -1], [0, -1, 0, -1]], 0.4, rtol=2 * half_pixel)
+    half_pixel = 0.0153  # relative: a corner pixel's centre is not the corner; measured: 0.0139
+    np.testing.assert_allclose(loss[[0, 0, -1, -1], [0, -1, 0, -1]], 0.4, rtol=half_pixel)
     x, y = WIDTH / 4, HEIGHT / 4  # half way to a corner
-    np.testing.assert_allclose(loss[int(y), int(x)], 0.4 / 4, rtol=4 * half_pixel)
+    np.testing.assert_allclose(loss[int(y), int(x)], 0.4 / 4, rtol=2 * half_pixel)
 
 
 def test_sharpening_leaves_even_light_and_overshoots_at_an_edge():
@@ -213,7 +213,7 @@ def test_sharpening_leaves_even_light_and_overshoots_at_an_edge():
     assert (expose(light, sharp.capture) == expose(light, PLAIN.capture)).all()
     light[:, 20:] = 0.6
     row = expose(light, sharp.capture)[20].astype(int)
-    assert row[:20].min() < 51 - 10 and row[20:].max() > 153 + 10 and row[0] == 51 and row[-1] == 153
+    assert row[:20].min() < 51 - 33 and row[20:].max() > 153 + 33 and row[0] == 51 and row[-1] == 153
 
 
 def luma(frame: np.ndarray) -> np.ndarray:
@@ -223,7 +223,7 @@ def luma(frame: np.ndarray) -> np.ndarray:
 def test_lost_chroma_leaves_the_luma_as_it_is():
     light, soft = picture(), changed(PLAIN, response={"chroma_sigma_px": 2.0, "chroma_columns": 2}).response
     lost = developed(light, light, soft)
-    assert np.abs(luma(lost) - luma(255 * light)).max() < 1e-3 and np.abs(lost - 255 * light).max() > 10
+    assert np.abs(luma(lost) - luma(255 * light)).max() < 5e-5 and np.abs(lost - 255 * light).max() > 58
 
 
 def test_soft_colour_of_a_bright_spot_reaches_further_out():
@@ -235,7 +235,7 @@ def test_soft_colour_of_a_bright_spot_reaches_further_out():
     row = (gray[20, :, 2] - luma(gray[20]))[30:50]
     half = np.interp((row[0] + row[-1]) / 2, row, np.arange(30.0, 50.0))
     edge = 39.5
-    assert half < edge - 0.5
+    assert half < edge - 1.26
 
 
 def test_neighbouring_columns_share_the_first_ones_chroma():
@@ -249,7 +249,7 @@ def test_neighbouring_columns_share_the_first_ones_chroma():
 def test_sharpening_changes_all_channels_alike():
     light = picture()
     change = sharpened(light, changed(PLAIN, response={"sharpening": 1.0}).response) - light
-    assert np.abs(change - change[..., :1]).max() < 1e-5 and np.abs(change).max() > 0.01
+    assert np.abs(change - change[..., :1]).max() < 1e-6 and np.abs(change).max() > 0.079
 
 
 def test_noise_is_smoothed_but_not_sharpened():
@@ -258,7 +258,7 @@ def test_noise_is_smoothed_but_not_sharpened():
     sd = {}
     for name, more in (("plain", {}), ("sharp", {"sharpening": 2.0}), ("smooth", {"noise_sigma_px": 0.6})):
         sd[name] = expose(light, changed(PLAIN, response=noise | more).capture, np.random.default_rng(0)).std()
-    assert sd["sharp"] == sd["plain"] > 1.2 * sd["smooth"]
+    assert sd["sharp"] == sd["plain"] > 1.48 * sd["smooth"]
 
 
 def test_a_window_of_a_frame_is_exposed_as_the_frame_is():
@@ -272,7 +272,7 @@ def test_a_window_of_a_frame_is_exposed_as_the_frame_is():
     apart = np.abs(part[border:-border, border:-border].astype(int) - whole[y0:118, x0:157][border:-border, border:-border])
     assert apart.mean() < 0.01 and apart.max() <= gray_levels
     without = expose(picture()[y0:118, x0:157], spec.capture)[border:-border, border:-border].astype(int)
-    assert np.abs(without - whole[y0:118, x0:157][border:-border, border:-border]).mean() > 1, "the origin has no effect"
+    assert np.abs(without - whole[y0:118, x0:157][border:-border, border:-border]).mean() > 3.6, "the origin has no effect"
 
 
 @pytest.mark.parametrize("mono", [False, True])
@@ -282,8 +282,8 @@ def test_a_stream_of_lower_quality_is_further_from_the_frame(mono):
     errors = [
         np.sqrt(((expose(light, changed(PLAIN, response={"jpeg_quality": q}).capture) - clean) ** 2).mean()) for q in (98, 80, 40, 10)
     ]
-    fine_gray = 2 if mono else 6  # gray levels; the finest stream still halves the resolution of colour
-    assert errors == sorted(errors) and errors[0] < fine_gray and errors[-1] > 1.5 * errors[0]
+    fine_gray, coarse_gray = (0.56, 7.5) if mono else (4.7, 18.7)  # the finest stream still halves the resolution of colour
+    assert errors == sorted(errors) and errors[0] < fine_gray and errors[-1] > coarse_gray
 
 
 def test_a_stream_keeps_colours_in_their_channels():
@@ -297,7 +297,7 @@ def test_a_stream_keeps_colours_in_their_channels():
 
 def test_the_curve_is_the_inverse_of_its_power_law():
     light = np.linspace(0, 1, 101, dtype=np.float32)
-    rounding = 1e-5
+    rounding = 1e-6
     np.testing.assert_allclose(((curve(light, CURVED.response) - 4) / 251) ** 2.2, light, atol=rounding)
 
 
@@ -311,7 +311,7 @@ def test_a_recording_is_binary_and_shows_the_dots():
 
 def test_a_resized_recording_has_gray_edges():
     image = record(dots(), RECORDING.model_copy(update={"width_px": 90, "height_px": 80}))
-    assert image.shape == (80, 90) and 0 < np.mean((image > 0) & (image < 255)) < 0.3
+    assert image.shape == (80, 90) and 0 < np.mean((image > 0) & (image < 255)) < 0.108
 
 
 def test_a_part_of_the_frame_records_as_the_whole_does():
@@ -332,7 +332,7 @@ def test_colour_frames_are_recorded_as_their_gray():
     assert (record(np.repeat(raw[..., None], 3, axis=2), RECORDING) == record(raw, RECORDING)).all()
 
 
-def test_shifted_colours_move_alone():
+def test_a_colour_shift_moves_only_that_colour():
     """A spot's red moves by the shift, green stays."""
     spec = plain()
     camera = spec.camera.model_copy(update={"red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.4, -0.3), "blue_shift_px": (0.0, 0.0)})
@@ -340,4 +340,4 @@ def test_shifted_colours_move_alone():
     spot = np.exp(-((x - 40.0) ** 2 + (y - 30.0) ** 2) / (2 * 3.0**2)).astype(np.float32)
     seen = dispersed(np.stack([spot] * 3, axis=-1), camera)
     moved = [[(c * x).sum() / c.sum() - 40, (c * y).sum() / c.sum() - 30] for c in np.moveaxis(seen, 2, 0)]
-    np.testing.assert_allclose(moved, [[0.4, -0.3], [0, 0], [0, 0]], atol=1e-3)
+    np.testing.assert_allclose(moved, [[0.4, -0.3], [0, 0], [0, 0]], atol=1e-6)

@@ -1,12 +1,17 @@
 """The command line is options and one call: what it does can be done from Python, and nothing else depends on it."""
 
 import ast
+import io
+from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+import typer
+from command import run_twin
 from typer.testing import CliRunner
 
-from twin.cli import command_line
+from twin.cli import command_line, main
 
 ROOT = Path(__file__).parents[2]
 CLI = ROOT / "twin" / "cli"
@@ -104,4 +109,113 @@ def test_what_could_not_be_let_go_of_is_printed_after_ctrl_c(monkeypatch, tmp_pa
     monkeypatch.setattr("hardware.collect.collect_frames", interrupted)
     command = ["collect", "--camera", "twin", "--arm", "simulated", "--sensor", "mg400-331", "--out", str(tmp_path)]
     ended = CliRunner().invoke(command_line(), command)
-    assert ended.exit_code == 130 and "twin: note: stop failed: press its emergency stop" in ended.stderr
+    assert ended.exit_code == 130
+    assert ended.stderr.splitlines()[-2:] == ["twin: interrupted", "twin: note: stop failed: press its emergency stop"]
+
+
+TRAIN = ["train", "--model", "gnn", "--sensor", "mg400-127", "--data", "nowhere", "--out", "nowhere/run"]
+STUDY = ["study", "tac-vgnn", "--sensor", "mg400-127", "--data", "nowhere", "--out", "nowhere/study"]
+OUT_OF_RANGE = [
+    *([*TRAIN, option, value] for option, values in {
+        "--seed": ("-1", "4294967296"), "--split": ("-2", "4294967296"), "--max-minutes": ("nan", "-1", "inf"),
+        "--threads": ("0", "-3", "100000"), "--target": ("pose_2,pose_2", ",", ""),
+    }.items() for value in values),
+    *([*STUDY, option, value] for option, values in {
+        "--seeds": ("-1", "x", "1.5"), "--batches": ("0", "-1", "x"), "--max-minutes": ("nan",), "--threads": ("0",),
+    }.items() for value in values),
+    ["study", "servo", "--model", "mg400-127", "--out", "nowhere", "--objects", ","],
+    ["study", "servo", "--model", "mg400-127", "--out", "nowhere", "--objects", "can,can"],
+    ["study", "sim-to-real", "--sensor", "mg400-127", "--frames", "nowhere", "--out", "nowhere", "--sim", "nowhere"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", OUT_OF_RANGE, ids=lambda command: " ".join((command[0], *command[-2:])))
+def test_an_option_out_of_range_is_a_usage_error_of_one_line_before_any_work(command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    ended = CliRunner().invoke(command_line(), command)
+    assert ended.exit_code == 2
+    last = ended.output.strip().splitlines()[-1]
+    assert last.startswith("Error: ") and command[-2] in last
+    assert not list(tmp_path.iterdir())
+
+
+def commands() -> Iterator[list[str]]:
+    """The words of every command and of every group of commands."""
+
+    def below(words, group):
+        yield words
+        for name, command in getattr(group, "commands", {}).items():
+            yield from below([*words, name], command)
+
+    return below([], typer.main.get_command(command_line()))
+
+
+def test_ctrl_c_is_one_line(monkeypatch):
+    """typer itself ends the program without a word."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("scenes.catalog.sensors", interrupted)
+    ended = run_twin("sensors")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "twin: interrupted\n")
+
+
+def test_the_version_is_that_of_the_package():
+    ended = run_twin("--version")
+    assert ended.returncode == 0 and ended.stdout == f"twin {metadata.version('tactip-twin')}\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["nonsense"],
+        ["render", "--nonsense"],
+        ["robustness"],
+        ["graph", "frame.png", "--sensor", "mg400-127"],
+        ["preprocess", "frames", "--sensor", "mg400-127"],
+        ["dataset", "--experiment", "surface-2d", "--sensor", "mg400-127", "--count", "1", "--out", "out", "--across", "7"],
+        ["live", "--headless"],
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_a_wrong_command_line_is_told_apart_from_a_failure_and_begins_nothing(words, tmp_path, monkeypatch):
+    """Without --out, too: nothing is begun in the folder that one happens to be in."""
+    monkeypatch.chdir(tmp_path)
+    ended = run_twin(*words)
+    assert ended.returncode == 2 and "rror: " in ended.stderr.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+def test_lists_of_a_command_need_none_of_its_options():
+    for words, line in ((["robustness", "--list"], "leds-dim"), (["emulate", "mg400", "--fault", "help"], "=")):
+        ended = run_twin(*words)
+        assert ended.returncode == 0 and line in ended.stdout
+
+
+def test_the_help_of_every_command_fits_a_terminal_of_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for words in commands():
+        lines = run_twin(*words, "--help").stdout.splitlines()
+        assert len(lines) > 4 and max(map(len, lines)) <= 80, (words, max(lines, key=len))
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [("twin rob", {"robustness"}), ("twin study s", {"servo", "sim-to-real"}), ("twin graph --kind ", {"knn", "delaunay", "voronoi"})],
+)
+def test_the_shell_completes_commands_options_and_values(typed, offered, monkeypatch):
+    monkeypatch.setenv("_TWIN_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", typed)
+    monkeypatch.setenv("COMP_CWORD", str(len(typed.split(" ")) - 1))
+    assert set(run_twin().stdout.split()) == offered
+
+
+def test_a_letter_that_the_terminal_lacks_is_printed_by_its_number(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, encoding="ascii"))
+    monkeypatch.setattr("sys.argv", ["twin", "sensors"])
+    monkeypatch.setattr("scenes.catalog.Catalog.lines", lambda _: ["f_\xe4.png", "f_\udcc3\udca4.png"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 0 and written.getvalue() == b"f_\\xe4.png\nf_\\udcc3\\udca4.png\n"

@@ -64,7 +64,7 @@ def test_numbers_and_sign_are_found_again_within_their_uncertainty(calibrated):
     assert fit.sensor.rig.contact_offset_mm == fit.value[0] and (fit.told > 0.9).all()
 
 
-def test_moves_that_were_not_executed_and_odd_frames_are_known(calibrated):
+def test_moves_that_were_not_executed_and_odd_frames_are_found(calibrated):
     _, _, done, fit, _ = calibrated
     good = np.arange(FRAMES) != 4
     assert np.array_equal(fit.executed[good] > 0.5, done[good])
@@ -78,14 +78,14 @@ def test_frames_that_were_not_fitted_are_met_as_well(calibrated):
     assert after < 0.25 * before
 
 
-def test_taken_up_again_nothing_is_computed_twice(calibrated, monkeypatch):
+def test_a_continued_calibration_computes_nothing_twice(calibrated, monkeypatch):
     setup, measured, _, fit, _ = calibrated
     monkeypatch.setattr("twin.fit.contact.simulate._contact", None)  # not callable: a new contact would fail
     again = fit_contact(setup, measured)
     assert np.array_equal(again.value, fit.value) and np.array_equal(again.executed, fit.executed)
 
 
-def test_what_frames_do_not_tell_is_left_at_the_start():
+def test_parameters_that_frames_do_not_determine_stay_at_their_start():
     """Frames of which neither story is likelier: the probability is the share, and nobody is sure."""
     made = expect(np.array([[1.0, 1.0]] * 6))
     assert np.allclose(made.executed, made.executed[0]) and made.share == pytest.approx(0.5, abs=0.05)

@@ -84,7 +84,7 @@ FINEST, ORDER = (
 def pressed_caps(across: int) -> tuple[np.ndarray, np.ndarray]:
     """Caps (N, 3) at rest and pressed on a plane."""
     usual = Resolution()
-    solver = SkinSolver(load_sensor("mg400-331"), resolution=Resolution(across, usual.skin_layers, usual.gel_layers), keep=False)
+    solver = SkinSolver(load_sensor("mg400-331"), resolution=Resolution(across, usual.skin_layers, usual.gel_layers))
     return solver.rest().caps_mm, solver.press(load_object("plane"), ContactPose(PRESS_MM)).caps_mm
 
 

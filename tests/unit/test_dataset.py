@@ -1,6 +1,7 @@
 """Recordings as data sets: what is odd in them is said once, and the good rows are used."""
 
 import json
+import os
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ from drawn_frames import drawn_frame, smooth_warp
 
 from scenes import load_sensor
 from training.dataset import load_dataset, split_rows
+from training.models.cnn.inputs import image_inputs
 from training.pins import pin_table
 from training.targets import corrected, unit_of
 from twin.errors import FrameError
@@ -64,6 +66,29 @@ def test_good_rows_are_used_and_every_fault_is_said(faulty):
     ):
         assert fault.split(" (")[0] in said, (fault, said)
     assert "f_1.png" in said and "f_3.png" in said and "f_4.png" in said
+
+
+def replaced_in_secret(file, other):
+    """Another picture in the place of a file: of the same size and the same time of the last change, as copying tools leave it."""
+    before, content = file.stat(), other.read_bytes()
+    size = max(before.st_size, len(content))
+    file.write_bytes(content.ljust(size, b"\0"))
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    return size
+
+
+@pytest.mark.parametrize("of", [lambda data: data.pins.nodes_px, lambda data: image_inputs(data).images.numpy()], ids=["pins", "pictures"])
+def test_what_is_kept_of_frames_is_not_that_of_frames_that_were_replaced(tmp_path, of):
+    names = [f"f_{k}.png" for k in range(2)]
+    folder = tmp_path / "r"
+    spec = write_recording(folder, [f"{name},-1,5,1,2" for name in names], names)
+    first, second = (folder / "frames_bw" / name for name in names)
+    size = max(first.stat().st_size, second.stat().st_size)
+    first.write_bytes(first.read_bytes().ljust(size, b"\0"))
+    before = of(load_dataset(folder, spec))
+    assert replaced_in_secret(first, second) == size == first.stat().st_size
+    after = of(load_dataset(folder, spec))
+    assert not np.array_equal(before[0], after[0]) and np.array_equal(after[0], before[1])
 
 
 def test_a_missing_column_names_those_that_are_there(tmp_path):

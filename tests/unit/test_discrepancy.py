@@ -44,7 +44,7 @@ def learnt(rng, scatter=0.0, count=40):
     )
 
 
-def test_a_smooth_miss_is_recovered_on_other_labels(rng):
+def test_a_smooth_discrepancy_is_recovered_on_other_labels(rng):
     found, labels = learnt(rng), labels_of(rng, 50)
     moved = moved_of(labels)
     missed = missed_by(labels, moved)
@@ -52,7 +52,7 @@ def test_a_smooth_miss_is_recovered_on_other_labels(rng):
     assert np.abs(left).mean() < RECOVERED * np.abs(missed).mean()
 
 
-def test_what_no_label_tells_is_drawn_as_widely_as_it_was_seen(rng):
+def test_a_residual_that_no_label_explains_is_drawn_with_its_observed_spread(rng):
     found, labels = learnt(rng, scatter=0.05), labels_of(rng, 200)
     moved = moved_of(labels)
     missed = missed_by(labels, moved, scatter=0.05, seed=10)
@@ -74,7 +74,7 @@ def test_states_of_one_contact_share_one_function_and_the_draw_repeats(rng):
     assert np.array_equal(together, found.draw_px(twice, moved, np.array([4, 4]), seed=2))
 
 
-def test_it_grows_with_the_displacement(rng):
+def test_the_discrepancy_is_proportional_to_the_displacement(rng):
     """A contact that moves the pins half as far misses half as much."""
     found, labels = learnt(rng), labels_of(rng, 5)
     moved = 2 * moved_of(labels)
@@ -98,7 +98,7 @@ def test_a_frames_friction_is_found_between_those_that_were_tried():
     assert np.isnan(_likeliest(fields, real, FRICTIONS)[0][5, 0]).all()
 
 
-def test_friction_is_drawn_where_the_frames_had_it():
+def test_friction_is_drawn_in_the_range_of_the_frames():
     nothing = np.zeros((20, 5, 2))
     frictions = np.exp(np.linspace(np.log(0.3), np.log(0.6), 20))
     spread = Residuals(np.zeros((20, 12)), nothing, nothing, frictions, np.ones(20)).friction_spread()

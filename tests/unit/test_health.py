@@ -33,7 +33,7 @@ def verdicts(shown):
     return {found.name: found for found in examine(shown, sensor())}
 
 
-def test_a_well_sensor_is_well():
+def test_an_undamaged_sensor_has_no_bad_finding():
     found = verdicts(frames("noise", 0.0))
     assert {f.verdict for f in found.values()} == {Grade.GOOD}, found
     assert set(found) == {"brightness", "saturation", "focus", "glare", "layout", "pins", "specks", "shift", "turn", "scale"}

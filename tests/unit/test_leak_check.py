@@ -27,7 +27,7 @@ def test_a_model_that_gives_the_published_label_leaks_wholly_and_one_that_gives_
     assert leak_check(targets.corrected, targets).slope == pytest.approx(0.0, abs=1e-12)
 
 
-def test_frames_without_a_prediction_do_not_spoil_it(targets):
+def test_frames_without_a_prediction_do_not_change_the_leak_check(targets):
     made = targets.raw.copy()
     made[0] = np.nan
     assert leak_check(made, targets).slope == pytest.approx(1.0)
@@ -43,7 +43,7 @@ def test_frames_without_a_prediction_do_not_spoil_it(targets):
         ({"move": np.full((FRAMES, 2), np.nan)}, "0 frames"),
     ],
 )
-def test_where_it_cannot_be_made_it_says_why(targets, change, why):
+def test_a_leak_check_that_is_impossible_states_the_reason(targets, change, why):
     found = leak_check(targets.raw, replace(targets, **change))
     assert found.slope is None
     assert re.search(why, found.reason)

@@ -14,9 +14,8 @@ from twin.mechanics.path import plan_path
 from twin.objects import build_field
 
 SOLVER_MM = 1e-4  # what the residual's tolerance leaves open in a position
-BALANCE = 1e-6  # relative to the force: the residual's tolerance
-GRID = 0.03  # relative: the same contact on a grid of 10 elements that lies otherwise
-TURNED_N = 1e-4  # relative to the force: a turned scene, its grid turned with it; the residual's tolerance and what the penalty makes of it
+BALANCE = 1e-6  # relative to the force: rounding
+TURNED = 1e-3  # relative: a turned scene; the grid turns with it, and the penalty may be raised at another time
 
 
 @pytest.fixture(scope="module")
@@ -142,11 +141,11 @@ def test_the_clamps_carry_the_force_and_its_torque(tilted):
     spread_forces(points.controls[where], points.weights[where], traction, inner)
     free = solver.setting.body.free
     size = np.linalg.norm(state.force_n)
-    assert np.linalg.norm(inner[free]) < 2 * BALANCE * np.abs(traction).sum()
-    assert np.abs(inner[~free].sum(axis=0) - state.force_n).max() < 10 * BALANCE * size
+    assert np.linalg.norm(inner[free]) < 2 * RESIDUAL_TOLERANCE * np.abs(traction).sum()
+    assert np.abs(inner[~free].sum(axis=0) - state.force_n).max() < 10 * RESIDUAL_TOLERANCE * size
     torque = np.cross(solver.state.control_mm[~free], inner[~free]).sum(axis=0)
     lifted = np.cross(points.lift_mm[where], traction).sum(axis=0)
-    assert np.abs(torque + lifted - state.torque_nmm).max() < 10 * BALANCE * size * 20
+    assert np.abs(torque + lifted - state.torque_nmm).max() < 10 * RESIDUAL_TOLERANCE * size * 20
     assert np.linalg.norm(lifted) < 0.02 * np.linalg.norm(state.torque_nmm)
 
 
@@ -228,47 +227,22 @@ def turned(plan, angle_rad):
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
-@pytest.mark.parametrize("angle_deg", [90, 15, -105])
-def test_a_scene_turned_by_steps_of_the_focus_gives_the_turned_answer(solver, friction, angle_deg):
-    """Off the axis the grid turns with the contact, by steps of 15 deg: all is the same but rounding."""
-    field = build_field(load_object("cylinder"))
-    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, tilt_deg=(0.0, 20.0), shear_mm=(0.8, 0.3), offset_mm=(2.0, 0.0)))
+@pytest.mark.parametrize("angle_deg", [90, 15, 37, -105])
+@pytest.mark.parametrize("name", ["cylinder", "edge"])
+def test_a_turned_scene_gives_the_turned_answer(solver, name, friction, angle_deg):
+    """The grid turns with the object and the contact."""
+    field = build_field(load_object(name))
+    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, tilt_deg=(0.0, 12.0), shear_mm=(0.8, 0.3), offset_mm=(2.0, 0.0)))
     state = solver.press(field, plan, friction=friction)
-    control, at = solver.state.control_mm, state.T_sensor_object
+    caps, at = state.caps_mm, state.T_sensor_object
     plan, turn = turned(plan, np.radians(angle_deg))
     other = solver.press(field, plan, friction=friction)
     assert np.abs(other.T_sensor_object[:3, :3] - turn @ at[:3, :3]).max() < 1e-9
     size = np.linalg.norm(state.force_n)
-    assert np.abs(solver.state.control_mm - control @ turn.T).max() < SOLVER_MM
-    assert np.abs(turn @ state.force_n - other.force_n).max() < TURNED_N * size
-    assert np.abs(turn @ state.torque_nmm - other.torque_nmm).max() < TURNED_N * size * 20
-    assert other.area_mm2 == pytest.approx(state.area_mm2, rel=1e-6)
-    assert other.elastic_nmm == pytest.approx(state.elastic_nmm, rel=1e-4)
-
-
-@pytest.mark.parametrize("name", ["plane", "sphere"])
-def test_a_scene_turned_by_any_angle_gives_about_the_turned_answer(solver, name):
-    """On the axis the grid stays, off the axis it turns by a rounded angle: the answers differ by the grid's error."""
-    field = build_field(load_object(name))
-    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, tilt_deg=(10.0, 0.0), shear_mm=(0.8, 0.3)))
-    state = solver.press(field, plan, friction=0.5)
-    plan, turn = turned(plan, np.radians(37))
-    other = solver.press(field, plan, friction=0.5)
-    size = np.linalg.norm(state.force_n)
-    assert np.abs(turn @ state.force_n - other.force_n).max() < GRID * size
-    assert np.abs(turn @ state.torque_nmm - other.torque_nmm).max() < GRID * size * 20
-
-
-def test_a_contact_on_the_axis_turned_by_a_quarter_turns_the_nodes(solver):
-    field = build_field(load_object("plane"))
-    plan = plan_path(solver.spec.geometry, field, ContactPose(2.0, shear_mm=(0.8, 0.3)))
-    state = solver.press(field, plan, friction=0.5)
-    plan, turn = turned(plan, np.pi / 2)
-    other = solver.press(field, plan, friction=0.5)
-    layers, side, _ = solver.mesh.grid
-    grid = (state.nodes_mm @ turn.T).reshape(layers, side, side, 3)
-    # the node that a quarter turn takes to row v, column u
-    assert np.abs(grid[:, ::-1, :].transpose(0, 2, 1, 3).reshape(-1, 3) - other.nodes_mm).max() < SOLVER_MM
+    assert np.abs(turn @ state.force_n - other.force_n).max() < TURNED * size
+    assert np.abs(turn @ state.torque_nmm - other.torque_nmm).max() < TURNED * size * 20
+    assert other.elastic_nmm == pytest.approx(state.elastic_nmm, rel=TURNED)
+    assert len(caps) == len(other.caps_mm)
 
 
 # --- compliance, sealing

@@ -1,5 +1,7 @@
 """Contacts along any path: history, hysteresis, load steps, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from block import Watched, last, rotation, usual_sensor
@@ -10,7 +12,7 @@ from scenes.sensor import MaterialSpec
 from twin.errors import ContactError
 from twin.geometry.solid import Resolution
 from twin.mechanics import ContactPath, ContactPose, Friction, SkinSolver
-from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
+from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
 from twin.mechanics.path import plan_path
 from twin.objects import build_field
 
@@ -132,7 +134,7 @@ def test_an_object_that_crosses_the_dome_between_two_free_poses_touches_it(solve
     force = np.array([state.force_n[2] for state in states])
     assert force[0] == force[-1] == 0
     pressed = solver.press(field, ContactPose(1.0), friction=0.0).force_n[2]
-    assert force.max() == pytest.approx(pressed, rel=0.05)
+    assert force.max() == pytest.approx(pressed, rel=0.15)  # the grid is fine along the whole crossing there, at one place here
 
 
 def test_twist_is_resisted(solver):
@@ -224,8 +226,55 @@ def test_load_steps_half_as_large_change_little(solver, friction):
     coarse, fine = (last(solver.path(load_object("cylinder"), pose_, friction=friction, step_mm=mm)) for mm in (0.6, 0.3))
     largest = np.linalg.norm(fine.nodes_mm - solver.mesh.nodes_mm, axis=1).max()
     off = np.linalg.norm(coarse.nodes_mm - fine.nodes_mm, axis=1).max()
-    assert off < (STEP_SHARE * largest if friction else SOLVER_MM)
-    assert np.abs(coarse.force_n - fine.force_n).max() < (STEP_SHARE if friction else 1e-4) * fine.force_n[2]
+    assert off < (STEP_SHARE * largest if friction else GAP_BOUND_MM)  # the penalty may have been raised on one way only
+    assert np.abs(coarse.force_n - fine.force_n).max() < (STEP_SHARE if friction else 0.003) * fine.force_n[2]
+
+
+def sheared_edge(**options):
+    return ContactPose(2.0, tilt_deg=(0.0, 7.5), offset_mm=(3.0, 1.0), **options)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_a_pose_a_little_further_gives_a_state_a_little_further(solver, friction):
+    """The grid is a continuous function of the pose: nothing jumps."""
+    edge = load_object("edge")
+    for near in (dict(offset_mm=(3.0001, 1.0)), dict(tilt_deg=(0.0, 7.5001)), dict(tilt_deg=(0.0001, 7.5))):
+        here = solver.press(edge, sheared_edge(), friction=friction)
+        there = solver.press(edge, replace(sheared_edge(), **near), friction=friction)
+        assert np.abs(here.caps_mm - there.caps_mm).max() < 1e-3
+        assert np.linalg.norm(here.force_n - there.force_n) < 3e-3 * np.linalg.norm(here.force_n)
+
+
+def test_without_friction_deeper_and_back_is_where_it_was_on_an_edge(solver):
+    """The grid does not depend on how deep the path goes."""
+    field = build_field(load_object("edge"))
+    straight = plan_path(solver.spec.geometry, field, sheared_edge())
+    deeper = straight.poses[1] - 0.8 * np.eye(4)[:, [2]] * np.eye(4)[3]
+    here = solver.press(field, straight, friction=0.0)
+    again = solver.press(field, ContactPath(np.stack([*straight.poses, deeper, straight.poses[1]])), friction=0.0)
+    largest = np.linalg.norm(here.caps_mm - solver.rest().caps_mm, axis=1).max()
+    assert np.abs(here.caps_mm - again.caps_mm).max() < 1e-3 * largest
+    assert np.linalg.norm(here.force_n - again.force_n) < 1e-3 * np.linalg.norm(here.force_n)
+
+
+def test_an_edge_s_shear_does_not_depend_on_the_load_step(solver):
+    edge, pose_ = load_object("edge"), ContactPose(2.0, shear_mm=(1.5, 0.0))
+    forces = np.array([last(solver.path(edge, pose_, friction=0.5, step_mm=mm)).force_n for mm in (0.2, 0.3, 0.6)])
+    assert np.linalg.norm(np.ptp(forces, axis=0)) < 0.01 * np.linalg.norm(forces[0])
+
+
+@pytest.mark.parametrize("friction", [Friction(0.3, 0.3), Friction(0.5, 0.2)])
+def test_a_cycle_of_friction_takes_the_work_that_is_done(solver, friction):
+    """Also where the coefficient falls with the slip; the work is a sum of trapezoids over the load steps."""
+    path = through(pose(), pose(height=-1.5), pose(1.5, 0, -1.5), pose(-1.5, 0, -1.5), pose(1.5, 0, -1.5))
+    states = [state for _, state in solver.path(load_object("plane"), path, friction=friction, step_mm=0.1)]
+    start, end = np.flatnonzero(np.abs([state.T_sensor_object[0, 3] - 1.5 for state in states]) < 1e-9)
+    cycle = states[start : end + 1]
+    moved = np.diff([state.T_sensor_object[:3, 3] for state in cycle], axis=0)
+    force = np.array([state.force_n for state in cycle])
+    work = -((force[1:] + force[:-1]) / 2 * moved).sum()
+    taken = sum(state.dissipated_nmm for state in cycle[1:]) + cycle[-1].elastic_nmm - cycle[0].elastic_nmm
+    assert taken == pytest.approx(work, rel=0.01)
 
 
 # --- what is refused
@@ -260,7 +309,7 @@ def test_a_step_that_does_not_converge_is_named_and_nothing_is_returned(solver, 
         raise NoConvergence(0.25)
 
     monkeypatch.setattr(LoadStepper, "step", fail)
-    with pytest.raises(ContactError, match=r"load step 1 of \d .*relative residual 2.5e-01, needed 1e-06; try less indentation"):
+    with pytest.raises(ContactError, match=r"load step 1 of \d .*relative residual 2.5e-01, needed 1e-05; try less indentation"):
         solver.press(load_object("plane"), ContactPose(1.5))
 
 

@@ -258,5 +258,5 @@ def test_a_run_whose_processes_are_kept_as_by_an_earlier_version_is_refused_with
         kernel |= {"smooth": kernel["sizes"][:, 0], "linear": kernel["sizes"][:, 1], "noise": kernel.pop("noises")[:, 0]}
         del kernel["sizes"]
     torch.save(content, tmp_path / "weights.pt")
-    with pytest.raises(TrainingError, match="not a run of this version.*train again"):
+    with pytest.raises(TrainingError, match="not of a run of this version.*train again"):
         PoseEstimator.load(tmp_path)

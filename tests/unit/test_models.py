@@ -191,7 +191,7 @@ def test_the_cameras_own_motion_is_taken_out_and_contact_is_left():
 
 
 @pytest.mark.parametrize("known", [8, 12, 40])
-def test_what_few_frames_tell_of_the_camera_never_throws_others_far_off(known):
+def test_a_registration_of_few_frames_has_bounded_corrections(known):
     rng = np.random.default_rng(11)
     rest = rng.uniform(-100, 100, (60, 2)) + 128
     waves = np.stack([np.sin((rest - 128) / scale) for scale in (30, 50, 90)])
@@ -214,7 +214,7 @@ def test_with_all_of_a_difference_taken_out_a_displaced_frame_is_the_same():
     assert (np.abs(left) >= np.abs(registration.difference(frames)) - 1e-9).all()  # what was not fitted to lies further off
 
 
-def test_lost_pins_continue_what_the_others_do():
+def test_lost_pins_follow_the_modes_of_the_others():
     rng = np.random.default_rng(8)
     rest = rng.uniform(-100, 100, (60, 2)) + 128
     waves = np.stack([np.sin((rest - 128) / 50), np.cos((rest[:, ::-1] - 128) / 70)])

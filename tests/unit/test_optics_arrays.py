@@ -19,7 +19,7 @@ def test_values_shape_and_room(shape, dtype):
     assert whole.__array_interface__["data"][0] + whole.nbytes - end >= ROOM_BYTES
 
 
-def test_what_is_taken_over_is_nobody_elses():
+def test_a_copy_shares_no_memory_with_its_original():
     values = np.zeros(5, np.float32)
     made = with_room(values, np.float32)
     values[:] = 1

@@ -93,7 +93,7 @@ def test_all_light_that_enters_the_gel_crosses_each_plane_in_it(depth_mm):
     strength = direct_light(changed(spec, gel={"refractive_index": 1.0}))(np.array([[*out, 1e4]]), np.array([[0.0, 0.0, -1.0]]))[0, 1]
     flux = strength * (1e4 - spec.leds.z_mm) ** 2  # radiance times area: all indices 1, seen from far away
     ring = np.gradient(rho) * 2 * np.pi * rho
-    quadrature = 2e-3
+    quadrature = 2.5e-7
     assert (light * ring)[cone].sum() * 1.4**2 == pytest.approx(flux * expected, rel=quadrature)
 
 
@@ -101,8 +101,9 @@ def test_a_way_to_the_camera_is_the_ray_of_the_pixel(small):
     rest = rest_pins(small.geometry)
     toward, length = direct_light(small).ways(rest.caps_mm, np.array([0.0, 0.0, -small.camera.distance_mm]))
     entry, inward = pixel_rays(small.view, project(small.view, rest.caps_mm))
-    np.testing.assert_allclose(toward, -inward, atol=1e-5)
-    np.testing.assert_allclose(rest.caps_mm + length[:, None] * toward, entry, atol=1e-3)
+    rounding = 1e-12
+    np.testing.assert_allclose(toward, -inward, atol=rounding)
+    np.testing.assert_allclose(rest.caps_mm + length[:, None] * toward, entry, atol=rounding)
 
 
 def test_the_centroid_of_a_cap_is_that_of_its_projected_disc(small):
@@ -112,27 +113,27 @@ def test_the_centroid_of_a_cap_is_that_of_its_projected_disc(small):
         _, centroid = area_and_centroid(disc)
         weight = np.where(np.hypot(x - centroid[0], y - centroid[1]) < 7.5, image, 0.0)
         errors.append([(weight * x).sum() / weight.sum() - centroid[0], (weight * y).sum() / weight.sum() - centroid[1]])
-    tolerance_px = 0.05
+    tolerance_px = 0.0036  # measured: 0.0033; an outline is a polygon
     assert np.sqrt(np.square(errors).sum(axis=1).mean()) < tolerance_px
 
 
 def test_caps_cover_their_projected_area(small):
     clear = changed(small, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.0})  # the window takes no light
     covered = Preview(clear, light=evenly, static=NOTHING).render().sum() / (0.8 / np.pi)
-    share = 0.01
+    share = 0.009  # measured: 0.0081, because caps overlap
     assert covered == pytest.approx(sum(area_and_centroid(disc)[0] for disc in projected_discs(clear)), rel=share)
 
 
-def test_outlines_of_their_own_keep_to_their_shape(small):
+def test_caps_with_measured_outlines_have_their_shape(small):
     """``1 + a cos 2t`` has (1 + a^2 / 2) of the circle's area and is longest along x."""
     clear = changed(small, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.0})
     round_, oval = (
         Preview(changed(clear, appearance={"cap_shapes": s}), light=evenly, static=NOTHING).render() for s in ((), ((0.0, 0.2, 0.0),) * 19)
     )
-    assert oval.sum() / round_.sum() == pytest.approx(1 + 0.2**2 / 2, rel=0.01)
+    assert oval.sum() / round_.sum() == pytest.approx(1 + 0.2**2 / 2, rel=0.0062)
     u, v = np.rint(project(clear.view, rest_pins(clear.geometry).caps_mm[0])).astype(int)
     wider, lower = (oval - round_)[v, u - 9 : u + 10].sum(), (oval - round_)[v - 9 : v + 10, u].sum()
-    assert wider > 0.1 and lower < -0.1
+    assert wider > 0.69 and lower < -0.36
 
 
 def test_moving_one_cap_changes_its_neighbourhood_only(small):
@@ -140,41 +141,41 @@ def test_moving_one_cap_changes_its_neighbourhood_only(small):
     after, before = preview.render(moved(rest, 4, (0.3, 0.2, -0.4))), preview.render()
     y, x = np.nonzero(after != before)
     away = np.hypot(x - project(small.view, rest.caps_mm[4])[0], y - project(small.view, rest.caps_mm[4])[1])
-    reach_px = 12.0  # of a stem and cap of 4 mm
-    assert len(away) > 20 and away.max() < reach_px
+    reach_px = 8.7  # of a stem and cap of 4 mm; measured: 7.9
+    assert len(away) > 103 and away.max() < reach_px
     assert (preview.render() == before).all()
 
 
 def test_a_turned_scene_is_a_turned_picture(straight):
     """Pin j of ring r takes the place of pin j - r when the sensor is turned by 60 deg: here all pins of ring 2 by one dead LED."""
     pictures = [Preview(changed(straight, leds={"off": (k,)}), static=NOTHING).render() for k in (0, 3)]
-    rounding = 1e-4
+    rounding = 1e-6  # of single precision
     np.testing.assert_allclose(pictures[0], pictures[1][::-1, ::-1], atol=rounding * pictures[0].max())
     places = np.rint(project(straight.view, rest_pins(straight.geometry).caps_mm[7:])).astype(int)
     near, next_ = (np.array([p[v - 2 : v + 3, u - 2 : u + 3].mean() for u, v in places])
                    for p in (Preview(changed(straight, leds={"off": (k,)}), static=NOTHING).render() for k in (0, 1)))  # fmt: skip
-    np.testing.assert_allclose(np.roll(near, 2), next_, rtol=0.01)
+    np.testing.assert_allclose(np.roll(near, 2), next_, rtol=5 * rounding)
 
 
 def test_a_dead_led_darkens_its_side(straight):
     lit, dark = (Preview(changed(straight, leds={"off": off}), static=NOTHING).render() for off in ((), (0,)))
-    rounding = 1e-4 * lit.max()
+    rounding = 1e-6 * lit.max()
     assert (dark <= lit + rounding).all()
     left, right = np.s_[:, :40], np.s_[:, 61:]  # LED 0 is to the right; light from there falls on caps to the left
     ratios = [dark[side].sum() / lit[side].sum() for side in (left, right)]
-    assert abs(ratios[0] - ratios[1]) > 0.02 and max(ratios) < 1
+    assert abs(ratios[0] - ratios[1]) > 0.24 and max(ratios) < 1
 
 
 def test_light_is_proportional_to_the_leds(small):
     one, two = (Preview(changed(small, leds={"power": power}), static=NOTHING).render() for power in (0.4, 0.8))
-    np.testing.assert_allclose(two, 2 * one, rtol=1e-5)
+    np.testing.assert_allclose(two, 2 * one, rtol=1e-6)
 
 
 def test_levels_scale_their_caps(small):
     levels = tuple(0.5 + 0.02 * k for k in range(19))
     even, own = (Preview(changed(small, appearance={"cap_levels": each}), static=NOTHING).render() for each in ((), levels))
     places = np.rint(project(small.view, rest_pins(small.geometry).caps_mm)).astype(int)
-    np.testing.assert_allclose([own[v, u] / even[v, u] for u, v in places], levels, rtol=1e-4)
+    np.testing.assert_allclose([own[v, u] / even[v, u] for u, v in places], levels, rtol=1e-6)
 
 
 def test_an_absorbing_gel_takes_most_of_its_own_colour(small):
@@ -186,20 +187,20 @@ def test_an_absorbing_gel_takes_most_of_its_own_colour(small):
     kept = blue[v, u] / clear[v, u]
     way_mm = 2 * 20.0  # in and out of the gel, at least
     assert kept[2] == pytest.approx(1) and kept[1] < np.exp(-0.01 * 0.9 * way_mm)
-    np.testing.assert_allclose(kept[0], kept[1] ** 2, rtol=0.02)
+    np.testing.assert_allclose(kept[0], kept[1] ** 2, rtol=1e-6)
 
 
 def test_a_window_is_a_part_of_the_whole_frame(small):
     preview = Preview(small, window_px=(30, 20, 91, 77), static=NOTHING)
-    np.testing.assert_allclose(preview.render(), Preview(small, static=NOTHING).render()[20:77, 30:91], atol=1e-5)
+    np.testing.assert_allclose(preview.render(), Preview(small, static=NOTHING).render()[20:77, 30:91], atol=1e-6)
 
 
-def test_what_is_static_lies_over_the_gel(small):
+def test_the_static_layer_covers_the_gel(small):
     rng = np.random.default_rng(0)
     shine, cover = rng.uniform(0, 1, (100, 120, 3)), rng.uniform(0, 1, (100, 120))
     grayish = shine @ [0.212671, 0.715160, 0.072169]
     expected = grayish + (1 - cover) * Preview(small, static=NOTHING).render()
-    np.testing.assert_allclose(Preview(small, static=(shine, cover)).render(), expected, atol=1e-5)
+    np.testing.assert_allclose(Preview(small, static=(shine, cover)).render(), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(("towards_mm", "seen"), [(-3.0, 0.5), (3.0, 1.0)])
@@ -210,7 +211,7 @@ def test_a_nearer_cap_hides_a_farther_one(small, towards_mm, seen):
     state = moved(rest, 1, rest.caps_mm[0] - rest.caps_mm[1] + [0.0, 0.0, towards_mm])
     image = Preview(changed(small, appearance={"cap_levels": levels}), light=evenly, static=NOTHING).render(state)
     u, v = np.rint(project(small.view, rest.caps_mm[0])).astype(int)
-    window_takes = 0.05
+    window_takes = 0.043
     assert image[v, u] == pytest.approx(seen * 0.8 / np.pi, rel=window_takes)
 
 
@@ -222,10 +223,10 @@ def test_calibration_finds_the_shading_of_a_frame(channels):
     known = Shading(rng.uniform(0.7, 1.3, (4, size)), rng.uniform(0.0, 0.2, (4, size)))
     preview = Preview(spec, window_px=window, static=NOTHING)
     found = preview.calibrate(Preview(spec, window_px=window, shading=known, static=NOTHING))
-    single_precision = 0.02
-    np.testing.assert_allclose(found.gain, known.gain, atol=single_precision)
-    np.testing.assert_allclose(found.offset, known.offset, atol=single_precision)
-    np.testing.assert_allclose(found.skin, 1, atol=single_precision)
+    gain, offset, skin = 0.0068, 0.0089, 0.00035  # errors by single precision; measured: 0.0062, 0.0081, 0.00031
+    np.testing.assert_allclose(found.gain, known.gain, atol=gain)
+    np.testing.assert_allclose(found.offset, known.offset, atol=offset)
+    np.testing.assert_allclose(found.skin, 1, atol=skin)
     with pytest.raises(RenderError, match="window_px"):
         preview.calibrate(Preview(spec, static=NOTHING))
 
@@ -238,7 +239,7 @@ def test_calibration_finds_where_the_skin_is_shaded():
     shaded = Preview(spec, static=NOTHING, shading=Shading(skin=shade))
     before = np.abs(preview.render() - shaded.render()).sum()
     preview.calibrate(shaded)
-    left_over = 0.15  # what the surroundings of a corner smear
+    left_over = 0.091  # a corner's gain is a mean over its surroundings; measured: 0.083
     assert np.abs(preview.render() - shaded.render()).sum() < left_over * before
 
 

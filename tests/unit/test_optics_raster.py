@@ -48,14 +48,14 @@ def test_a_pixels_cover_is_the_share_of_its_square_inside():
     np.testing.assert_allclose(image[..., 0], inside.reshape(30, across, 40, across).mean(axis=(1, 3)), atol=points)
 
 
-def test_what_leaves_the_image_is_cut_off():
+def test_polygons_are_clipped_at_the_border():
     rng = np.random.default_rng(1)
     polygons = np.stack([ring_of(8, rng) for _ in range(20)])
     light = rng.uniform(0, 1, (20, 2))
     np.testing.assert_allclose(drawn((11, 15, 2), polygons - [13, 9], light), drawn((30, 40, 2), polygons, light)[9:20, 13:28], atol=1e-12)
 
 
-def test_what_lies_within_adds_no_edge_of_its_own():
+def test_an_inner_polygon_adds_no_edge():
     """The same outline again, as an inner one of the same light, changes nothing; of another light, it replaces it."""
     polygon, light = ring_of(6, np.random.default_rng(4)), np.array([[1.0], [0.3]])
     once, twice = drawn((30, 40, 1), polygon[None]), np.stack([polygon, polygon])

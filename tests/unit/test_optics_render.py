@@ -174,8 +174,8 @@ def test_what_cannot_be_rendered_is_refused(small):
         Renderer(small, spp=1).render(PinRest(rest.base_mm[:5], rest.axis[:5], rest.caps_mm[:5]))
 
 
-def test_the_samples_stand_where_pins_are():
-    """A ray traced onto a pin belongs to a pixel that counts as near one; bare skin is left out."""
+def test_pixels_that_show_a_pin_count_as_near_one():
+    """Pixels onto which rims and feet of pins are projected count as near a pin; most pixels of bare skin do not."""
     spec, window = plain(), (200, 150, 400, 350)
     rest = rest_pins(spec.geometry)
     near = near_pins(spec.view, spec.pins, spec.appearance, rest, window)

@@ -127,7 +127,7 @@ def test_a_speck_hides_its_opacity_and_sends_its_light(bare):
     assert cover.sum() == pytest.approx(7 / 12 * speck.opacity * area_px2, rel=over_the_disc)
 
 
-def test_specks_over_each_other_hide_like_filters(bare):
+def test_overlapping_specks_multiply_their_transmittance(bare):
     speck = SpeckSpec(x_mm=0.0, y_mm=0.0, radius_mm=2.0, opacity=0.5)
     _, cover = static_layer(changed(bare, appearance={"specks": (speck, speck)}), WINDOW)
     assert cover.max() == pytest.approx(0.75, abs=1e-6)

@@ -183,7 +183,7 @@ def test_a_pixels_samples_are_stratified_in_every_way(jit, spp):
             assert (np.sort(box, axis=1) == np.arange(spp)).all()
 
 
-def test_seeds_pixels_and_dimensions_are_unlike(jit):
+def test_seeds_pixels_and_dimensions_are_uncorrelated(jit):
     """Correlations of the numbers of one draw with another's are those of chance."""
     mi, dr = jit
     spp, pixels = 4, 4000

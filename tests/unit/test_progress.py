@@ -1,6 +1,7 @@
 """Whoever asks is told how far work is: stages in their order, bars on a terminal, lines elsewhere."""
 
 import io
+import time
 
 import pytest
 from rich.console import Console
@@ -27,7 +28,7 @@ def test_a_stage_begins_unknown_and_tells_each_step_under_its_title():
     assert heard.calls == [("frames", 0, 0, ""), ("frames", 1, 3, ""), ("frames", 3, 3, "good")]
 
 
-def test_a_stage_that_tells_nothing_is_one_thing_done():
+def test_a_stage_without_reports_counts_as_one_finished_item():
     heard = Heard()
     with stage(heard, "render"):
         pass
@@ -41,7 +42,7 @@ def test_a_stage_that_fails_is_not_told_as_done():
     assert heard.calls == [("render", 0, 0, "")]
 
 
-def test_nobody_needs_to_listen():
+def test_progress_is_optional():
     with stage(silent, "frames") as step:
         step(0.5)
 
@@ -57,6 +58,27 @@ def test_without_a_terminal_a_line_is_printed_every_ten_seconds_and_no_more_ofte
     now_s[0] += 10.0
     lines("press", 0.25, 1.0)
     assert out.getvalue().splitlines()[-1] == "press: 25%"
+
+
+def test_a_line_is_printed_also_while_nothing_is_reported():
+    out = io.StringIO()
+    with Lines(out, every_s=0.02) as lines:
+        lines("mesh", 0, 0)
+        wait_until(lambda: out.getvalue().count("mesh: begun") >= 2)
+        with stage(lines, "contacts") as step:
+            step(3, 40)
+            wait_until(lambda: "contacts: 3 of 40" in out.getvalue())
+    said = out.getvalue()
+    time.sleep(0.06)
+    assert out.getvalue() == said, "a line after the end"
+
+
+def wait_until(true):
+    """Wait until something is true, at most for ten seconds."""
+    ends = time.monotonic() + 10
+    while not true() and time.monotonic() < ends:
+        time.sleep(0.005)
+    assert true()
 
 
 def test_each_stage_has_a_bar_also_when_its_title_comes_again():

@@ -26,7 +26,7 @@ def good(spec):
 def read(folder, spec, images, **options):
     for name, image in images.items():
         cv2.imwrite(str(folder / name), image)
-    return read_real(folder, spec, lens_disc(spec), **options)
+    return read_real(folder, spec, lens_disc(spec.view, spec.housing), **options)
 
 
 def test_bad_frames_are_refused_by_name_and_good_ones_kept(tmp_path, spec, good):

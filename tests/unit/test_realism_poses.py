@@ -32,8 +32,8 @@ TRUE = RigSpec(
     turn_offset_deg=(1.2, -0.8, 0.0),
     turn_sign=-1,
 )
-SAME_CONTACT = 1e-4  # mm, and of the unit normal
-PENETRATION_MM = 0.02  # twice what the solver allows
+SAME_CONTACT = 1e-12  # mm, and of the unit normal: rounding
+PENETRATION_MM = 0.0052  # half of what the solver allows; measured: 0.0047
 
 
 def label(depth_mm, about_x_deg, about_y_deg):
@@ -77,8 +77,8 @@ def test_a_known_rig_is_recovered_from_its_pins(start):
     )
 
 
-def test_what_the_polynomial_misses_is_made_good_in_the_second_round():
-    """Pins that stand elsewhere than the polynomial has them by a constant: only the second round knows."""
+def test_the_second_round_corrects_the_polynomials_errors():
+    """Pins that differ from the polynomial by a constant: only the second round corrects this."""
     labels, off_px = spread(12), np.array([1.5, -0.7])
     meant = contacts_of(TRUE, SURFACE, labels, RADIUS_MM)
     seen = AnalyticBank().pins_px(meant) + off_px
@@ -88,10 +88,10 @@ def test_what_the_polynomial_misses_is_made_good_in_the_second_round():
 
     first, second = (fit_rig(AnalyticBank(), TRUE, SURFACE, labels, seen, RADIUS_MM, simulate=each) for each in (None, simulate))
     np.testing.assert_allclose(contacts_of(second, SURFACE, labels, RADIUS_MM), meant, atol=SAME_CONTACT)
-    assert np.abs(contacts_of(first, SURFACE, labels, RADIUS_MM) - meant).max() > 10 * SAME_CONTACT
+    assert np.abs(contacts_of(first, SURFACE, labels, RADIUS_MM) - meant).max() > 0.099
 
 
-def test_the_bank_covers_the_labels_of_a_rig_that_is_some_off():
+def test_the_bank_covers_labels_of_a_wrong_rig():
     labels = spread(30)
     bank = contacts_of(PLAIN, SURFACE, bank_labels(PLAIN, SURFACE, labels, RADIUS_MM), RADIUS_MM)
     true = contacts_of(TRUE, SURFACE, labels, RADIUS_MM)
@@ -106,7 +106,9 @@ def test_a_label_is_pressed_along_its_normal_to_its_depth():
     normal = np.array([x, y, np.sqrt(1 - x * x - y * y)])
     np.testing.assert_allclose(RADIUS_MM - state.contact_mm @ normal, indent, atol=PENETRATION_MM)
     middle = state.contact_mm.mean(axis=0)
-    np.testing.assert_allclose(middle / np.linalg.norm(middle), normal, atol=0.05)  # the clamped rim is nearer on one side
+    np.testing.assert_allclose(
+        middle / np.linalg.norm(middle), normal, atol=0.0387
+    )  # the clamped rim is nearer on one side; measured: 0.0351
 
 
 def test_half_of_the_frames_are_for_the_test():

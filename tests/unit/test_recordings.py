@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import zlib
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,9 +18,10 @@ from twin.errors import FrameError, StoreError
 from twin.frames import natural_key, open_recording, read_image
 from twin.frames.images import write_image
 from twin.frames.recording import _is_cut
-from twin.pins import nominal_reference
+from twin.pins import Pipeline, nominal_reference
 from twin.pins.batch import overlay_name, preprocess_recording
 from twin.rig.labels import read_arm_labels
+from twin.store import write_text
 from twin.types import Form
 
 
@@ -539,3 +541,28 @@ def test_a_picture_that_can_not_be_written_is_an_error_and_leaves_no_half_of_it(
     with pytest.raises(StoreError, match="can't be written"):
         write_image(tmp_path / "frame.png", pictures[0])
     assert [path.name for path in tmp_path.iterdir()] == ["frame.png"]
+
+
+def test_the_time_of_a_frame_is_without_that_of_compiling(tmp_path, spec, pictures, monkeypatch):
+    """Also where there is one frame alone."""
+    write_image(tmp_path / "one.png", pictures[1])
+    looks, look = [], Pipeline.__call__
+
+    def slow_at_first(self, frame):
+        looks.append(look(self, frame))
+        return replace(looks[-1], ms=looks[-1].ms | {"total": 9000.0}) if len(looks) == 1 else looks[-1]
+
+    monkeypatch.setattr(Pipeline, "__call__", slow_at_first)
+    assert preprocess_recording(tmp_path / "one.png", spec, tmp_path / "out")["ms"]["total"]["p50"] < 9000
+
+
+def test_a_name_that_the_locale_cannot_decode_is_drawn_and_written(tmp_path, spec, pictures):
+    """OpenCV itself ends the process at such a name."""
+    name = b"f_\xe4.png"
+    (tmp_path / "set").mkdir()
+    with open(os.path.join(os.fsencode(tmp_path / "set"), name), "wb") as file:
+        file.write(cv2.imencode(".png", pictures[1])[1].tobytes())
+    preprocess_recording(tmp_path / "set", spec, tmp_path / "out", overlay=True)
+    assert os.listdir(os.fsencode(tmp_path / "out" / "overlay")) == [name]
+    page = write_text(tmp_path / "page.txt", f"{os.fsdecode(name)} \xe4")
+    assert page.read_bytes() == name + " \xe4".encode()

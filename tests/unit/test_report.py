@@ -160,7 +160,7 @@ def test_the_stylesheet_takes_its_colours_from_the_themes():
     assert set(re.findall(r"var\(--(\w+)\)", rules)) <= {field.name for field in fields(Theme)}
 
 
-def test_series_are_seen_and_told_apart_by_everybody():
+def test_series_differ_for_every_kind_of_colour_vision():
     for color, theme in itertools.product(SERIES, (LIGHT, DARK)):
         assert contrast(color, theme.surface) >= LINE_CONTRAST, f"{color} on {theme.surface}"
     for (sight, matrix), (one, other) in itertools.product(SIGHTS.items(), itertools.combinations(SERIES, 2)):

@@ -14,6 +14,7 @@ from hardware.errors import DeviceError
 from hardware.view.rerun import RerunView
 from scenes import load_sensor
 from training.estimator import PoseEstimate
+from twin.errors import OptionError
 from twin.pins import Pipeline
 from twin.types import Form
 
@@ -25,7 +26,7 @@ def test_without_the_package_the_remedy_is_told(monkeypatch):
 
 
 def test_a_target_that_is_none_is_an_error():
-    with pytest.raises(DeviceError, match="expected 'viewer'"):
+    with pytest.raises(OptionError, match="expected 'viewer'"):
         RerunView("title", "somewhere")
 
 

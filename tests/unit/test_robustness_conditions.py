@@ -162,7 +162,7 @@ def test_caps_that_have_come_off_are_dark():
 
 
 @pytest.mark.parametrize("name", those_with("setting"))
-def test_settings_go_astray_further(name):
+def test_a_wrong_setting_becomes_worse_with_severity(name):
     thresholds = [Case((CONDITIONS[name],)).on_setting(detector(), severity).blob.threshold for severity in LADDER]
     steps = np.diff(thresholds)
     assert (steps > 0).all() or (steps < 0).all()

@@ -60,7 +60,7 @@ def test_a_perfect_answer_is_perfect(detector, rest):
     }  # fmt: skip
 
 
-def test_planted_errors_are_counted(detector, rest):
+def test_injected_errors_are_counted(detector, rest):
     n = len(rest)
     pins = rest.copy()
     pins[:5] = np.nan
@@ -241,7 +241,7 @@ def test_a_sweep_can_be_read_from_a_file(tmp_path):
         load_plan(path)
 
 
-def test_what_was_not_looked_at_is_not_claimed(tmp_path):
+def test_an_envelope_ends_at_the_severest_step(tmp_path):
     """A pipeline that never fails is as wide as the severest step, not as the condition's range."""
     case = Case((CONDITIONS["noise"],))
     rows = [

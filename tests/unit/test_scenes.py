@@ -92,3 +92,18 @@ def test_a_users_own_specification_is_found_and_wins(tmp_path, monkeypatch):
     (tmp_path / "objects" / "sphere.toml").write_text('description = "mine"\nshape = { kind = "sphere", radius_mm = 4.0 }\n')
     monkeypatch.setenv("TACTIP_SPECS", str(tmp_path))
     assert load_object("sphere").description == "mine"
+
+
+def test_an_object_of_a_mesh_knows_its_content(tmp_path):
+    mesh, spec = tmp_path / "part.stl", tmp_path / "part.toml"
+    mesh.write_bytes(b"first")
+    spec.write_text('description = ""\nshape = { kind = "mesh", file = "part.stl" }\n')
+    before = [load_object(path) for path in (mesh, spec)]
+    mesh.write_bytes(b"other")
+    after = [load_object(path) for path in (mesh, spec)]
+    assert before[0] != after[0] and before[1] != after[1] and before[0].shape.sha256 == before[1].shape.sha256
+    spec.write_text(f'description = ""\nshape = {{ kind = "mesh", file = "part.stl", sha256 = "{before[0].shape.sha256}" }}\n')
+    with pytest.raises(SpecError, match=r"part.toml: shape.sha256: .*part.stl has another content.*leave the key out"):
+        load_object(spec)
+    mesh.write_bytes(b"first")
+    assert load_object(spec) == before[1]

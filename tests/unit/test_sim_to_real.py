@@ -43,7 +43,7 @@ def test_pins_are_counted_from_the_no_contact_frame_in_hand(data, run):
     assert np.abs(here.mean - unknown.mean).max() > 100 * SAME
 
 
-def test_what_the_twin_misses_is_learnt_from_few_frames_and_told_honestly():
+def test_the_discrepancy_is_learnt_from_few_frames_and_its_uncertainty_is_right():
     rng = np.random.default_rng(1)
     simulated, real = rng.normal(size=(400, 6)), rng.normal(size=(240, 6))
 

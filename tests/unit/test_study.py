@@ -50,7 +50,7 @@ def test_a_study_is_resumed_and_never_speaks_of_what_was_not_run(data, tmp_path)
 def test_a_run_taught_by_other_labelled_frames_is_not_gone_on_with(data, tmp_path):
     """The simulated contacts' pins differ, and nothing else that a run tells."""
     plan = plan_run("vgnn-without-kernel", labels="raw", seed=0, split=0, epochs=2).config
-    taught, otherwise = (replace(plan, labelled=names) for names in (("frame_1.png",), ("frame_2.png",)))
+    taught, otherwise = (replace(plan, labelled={"image_names": [name]}) for name in ("frame_1.png", "frame_2.png"))
     train_run(taught, data, tmp_path, max_minutes=0.0)
     with pytest.raises(TrainingError, match="other settings or data"):
         train_run(otherwise, data, tmp_path)

@@ -62,7 +62,7 @@ def test_a_texture_lifts_the_surface_by_its_height():
     assert np.allclose(lifted, can.texture.wire_diameter_mm)
 
 
-def test_where_the_tool_turns_about_other_axes_too_no_single_angle_tells():
+def test_turns_about_several_axes_give_no_angle_label():
     sensor, tilted = load_sensor("ur5-331"), load_experiment("surface-3d")
     _, T = poses_of(sensor, 2)
     assert surface_labels(tilted, Mounting.of(sensor, tilted), Surface(load_object("sphere")), T) == {}

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,14 +12,17 @@ from drawn_frames import drawn_frame
 from drawn_recording import FRAMES, config_of
 
 from scenes import load_sensor
-from training.dataset import Dataset
+from training.dataset import Dataset, joined
 from training.estimator import PoseEstimator, digest_of, folder_of
 from training.evaluate import judge, leak_check, rows_to_judge, write_evaluation
+from training.identity import changed_since
 from training.models import recipe_of
 from training.models.part import Prediction
 from training.pins import PinTable
 from training.recipes import TrainingError
-from training.run import fold_rows, train_run
+from training.run import fold_rows, is_finished, train_run, training_rows
+from training.run_files import read_tensors
+from training.studies.evaluation import Predictions
 from twin.errors import FrameError
 from twin.pins import Pipeline, nominal_reference
 from twin.types import Form, Frame
@@ -46,6 +50,121 @@ def test_another_run_in_the_same_folder_is_refused(data, trained, tmp_path):
     train_run(config_of("vgnn", epochs=3), data, tmp_path, max_minutes=0)
     with pytest.raises(TrainingError, match="other settings"):
         train_run(config_of("vgnn", epochs=4), data, tmp_path)
+
+
+def in_another_order(data):
+    return data.rows(np.random.default_rng(5).permutation(len(data)))
+
+
+def with_other_labels(data):
+    return replace(data, targets=replace(data.targets, raw=data.targets.raw + 1, corrected=data.targets.corrected + 1))
+
+
+def with_other_moves(data):
+    return replace(data, targets=replace(data.targets, executed=1 - data.targets.executed))
+
+
+def with_another_frame(data):
+    nodes = data.pins.nodes_px.copy()
+    nodes[7] = nodes[8]
+    return replace(data, pins=replace(data.pins, nodes_px=nodes))
+
+
+def with_other_names(data):
+    return replace(data, pins=replace(data.pins, image_name=np.char.add("g", data.pins.image_name)))
+
+
+CHANGES = {
+    "other labels": with_other_labels,
+    "other labels ": with_other_moves,
+    "other frames under the same names": with_another_frame,
+    "frames of other names": with_other_names,
+}
+
+
+@pytest.mark.parametrize("words", CHANGES)
+def test_a_run_is_not_gone_on_with_and_not_offered_on_data_that_changed(data, tmp_path, words):
+    config, changed = config_of("vgnn", epochs=2, batch=32, members=1, kernel=False), CHANGES[words](data)
+    for minutes in (0, None):  # begun, then finished
+        train_run(config, data, tmp_path, max_minutes=minutes)
+        assert is_finished(config, data, tmp_path) == (minutes is None)
+        with pytest.raises(TrainingError, match=words.strip()):
+            is_finished(config, changed, tmp_path)
+        with pytest.raises(TrainingError, match=words.strip() if minutes == 0 else "finished run"):
+            train_run(config, changed, tmp_path)
+
+
+def test_a_table_in_another_order_is_the_same_data(data, tmp_path):
+    config, mixed = config_of("vgnn", epochs=2, batch=32, members=1, kernel=False), in_another_order(data)
+    train_run(config, data, tmp_path / "one")
+    train_run(config, mixed, tmp_path / "other", max_minutes=0)
+    train_run(config, data, tmp_path / "other")
+    one, other = (read_tensors(tmp_path / name / "weights.pt") for name in ("one", "other"))
+    assert all(torch.equal(value, other["networks"][0][key]) for key, value in one["networks"][0].items())
+    assert is_finished(config, mixed, tmp_path / "one")
+
+
+def test_the_frames_kept_out_are_judged_whatever_the_order_of_the_table(data, trained):
+    estimator, mixed = PoseEstimator.load(trained), in_another_order(data)
+    kept = json.loads((trained / "config.json").read_text())["rows"]["kept_out"]
+    assert len(kept) == 18
+    for each in (data, mixed, mixed.rows(np.flatnonzero(np.isin(mixed.pins.image_name, kept)))):
+        assert each.pins.image_name[rows_to_judge(estimator, each, "validation")].tolist() == kept
+    made = [estimator.predict_rows(each, rows_to_judge(estimator, each, "validation")).mean for each in (data, mixed)]
+    assert np.array_equal(*made)
+    assert not changed_since(estimator.config, mixed, estimator.part)
+    (said,) = changed_since(estimator.config, with_other_labels(data), estimator.part)
+    assert "other labels" in said
+
+
+def test_a_run_of_an_earlier_version_is_judged_and_says_what_it_cannot_tell(data, trained, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    config = json.loads((run / "config.json").read_text())
+    kept = config["rows"]["kept_out"]
+    (run / "config.json").write_text(json.dumps(config | {"rows": {"usable": FRAMES, "train": 72}}))
+    estimator = PoseEstimator.load(run)
+    judged = data.pins.image_name[rows_to_judge(estimator, data, "validation")].tolist()
+    assert sorted(judged) == sorted(kept)
+    (said,) = changed_since(estimator.config, data, estimator.part)
+    assert "can't be told" in said
+
+
+def test_frames_of_folders_of_one_name_are_told_apart(data, tmp_path):
+    parts = [replace(data, folders=(tmp_path / place / "taps",)) for place in ("monday", "tuesday")]
+    both = joined(parts)
+    assert len(set(both.pins.image_name.tolist())) == 2 * FRAMES
+    assert both.pins.image_name[0] == "monday/taps/f_0.png"
+    assert joined([parts[0], replace(data, folders=(tmp_path / "tilts",))]).pins.image_name[0] == "taps/f_0.png"
+
+
+def test_the_split_of_several_recordings_goes_by_name(data, tmp_path):
+    parts = [replace(data, folders=(tmp_path / name,)) for name in ("taps", "tilts")]
+    config = config_of("vgnn")
+    kept = []
+    for each in (parts, [in_another_order(part) for part in parts]):
+        both = joined(each).in_order()
+        kept.append(np.delete(both.pins.image_name, training_rows(config, both)).tolist())
+    assert kept[0] == kept[1] and len(kept[0]) == 36
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_too_few_frames_to_learn_from_are_refused_in_words(data, tmp_path, frames):
+    with pytest.raises(TrainingError, match=f"{frames} usable frames, .*are too few; 3 frames to learn from are needed"):
+        train_run(config_of("vgnn", epochs=1), data.rows(np.arange(frames)), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_fewest_frames_are_learnt_from(data, tmp_path):
+    for model in ("vgnn", "gnn", "tac-vgnn-release"):
+        assert train_run(config_of(model, epochs=1), data.rows(np.arange(4)), tmp_path / model)
+        assert PoseEstimator.load(tmp_path / model)
+
+
+@pytest.mark.parametrize("changes", [{"seed": -1}, {"seed": 10**20}, {"split": -2}])
+def test_seeds_out_of_range_are_refused(changes):
+    with pytest.raises(TrainingError, match=f"--{next(iter(changes))} .*from 0 to 4294967295"):
+        replace(config_of("vgnn"), **changes)
 
 
 def test_a_run_begun_by_other_code_is_not_gone_on_with(data, tmp_path, monkeypatch):
@@ -108,7 +227,7 @@ def test_rows_a_model_learnt_from_are_not_judged(data, trained):
     estimator = PoseEstimator.load(trained)
     assert len(rows_to_judge(estimator, data, "all")) == FRAMES
     fewer = Dataset(data.pins.rows(np.arange(50)), data.targets.rows(np.arange(50)), data.folders)
-    with pytest.raises(TrainingError, match="trained on part of 90 rows"):
+    with pytest.raises(TrainingError, match="of the 18 frames that the run kept out of its training are not among its 50 usable ones"):
         rows_to_judge(estimator, fewer, "validation")
 
 
@@ -119,7 +238,7 @@ def test_each_network_watches_rows_of_its_own():
     assert all(not set(held) & set(learnt) for held, learnt in folds)
 
 
-def test_a_model_that_reads_the_clock_is_found_out(data):
+def test_a_model_that_estimates_from_time_is_found(data):
     undone = data.targets.executed < 0.5
     honest = Prediction(data.targets.corrected, np.ones((FRAMES, 2)), np.ones((FRAMES, 2)), np.full(FRAMES, np.nan))
     clock = Prediction(data.targets.corrected + 0.5 * np.column_stack([np.zeros(FRAMES), data.targets.move[:, 1]]), *[None] * 3)
@@ -149,3 +268,15 @@ def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkey
     monkeypatch.setattr("training.estimator.fingerprint", lambda *makers: "of another version")
     found.append(digest_of(copy))
     assert len(set(found)) == 4
+
+
+def test_the_time_of_an_estimate_is_without_that_of_compiling():
+    """The first estimate of a process loads or compiles code, so it is made twice."""
+    seen = []
+
+    def estimator(frame):
+        seen.append(frame.name)
+        return len(seen)
+
+    frames = [SimpleNamespace(name=name) for name in "ab"]
+    assert list(Predictions(estimator, frames)) == [("a", 2), ("b", 3)] and seen == ["a", "a", "b"]

@@ -18,7 +18,7 @@ def twins():
     return full, {twin.name: twin for twin in without_one_ingredient(full, as_mounted(sensor), moves, contact)}
 
 
-def test_each_lacks_one_thing_and_shares_contacts_only_where_they_are_the_same(twins):
+def test_each_twin_lacks_one_ingredient_and_shares_contacts_only_if_they_are_equal(twins):
     full, others = twins
     plane = load_object("plane")
     for twin in others.values():
@@ -33,7 +33,7 @@ def test_friction_that_is_never_drawn_is_not_tried_on_frames_either(twins):
     assert full.frictions == FRICTIONS and others["sim_one_friction"].frictions == (full.sensor.rig.friction,)
 
 
-def test_an_uncalibrated_rig_knows_directions_alone():
+def test_an_uncalibrated_rig_has_only_directions():
     sensor = load_sensor("mg400-331")
     rig = as_mounted(sensor).rig
     assert rig.turn_sign == sensor.rig.turn_sign and rig.image_turn_deg == 90 and rig.contact_offset_mm == 0

@@ -29,13 +29,13 @@ def pictures(count, seed, *, blue=1.0):
     return out
 
 
-def test_what_has_one_distribution_is_not_told_apart():
+def test_sets_of_one_distribution_are_not_distinguished():
     outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1), INSIDE)
     assert outcome.accuracy == pytest.approx(0.5, abs=CHANCE)
     assert outcome.low <= outcome.accuracy <= outcome.high
 
 
-def test_what_differs_is_told_apart_in_unseen_frames():
+def test_different_sets_are_distinguished_in_unseen_frames():
     outcome = two_sample(pictures(PAIRS, 0), pictures(PAIRS, 1, blue=0.8), INSIDE)
     assert outcome.accuracy > 0.95
 

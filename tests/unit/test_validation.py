@@ -48,14 +48,14 @@ def found(recorded):
     return compare(model, measure_frames(folder, config.sensor, None, 0), friction_frames=1)
 
 
-def test_with_its_own_friction_a_frame_of_the_twin_is_met(found):
+def test_an_individual_friction_reproduces_a_frame_of_the_twin(found):
     sought = np.flatnonzero(np.isfinite(found.friction_error_px))
     assert len(sought) == 1 and found.executed[sought[0]]
     assert found.friction[sought[0]] == FRICTION and found.friction_error_px[sought[0]] < FOUND_PX
     assert found.friction_error_px[sought[0]] < found.error_px[sought[0]]
 
 
-def test_figures_are_apart_for_executed_and_not_executed_moves(found):
+def test_figures_are_separate_for_executed_and_not_executed_moves(found):
     rows = {row["group"]: row for row in table_of(found)}
     assert rows["move executed"]["frames"] == rows["move not executed"]["frames"] == COUNT // 2
     assert rows["all"]["error_px"] == pytest.approx(found.error_px.mean())
@@ -75,7 +75,7 @@ def test_a_wrong_executed_flag_shows(recorded, found):
 
 def test_page_and_table_hold_every_frame(found, recorded, tmp_path):
     _, config, _ = recorded
-    page, table, _ = write_validation(tmp_path, found, config.sensor, summary_of(found, config.sensor))
+    page, table, _ = write_validation(tmp_path, found, config.sensor.description, summary_of(found, config.sensor.name))
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["image_name"] for row in rows] == found.measured.names

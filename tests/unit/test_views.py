@@ -13,7 +13,7 @@ from twin.report.charts import new_figure
 from twin.report.plots import ENLARGEMENTS, area_surface_figure, draw_area_change, draw_displacement, enlargement
 
 
-def test_a_dying_vtk_leaves_a_plain_picture_and_a_reason(tmp_path, monkeypatch):
+def test_a_vtk_that_is_killed_gives_a_plain_picture_and_a_reason(tmp_path, monkeypatch):
     dying = tmp_path / "python"
     dying.write_text("#!/bin/sh\nkill -SEGV $$\n")
     dying.chmod(0o755)

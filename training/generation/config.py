@@ -1,4 +1,4 @@
-"""What a simulated data set is made of, and what is drawn for each of its contacts."""
+"""The configuration of a simulated data set, and the random draw of each of its contacts."""
 
 import json
 from dataclasses import dataclass
@@ -33,16 +33,16 @@ def require_count(count: int, option: str = "--count") -> None:
 
 
 class GenerationConfig(Section):
-    """All that the frames of a data set depend on, but for how many there are.
+    """Everything that determines the frames of a data set, except their number.
 
     Attributes
     ----------
     friction : float
-        Of every contact, unless the randomisation draws it.
+        Coefficient of friction of every contact, unless the randomisation draws it.
     images : {"raw", "gray", "recording", "none"}
-        The camera's frame, its luminance, the recordings' thresholded form, or pins alone without any rendering.
+        Which pictures are rendered: the camera's frame, its luminance, the recordings' thresholded form, or none (pins alone).
     states : {"end", "all"}
-        Each contact's last state, or every converged state on its way.
+        Which states of a contact are kept: the last one, or every converged state on the way to it.
     across : int
         Elements along each side of the skin's grid.
     """
@@ -60,36 +60,38 @@ class GenerationConfig(Section):
 
     @property
     def form(self) -> Form:
-        """Form whose pixels the pins are given in; without pictures that of the recordings, if the sensor has one."""
+        """Form of frame in whose pixels the pins are given. Without pictures it is the recordings' form if the sensor has one, else raw."""
         if self.images == "none":
             return Form.RECORDING if self.sensor.recording else Form.RAW
         return Form.RECORDING if self.images == "recording" else Form.RAW
 
     @property
     def image_folder(self) -> str:
-        """Where pictures of this kind lie in a recording's folder."""
+        """Name of the subfolder of a recording that holds pictures of this kind."""
         return "frames_bw" if self.images == "recording" else "images"
 
     def text(self) -> str:
-        """As JSON, the same for the same configuration."""
+        """The configuration as JSON. Equal configurations give equal texts."""
         return json.dumps(self.model_dump(mode="json"), indent=1, sort_keys=True) + "\n"
 
 
 @dataclass(frozen=True)
 class Draw:
-    """One contact as drawn.
+    """One randomly drawn contact.
 
     Attributes
     ----------
     label : ArmLabel
     sensor : SensorSpec
-        With the numbers drawn for this contact.
+        The sensor with the values drawn for this contact.
     friction : float
+        Coefficient of friction.
     values : dict of str to float
-        Those numbers, by key.
+        The drawn values, by key of the randomisation.
     image_seed : int
+        Seed of the picture's noise.
     noise : numpy.random.Generator
-        Of the stored pins.
+        Generator of the noise of the stored pins.
     """
 
     label: ArmLabel
@@ -101,19 +103,19 @@ class Draw:
 
 
 def draw_label(experiment: ExperimentSpec, rng: np.random.Generator, executed_share: float = 1.0) -> ArmLabel:
-    """Pose and move, each number even over its range."""
+    """Draw pose and move, each number uniformly over its range."""
     low, high = np.array(list(experiment.ranges().values())).T
     numbers = rng.uniform(low, high)
     return ArmLabel(numbers[:6], numbers[6:], bool(rng.random() < executed_share))
 
 
 def draw_contact(config: GenerationConfig, index: int, attempt: int) -> Draw:
-    """The ``attempt``-th draw of contact ``index``; depends on nothing else but the configuration.
+    """The ``attempt``-th draw of contact ``index``. It depends on these two numbers and the configuration alone.
 
     Raises
     ------
     ContactError
-        The numbers drawn make no sensor.
+        The drawn values do not make a valid sensor.
     """
     streams = [np.random.default_rng([config.seed, index, attempt, part]) for part in range(5)]
     how = config.randomisation
@@ -131,7 +133,7 @@ def _friction(spread: FrictionSpread, rng: np.random.Generator) -> float:
 
 
 def _sensor(nominal: SensorSpec, how: RandomisationSpec, rng: np.random.Generator) -> tuple[SensorSpec, dict]:
-    """A copy of a sensor with numbers drawn, one for each key in alphabetical order."""
+    """A copy of a sensor with randomly drawn values, and these values by key. They are drawn in the alphabetical order of the keys."""
     plain = nominal.model_dump(mode="json") | {"rig": rig_of(nominal).model_dump(mode="json")}
     values = {}
     for key, spread in sorted(how.sensor.items()):

@@ -1,4 +1,4 @@
-"""One contact of a data set, from its number to pictures and truth: what a worker does."""
+"""One contact of a data set: a worker process makes its pictures and its truth from its number."""
 
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -19,24 +19,26 @@ from twin.rig.labels import ArmLabel
 from twin.simulator import Simulator
 from twin.types import ContactState
 
-MOST_ATTEMPTS = 20  # draws for one contact
-REST = -1  # the number that stands for the no-contact frame
+# Most draws for one contact before the data set is given up.
+MOST_ATTEMPTS = 20
+# Index of the frame without contact.
+REST = -1
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one contact.
+    """The result of one contact.
 
     Attributes
     ----------
     index : int
-        Of the contact; ``REST`` for the no-contact frame.
+        Index of the contact; ``REST`` for the frame without contact.
     images : list of bytes
-        PNG of each of the S states, empty where none were asked for.
+        PNG of each of the S states; empty if the configuration asks for no pictures.
     arrays : dict of str to (S, ...) array
         Truth and labels of each state.
     draw : dict of str to float
-        What was drawn beside the label.
+        The values drawn in addition to the label.
     failures : list of str
         Why earlier draws for this contact failed, in order.
     """
@@ -54,7 +56,7 @@ def make_contact(text: str, index: int) -> Outcome:
     Raises
     ------
     DatasetError
-        No draw led to a contact.
+        All draws failed.
     RenderError
         Nothing can be rendered here.
     """
@@ -75,7 +77,7 @@ def make_contact(text: str, index: int) -> Outcome:
 
 
 def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, failures: list) -> Outcome:
-    simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor, keep=False)
+    simulator = _nominal(text) if not draw.values else _simulator(config, draw.sensor)
     contact = RigContact(simulator.solver, config.experiment, config.object)
     way = contact.way(draw.label)
     found = list(contact.along(way, friction=draw.friction))
@@ -127,8 +129,8 @@ def _config(text: str) -> GenerationConfig:
 @lru_cache(maxsize=1)
 def _nominal(text: str) -> Simulator:
     config = _config(text)
-    return _simulator(config, config.sensor, keep=True)
+    return _simulator(config, config.sensor)
 
 
-def _simulator(config: GenerationConfig, sensor: SensorSpec, *, keep: bool) -> Simulator:
-    return Simulator(sensor, quality=config.quality, solver=SkinSolver(sensor, resolution=Resolution(config.across), keep=keep))
+def _simulator(config: GenerationConfig, sensor: SensorSpec) -> Simulator:
+    return Simulator(sensor, quality=config.quality, solver=SkinSolver(sensor, resolution=Resolution(config.across)))

@@ -1,4 +1,4 @@
-"""Making a simulated data set, from what a user asks for to its folder: in this process, in several, or on a cluster."""
+"""Generation of a simulated data set in this process, in several processes, or on a cluster."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +17,14 @@ from twin.workers import outcomes, require_scheduler
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run made.
+    """Numbers of a run of ``generate``.
 
     Attributes
     ----------
     contacts, frames : int
-        In the whole data set.
-    before : int
-        Contacts that were there before this run.
+        Number in the whole data set.
+        before : int
+            Contacts that the folder held before this run.
     failed : int
         Draws that failed in this run.
     """
@@ -96,7 +96,7 @@ class Simulated:
         return [self.folder]
 
     def lines(self) -> list[str]:
-        """Lines for people."""
+        """The result as lines of text."""
         lines = [f"{self.made.before} contacts were there before"] if self.made.before else []
         if self.made.failed:
             lines.append(f"{self.made.failed} draws failed and were drawn anew: see {self.folder / 'failures.csv'}")
@@ -120,11 +120,11 @@ def config_for(
     Parameters
     ----------
     touched : ObjectSpec, optional
-        The object; the experiment's own by default. ``friction_between`` tells which friction it has on this sensor.
+        The object; the experiment's own by default. For its friction on this sensor see ``friction_between``.
     seed : int, optional
-        Seed of everything that is drawn; the experiment's own by default.
+        Seed of all random numbers; the experiment's own by default.
     quality : {"preview", "standard", "high"}, optional
-        By default ``preview`` for images in the recordings' form, which are thresholded, else ``standard``.
+        By default ``preview`` for images in the recordings' form, because these are thresholded, else ``standard``.
 
     Raises
     ------

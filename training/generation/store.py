@@ -1,7 +1,7 @@
-"""The folder of a simulated data set, written so that the work can be stopped at any moment and continued.
+"""The folder of a simulated data set. Work on it can be stopped at any moment and continued.
 
-A contact is done once its record lies in ``records/``. The record is written after the contact's pictures, whole or not at all. When
-all records are there, the tables and ``truth.zarr`` are put together from them in the contacts' order. So a data set does not depend on
+A contact is done when its record exists in ``records/``. The record is written after the contact's pictures, whole or not at all. When
+all records exist, the tables and ``truth.zarr`` are made from them in the order of the contacts. Therefore a data set does not depend on
 the order in which its contacts were made, on the number of workers, or on interruptions.
 
 ``truth.zarr`` holds everything that is known about the frames, row by row as in the table ``targets.csv``.
@@ -12,6 +12,7 @@ import io
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zarr
@@ -24,13 +25,19 @@ from twin.store import remove_parts, replace_folder, require_same_code, unwritte
 from twin.store.atomic import LOCK, PART
 from twin.store.resume import MADE_BY
 
-CONFIG = "generation.json"  # the data set's configuration
-RECORDS = "records"  # folder of a record for each contact that is done
-DRAWS = "draws.csv"  # table of what was drawn for each contact
-FAILURE_COLUMNS = ("path_id", "attempt", "reason")  # of the table of draws that failed
-TRUTH = "truth.zarr"  # all that is known about the frames
-CHUNK_ROWS = 256  # rows of a chunk of its arrays
-UNITS = {  # unit and meaning of each of its arrays
+# File of the data set's configuration.
+CONFIG = "generation.json"
+# Folder that holds a record of each contact that is done.
+RECORDS = "records"
+# Table of the values that were drawn for each contact.
+DRAWS = "draws.csv"
+# Columns of the table of draws that failed.
+FAILURE_COLUMNS = ("path_id", "attempt", "reason")
+# Zarr group of everything that is known about the frames.
+TRUTH = "truth.zarr"
+# Number of rows in a chunk of this group's arrays.
+CHUNK_ROWS = 256
+UNITS = {  # unit and meaning of each array in this group
     "caps_mm": "mm, sensor frame",
     "caps_px": "px of the frame: exact projection of each cap's centre",
     "rest_px": "px of the frame: the same sensor without contact",
@@ -80,7 +87,7 @@ class Store:
             raise DatasetError(f"{folder}: can't be written to ({error.strerror}); give another folder with --out") from error
 
     def finished(self) -> set[int]:
-        """Numbers of the contacts that are done; ``REST`` is among them where the no-contact frame is there, or no pictures are wanted."""
+        """Indices of the contacts that are done. They include ``REST`` if the frame without contact is done or no pictures are wanted."""
         done = {int(path.stem) for path in (self.folder / RECORDS).glob("*.npz")}
         if self.config.images != "none":
             done = {index for index in done if (self.pictures / image_name(index, 0)).is_file()}
@@ -89,7 +96,7 @@ class Store:
         return done
 
     def check_count(self, count: int) -> None:
-        """Raise DatasetError where the folder holds more contacts than the ``count`` that are wanted."""
+        """Raise DatasetError if the folder holds more contacts than the ``count`` that are wanted."""
         highest = max(self.finished(), default=REST)
         if highest >= count:
             raise DatasetError(f"{self.folder}: holds contacts up to {highest}; give --count {highest + 1} or more, or another --out")
@@ -117,7 +124,7 @@ class Store:
         write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", {"notes": np.array(notes), **outcome.arrays})
 
     def finish(self, count: int) -> int:
-        """Write tables and truth of the contacts 0 to ``count`` - 1; returns the number of frames."""
+        """Write tables and truth of the contacts 0 to ``count`` - 1, and return the number of frames."""
         tables: dict[str, list[dict]] = {"targets.csv": [], "move_executed.csv": [], DRAWS: [], "failures.csv": []}
         truth = TruthFile(self.folder / f".{TRUTH}.part")
         try:
@@ -150,7 +157,7 @@ class Store:
             tables["move_executed.csv"].append({"image_name": name, "executed": int(arrays["executed"][state])})
 
     def _meta(self, count: int) -> dict:
-        """``meta.json`` as the recordings have it."""
+        """Content of ``meta.json``, with the keys that recordings have."""
         experiment, recording = self.config.experiment, self.config.sensor.recording
         low, high = np.array(list(experiment.ranges().values())).T.tolist()
         meta = {
@@ -172,26 +179,40 @@ class Store:
     def _check_config(self) -> None:
         path, text = self.folder / CONFIG, self.config.text()
         if path.is_file():
-            try:
-                before = json.loads(path.read_text())
-            except ValueError as error:
-                raise DatasetError(f"{path}: not readable ({error}); give another folder with --out") from error
-            now = json.loads(text)
+            before, now = read_record(path), json.loads(text)
             if before != now:
-                other = ", ".join(key for key in now if before.get(key) != now[key])
+                other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
                 raise DatasetError(f"{self.folder}: holds a data set made otherwise ({other}); repeat its options, or give another --out")
             require_same_code(self.folder, make_contact, begun=True)
             return
         require_same_code(self.folder, make_contact, begun=False)
-        write_text(path, text)  # last: a folder with a configuration says what code made it
+        write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
 
     def _unfinished(self, error: StoreError) -> DatasetError:
         done = len(self.finished() - {REST})
         return DatasetError(f"{error}; {done} contacts are kept, and the same command goes on from there")
 
 
+def read_record(path: Path) -> dict[str, Any]:
+    """What a JSON file of a data set says.
+
+    Raises
+    ------
+    DatasetError
+        It can't be read, or does not hold what it should.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(found, dict):
+            return found
+        how = "it holds no record"
+    except (OSError, ValueError, RecursionError) as error:
+        how = getattr(error, "strerror", None) or "no readable JSON"
+    raise DatasetError(f"{path}: damaged ({how}); copy the data set anew, or make it anew in another --out")
+
+
 def refuse_foreign(folder: Path) -> None:
-    """Raise DatasetError where a folder holds files but no data set's configuration."""
+    """Raise DatasetError if a folder holds files but no configuration of a data set."""
     if not folder.exists() or (folder / CONFIG).is_file():
         return
     try:
@@ -203,7 +224,7 @@ def refuse_foreign(folder: Path) -> None:
 
 
 def image_name(index: int, state: int) -> str:
-    """Name of a contact's picture, as recordings number them."""
+    """Name of a contact's picture, in the way that recordings number them."""
     return f"frame_{index}_{state}.png"
 
 
@@ -224,7 +245,7 @@ class TruthFile:
             self._flush(CHUNK_ROWS)
 
     def close(self, attributes: dict) -> None:
-        """Write the rows that are left, and the attributes."""
+        """Write the remaining rows and the attributes."""
         if self._waiting["path_id"]:
             self._flush(len(self._waiting["path_id"]))
         self._group.attrs.update(attributes)

@@ -9,7 +9,8 @@ from training.models.vgnn.model import VGNN
 from training.recipes import Recipe, TrainingError
 
 MODELS: dict[str, Model] = {}
-WITHOUT = "-without-"  # between a model's name and the ingredient that is left out
+# Text between a model's name and the name of the ingredient that is left out.
+WITHOUT = "-without-"
 
 
 def register(model: Model) -> None:
@@ -18,7 +19,7 @@ def register(model: Model) -> None:
     Raises
     ------
     ValueError
-        Another one has it.
+        Another model has this name, or the name contains ``WITHOUT``.
     """
     if model.name in MODELS or WITHOUT in model.name:
         raise ValueError(f"a model can't be registered as '{model.name}': another one is called so, or it holds '{WITHOUT}'")
@@ -34,12 +35,12 @@ register(CNN_V2)
 
 
 def model_named(name: str) -> Model:
-    """The model of a name.
+    """The model with this name.
 
     Raises
     ------
     TrainingError
-        There is none.
+        There is no such model.
     """
     if name not in MODELS:
         raise TrainingError(f"no model '{name}'; choose one of {', '.join(MODELS)}")
@@ -47,7 +48,7 @@ def model_named(name: str) -> Model:
 
 
 def variant_named(name: str) -> tuple[Model, Variant]:
-    """The model of a name, and what is changed of it: nothing, or as ``MODEL-without-PART`` says.
+    """The model with this name, and its variant: for ``MODEL-without-PART`` the one that leaves PART out, else an empty one.
 
     Raises
     ------
@@ -70,7 +71,7 @@ def recipe_of(model: str, **changes: object) -> Recipe:
     Raises
     ------
     TrainingError
-        For a model or setting that does not exist.
+        The model or the setting does not exist.
     """
     chosen = model_named(model)
     known = {field.name for field in fields(Recipe)}

@@ -1,10 +1,10 @@
-"""What the rest of the code asks of a model. A model is one object of a class below, in a package of its own.
+"""The interface of a model to the rest of the code. Each model is an object of a class below, in its own package.
 
-A run asks a model, in this order: ``prepare`` (frames to inputs, and what is learnt from the training frames before any
-network learns), ``build`` (a network with random weights), ``initialise`` (what the network takes from its training rows
-before the first step), and, where a Gaussian process is averaged in, ``modes`` (what that process sees). A trained model is
-asked to ``estimate_frame`` and ``estimate_rows``; a small copy of it is made and read by ``pack`` and ``unpack``. Ensembles
-and intervals are the same for all models (``training.assemble``).
+A run calls these methods in this order: ``prepare`` (makes inputs of frames, and learns from the training frames what the networks
+need), ``build`` (makes a network with random weights), ``initialise`` (sets a network's constants from the training rows before the
+first step), and ``modes`` if a Gaussian process is averaged with the networks (makes that process's inputs). A trained model estimates
+by ``estimate_frame`` and ``estimate_rows``. ``pack`` and ``unpack`` make and read its small copy. Ensembles and intervals are the same
+for all models (``training.assemble``).
 """
 
 from abc import ABC, abstractmethod
@@ -24,12 +24,13 @@ from twin.pins import Pipeline
 from twin.pins.reference import Reference
 from twin.types import Frame
 
+SEEN_DECIMALS = 3  # of pins (px) and areas (px^2) that tell frames apart: the last bits of a centroid may differ between machines
 Learnt = Mapping[str, Mapping[str, np.ndarray]]  # groups of named arrays that a model learnt before its networks did
 Weights = dict[str, torch.Tensor]  # a network's state
 
 
 class Inputs(Protocol):
-    """What networks see of M frames."""
+    """The networks' inputs of M frames."""
 
     def __len__(self) -> int: ...
 
@@ -40,16 +41,16 @@ class Inputs(Protocol):
 
 @dataclass(frozen=True)
 class Prepared:
-    """What training on M frames starts from.
+    """Inputs for training on M frames.
 
     Attributes
     ----------
     inputs : Inputs
-        ``views`` times M rows: row v M + k is frame k in view v, and view 0 is the frame as it is.
-    learnt : dict
-        What was learnt from the training frames; it is kept with the weights.
-    views : int
-        Ways in which the network sees each frame.
+        ``views`` times M rows: row v M + k is frame k in view v. View 0 is the unchanged frame.
+        learnt : dict
+            Arrays learnt from the training frames; they are stored with the weights.
+        views : int
+            Number of versions of each frame that the network is trained on.
     """
 
     inputs: Inputs
@@ -64,11 +65,11 @@ class Prediction:
     Attributes
     ----------
     mean, half_width : (B, K) float
-        mm and deg; half of the 90 % interval, of the labels that were learnt.
-    half_width_raw : (B, K) float
-        The same for the labels as published, whose moves may not have been executed.
-    executed : (B,) float
-        Probability that the shear move was executed; NaN where the model does not tell.
+        Estimated labels in mm and deg, and half of the 90 % interval for the kind of label that the model was trained on.
+        half_width_raw : (B, K) float
+            Half of the 90 % interval for raw labels, whose moves may not have been executed.
+        executed : (B,) float
+            Probability that the shear move was executed; NaN if the model does not estimate it.
     """
 
     mean: np.ndarray
@@ -79,20 +80,20 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Unseen:
-    """A frame in which a model sees too little to estimate anything, and why."""
+    """A frame that shows too little for an estimate, and the reason."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class Modes:
-    """What a Gaussian process sees of B rows.
+    """Inputs of a Gaussian process for B rows.
 
     Attributes
     ----------
     inputs : (B, D) float
     share : (B,) float
-        Part of each row, 0 to 1, that is seen in view 1 (see ``Prepared``); the rest is seen in view 0.
+        Weight of view 1 (see ``Prepared``) for each row, 0 to 1; view 0 has the remaining weight.
     """
 
     inputs: np.ndarray
@@ -101,19 +102,19 @@ class Modes:
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained model as it estimates.
+    """What a trained model estimates with.
 
     Attributes
     ----------
     sensor : SensorSpec
     pipeline : Pipeline
-        Of the sensor in hand.
+        Pipeline of the sensor whose frames are estimated.
     reference : Reference
         The pins at rest in training.
     learnt : dict
         As in ``Prepared``.
     ensemble : callable
-        Labels of some rows (B,) of inputs.
+        ``ensemble(inputs, rows)`` gives the labels of rows (B,) of inputs.
     """
 
     sensor: SensorSpec
@@ -125,14 +126,14 @@ class Trained:
 
 @dataclass(frozen=True)
 class Variant:
-    """A model with one of its ingredients left out, to see what that ingredient is worth.
+    """A model without one of its ingredients, to measure what that ingredient contributes.
 
     Attributes
     ----------
     size : dict
-        Sizes of the network that differ.
-    recipe : dict
-        Settings of the recipe that differ.
+        Sizes of the network that differ from the model's own.
+        recipe : dict
+            Settings of the recipe that differ from the model's own.
     """
 
     size: Mapping[str, int] = field(default_factory=dict)
@@ -141,26 +142,26 @@ class Variant:
 
 @dataclass(frozen=True, kw_only=True)
 class Model(ABC):
-    """One model, by all that others need to know of it.
+    """One model, with everything that the rest of the code needs to know about it.
 
     Attributes
     ----------
     name : str
-        As the user gives it.
-    description : str
-        One line.
-    recipe : Recipe
-        How it is trained unless told otherwise.
-    variants : dict of str to Variant
-        By the name of what is left out: ``NAME-without-PART`` can be trained.
+        Name by which a user chooses the model.
+        description : str
+            One line.
+        recipe : Recipe
+            Settings of its training, where the user gives no others.
+        variants : dict of str to Variant
+            Variants by the name of the part that is left out. ``NAME-without-PART`` can be trained.
     published_mm_deg : (float, float), optional
-        Mean absolute errors of depth (mm) and angle (deg) that its authors state.
-    timed_batches : int, optional
-        Batches after which a measurement of its speed stops, where a whole epoch takes many minutes on a CPU; None times an epoch.
-    counts_from_rest : bool
-        Whether it counts pins from rest, so that a no-contact frame of the sensor in hand serves it.
-    has_modes : bool
-        Whether it has ``modes``, so that a Gaussian process can be averaged in.
+        Mean absolute errors of depth (mm) and angle (deg) that its authors published.
+        timed_batches : int, optional
+            Number of batches that a speed measurement runs, for models whose epoch takes many minutes on a CPU. None: a whole epoch.
+        counts_from_rest : bool
+            Whether its inputs are displacements from the pins at rest, so that a frame without contact of the sensor in use improves them.
+        has_modes : bool
+            Whether it has ``modes``, so that a Gaussian process can be averaged with its networks.
     """
 
     name: str
@@ -175,14 +176,18 @@ class Model(ABC):
 
     @abstractmethod
     def prepare(self, data: Dataset, train: np.ndarray) -> Prepared:
-        """Inputs of all M frames of a data set, and what is learnt beforehand from its training rows (m,)."""
+        """Make the inputs of all M frames of a data set, and learn from its training rows (m,) what the networks need."""
+
+    @abstractmethod
+    def seen(self, data: Dataset) -> object:
+        """All that the model sees of a data set's frames, as ``inputs_digest`` takes it: frames with the same are the same to it."""
 
     @abstractmethod
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> nn.Module:
-        """A network with random weights, whose outputs are a dict with ``mean`` (B, K).
+        """Make a network with random weights. Its output is a dict with ``mean`` (B, K).
 
-        It may also give ``log_scale`` (B, K), the logarithm of each label's expected error, and ``executed`` (B,), the logit
-        that the shear move was executed.
+        The output may also have ``log_scale`` (B, K), the logarithm of each label's expected error, and ``executed`` (B,), the logit
+        of the probability that the shear move was executed.
 
         Parameters
         ----------
@@ -200,14 +205,14 @@ class Model(ABC):
         """
 
     def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> None:  # noqa: B027  (most take nothing)
-        """Let a network take from the training rows (m,) what it needs before its first step: nothing, unless a model says otherwise."""
+        """Set what a network needs from the training rows (m,) before its first step. Most models need nothing."""
 
     def penalty(self, network: nn.Module) -> torch.Tensor | None:
-        """A number that training adds to the loss of every batch; None for none."""
+        """The number that training adds to the loss of every batch; None if there is none."""
         return None
 
     def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
-        """What a Gaussian process sees of rows (B,).
+        """Inputs of a Gaussian process for rows (B,).
 
         Raises
         ------
@@ -218,7 +223,7 @@ class Model(ABC):
 
     @abstractmethod
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:
-        """Labels of one frame.
+        """Estimate the labels of one frame.
 
         Raises
         ------
@@ -228,10 +233,10 @@ class Model(ABC):
 
     @abstractmethod
     def estimate_rows(self, trained: Trained, data: Dataset, rows: np.ndarray) -> Prediction:
-        """Labels of some rows (B,) of a data set, whose frames are of one camera."""
+        """Estimate the labels of some rows (B,) of a data set whose frames are all of one camera."""
 
     def pack(self, weights: Weights) -> Weights:
-        """What a small copy keeps of a network's weights.
+        """The weights of a network that its small copy stores.
 
         Raises
         ------
@@ -241,12 +246,12 @@ class Model(ABC):
         raise TrainingError(f"a small copy of {self.name} is not provided for: what half precision does to it was never measured")
 
     def unpack(self, packed: Weights, blank: Weights) -> Weights:
-        """The weights whose small copy is ``packed``; ``blank`` are those of the same network as ``build`` gives it."""
+        """The weights of a network from its small copy ``packed``; ``blank`` are the weights of the network that ``build`` makes."""
         raise TrainingError(f"a small copy of {self.name} is not provided for")
 
 
 class PinModel(Model):
-    """A model that sees the pins which the pipeline finds, and nothing else of a frame."""
+    """A model whose only inputs are the pins that the pipeline finds."""
 
     @abstractmethod
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> Inputs:
@@ -259,16 +264,23 @@ class PinModel(Model):
         reference : Reference
             The pins at rest in training; ``pins`` has those of the sensor in hand.
         together : bool
-            Whether the frames are of one camera that did not move between them and that no no-contact frame tells of.
+            Whether all frames are of one camera that did not move between them, and there is no frame without contact that shows
+            where it sits.
         """
 
     def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:
-        """``prepare`` from the pins alone."""
+        """See ``Model.prepare``; only the pins are given."""
         return Prepared(self.inputs(pins, {}, pins.reference, together=False))
 
     def prepare(self, data: Dataset, train: np.ndarray) -> Prepared:
         """See ``Model``."""
         return self.prepare_pins(data.pins, train)
+
+    def seen(self, data: Dataset) -> object:
+        """See ``Model``: the pins, and where they are at rest."""
+        pins = data.pins
+        places = [np.round(px, SEEN_DECIMALS) + 0.0 for px in (pins.nodes_px, pins.area_px2, pins.reference.pins_px)]
+        return [*places, pins.lost, pins.measured]
 
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:
         """See ``Model``."""
@@ -293,10 +305,10 @@ class PinModel(Model):
         return self.estimate_pins(trained, data.pins.rows(rows))
 
     def estimate_pins(self, trained: Trained, pins: PinTable) -> Prediction:
-        """Labels of the valid frames of one camera.
+        """Estimate the labels of the valid frames of one camera.
 
-        Where the camera sits otherwise than in training, the table's own no-contact frame tells, or without one the median
-        of the frames.
+        If the camera sits elsewhere than in training, its displacement is measured in the table's own frame without contact. If there
+        is none, it is the median over the frames.
         """
         return self._estimated(trained, pins, together=not pins.measured)
 

@@ -1,4 +1,4 @@
-"""How far a sensor may degrade before its pins are lost, and what trained models make of it."""
+"""Study: how far may a sensor degrade before pipelines lose its pins, and what do trained models estimate then?"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenes import SensorSpec
+from scenes.sensor import RecordingSpec
 from training.estimator import PoseEstimator, digest_of
 from twin.camera.capture import record
 from twin.judge.degradation.envelope import Envelope
@@ -17,8 +18,10 @@ from twin.judge.degradation.study import check_pipelines, real_study, rendered_s
 from twin.progress import Progress, silent
 from twin.types import Form, Frame
 
+# Pipelines that are judged if none are named.
 PIPELINES = ("twin", "legacy")
-LIMIT = 12  # real frames
+# Most real frames that are judged if no other number is given.
+LIMIT = 12
 Estimates = tuple[np.ndarray, tuple[str, ...], bool]  # values, their units, whether they are valid
 
 
@@ -38,9 +41,9 @@ class Plan:
     frames : Path or None
         Real frames instead of rendered ones.
     limit : int
-        At most so many of them, evenly spread.
+        Most real frames that are used; they are spread evenly over the recording.
     rendered : bool
-        Raw real frames are shown beside rendered ones.
+        Also sweep rendered frames, to show them beside raw real ones.
     jobs : int
         Processes.
     """
@@ -63,26 +66,26 @@ class Result:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """For people: by pipeline, the narrowest first."""
+        """The result as lines of text, sorted by pipeline; the condition with the narrowest envelope comes first."""
         found = sorted(self.envelopes, key=lambda each: (each.pipeline, each.width))
         return [f"{e.pipeline:10} {e.case.name:18} {e.label}{f' ({e.measure})' if e.measure else ''}" for e in found]
 
 
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
-    """Sweep every condition from nothing to severe, judge pipelines and models on every frame, and write what was found.
+    """Sweep every condition from severity 0 to 1, judge pipelines and models on every frame, and write the result.
 
-    ``out`` exists. What lies there from an earlier call is not computed again where it depends on nothing else.
+    The folder ``out`` must exist. Results of an earlier call there are used again if their inputs have not changed.
 
     Raises
     ------
     TwinError
-        A pipeline or model is not there, two have the same name, or no condition can be applied to the frames.
+        A pipeline or model does not exist, two have the same name, or no condition can be applied to the frames.
     """
     pipelines, runs = list(plan.pipelines), plan.models
     check_pipelines(pipelines, tuple(each.name for each in runs))
     options: dict[str, Any] = {"jobs": plan.jobs, "progress": progress}
     if runs:
-        load_models(runs, plan.sensor)  # each process loads its own: what can't be is told here, and once
+        load_models(runs, plan.sensor)  # each worker process loads its own; loading here reports an error once, before the work starts
         options["models"] = partial(load_models, runs, plan.sensor)
         options["model_digests"] = {each.name: digest_of(each) for each in runs}
     cases, severities = plan.sweep.cases(), plan.sweep.severities()
@@ -92,8 +95,8 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
 
 
 def load_models(runs: tuple[Path, ...], sensor: SensorSpec) -> dict[str, Callable[[Frame], Estimates]]:
-    """Models by name, as a sweep calls them: raw frames are recorded first where the model was trained on recordings."""
-    return {each.name: partial(_estimates, _checked(each, sensor), sensor) for each in runs}
+    """Models by name, as a sweep calls them. If a model was trained on recordings, raw frames are converted to that form first."""
+    return {each.name: partial(_estimates, _checked(each, sensor), sensor.recording) for each in runs}
 
 
 def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
@@ -102,8 +105,8 @@ def _checked(run: Path, sensor: SensorSpec) -> PoseEstimator:
     return estimator
 
 
-def _estimates(estimator: PoseEstimator, sensor: SensorSpec, frame: Frame) -> Estimates:
-    if frame.form == Form.RAW and estimator.form == Form.RECORDING and sensor.recording is not None:
-        frame = replace(frame, image=record(frame.image, sensor.recording), form=Form.RECORDING)
+def _estimates(estimator: PoseEstimator, recording: RecordingSpec | None, frame: Frame) -> Estimates:
+    if frame.form == Form.RAW and estimator.form == Form.RECORDING and recording is not None:
+        frame = replace(frame, image=record(frame.image, recording), form=Form.RECORDING)
     found = estimator(frame)
     return found.value, found.units, found.valid

@@ -1,4 +1,4 @@
-"""Use of trained models on recordings: the pose in every frame, and how good a model is on labelled frames."""
+"""Use of trained models on recordings: estimates of the pose in every frame, and a model's errors on labelled frames."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -8,19 +8,23 @@ from typing import Any
 from training.dataset import joined, load_dataset
 from training.estimator import PoseEstimate, PoseEstimator
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
+from training.identity import changed_since
 from training.recipes import TrainingError
+from twin.errors import FrameError
 from twin.frames import Recording, open_recording
 from twin.pins.batch import MEASURED_BEFORE, recording_reference
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 
-ROWS = ("validation", "all")  # which rows can be judged
-LABELS = ("corrected", "raw")  # which labels can be the truth
+# Choices of the rows to judge.
+ROWS = ("validation", "all")
+# Choices of the labels that count as truth.
+LABELS = ("corrected", "raw")
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Estimates of a recording's frames. Iterate over it: each estimate is made when it is asked for.
+    """Estimates of a recording's frames, as an iterable. Each estimate is made when the iteration reaches its frame.
 
     Attributes
     ----------
@@ -33,24 +37,40 @@ class Predictions:
 
     def __iter__(self) -> Iterator[tuple[str, PoseEstimate]]:
         """The name of each frame and its estimate."""
+        warm = False
         for frame in self.recording:
+            if not warm:
+                self.estimator(frame)  # loads or compiles code, which is no part of a frame's time
+                warm = True
             yield frame.name, self.estimator(frame)
 
     def lines(self) -> Iterator[str]:
-        """Lines for people: what is odd in the recording, each frame's pose once it is estimated, and the frames that can't be read."""
-        told = len(self.recording.problems)
+        """Lines for people: what is odd in the recording, each frame's pose once it is estimated, and the frames that can't be read.
+
+        Raises
+        ------
+        FrameError
+            At the end, if no frame gave a pose.
+        """
+        told, poses, reasons = len(self.recording.problems), 0, []
         yield from (f"note: {problem}" for problem in self.recording.problems)
         for name, made in self:
             yield f"{name}: {_said(made)}"
+            poses += made.valid
+            if not made.valid:
+                reasons.append(f"{name}: {made.reason}")
         yield from (f"note: {problem}" for problem in self.recording.problems[told:])
         for bad in self.recording.failed:
             yield f"skipped {bad['image_name']}: {bad['reason']}"
+            reasons.append(f"{bad['image_name']}: {bad['reason']}")
+        if not poses:
+            raise FrameError(f"{self.recording.path}: none of {len(self.recording)} frames gave a pose ({reasons[0]}); give other frames")
 
 
 def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
-    """Poses in the frames at a path, by a trained model.
+    """Estimate the poses in the frames at a path by a trained model.
 
-    Where the model counts pins from rest and the recording has a frame without contact, they are counted from that frame.
+    If the model uses displacements from rest and the recording has a frame without contact, displacements are counted from that frame.
 
     Parameters
     ----------
@@ -82,26 +102,26 @@ def _said(made: PoseEstimate) -> str:
         return f"not valid: {made.reason}"
     rows = zip(made.names, made.units, made.value, made.low, made.high, strict=True)
     pose = ", ".join(f"{name} {value:.3f} {unit} [{low:.3f}, {high:.3f}]" for name, unit, value, low, high in rows)
-    moved = "" if made.executed != made.executed else f", move executed {made.executed:.2f}"  # NaN: the model doesn't tell
+    moved = "" if made.executed != made.executed else f", move executed {made.executed:.2f}"  # NaN: the model does not estimate it
     return f"{pose}{moved} ({made.ms:.1f} ms)"
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good a model is.
+    """Evaluation of a model.
 
     Attributes
     ----------
     metrics : dict
-        As ``metrics.json`` holds them.
-    changes : list of dict
-        Errors on changed images; empty where they were not asked for.
-    units : dict of str to str
-        Of each label.
-    frames : int
-        Number of judged frames.
-    problems : list of str
-        What is odd about the recordings.
+        Content of ``metrics.json``.
+        changes : list of dict
+            Errors on changed images; empty if they were not asked for.
+        units : dict of str to str
+            Unit of each label.
+        frames : int
+            Number of judged frames.
+        problems : list of str
+            Irregularities of the recordings.
     written : list of Path
     """
 
@@ -113,7 +133,7 @@ class Evaluation:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """Lines for people."""
+        """The result as lines of text."""
         lines = [f"note: {problem}" for problem in self.problems]
         for name, unit in self.units.items():
             raw, corrected = self.metrics["raw"][name], self.metrics["corrected"][name]
@@ -141,18 +161,18 @@ def evaluate_run(
     robustness: bool = False,
     progress: Progress = silent,
 ) -> Evaluation:
-    """Judge a trained model, and write what was found to an existing folder.
+    """Judge a trained model, and write the result to an existing folder.
 
     Parameters
     ----------
     run : path
         As ``PoseEstimator.load`` takes it.
     recordings : sequence of Path
-        Labelled recordings; for ``validation`` exactly those that the run was trained on.
+        Labelled recordings; for ``rows="validation"`` exactly those that the run was trained on.
     rows : {"validation", "all"}
-        The rows that were kept out of the run's training, or every row.
+        Judge the rows that were kept out of the run's training, or all rows.
     labels : {"corrected", "raw"}
-        Which labels are the truth in ``predictions.csv`` and ``errors.png``.
+        Labels that count as truth in ``predictions.csv`` and ``errors.png``.
     robustness : bool
         Also judge changed images.
 
@@ -172,6 +192,8 @@ def evaluate_run(
             parts.append(load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form, progress=step))
     found = joined(parts)
     chosen = rows_to_judge(estimator, found, rows)
+    if rows == "validation":
+        found.problems.extend(changed_since(estimator.config, found, estimator.part))
     made = estimator.predict_rows(found, chosen)
     metrics = {"model": estimator.model, "rows": rows, **judge(made, found, chosen), "ms_per_frame": time_frames(estimator, found)}
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []

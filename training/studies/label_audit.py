@@ -1,4 +1,4 @@
-"""Whether a recording's labels agree with its pins: the audit of a recording, written as tables, numbers, a picture and a page."""
+"""Audit of a recording: do its labels agree with its pins? The result are tables, numbers, a picture and a page."""
 
 import csv
 import io
@@ -21,23 +21,29 @@ from twin.report.table import Column
 from twin.store import made_by, write_json, write_text
 from twin.types import Form
 
-TARGET = "surface-2d-shear"  # the preset of labels that an audit needs
-NAMES = PRESETS[TARGET]  # depth (mm), angle (deg), shear (mm) and shear (deg), as columns of the table
-LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")  # findings that are lists of frames
-SAID = 3  # frames of each list that are named on the terminal
-NAMED = 8  # frames of each list that are named on the page; audit.json names all
-LARGE_MOVE = 1.0  # mm or deg; whether a smaller move was executed changes the labels too little to count
+# Preset of the labels that an audit needs.
+TARGET = "surface-2d-shear"
+# Columns of depth (mm), angle (deg), shear (mm) and shear (deg).
+NAMES = PRESETS[TARGET]
+# Findings that are lists of frames.
+LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")
+# Number of frames of each list that are named on the terminal.
+SAID = 3
+# Number of frames of each list that are named on the page; audit.json names all.
+NAMED = 8
+# Move in mm or deg above which a move is large. Some figures are of large moves alone, because a small move hardly changes the pins.
+LARGE_MOVE = 1.0
 
 
 @dataclass(frozen=True)
 class LabelAudit:
-    """What an audit found, and its files.
+    """The result of an audit, and its files.
 
     Attributes
     ----------
     audit : Audit
     summary : dict
-        As ``audit.json`` holds it.
+        Content of ``audit.json``.
     frames : int
     written : list of Path
     """
@@ -49,12 +55,17 @@ class LabelAudit:
 
     def lines(self) -> list[str]:
         """Lines for people."""
-        undone, undecided = self.summary["moves_not_executed"], self.summary["undecided"]
-        lines = [f"{self.frames} frames; in {undone['frames']} the move was not executed; {undecided} undecided"]
+        if self.audit.untold:
+            lines = [f"{self.frames} frames: {self.audit.untold}", "no labels_corrected.csv: whether the labels are right is not known"]
+        else:
+            undone, undecided = self.summary["moves_not_executed"], self.summary["undecided"]
+            lines = [f"{self.frames} frames; in {undone['frames']} the move was not executed; {undecided} undecided"]
         for key in (*LISTS, "reader"):
             if names := self.summary[key]:
                 more = ", ..." if len(names) > SAID else ""
                 lines.append(f"{key.replace('_', ' ')}: {len(names)} ({', '.join(names[:SAID])}{more})")
+        if self.audit.untold:
+            return lines
         drift = self.audit.drift["r2_of_row_number_beyond_labels"]
         return [
             *lines,
@@ -64,7 +75,9 @@ class LabelAudit:
 
 
 def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
-    """Audit the labels of a flat-surface recording, and write what was found to an existing folder.
+    """Audit the labels of a flat-surface recording, and write the result to an existing folder.
+
+    A recording of too few frames is not judged: the result says so (``Audit.untold``), and no corrected labels are written.
 
     Raises
     ------
@@ -81,35 +94,40 @@ def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | N
 def summary_of(audit: Audit, data: Dataset) -> dict:
     """The findings as numbers and lists of frame names."""
     names = data.pins.image_name
-    large = np.abs(data.targets.raw[:, 2:]).max(axis=1) > LARGE_MOVE
-    undone = audit.executed < 0.5
-    second = np.sort(audit.chi2[:, :2], axis=1)
     lost = data.pins.lost.any(axis=1)
     return {
         "frames": len(data),
-        "moves_not_executed": {"frames": int(undone.sum()), "of_large_moves": float(undone[large].mean()) if large.any() else None},
-        "undecided": int(((audit.executed > 0.05) & (audit.executed < 0.95)).sum()),
-        "median_chi2": {
-            "better_story": float(np.nanmedian(second[:, 0])),
-            "worse_story_large_moves": float(np.nanmedian(second[large, 1])),
-        },
+        **({"not_told": audit.untold} if audit.untold else _moves(audit, data)),
         "no_contact": names[audit.no_contact].tolist(),
         "wrong_sign": names[audit.wrong_sign].tolist(),
         "fit_no_story": names[audit.odd].tolist(),
         "same_pins_as_an_earlier_frame": names[audit.twins != np.arange(len(names))].tolist(),
         "frames_with_lost_pins": int(lost.sum()),
-        "depth_mm_per_mm_of_move_not_executed": audit.depth_per_move,
-        "drift": audit.drift,
+        **({} if audit.untold else {"depth_mm_per_mm_of_move_not_executed": audit.depth_per_move, "drift": audit.drift}),
         "reader": data.problems,
     }
 
 
+def _moves(audit: Audit, data: Dataset) -> dict:
+    large = np.abs(data.targets.raw[:, 2:]).max(axis=1) > LARGE_MOVE
+    undone = audit.executed < 0.5
+    second = np.sort(audit.chi2[:, :2], axis=1)
+    return {
+        "moves_not_executed": {"frames": int(undone.sum()), "of_large_moves": float(undone[large].mean()) if large.any() else None},
+        "undecided": int(((audit.executed > 0.05) & (audit.executed < 0.95)).sum()),
+        "median_chi2": {
+            "better_story": float(np.nanmedian(second[:, 0])),
+            "worse_story_large_moves": float(np.nanmedian(second[large, 1])) if large.any() else None,
+        },
+    }
+
+
 def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[Path]:
-    """Write ``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``; their paths."""
-    labels = corrected(NAMES, data.targets.raw, audit.executed.round(), data.targets.raw[:, 2:], audit.depth_per_move)
-    table = write_text(out / "labels_corrected.csv", _labels_csv(audit, data, labels))
+    """Write ``labels_corrected.csv``, ``audit.json``, ``audit.png`` and ``audit.html``; their paths.
+
+    Of frames that are too few to tell anything neither corrected labels nor a picture are written.
+    """
     numbers = write_json(out / "audit.json", summary | {"made_by": made_by("training.audit")})
-    chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
     page = Page(
         f"Audit of {data.folder.name}",
         "twin audit",
@@ -118,10 +136,9 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
         "before it; labels_corrected.csv holds the answer. Laid beside the recording's targets.csv, it is what training with corrected "
         "labels uses.",
     )
+    page.notice("Not told, and no corrected labels written", [audit.untold] if audit.untold else [], tone="bad")
     page.notice("The reader says", summary["reader"])
-    page.figures(
-        Picture(chart, "Evidence for the findings: which story fits each frame, corrections of the angle, moves along the table, drift")
-    )
+    evidence = [] if audit.untold else _write_evidence(out, audit, data, page)
     page.section("Findings")
     page.table(_findings(summary), [Column("finding", "finding"), Column("value", "value", align="right")])
     page.section("Frames that stand out")
@@ -129,16 +146,27 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
         [{"finding": _title(key), "count": len(summary[key]), "frames": _some(summary[key])} for key in LISTS],
         [Column("finding", "finding"), Column("count", "frames"), Column("frames", "which")],
     )
-    page.download(table, "corrected labels, and what is said of each frame")
+    for table in evidence[:1]:
+        page.download(table, "corrected labels, and what is said of each frame")
     page.download(numbers, "all findings, with the names of all frames")
-    return [table, numbers, chart, page.write(out / "audit.html")]
+    return [*evidence[:1], numbers, *evidence[1:], page.write(out / "audit.html")]
+
+
+def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[Path]:
+    """Write the corrected labels and the picture, and show the picture on the page."""
+    labels = corrected(NAMES, data.targets.raw, audit.executed.round(), data.targets.raw[:, 2:], audit.depth_per_move)
+    chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
+    page.figures(
+        Picture(chart, "Evidence for the findings: which story fits each frame, corrections of the angle, moves along the table, drift")
+    )
+    return [write_text(out / "labels_corrected.csv", _labels_csv(audit, data, labels)), chart]
 
 
 def _findings(summary: dict) -> list[dict]:
-    """The findings that are numbers, one in each row; the names in a group begin with the group's name."""
+    """The findings that are numbers, one in each row. A finding within a group is named with the group's name first."""
     rows = []
     for key, value in summary.items():
-        if key in LISTS or key == "reader":
+        if key in LISTS or key in ("reader", "not_told"):
             continue
         parts = _flat(_title(key), value)
         rows += [{"finding": name, "value": number(part)} for name, part in parts]

@@ -1,4 +1,4 @@
-"""How close the renders of a sensor come to its real frames, the two-sample test included."""
+"""Study: how close are the renders of a sensor to its real frames? It includes the two-sample test."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +17,13 @@ IMAGES = ("psnr_db", "psnr_gray_db", "ssim", "ssim_gray", "flip")
 
 @dataclass(frozen=True)
 class Realism:
-    """What was found: all figures, as ``metrics.json`` holds them, and the files, the page first."""
+    """The result: all figures, as ``metrics.json`` holds them, and the files, the page first."""
 
     metrics: dict[str, Any]
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result as lines of text."""
         metrics, found = self.metrics, self.metrics["statistics"]
         lines = [f"refused {refused['image_name']}: {refused['reason']}" for refused in metrics["refused"]]
         lines.append(_image_line("pin-aligned", metrics["frames"], metrics["pin_aligned"]))
@@ -59,14 +59,14 @@ def compare_with_renders(
     test: bool = True,
     progress: Progress = silent,
 ) -> Realism:
-    """Compare a folder of real raw frames with their renders, and write what was found to an existing folder.
+    """Compare a folder of real raw frames with their renders, and write the result to an existing folder.
 
     Parameters
     ----------
     pose_aligned : bool
         Also render from the labels alone.
     limit : int, optional
-        Most frames, evenly spread.
+        Most frames that are used; they are spread evenly over the folder.
     quality : {"preview", "standard", "high"}
     test : bool
         Train the two-sample test (minutes).

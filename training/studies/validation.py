@@ -1,4 +1,4 @@
-"""The twin's pins against those of labelled real frames, from the recording to tables and a page."""
+"""Validation: the twin's pins are compared with those of labelled real frames. The result are tables and a page."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,18 +11,19 @@ from twin.judge.labelled.report import summary_of, write_validation
 from twin.progress import Progress, silent, stage
 from twin.types import FINE, Form
 
-FRICTION_FRAMES = 5  # frames for which a friction of their own is sought
+# Number of frames for which an individual friction is fitted.
+FRICTION_FRAMES = 5
 
 
 @dataclass(frozen=True)
 class Validation:
-    """What was found.
+    """The result of a validation.
 
     Attributes
     ----------
     comparison : Comparison
     summary : dict
-        As ``validation.json`` holds it.
+        Content of ``validation.json``.
     sensor : SensorSpec
     written : list of Path
     """
@@ -33,7 +34,7 @@ class Validation:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result as lines of text."""
         lines = []
         if self.sensor.rig is None:
             lines.append(f"note: {self.sensor.name} has no [rig]: the tool point counts as the tip; 'twin calibrate contact' fits one")
@@ -61,20 +62,20 @@ def validate_contacts(
     form: Form | None = None,
     progress: Progress = silent,
 ) -> Validation:
-    """Simulate the contacts of labelled frames, compare the pins, and write what was found to an existing folder.
+    """Simulate the contacts of labelled frames, compare the pins, and write the result to an existing folder.
 
     Parameters
     ----------
     frames : Path
         A labelled recording.
     experiment : ExperimentSpec
-        How it was recorded.
+        The experiment that the recording was made with.
     touched : ObjectSpec, optional
         The experiment's own object by default.
     limit : int, optional
-        So many frames, chosen at random with ``seed``; all by default.
-    friction_frames : int
-        Frames for which a friction of their own is sought.
+        Number of frames, chosen at random with ``seed``; all by default.
+        friction_frames : int
+            Number of frames for which an individual friction is fitted.
     across : int
         Elements along each side of the skin's grid.
 
@@ -88,5 +89,5 @@ def validate_contacts(
     model = ContactModel(sensor, experiment, touched or load_object(experiment.object), measured.form, across=across)
     with stage(progress, "contacts") as step:
         found = compare(model, measured, friction_frames=friction_frames, progress=step)
-    summary = summary_of(found, sensor)
-    return Validation(found, summary, sensor, write_validation(out, found, sensor, summary))
+    summary = summary_of(found, sensor.name)
+    return Validation(found, summary, sensor, write_validation(out, found, sensor.description, summary))

@@ -1,1 +1,1 @@
-"""The camera: where points of space appear in its picture, and from light to the levels of a frame."""
+"""The camera: projection of points in space to its picture, and conversion of light to the gray levels of a frame."""

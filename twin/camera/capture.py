@@ -1,8 +1,8 @@
 """The capture side: from light on the film to the frames that a camera and its recorder deliver.
 
-Cameras send luma and colour differences, and 8-bit colours come out of them. Both are in studio range: luma from 16 to 235, colour
-differences from 16 to 240. The way back is the usual integer arithmetic (products with 256 times the coefficients, rounded), so that
-only about 18 % of all colours ever appear in such a frame.
+Cameras send luma and colour differences, which the computer converts to 8-bit colours. Luma is in the studio range 16 to 235, colour
+differences are in 16 to 240. The conversion uses the usual integer arithmetic (products with 256 times the coefficients, rounded). Only
+about 18 % of all 8-bit colours can be the result.
 """
 
 import cv2
@@ -15,7 +15,7 @@ from twin.types import BoolArray, FloatArray, ImageArray, IntArray
 RED_BLUE = {"rgb": (0.299, 0.114), "bt601": (0.299, 0.114), "bt709": (0.2126, 0.0722)}
 """Shares of red and blue in the luma, by stream (ITU-R BT.601 and BT.709)."""
 STREAMS = ("bt601", "bt709")
-"""Streams that can be told from the colours of a frame."""
+"""Streams that can be recognised by the colours of a frame."""
 LUMA_RANGE = 219
 """Studio range: number of steps of the luma."""
 CHROMA_RANGE = 224
@@ -25,11 +25,11 @@ LUMA_FLOOR = 16
 CHROMA_MIDDLE = 128
 """Studio range: colour difference of gray."""
 ON_STREAM = 0.98
-"""A frame came by a stream if at least this share of its pixels has colours that the stream can give."""
+"""Least share of a frame's pixels whose colours a stream can produce, for the frame to be recognised as sent by this stream."""
 CLIPPED = (2, 253)
-"""Pixels with a level at or beyond these are not looked at: their colours may have been cut off."""
+"""Gray levels at or beyond which a pixel is not used to recognise a stream, because its colour may be clipped."""
 MOST_PIXELS = 20_000
-"""At most this many pixels are looked at to tell a stream."""
+"""Most pixels that are used to recognise a stream."""
 JPEG_BLOCK_PX = 16
 """Side of the blocks of a JPEG whose chroma has half the resolution."""
 MEDIAN_PX = 5
@@ -39,11 +39,11 @@ MEDIAN_PX = 5
 def expose(
     linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
 ) -> ImageArray:
-    """What gel, lens and camera make of the light: a raw frame.
+    """The raw frame that gel, lens and camera make of the light.
 
-    Gel haze, lateral chromatic aberration, blur and vignetting act on light; then come gain, noise, sharpening of the luma,
+    Gel haze, lateral chromatic aberration, blur and vignetting act on light. They are followed by gain, noise, sharpening of the luma,
     the response curve, loss of colour detail, the video stream and its compression (`GelSpec`, `CameraSpec`, `ResponseSpec`).
-    A step whose parameter is neutral does nothing at all.
+    A step whose parameter is neutral changes nothing.
 
     Parameters
     ----------
@@ -51,9 +51,9 @@ def expose(
         Chromatic aberration and white balance apply to colour only.
     capture : CaptureSpec
     rng : numpy.random.Generator, optional
-        Source of the frame's gain and noise; without it there is neither.
+        Source of the frame's random gain and noise; without it the frame has neither.
     origin_px : (x, y)
-        Place of ``linear``'s first pixel in the camera's full frame, where only a part was rendered.
+        Place of ``linear``'s first pixel in the camera's full frame, if only a part was rendered.
 
     Returns
     -------
@@ -71,7 +71,7 @@ def expose(
 
 
 def hazed(light: FloatArray, gel: GelSpec) -> FloatArray:
-    """A share of the light scattered forward by the gel."""
+    """Light after the gel has scattered a share of it forward."""
     if gel.haze == 0:
         return light
     return light + np.float32(gel.haze) * (blurred(light, gel.haze_sigma_px) - light)
@@ -91,7 +91,7 @@ def dispersed(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] 
 
 
 def blurred(light: FloatArray, sigma_px: float) -> FloatArray:
-    """Gaussian blur that keeps the light's sum: the frame goes on mirrored."""
+    """Gaussian blur. The frame is mirrored at its border, so that the sum of the light stays the same."""
     if sigma_px <= 0:
         return light
     return np.asarray(cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT), light.dtype)
@@ -109,7 +109,7 @@ def vignetted(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] 
 
 
 def amplified(light: FloatArray, response: ResponseSpec, rng: np.random.Generator | None = None) -> FloatArray:
-    """Exposure, white balance (colour only) and, with a generator, the frame's own gain."""
+    """Light times exposure, white balance (colour only) and, with a generator, the frame's random gain."""
     gain = response.exposure * np.array(response.white_balance if light.ndim == 3 else 1.0)
     if rng is not None and response.brightness_drift > 0:
         gain = gain * max(1 + response.brightness_drift * rng.standard_normal(), 0)
@@ -132,7 +132,7 @@ def curve(light: FloatArray, response: ResponseSpec) -> FloatArray:
 
 
 def sharpened(light: FloatArray, response: ResponseSpec) -> FloatArray:
-    """Light with an unsharp mask of its luma added to every channel; the response curve then amplifies the dark side of an edge."""
+    """Light with an unsharp mask of its luma added to every channel. The response curve then amplifies the dark side of edges."""
     if response.sharpening == 0:
         return light
     luma = light @ luma_weights(response.stream) if light.ndim == 3 else light
@@ -141,11 +141,11 @@ def sharpened(light: FloatArray, response: ResponseSpec) -> FloatArray:
 
 
 def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
-    """Gray levels of light, and of the same with its noise: the luma sharpened, colour taken from softer light.
+    """Gray levels of ``light``, with the noise of ``grainy``: the luma is sharpened, and colour is taken from softer light.
 
     A camera measures one colour at each pixel of its sensor and takes the other two from neighbouring pixels, in linear light.
-    Therefore colour is softer than luma, and the response curve moves its edges outwards. The camera's sharpening leaves out the noise.
-    Neighbouring columns of the full frame share their colour differences.
+    Therefore colour is softer than luma, and the response curve moves its edges outwards. The camera does not sharpen the noise.
+    Neighbouring columns of the full frame have the same colour differences.
     """
     gray = curve(sharpened(light, response), response)
     if grainy is not light:
@@ -159,9 +159,9 @@ def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, ori
 
 
 def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
-    """Chroma (H, W, 3) with that of the first of every ``columns`` neighbouring columns in all of them, as 4:2:2 streams sample it.
+    """Chroma (H, W, 3) in which ``columns`` neighbouring columns have that of the first of them, as 4:2:2 streams sample it.
 
-    Groups begin at the full frame's first column; ``left_px`` is this part's place in it.
+    The groups begin at the full frame's first column; ``left_px`` is the first column's number in the full frame.
     """
     if columns == 1:
         return chroma
@@ -171,7 +171,7 @@ def shared(chroma: FloatArray, columns: int, left_px: int = 0) -> FloatArray:
 
 
 def compressed(frame: ImageArray, quality: int, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:
-    """A frame after JPEG compression with halved chroma (quality 0: not compressed). Blocks lie where those of the full frame lie."""
+    """A frame after JPEG compression with halved chroma (quality 0: not compressed). The blocks are aligned with the full frame's."""
     if quality == 0:
         return frame
     left, top = (place % JPEG_BLOCK_PX for place in origin_px)
@@ -187,8 +187,8 @@ def compressed(frame: ImageArray, quality: int, origin_px: tuple[int, int] = (0,
 def record(raw: ImageArray, recording: RecordingSpec, *, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:
     """A raw frame as the recorder stores it: crop, gray, median, adaptive Gaussian threshold, area resize.
 
-    This is the preprocessing camera of the makers' capture software (``CvPreprocVideoCamera``). Where the
-    stored size differs from the crop's, the binary image gets gray edges from the resize.
+    This is the preprocessing of the sensor group's capture software (``CvPreprocVideoCamera``). If the stored size differs from the
+    crop's, resizing gives the binary image gray edges.
 
     Parameters
     ----------
@@ -196,12 +196,12 @@ def record(raw: ImageArray, recording: RecordingSpec, *, origin_px: tuple[int, i
         RGB or gray.
     recording : RecordingSpec
     origin_px : (x, y)
-        Place of ``raw``'s first pixel in the camera's full frame, where only a part was rendered.
+        Place of ``raw``'s first pixel in the camera's full frame, if only a part was rendered.
 
     Raises
     ------
     FrameError
-        If the crop does not lie within the frame.
+        The crop does not lie within the frame.
     """
     x0, y0, x1, y1 = np.array(recording.crop_px) - [*origin_px, *origin_px]
     height, width = raw.shape[:2]
@@ -243,14 +243,14 @@ def decoded(numbers: IntArray, stream: str) -> ImageArray:
 
 
 def through_stream(gray: FloatArray, stream: str) -> ImageArray:
-    """Colours (H, W, 3) uint8 that gray levels (H, W, 3) leave a stream with; "rgb": only rounded."""
+    """Colours (H, W, 3) uint8 of gray levels (H, W, 3) after a stream; for "rgb" they are only rounded."""
     if stream == "rgb":
         return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
     return decoded(encoded(np.clip(gray, 0, 255), stream), stream)
 
 
 def stream_of(images: list[ImageArray]) -> str:
-    """The stream that frames (H, W, 3) uint8 came by, told by which colours they have; "rgb" where none explains them."""
+    """The stream by which frames (H, W, 3) uint8 were sent, recognised by their colours; "rgb" if no stream explains them."""
     pixels = np.concatenate([image.reshape(-1, 3) for image in images if image.ndim == 3] or [np.zeros((0, 3), np.uint8)])
     pixels = pixels[((pixels > CLIPPED[0]) & (pixels < CLIPPED[1])).all(axis=1)]
     pixels = pixels[:: max(len(pixels) // MOST_PIXELS, 1)]
@@ -262,14 +262,14 @@ def stream_of(images: list[ImageArray]) -> str:
 
 
 def _possible(pixels: ImageArray, stream: str) -> BoolArray:
-    """(n,) bool: colours (n, 3) that the stream can give."""
+    """(n,) bool: whether the stream can produce each of the colours (n, 3)."""
     near = encoded(pixels.astype(np.float32), stream)
     steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 1, 3)
     return (decoded(near + steps, stream) == pixels).all(axis=2).any(axis=0)
 
 
 def _scaled(plane: FloatArray, scale: float, centre: float, shift: float) -> FloatArray:
-    """Rows of a plane (n, m) drawn apart about row ``centre`` and shifted: cubic convolution (Keys 1981), which keeps centroids exactly."""
+    """Scale and shift the rows of a plane (n, m) about row ``centre`` by cubic convolution (Keys 1981), which keeps centroids exactly."""
     place = centre + (np.arange(len(plane)) - shift - centre) / scale
     first = np.floor(place).astype(int)
     t = (place - first)[:, None].astype(np.float32)

@@ -20,19 +20,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.sensor import CameraSpec, SensorSpec, ViewSpec
+from scenes.sensor import CameraSpec, HousingSpec, ViewSpec
 from twin.types import FloatArray
 
 NEWTON_STEPS = 12
-"""Steps of Newton's method; it converges quadratically, so that the last steps change only the last digits."""
+"""Steps of Newton's method. It converges quadratically, so the last steps change only the last digits."""
 MOST_NEWTON_MOVE = 0.1
-"""Largest change of a normalised coordinate in one step: a start far from the solution does not jump past the distortion's fold."""
+"""Largest change of a normalised coordinate in one step, so that a start far from the solution does not jump past the distortion's fold."""
 GRAZING = 1e6
 """Tangent beyond which a ray counts as parallel to the window."""
 LEAST_FISHEYE_SLOPE = 0.05
-"""Slope of the fisheye's radius by the angle that Newton's method assumes at least, near the distortion's fold."""
+"""Least slope of the fisheye's radius by the angle that Newton's method uses. Near the distortion's fold the true slope is smaller."""
 CORNERS = 360
-"""Corners of the polygon that stands for the aperture's rim."""
+"""Corners of the polygon that approximates the aperture's rim."""
 
 
 def sensor_to_camera(camera: CameraSpec) -> FloatArray:
@@ -71,7 +71,7 @@ def distort(camera: CameraSpec, xy: FloatArray) -> FloatArray:
 def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None = None) -> FloatArray:
     """Normalised image coordinates (..., 2) to tangents: Newton's method on ``distort(ideal) = seen``.
 
-    Starts at ``guess`` (default: ``seen``). Meaningless where the distortion folds back, outside its valid field.
+    It starts at ``guess`` (default: ``seen``). The result is meaningless outside the valid field, where the distortion folds back.
     """
     if camera.projection == "fisheye":
         radius = np.linalg.norm(seen, axis=-1)
@@ -93,7 +93,7 @@ def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None 
 def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
     """Sensor-frame points (..., 3) in front of the camera to raw-frame pixels (..., 2), pixel centres at integers.
 
-    A point's height decides the layers its ray passes: points behind the window are seen straight.
+    A point's height decides which layers its ray passes. The rays of points behind the window are straight.
     """
     camera = view.camera
     rho = np.linalg.norm(points_mm[..., :2], axis=-1)
@@ -105,7 +105,7 @@ def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
 
 
 def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
-    """Tangent u of the angle in air of the rays that join (0, z0) to (rho, z), z0 the pupil's or ``behind_mm``."""
+    """Tangent u of the angle in air of the rays from (0, z0) to (rho, z), where z0 is that of the pupil or ``behind_mm``."""
     heights, indices = _layers(view, z_mm, -view.camera.distance_mm if behind_mm is None else behind_mm)
     u = rho_mm / sum(h / n for h, n in zip(heights, indices, strict=True))
     for _ in range(NEWTON_STEPS):
@@ -119,7 +119,7 @@ def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behi
 
 
 def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the rays of raw-frame pixels (..., 2) enter the gel, (..., 3) mm, and their unit directions (..., 3) in it."""
+    """Places (..., 3), mm, at which the rays of raw-frame pixels (..., 2) enter the gel, and their unit directions (..., 3) in it."""
     camera = view.camera
     ideal = undistort(camera, (np.asarray(pixels, float) - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px])
     in_camera = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
@@ -148,7 +148,7 @@ class Disc:
     center_px : (2,) float
     radius_px : float
     inside : (H, W) bool
-        Pixels whose centre lies in it.
+        Pixels whose centre lies in the disc.
     """
 
     center_px: np.ndarray
@@ -167,14 +167,14 @@ def round_disc(size_px: tuple[int, int], center_px: np.ndarray, radius_px: float
     return Disc(np.asarray(center_px, float), float(radius_px), inside)
 
 
-def lens_disc(spec: SensorSpec) -> Disc:
-    """The housing's aperture as the specification's camera sees it: centre and mean radius of its projected rim."""
-    turn, housing = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False), spec.housing
+def lens_disc(view: ViewSpec, housing: HousingSpec) -> Disc:
+    """The housing's aperture as the camera sees it: centre and mean radius of its projected rim."""
+    turn = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
     rim = np.column_stack([housing.aperture_radius_mm * np.cos(turn), housing.aperture_radius_mm * np.sin(turn), np.zeros(CORNERS)])
-    rim_px = project(spec.view, rim + [*housing.center_mm, housing.z_mm])
+    rim_px = project(view, rim + [*housing.center_mm, housing.z_mm])
     center = rim_px.mean(axis=0)
     radius = float(np.linalg.norm(rim_px - center, axis=1).mean())
-    return round_disc((spec.camera.width_px, spec.camera.height_px), center, radius)
+    return round_disc((view.camera.width_px, view.camera.height_px), center, radius)
 
 
 def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:

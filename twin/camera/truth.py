@@ -1,12 +1,12 @@
-"""Exact ground truth of a rendered contact: where every cap is, in space and in the frame."""
+"""Exact ground truth of a rendered contact: the place of every cap in space and in the frame."""
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from scenes.sensor import SensorSpec, ViewSpec
 from twin.camera.projection import pixel_rays, project
+from twin.compiled import compiled
 from twin.frames.forms import frame_size, from_raw
 from twin.types import BoolArray, FloatArray, Form, PinState
 
@@ -20,9 +20,9 @@ class CapTruth:
     caps_mm : (N, 3) float
         Cap centres, sensor frame.
     caps_px, rest_px : (N, 2) float
-        Their projections in px of the frame, now and at rest.
-    visible : (N,) bool
-        Inside the frame, and the line of sight to the cap's centre meets no other pin.
+        Projections of the cap centres in px of the frame, in the contact and at rest.
+        visible : (N,) bool
+            The cap's centre is inside the frame, and the line of sight to it meets no other pin.
     """
 
     caps_mm: FloatArray
@@ -42,13 +42,13 @@ def cap_truth(spec: SensorSpec, rest: PinState, state: PinState, form: Form) -> 
 def occluded(view: ViewSpec, cap_radius_mm: float, state: PinState) -> BoolArray:
     """(N,) bool: the ray in the gel from the window to the cap's centre passes through another pin.
 
-    Pins count as capsules of the cap's radius around the axis from foot to cap.
+    Each pin is approximated by a capsule of the cap's radius around the axis from foot to cap.
     """
     window_mm, _ = pixel_rays(view, project(view, state.caps_mm))
     return _meets_another(window_mm, state.base_mm, state.caps_mm, cap_radius_mm)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _meets_another(eyes: FloatArray, base: FloatArray, caps: FloatArray, radius: float) -> BoolArray:
     """(N,) bool: the segment from ``eyes`` to ``caps``, (N, 3) each, comes nearer than ``radius`` to another pin's axis."""
     hidden = np.zeros(len(caps), np.bool_)
@@ -60,7 +60,7 @@ def _meets_another(eyes: FloatArray, base: FloatArray, caps: FloatArray, radius:
     return hidden
 
 
-@numba.njit(cache=True)
+@compiled()
 def segment_distance(p0: FloatArray, p1: FloatArray, q0: FloatArray, q1: FloatArray) -> float:
     """Distance of the segment p0-p1 to the segment q0-q1, (3,) each (Ericson 2004, 5.1.9)."""
     a = b = c = e = f = 0.0

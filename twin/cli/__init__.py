@@ -4,27 +4,57 @@ Each module of this package holds the commands of one kind of work. A command im
 ``--help`` does not wait for libraries that it does not need.
 """
 
+import io
+import logging
 import sys
+import warnings
 from importlib import import_module
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 
-from twin.errors import TwinError
+from twin.errors import OptionError, TwinError
 
 # Modules of commands, in the order in which 'twin --help' lists them.
 COMMANDS = ("start", "frames", "calibration", "learning", "studies", "live")
 
-app = typer.Typer(
-    name="twin",
+# Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as shells count).
+FAILED, MISUSED, INTERRUPTED = 1, 2, 130
+
+
+class _Commands(TyperGroup):
+    """All commands. After Ctrl-C typer alone would end the program without a word."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as interrupt:
+            _end_interrupted(interrupt)
+
+
+app = typer.Typer(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+def _tell_version(asked: bool) -> None:
+    from twin.store.made import program_version
+
+    if asked:
+        print(f"twin {program_version()}")
+        raise typer.Exit
+
+
+@app.callback(
     help="A rendered-sensor digital twin of the TacTip optical tactile sensor.\n\n"
     "Press a skin by finite elements, path-trace what the camera inside sees, find the pins, build the graph: "
     "on rendered, recorded and live frames alike.\n\n"
-    "Start with 'twin doctor', then 'twin demo --out out/demo'.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+    "Start with 'twin doctor', then 'twin demo --out out/demo'.\n\n"
+    "Exit codes: 0 done, 1 failed, 2 wrong command line, 130 ended by Ctrl-C.",
 )
+def _twin(
+    version: Annotated[bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="print the version and stop")] = False,
+) -> None:
+    """What may stand before a command."""
 
 
 def command_line() -> typer.Typer:
@@ -35,18 +65,31 @@ def command_line() -> typer.Typer:
 
 
 def main() -> None:
-    """Run the command line. An error that a user can act on is printed as one line on stderr, and the exit code is 1."""
+    """Run the command line.
+
+    An error that a user can act on is printed as one line on stderr. The exit code is then 2 if the command line itself is wrong,
+    and 1 otherwise. Ctrl-C is one line, too, and exit code 130. A warning is one line without the place in the source.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a letter that the encoding lacks is printed by its number, as on stderr
+    warnings.formatwarning = lambda message, *_, **__: f"twin: warning: {' '.join(str(message).split())}\n"
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where the home can't be written it is slower, and says so in four lines
     try:
-        command_line()()
-    except KeyboardInterrupt:
-        print("twin: interrupted", file=sys.stderr)
-        sys.exit(130)
+        command_line()(prog_name="twin")
+    except KeyboardInterrupt as interrupt:  # before a command runs
+        _end_interrupted(interrupt)
     except Exception as error:
         if not _for_user(error):
             raise
         print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
-        print_notes(error)
-        sys.exit(1)
+        _print_notes(error)
+        sys.exit(MISUSED if isinstance(error, OptionError) else FAILED)
+
+
+def _end_interrupted(interrupt: KeyboardInterrupt) -> NoReturn:
+    print("twin: interrupted", file=sys.stderr)
+    _print_notes(interrupt)
+    sys.exit(INTERRUPTED)
 
 
 def _for_user(error: Exception) -> bool:
@@ -56,7 +99,7 @@ def _for_user(error: Exception) -> bool:
     return isinstance(error, TwinError | SpecError)
 
 
-def print_notes(error: BaseException) -> None:
+def _print_notes(error: BaseException) -> None:
     """Print each note of an error on stderr. Notes tell what failed after the error, for example that an arm could not be stopped."""
     for note in getattr(error, "__notes__", ()):
         print(f"twin: note: {' '.join(note.split())}", file=sys.stderr)

@@ -89,16 +89,17 @@ reflectance and outline, blur, aperture, sharpening, colour fringes, compression
 contact fits the camera first.
 
 \b
-Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-calibration/ with
-index.html (before, after, what is left, what changed) and the stages' results. An
-interrupted run continues where it ended.
+Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it
+SPEC-calibration/ with index.html (before, after, what is left, what changed)
+and the stages' results. An interrupted run continues where it ended.
 
 What frames cannot tell is kept at the starting values, and named: the response curve (gamma) and the product of LED power and
 exposure in any case; distance and focal length if all frames are without contact.
 
 \b
 Example:
-  twin calibrate optics --sensor ur5-331 --frames recordings/my-tactip --out my-tactip.toml
+  twin calibrate optics --sensor ur5-331 --frames recordings/my-tactip \\
+      --out my-tactip.toml
 """
 
 
@@ -130,16 +131,19 @@ when it was taken is found along with them. A frame that fits neither case gets 
 are kept out of the fit, and the error is stated on them.
 
 \b
-Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/ with index.html (parameters with their
-uncertainty and what the frames tell of them, frames with their probabilities, before and after), calibration.json and
+Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
+with index.html (parameters with their uncertainty and what the frames tell of
+them, frames with their probabilities, before and after), calibration.json and
 contacts/. An interrupted run continues where it ended.
 
 \b
-It simulates about 50 + 60 N contacts. Each takes 1 to 3 s on one core; --workers shares them among processes.
+It simulates about 50 + 60 N contacts. Each takes 1 to 3 s on one core;
+--workers shares them among processes.
 
 \b
 Example:
-  twin calibrate contact --sensor mg400-331 --frames recordings/my-surface --labels 20 --out my-tactip.toml
+  twin calibrate contact --sensor mg400-331 --frames recordings/my-surface \\
+      --labels 20 --out my-tactip.toml
 """
 
 
@@ -200,7 +204,8 @@ Writes index.html, frames.csv (a row a frame), validation.json.
 
 \b
 Example:
-  twin validate --sensor mg400-331 --frames recordings/surface --limit 40 --out out/validate
+  twin validate --sensor mg400-331 --frames recordings/surface --limit 40 \\
+      --out out/validate
 """
 
 
@@ -260,8 +265,9 @@ saturated, of another size or without all their pins are refused by name. The ex
 \b
 Writes:
   index.html      pictures side by side, all figures, plots
-  metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc; differences by
-                  radius; spots; spectra; two-sample accuracy; pin errors
+  metrics.json    every figure: PSNR, SSIM, FLIP over the lens disc;
+                  differences by radius; spots; spectra; two-sample accuracy;
+                  pin errors
   frames.csv      figures of each frame
   radial.csv      caps in 8 bins of the distance from the disc's centre
   spectrum.csv    radial power spectra
@@ -269,13 +275,15 @@ Writes:
   pictures/       real, rendered and difference of each frame
 
 \b
-How to read it: no render can do better than PSNR and SSIM of two real frames with the
-same contact. Two-sample accuracy is the share of patches of unseen frames that a small
-network puts into the right set: at 100 % it always tells real from rendered, at 50 % never.
+How to read it: no render can do better than PSNR and SSIM of two real frames
+with the same contact. Two-sample accuracy is the share of patches of unseen
+frames that a small network puts into the right set: at 100 % it always tells
+real from rendered, at 50 % never.
 
 \b
 Example:
-  twin realism recordings/my-tactip --sensor ur5-331 --limit 10 --out out/realism
+  twin realism recordings/my-tactip --sensor ur5-331 --limit 10 \\
+      --out out/realism
 """
 
 
@@ -317,20 +325,24 @@ over a set of contacts, runs pipelines and models on every frame, and compares w
 
 \b
 Writes:
-  index.html      envelope (where each pipeline fails), ranking, plots, worst frames
-  envelope.csv    severity and parameter at which each measure's limit is crossed
+  index.html      envelope (where each pipeline fails), ranking, plots, worst
+                  frames
+  envelope.csv    severity and parameter at which each measure's limit is
+                  crossed
   curves.csv      every measure against severity, with its 90 % interval
   frames.csv      every frame
-  real-on-rendered.csv  with --frames: where real and rendered frames fail, and their ratio
-  cells/          finished work: an interrupted run continues where it ended; work of
-                  another sensor, other weights or another version is not used
+  real-on-rendered.csv  with --frames: where real and rendered frames fail,
+                        and their ratio
+  cells/          finished work: an interrupted run continues where it ended;
+                  work of another sensor, other weights or another version is
+                  not used
 
 \b
-With --frames DIR real frames take the place of rendered ones. Then only conditions that
-act on a frame are swept, and the truth is the pins on which several detectors agree.
-Raw frames are compared with the envelope of rendered ones, which tells how much of a
-sound sensor's margin this sensor has left. Rendered frames are swept for that, too;
---no-rendered leaves this out.
+With --frames DIR real frames take the place of rendered ones. Then only
+conditions that act on a frame are swept, and the truth is the pins on which
+several detectors agree. Raw frames are compared with the envelope of rendered
+ones, which tells how much of a sound sensor's margin this sensor has left.
+Rendered frames are swept for that, too; --no-rendered leaves this out.
 
 \b
 A file for --conditions:
@@ -342,15 +354,25 @@ A file for --conditions:
 
 \b
 Examples:
-  twin robustness --sensor ur5-331 --pipeline twin --pipeline legacy --out out/robustness
-  twin robustness --sensor ur5-331 --frames recordings/mine --pipeline mine.toml --out out/mine
+  twin robustness --sensor ur5-331 --pipeline twin --pipeline legacy \\
+      --out out/robustness
+  twin robustness --sensor ur5-331 --frames recordings/mine \\
+      --pipeline mine.toml --out out/mine
 """
+
+
+def _list_conditions(asked: bool) -> None:
+    from twin.judge.degradation.conditions import condition_lines
+
+    if asked:
+        say(condition_lines())
+        raise typer.Exit
 
 
 @app.command("robustness", help=HELP_ROBUSTNESS)
 def robustness(
-    sensor: Sensor = "ur5-331",
-    out: Out = Path("out/robustness"),
+    sensor: Sensor,
+    out: Out,
     pipeline: Annotated[
         list[str] | None,
         typer.Option("--pipeline", metavar="P", help="twin, legacy, adaptive, fixed, simple, log, dog, doh, or a file of 'twin tune'"),
@@ -363,17 +385,13 @@ def robustness(
     limit: Annotated[int, typer.Option("--limit", min=2, metavar="N", help="at most N of the real frames, evenly spread")] = 12,
     rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
     jobs: Annotated[int, typer.Option("--jobs", min=1, metavar="N", help="processes")] = CORES,
-    show: Annotated[bool, typer.Option("--list", help="list the conditions and stop")] = False,
+    show: Annotated[bool, typer.Option("--list", is_eager=True, callback=_list_conditions, help="list the conditions and stop")] = False,
 ) -> None:
     from scenes import load_sensor
     from training.studies import degradation
     from twin.cli.progress import shown
-    from twin.judge.degradation.conditions import condition_lines
     from twin.judge.degradation.plan import SweepPlan, load_plan
 
-    if show:
-        say(condition_lines())
-        raise typer.Exit
     plan = degradation.Plan(
         load_sensor(sensor),
         pipelines=tuple(pipeline or degradation.PIPELINES),
@@ -397,8 +415,8 @@ frames that occur twice, drift along the table, and faults of the files.
 
 \b
 Writes:
-  labels_corrected.csv  image_name, executed, the four corrected labels, the misfit to
-                        each explanation, findings
+  labels_corrected.csv  image_name, executed, the four corrected labels, the
+                        misfit to each explanation, findings
   audit.json, audit.png, audit.html
 
 Copy labels_corrected.csv beside targets.csv, and 'twin train' corrects the labels with it.

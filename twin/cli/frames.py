@@ -24,14 +24,16 @@ listed and skipped. The exit code is 0 if at least one frame was good.
 
 \b
 Writes pins.npz:
-  image_name (M,)    base names, in the order of targets.csv where there is one
-  pins_px (M, N, 2)  (x, y) in px of the input frame, pixel centres at integers, the
-                     specification's pin order; NaN where a pin has no blob of its own
-  predicted_px       same shape: the motion model's guess for the pins that are NaN in
-                     pins_px, NaN for all others
+  image_name (M,)    base names, in the order of targets.csv if there is one
+  pins_px (M, N, 2)  (x, y) in px of the input frame, pixel centres at
+                     integers, the specification's pin order; NaN where a pin
+                     has no blob of its own
+  predicted_px       same shape: the motion model's guess for the pins that
+                     are NaN in pins_px, NaN for all others
   area_px2 (M, N)    Voronoi cell areas
   found (M,), valid (M,)
-and summary.json (frames, exact_fraction, ms.<stage>.p50|p95|p99, parameters, failed).
+and summary.json (frames, exact_fraction, ms.<stage>.p50|p95|p99, parameters,
+failed).
 """
 
 
@@ -78,14 +80,14 @@ The input is a frame, a folder of frames, or the pins.npz of 'twin preprocess'.
 \b
 knn       edges from each pin to its 6 nearest (directed)
 delaunay  both directions of every side of the Delaunay triangles
-voronoi   the same edges, and the area of each pin's Voronoi cell inside the enlarged
-          boundary around the outermost pins
+voronoi   the same edges, and the area of each pin's Voronoi cell inside the
+          enlarged boundary around the outermost pins
 
 \b
 Writes:
-  graph.npz     image_name (M,), nodes_px (M, N, 2), area_px2 (M, N), and edges (E, 2) of
-                all graphs one after the other: graph k has the edges
-                edges[edge_start[k]:edge_start[k+1]]
+  graph.npz     image_name (M,), nodes_px (M, N, 2), area_px2 (M, N), and
+                edges (E, 2) of all graphs one after the other: graph k has
+                the edges edges[edge_start[k]:edge_start[k+1]]
   graph.png     the first graph
   surface.png   its cell areas as a surface: no contact, contact, difference
 
@@ -107,20 +109,21 @@ class Kind(StrEnum):
 def graph(
     path: Annotated[Path, typer.Argument(help="frame, folder of frames, or pins.npz")],
     sensor: Sensor,
+    out: Out,
     kind: Annotated[Kind, typer.Option("--kind", help="kind of graph")] = Kind.VORONOI,
-    out: Out = Path("out/graph"),
     form: FormOrAuto = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
     table: Table = None,
     no_contact: NoContact = None,
     pipeline: Tuning = None,
 ) -> None:
+    from twin.cli.progress import shown
     from twin.frames import frames_at
     from twin.pins.graph_files import write_graphs_of
 
-    made = write_graphs_of(
-        frames_at(path, table, no_contact), sensor_with(sensor, pipeline), writable_folder(out), kind=kind.value, form=form, legacy=legacy
-    )
+    spec, at = sensor_with(sensor, pipeline), frames_at(path, table, no_contact)
+    with shown():
+        made = write_graphs_of(at, spec, writable_folder(out), kind=kind.value, form=form, legacy=legacy)
     tell(made)
 
 
@@ -160,6 +163,8 @@ def tune_command(
     tell(found)
 
 
+# Exit code of 'twin check' where the sensor is not well. It differs from those of a failure (1) and of a wrong command line (2).
+BAD = 3
 HELP_CHECK = """Check whether the sensor is well, and say what to do.
 
 It checks brightness, focus, missing pins, specks, glare, and drift from the calibration. It looks at a frame, a folder of frames, a
@@ -167,7 +172,7 @@ video or a camera, with or without contact, and compares the frames with the one
 Thresholded recordings show pins, specks and place only. A lost pin or a spot counts as a fault of the sensor if it is
 there in half of the frames, so give frames of several contacts.
 
-The exit code is 2 if something is bad, else 0.
+The exit code is 3 if something is bad, else 0.
 
 \b
 Example:
@@ -196,4 +201,4 @@ def check(
         found = examine_sensor(source, spec, form=form, detector=detector, limit=limit, progress=progress)
     say(found.lines())
     if found.bad:
-        raise SystemExit(2)
+        raise SystemExit(BAD)

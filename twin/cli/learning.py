@@ -16,6 +16,7 @@ import typer
 from twin.cli import app
 from twin.cli.options import (
     CORES,
+    MOST_SEED,
     Across,
     Device,
     FormOrAuto,
@@ -23,10 +24,13 @@ from twin.cli.options import (
     Out,
     Quality,
     Sensor,
+    Split,
     Table,
     Target,
+    Threads,
     Tuning,
     Workers,
+    finite,
     if_given,
     one_recording,
     say,
@@ -47,33 +51,38 @@ state, or every converged state, becomes a frame. A contact that does not conver
          gray       their luminance
          recording  cropped and thresholded, as the recordings are
          none       pins alone, without rendering (vgnn and the other graph
-                    networks train on them; 'twin train' reads them like frames)
---states all        also the states on the way, labelled by how far tap and move have
-                    gone. All states of a contact share a path_id, and they all go
-                    either into the training or into the validation part
---randomise R       what differs from contact to contact ('twin randomisations')
+                    networks train on them; 'twin train' reads them like
+                    frames)
+--states all        also the states on the way, labelled by how far tap and
+                    move have gone. All states of a contact share a path_id,
+                    and they all go either into the training or into the
+                    validation part
+--randomise R       what differs from contact to contact: a name ('twin
+                    randomisations') or a file
 
 \b
 Writes:
-  images/ or frames_bw/, init_0.png, targets.csv, meta.json   as in a recording
+  images/ or frames_bw/, init_0.png, targets.csv, meta.json: as in a recording
   move_executed.csv   whether each frame's move had been made
-  truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in contact
-                      and sliding, the object's pose: one row a frame
-  draws.csv           what was drawn for each contact; failures.csv: draws that failed
+  truth.zarr          caps (mm, px), pins with noise, forces, torque, areas in
+                      contact and sliding, the object's pose: one row a frame
+  draws.csv           what was drawn for each contact; failures.csv: draws
+                      that failed
   generation.json     all resolved specifications and options
-  made_by.json        the code that made it; a version whose code for contacts differs
-                      does not continue the data set, because its frames would differ
-  records/            one for each finished contact; with them the same command continues
-                      after any end, or to a larger --count
+  made_by.json        the code that made it; a version whose code for contacts
+                      differs does not continue the data set, because its
+                      frames would differ
+  records/            one for each finished contact; with them the same
+                      command continues after any end, or to a larger --count
 
 The result depends on the options alone. Every byte is the same with any number of workers and after any interruption.
 
 \b
 Examples:
-  twin dataset --experiment surface-2d --sensor mg400-331 --count 1000 --images none \\
-      --randomise contact --workers 8 --out sim/surface
-  twin dataset --experiment edge-2d --sensor ur5-331 --count 200 --out sim/edge \\
-      --scheduler tcp://192.168.0.10:8786
+  twin dataset --experiment surface-2d --sensor mg400-331 --count 1000 \\
+      --images none --randomise contact --workers 8 --out sim/surface
+  twin dataset --experiment edge-2d --sensor ur5-331 --count 200 \\
+      --out sim/edge --scheduler tcp://192.168.0.10:8786
 """
 
 
@@ -138,11 +147,14 @@ def dataset(
 HELP_TRAIN = """Train a model that tells the pose from a frame.
 
 \b
-vgnn              ours: Voronoi graph network on matched pins, ensemble, calibrated 90 % intervals
-tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense layers 96, 64
-tac-vgnn-release  the same with the dense layers of the published code: 128, 96
-gnn               the paper's graph network on 6 nearest neighbours, without areas
-cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters on 128 x 128 px
+vgnn              ours: Voronoi graph network on matched pins, ensemble,
+                  calibrated 90 % intervals
+tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense
+                  layers 96, 64
+tac-vgnn-release  the same with the published code's dense layers: 128, 96
+gnn               the paper's graph network: 6 nearest neighbours, no areas
+cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters, on
+                  128 x 128 px
 
 --target selects the labels, which are columns of the recording's table. It is a preset (surface-2d: pose_2 pose_6; surface-2d-shear:
 also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d) or names with commas between. With --labels corrected, a
@@ -152,12 +164,14 @@ Depth and angle of simulated contacts are relative to the touched surface, whate
 the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
 
 A random fifth of the rows is kept out of training for 'twin evaluate'. Of simulated data it is a fifth of the contacts, with all
-their states. --split gives the seed of this choice; with --split -1 all rows are trained on.
+their states. --split gives the seed of this choice; with --split -1 all rows are trained on. The choice goes by the frames' names: the
+order of the table does not matter.
 
 \b
-Writes to --out: config.json (resolved, with the sensor and the parameters of the
-pipeline), curves.csv, weights.pt, and checkpoint.pt while it runs. The same command
-continues a run that was interrupted.
+Writes to --out: config.json (resolved, with the sensor and the parameters of
+the pipeline), curves.csv, weights.pt, and checkpoint.pt while it runs. The
+same command continues a run that was interrupted, if frames and labels are
+still the same.
 """
 
 
@@ -169,8 +183,8 @@ def train(
     out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
     target: Target = "surface-2d",
     labels: Annotated[str, typer.Option("--labels", help="corrected or raw")] = "corrected",
-    seed: Annotated[int, typer.Option("--seed", help="seed of weights and order")] = 0,
-    split: Annotated[int, typer.Option("--split", help="seed of the fifth kept out of training; -1: none")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and order")] = 0,
+    split: Split = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", help="epochs of training, instead of the model's own number")] = None,
     batch: Annotated[int | None, typer.Option("--batch", help="batch size, instead of the model's own")] = None,
     members: Annotated[int | None, typer.Option("--members", help="networks in the ensemble")] = None,
@@ -178,8 +192,10 @@ def train(
         bool | None,
         typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows"),
     ] = None,
-    max_minutes: Annotated[float | None, typer.Option("--max-minutes", help="stop after the epoch that passes this time")] = None,
-    threads: Annotated[int | None, typer.Option("--threads", help="CPU threads")] = None,
+    max_minutes: Annotated[
+        float | None, typer.Option("--max-minutes", min=0, callback=finite, help="stop after the epoch that passes this time")
+    ] = None,
+    threads: Threads = None,
     device: Device = "auto",
     form: FormOrAuto = None,
     table: Table = None,
@@ -215,17 +231,18 @@ def train(
 HELP_EVALUATE = """Judge a trained model on a labelled recording.
 
 \b
---rows validation  the fifth of the run's own recording that was kept out of its training
+--rows validation  the fifth of the run's own recording that was kept out of
+                   its training, by the frames' names
 --rows all         every row, for a recording that the model has not seen
 
 \b
 Writes:
-  predictions.csv  image_name; <label>_true, _pred, _lo90, _hi90 of every label;
-                   executed_probability, valid
-  metrics.json     mean absolute errors against raw and corrected labels, overall and by
-                   depth, angle and shear; coverage of the 90 % intervals; slope of the
-                   angle's error on move_6 over frames whose move was not executed; ms
-                   per frame
+  predictions.csv  image_name; <label>_true, _pred, _lo90, _hi90 of every
+                   label; executed_probability, valid
+  metrics.json     mean absolute errors against raw and corrected labels,
+                   overall and by depth, angle and shear; coverage of the 90 %
+                   intervals; slope of the angle's error on move_6 over frames
+                   whose move was not executed; ms per frame
   errors.png
 
 With --robustness it also writes robustness.csv: errors on frames whose image is changed (1 % scale, 2 px shift, 1 deg turn, 5 pins
@@ -256,7 +273,7 @@ def evaluate(
 HELP_PREDICT = """Tell the pose in every frame, with its 90 % interval.
 
 The model contains its sensor and pipeline, and a frame of another sensor is refused. If a recording has a frame without contact
-(init_0.png), the pins are counted from that frame.
+(init_0.png), the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
 """
 
 
@@ -279,7 +296,8 @@ Its numbers have half the precision, and its size is less than a tenth. It can b
 weights below training/weights were made with these commands:
 
 \b
-  twin study sim-to-real --sensor mg400-331 --frames DIR --contacts surface-2d-wide --draws 2 --epochs 60 --out study
+  twin study sim-to-real --sensor mg400-331 --frames DIR \\
+      --contacts surface-2d-wide --draws 2 --epochs 60 --out study
   twin pack study/sim_only --out training/weights/mg400-331
 """
 

@@ -13,8 +13,6 @@ import typer
 
 from twin.cli import app
 from twin.cli.options import (
-    FIRST,
-    NONE,
     SHIPPED_MODEL,
     ArmOption,
     AtRest,
@@ -27,11 +25,11 @@ from twin.cli.options import (
     PlainLight,
     Sensor,
     ServoName,
-    arm_let_go,
     say,
     tell,
     writable_folder,
 )
+from twin.types import FIRST, NONE
 
 HELP_LIVE = """Show a model's estimates on a camera's frames.
 
@@ -45,7 +43,8 @@ contact at the start; the first frame is then kept with the session.
 
 \b
   twin live --camera /dev/video0 --model RUN
-  twin live --camera http://127.0.0.1:8081/stream.mjpg --model RUN --record out/session --headless --seconds 60
+  twin live --camera http://127.0.0.1:8081/stream.mjpg --model RUN \\
+      --record out/session --headless --seconds 60
   twin live --replay out/session --model RUN --headless
 """
 
@@ -66,6 +65,7 @@ def live(
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; 0: a free one")] = 8080,
 ) -> None:
     from hardware.live import WatchPlan, watch
+    from hardware.rig import signals_as_ctrl_c
     from training.estimator import PoseEstimator
 
     plan = WatchPlan(
@@ -79,7 +79,7 @@ def live(
         at_rest=at_rest,
         port=port,
     )
-    with arm_let_go():
+    with signals_as_ctrl_c():
         watched = watch(plan, PoseEstimator.load(model), name=str(model), on_shown=tell_view)
     say(watched.lines())
 
@@ -102,8 +102,10 @@ The folder has the recordings' own format (targets.csv, frames_bw/ or images/, i
 contacts.jsonl. The same command continues an interrupted collection.
 
 \b
-  twin collect --camera twin --arm simulated --sensor mg400-331 --experiment surface-2d --count 200 --out data/first
-  twin collect --camera /dev/video0 --arm mg400 --sensor mg400-331 --experiment surface-2d --count 5000 --out data/real
+  twin collect --camera twin --arm simulated --sensor mg400-331 \\
+      --experiment surface-2d --count 200 --out data/first
+  twin collect --camera /dev/video0 --arm mg400 --sensor mg400-331 \\
+      --experiment surface-2d --count 5000 --out data/real
 """
 
 
@@ -125,6 +127,7 @@ def collect_command(
     plain_light: PlainLight = False,
 ) -> None:
     from hardware.collect import CollectPlan, collect_frames
+    from hardware.rig import signals_as_ctrl_c
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from twin.cli.progress import shown
 
@@ -142,7 +145,7 @@ def collect_command(
         limits=limits,
         plain_light=plain_light,
     )
-    with arm_let_go(), shown() as progress:
+    with signals_as_ctrl_c(), shown() as progress:
         collected = collect_frames(plan, writable_folder(out), progress=progress)
     say(collected.lines())
 
@@ -161,15 +164,18 @@ specification's layout, as models on graphs always do.
 
 \b
   twin servo --object can --model RUN --out out/servo
-  twin emulate mg400 &  twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can --port 8081 &
-  twin servo --object can --model RUN --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1 --stream --steps 60 --out out/live
+  twin emulate mg400 &  twin emulate camera --arm mg400:127.0.0.1 \\
+      --sensor mg400-331 --object can --port 8081 &
+  twin servo --object can --model RUN \\
+      --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1 \\
+      --stream --steps 60 --out out/live
 
 \b
 Writes to --out:
   trajectory.csv, trajectory.png
-  measures.json   smoothness S as the Tac-VGNN paper defines it, path, depth and angle
-                  errors, jerk, share of the way, lost contacts; rate, latency and age
-                  of the frames
+  measures.json   smoothness S as the Tac-VGNN paper defines it, path, depth
+                  and angle errors, jerk, share of the way, lost contacts;
+                  rate, latency and age of the frames
   session/        with --record
 
 The exit code is 1 if it ended early.
@@ -195,6 +201,7 @@ def servo(
     at_rest: AtRest = FIRST,
 ) -> None:
     from hardware.following import FollowPlan, follow
+    from hardware.rig import signals_as_ctrl_c
     from scenes import load_object, load_servo
     from training.estimator import PoseEstimator
     from twin.cli.progress import shown
@@ -213,7 +220,7 @@ def servo(
         known_place=known_place,
         at_rest=at_rest,
     )
-    with arm_let_go(), shown() as progress:
+    with signals_as_ctrl_c(), shown() as progress:
         followed = follow(plan, PoseEstimator.load(model), writable_folder(out), about={"model": str(model)}, progress=progress)
     tell(followed)
     if followed.failure:
@@ -290,7 +297,8 @@ may run in different processes.
 
 \b
   twin emulate mg400 &
-  twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can --port 8081
+  twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can \\
+      --port 8081
 """
 
 

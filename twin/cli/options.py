@@ -1,15 +1,14 @@
-"""What several commands share: their options, what they print of a result, and how a command that moves an arm may be ended."""
+"""What several commands share: their options, and what they print of a result."""
 
+import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeVar
 
 import typer
 
-from twin.cli import print_notes
-from twin.errors import TwinError
+from twin.errors import OptionError, TwinError
 from twin.types import Form
 
 if TYPE_CHECKING:
@@ -25,6 +24,10 @@ def usable_cores() -> int:
 
 
 CORES = usable_cores()
+# The largest seed of weights and splits (the constant of training.run, which would load PyTorch).
+MOST_SEED = 2**32 - 1
+# More threads of a CPU than this have never made a training faster, and many more can't be started.
+MOST_THREADS = 256
 
 Quality = Literal["preview", "standard", "high"]
 """Presets of the renderer (``twin.optics.render.Quality``, which would load the renderer)."""
@@ -34,7 +37,26 @@ Object = Annotated[str, typer.Option("--object", metavar="O", help="object name 
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
 FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; found from size and content if not given")]
 Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
-Target = Annotated[str, typer.Option("--target", help="preset, or label columns with commas between")]
+
+
+def each_once(text: str) -> str:
+    """The names between commas, if there are some and none is there twice."""
+    names = names_in(text)
+    if not names or len(set(names)) < len(names):
+        raise typer.BadParameter(f"give one name or several with commas between, each once, got {text!r}")
+    return ",".join(names)
+
+
+def finite(value: float | None) -> float | None:
+    """The number, if it is one: comparisons with a least value let NaN pass."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"give a number, got {value}")
+    return value
+
+
+Target = Annotated[str, typer.Option("--target", callback=each_once, help="preset, or label columns with commas between")]
+Split = Annotated[int, typer.Option("--split", min=-1, max=MOST_SEED, help="seed of the fifth kept out of training; -1: none")]
+Threads = Annotated[int | None, typer.Option("--threads", min=1, max=MOST_THREADS, help="CPU threads")]
 Workers = Annotated[int, typer.Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
 Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
@@ -61,14 +83,12 @@ AtRest = Annotated[
         "or none (the specification's layout)",
     ),
 ]
-# What --at-rest takes besides a file (the constants of hardware.rig, which would load the devices).
-FIRST, NONE = "first", "none"
 
 
 def _even(value: int) -> int:
     """The number, if it is even."""
     if value % 2:
-        raise TwinError(f"--across {value}: give an even number")
+        raise OptionError(f"--across {value}: give an even number")
     return value
 
 
@@ -80,12 +100,15 @@ def names_in(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def numbers_in(text: str, option: str) -> tuple[int, ...]:
-    """The whole numbers between commas."""
+def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
+    """The whole numbers between commas, none of them less than ``least`` or beyond a seed."""
     try:
-        return tuple(int(part) for part in names_in(text))
+        numbers = tuple(int(part) for part in names_in(text))
     except ValueError as error:
-        raise TwinError(f"{option} takes whole numbers with commas between, got {text!r}") from error
+        raise typer.BadParameter(f"takes whole numbers with commas between, got {text!r}", param_hint=option) from error
+    if any(not least <= number <= MOST_SEED for number in numbers):
+        raise typer.BadParameter(f"takes whole numbers from {least} to {MOST_SEED}, got {text!r}", param_hint=option)
+    return numbers
 
 
 def if_given(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
@@ -144,19 +167,3 @@ def tell(result: Result) -> None:
     """Print a result and the files that were written."""
     say(result.lines())
     say(f"wrote {path}" for path in result.written)
-
-
-@contextmanager
-def arm_let_go() -> Iterator[None]:
-    """Context in which SIGTERM and a closed terminal end the command as Ctrl-C does, so that the arm is let go of.
-
-    If letting go failed, what failed is printed.
-    """
-    from hardware.rig import signals_as_ctrl_c
-
-    with signals_as_ctrl_c():
-        try:
-            yield
-        except KeyboardInterrupt as interrupt:
-            print_notes(interrupt)  # here, because typer ends the program without printing them
-            raise

@@ -1,6 +1,7 @@
 """What the command line makes of ``twin.progress``: bars on a terminal, else a line every ten seconds. All of it goes to stderr."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -77,7 +78,9 @@ class Bars:
 
 
 class Lines:
-    """A line of text at most every ``every_s`` seconds, for log files and pipes. A stage that ends sooner says nothing.
+    """A line of text every ``every_s`` seconds, for log files and pipes. Work that ends sooner says nothing.
+
+    Within its context a line is also printed where nothing is reported for that long, so a log shows that the program is at work.
 
     Parameters
     ----------
@@ -90,14 +93,38 @@ class Lines:
     def __init__(self, out: TextIO, *, every_s: float = LINE_S, clock: Callable[[], float] = time.monotonic) -> None:
         self._out, self._every_s, self._clock = out, every_s, clock
         self._last_s = clock()
+        self._line = ""
+        self._turn = threading.Lock()
+        self._over = threading.Event()
 
     def __call__(self, stage: str, done: float, total: float, note: str = "") -> None:
-        now_s = self._clock()
-        if now_s - self._last_s < self._every_s:
-            return
-        self._last_s = now_s
         far = "" if total <= 0 else f" {done:.0%}" if total <= 1 else f" {done:.0f} of {total:.0f}"
-        print(f"{stage}:{far or ' begun'}{f', {note}' if note else ''}", file=self._out, flush=True)
+        self._line = f"{stage}:{far or ' begun'}{f', {note}' if note else ''}"
+        self._print_if_due()
+
+    def _print_if_due(self) -> float:
+        """Print how far the work is if the last line is old; the seconds until the next line is due."""
+        with self._turn:
+            passed_s = self._clock() - self._last_s
+            if passed_s >= self._every_s:
+                self._last_s += passed_s
+                passed_s = 0.0
+                print(self._line or "at work", file=self._out, flush=True)
+            return self._every_s - passed_s
+
+    def _watch(self) -> None:
+        due_s = self._every_s
+        while not self._over.wait(due_s):
+            due_s = self._print_if_due()
+
+    def __enter__(self) -> "Lines":
+        self._watcher = threading.Thread(target=self._watch, daemon=True)
+        self._watcher.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._watcher.join()
 
 
 @contextmanager
@@ -105,7 +132,8 @@ def shown() -> Iterator[Told]:
     """The ``Progress`` of a command: bars where stderr is a terminal, else lines."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield Lines(sys.stderr)
+        with Lines(sys.stderr) as lines:
+            yield lines
         return
     bars = Bars(console)
     try:

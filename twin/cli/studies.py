@@ -14,6 +14,7 @@ import typer
 from twin.cli import app
 from twin.cli.options import (
     CORES,
+    MOST_SEED,
     Across,
     Device,
     FormOrAuto,
@@ -22,7 +23,10 @@ from twin.cli.options import (
     Sensor,
     ServoName,
     Target,
+    Threads,
     Workers,
+    each_once,
+    finite,
     if_given,
     names_in,
     numbers_in,
@@ -51,7 +55,7 @@ Writes to --out: a folder for each model and object as 'twin servo' writes it, s
 def servo_command(
     models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
     out: Out,
-    objects: Annotated[str, typer.Option("--objects", help="names with commas between")] = OBJECTS,
+    objects: Annotated[str, typer.Option("--objects", callback=each_once, help="names with commas between")] = OBJECTS,
     parameters: ServoName = "surface",
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="steps on each object, instead of once around it")] = None,
     seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
@@ -80,7 +84,8 @@ UNSEEN = "cylinder,edge"
 HELP_STUDY_OBJECTS = """Train on several objects, and judge on others.
 
 \b
-  twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod --unseen cylinder,edge --out out/objects
+  twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod \\
+      --unseen cylinder,edge --out out/objects
 
 Two models learn from the same number of contacts that are simulated in the twin (pins alone, every state on their way). 'mixed' learns
 from --count contacts of each object of --train, the other from the first of these objects alone. Both are judged on --tests other
@@ -96,8 +101,9 @@ The same command continues an interrupted study. The run that learnt several obj
   twin servo --object can --model out/objects/mixed --out out/can
 
 \b
-Writes to --out: mixed/ and one named after the first object, each a RUN; sim/ and tests/, a data set for each object
-(as 'twin dataset' writes them); objects.csv, index.html.
+Writes to --out: mixed/ and one named after the first object, each a RUN; sim/
+and tests/, a data set for each object (as 'twin dataset' writes them);
+objects.csv, index.html.
 """
 
 
@@ -111,7 +117,7 @@ def study_objects(
     tests: Annotated[int, typer.Option("--tests", min=1, metavar="N", help="other contacts of each object to judge on")] = 50,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="contacts to judge on ('twin experiments')")] = "objects-2d",
     randomise: Annotated[str, typer.Option("--randomise", metavar="R", help="randomisation ('twin randomisations')")] = "moves",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the contacts and the weights")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the contacts and the weights")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: Workers = CORES,
     across: Across = FINE,
@@ -141,7 +147,8 @@ def study_objects(
 HELP_STUDY_SIM_TO_REAL = """Train in the twin or on real frames, test on real ones.
 
 \b
-  twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 --seed 0 --out out/sim-to-real
+  twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 \\
+      --seed 0 --out out/sim-to-real
 
 --experiment says how the arm moved in the recording and what is learnt; --contacts is the experiment that is simulated.
 
@@ -155,21 +162,22 @@ these frames first ('twin calibrate contact'; about an hour). All models are jud
                        intervals are calibrated on the labelled frames
   simulated and real   the same, averaged with a Gaussian process of the pins
                        of both simulated contacts and labelled frames
-  real                 vgnn and a quadratic regression, trained on as many real
-                       frames, on 500 and on all
-  --ablate             also models trained on simulated contacts with one change
-                       each: without the learnt difference of the pins, with a
-                       fifth of the contacts, a coarse mesh, one friction, any
-                       friction, no moves, drawn tolerances of skin and gel, and
-                       without calibration; this simulates six more sets of
-                       contacts
+  real                 vgnn and a quadratic regression, trained on as many
+                       real frames, on 500 and on all
+  --ablate             also models trained on simulated contacts with one
+                       change each: without the learnt difference of the pins,
+                       with a fifth of the contacts, a coarse mesh, one
+                       friction, any friction, no moves, drawn tolerances of
+                       skin and gel, and without calibration; this simulates
+                       six more sets of contacts
 
 The contacts are simulated in --out/sim, without pictures. With --sim finished data sets of 'twin dataset' or 'twin study objects'
 are used instead (give it once for each). If a data set has pictures, the pins are those that the pipeline finds in them. The same
 command continues an interrupted study.
 
 \b
-Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv, index.html.
+Writes to --out: sim_only/, sim_plus_real/ and real_N/, each a RUN; study.csv,
+index.html.
 """
 
 
@@ -179,7 +187,7 @@ def study_sim_to_real(
     frames: Annotated[Path, typer.Option("--frames", metavar="DIR", help="labelled real recording")],
     out: Out,
     labels: Annotated[int, typer.Option("--labels", min=8, metavar="N", help="labelled frames beside the simulated ones")] = 40,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the drawn frames, the contacts and the weights")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of the drawn frames, the contacts and the weights")] = 0,
     experiment: Annotated[str, typer.Option("--experiment", metavar="E", help="how the frames were recorded")] = "surface-2d",
     contacts: Annotated[
         str | None,
@@ -187,7 +195,10 @@ def study_sim_to_real(
     ] = None,
     draws: Annotated[int, typer.Option("--draws", min=1, help="draws of the learnt difference of the pins, for each contact")] = 2,
     count: Annotated[int, typer.Option("--count", min=10, metavar="N", help="contacts to simulate")] = 500,
-    sim: Annotated[list[Path] | None, typer.Option("--sim", metavar="DIR", help="simulated data set instead; several are joined")] = None,
+    sim: Annotated[
+        list[Path] | None,
+        typer.Option("--sim", metavar="DIR", exists=True, file_okay=False, help="simulated data set instead; several are joined"),
+    ] = None,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
     ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time")] = False,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of every training, instead of the model's own")] = None,
@@ -225,7 +236,8 @@ HELP_STUDY_TAC_VGNN = """Repeat the Tac-VGNN paper's comparison on a recording.
 It compares graphs, models and training efficiency, and shows how the Voronoi areas tell the depth of a contact.
 
 \b
-  twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study --max-minutes 120
+  twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study \\
+      --max-minutes 120
 
 The models (--models) are gnn, tac-vgnn, tac-vgnn-release, cnn-v1, cnn-v2, and this project's vgnn. vgnn-without-graph,
 vgnn-without-modes and vgnn-without-kernel show what each part of vgnn contributes.
@@ -235,7 +247,8 @@ writes it. The same command continues an interrupted study, so a study may be sp
 evenly among the runs that are still to do. A run that this time ended is reported as ended early.
 
 \b
-Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv, curves.png, efficiency.png, contacts.png, index.html, runs/.
+Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv,
+curves.png, efficiency.png, contacts.png, index.html, runs/.
 """
 
 
@@ -248,15 +261,17 @@ def study_tac_vgnn(
     seeds: Annotated[str, typer.Option("--seeds", help="seeds of weights and order, with commas between")] = "0",
     labels: Annotated[str, typer.Option("--labels", help="labels to learn: raw (as in the paper) or corrected")] = "raw",
     target: Target = "surface-2d",
-    split: Annotated[int, typer.Option("--split", min=0, help="seed of the fifth kept out of training")] = 0,
+    split: Annotated[int, typer.Option("--split", min=0, max=MOST_SEED, help="seed of the fifth kept out of training")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="epochs of training, instead of each model's own number")] = None,
-    max_minutes: Annotated[float | None, typer.Option("--max-minutes", min=0, help="time for all training together")] = None,
+    max_minutes: Annotated[
+        float | None, typer.Option("--max-minutes", min=0, callback=finite, help="time for all training together")
+    ] = None,
     batches: Annotated[
         str, typer.Option("--batches", help="batch sizes of the efficiency figure, with commas between; empty: no figure")
     ] = "64,256,512",
     contacts: Annotated[bool, typer.Option("--contacts/--no-contacts", help="press and render the contacts of the area figure")] = True,
     device: Device = "auto",
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="CPU threads")] = None,
+    threads: Threads = None,
     form: FormOrAuto = None,
 ) -> None:
     from scenes import load_sensor
@@ -268,13 +283,13 @@ def study_tac_vgnn(
         data=data,
         sensor=load_sensor(sensor),
         models=tuple(names_in(models)),
-        seeds=numbers_in(seeds, "--seeds"),
+        seeds=numbers_in(seeds, "--seeds", 0),
         labels=labels,
         target=columns_of(target),
         split=split,
         epochs=epochs,
         max_minutes=max_minutes,
-        batches=numbers_in(batches, "--batches"),
+        batches=numbers_in(batches, "--batches", 1),
         contacts=contacts,
         device=device,
         threads=threads,

@@ -1,1 +1,1 @@
-"""The main job from end to end on shipped specifications, as pictures and one page."""
+"""The demo: the twin from specification to pin graph for shipped sensors, as pictures and one page."""

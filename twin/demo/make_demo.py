@@ -1,4 +1,4 @@
-"""The demo: its stages in their order, and the page that shows them."""
+"""The demo: all stages in their order, and a page that shows them."""
 
 import os
 import platform
@@ -24,21 +24,21 @@ from twin.types import Form
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo made.
+    """The result of the demo.
 
     Attributes
     ----------
     tables : dict of str to list of DepthRow
-        Displacement by depth, by sensor.
-    written : list of Path
-        The page first.
+        Displacement by depth, by the sensor's name.
+        written : list of Path
+            The files, the page first.
     """
 
     tables: dict[str, list[DepthRow]]
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """The tables for people."""
+        """The tables as lines of text."""
         lines = []
         for sensor, rows in self.tables.items():
             lines += [

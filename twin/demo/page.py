@@ -1,4 +1,4 @@
-"""The demo's page: what it computed, in pictures and tables."""
+"""The demo's page, with pictures and tables of its results."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,15 +28,15 @@ from twin.types import Form
 
 @dataclass(frozen=True)
 class ContactContent:
-    """What the page shows of one contact.
+    """The content of the page about one contact.
 
     Attributes
     ----------
     title, description : str
     pictures : dict of str to Path
-        As `contact_pictures` gives them, and ``skin``.
-    raw_size : str
-        Of the raw frame.
+        Pictures from `contact_pictures`, and ``skin``.
+        raw_size : str
+            Size of the raw frame.
     figures : list of (str, str)
         As `contact_figures` gives them.
     """
@@ -49,7 +49,7 @@ class ContactContent:
 
 
 def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
-    """Write the pictures of one contact; the skin's own picture is drawn elsewhere."""
+    """Write the pictures of one contact, except the picture of the skin."""
     look, stem = result.look, f"{result.sensor}-{result.object_name}"
     graph, rest = look.graphs()
     written = {
@@ -104,7 +104,7 @@ def write_page(
     ----------
     path : Path
     machine : str
-        What rendered on which machine.
+        Renderer and machine.
     contacts : sequence of ContactContent
     motions : Path
         Chart of `motion_figure`.

@@ -1,8 +1,8 @@
-"""Camera and pin pattern from the pins of one no-contact frame, and which of their parameters such a frame cannot tell.
+"""Fit of camera and pin pattern to the pins of one no-contact frame, and detection of parameters that such a frame does not determine.
 
-A camera that looks along the axis of a dome sees rings of pins, and little but the rings' radii tells anything. A longer focal
-length, a greater distance, a wider pattern and a stronger distortion change these radii alike. Only what the pins determine is
-fitted.
+A camera that looks along the axis of a dome sees rings of pins, and nearly all information is in the rings' radii. A longer focal length,
+a greater distance, a wider pattern and a stronger distortion change these radii in similar ways. Only parameters that the pins determine
+are fitted.
 """
 
 from dataclasses import dataclass
@@ -18,43 +18,43 @@ from twin.errors import FrameError
 from twin.geometry.pins import rest_pins
 from twin.judge.pictures.aligned import revised
 
-# Rms distance, px, by which real pins at rest miss every dome and camera, all pins of a ring alike. A parameter that moves the pins
-# by less is not determined.
+# Rms error, px, of any model of dome and camera for real pins at rest; all pins of a ring have a similar error. A parameter that moves
+# the pins by less is not determined.
 MODEL_PX = 0.4
-# A parameter is not determined if its sd is larger than this share of its plausible range.
+# Ratio of a parameter's standard deviation to its plausible range above which it is not determined.
 UNSURE = 1 / 3
-# Only one of two parameters is determined if their correlation is larger than this.
+# Absolute correlation of two parameters above which only one of them is determined.
 CORRELATED = 0.99
 # A parameter is not held if the rms distance without it is this many times as large, or this many times MODEL_PX.
 WORSE = 2.0
 # Residual, px, beyond which a pin counts less (soft L1).
 ROBUST_PX = 1.0
-# Step for slopes, as a share of the plausible range.
+# Step of the numerical derivatives, as a share of the plausible range.
 STEP = 1e-4
-# Rounds of matching and fitting, and steps of each fit.
+# Rounds of matching and fitting, and most steps of each fit.
 ROUNDS, MOST_STEPS = 6, 20
-# Turns that are tried, deg: layouts repeat every 60 deg.
+# Turns that are tried, deg. A turn by 60 deg does not change a layout.
 TURNS_DEG = np.arange(-30.0, 30.0)
 # Fewest pins that a camera is fitted to.
 LEAST_PINS = 20
-# The pupil stays at least this far behind the window's back, mm.
+# Least distance of the pupil behind the window's back, mm.
 BEHIND_WINDOW_MM = 0.5
 
 
 @dataclass(frozen=True)
 class CameraParameter:
-    """A parameter that pins at rest may tell.
+    """A parameter that pins at rest may determine.
 
     Attributes
     ----------
     section : str
         Section of the specification that holds it.
     plausible : float
-        Sd of its plausible values, in its own unit; relative to its value where ``relative``.
-    relative : bool
-    bounds : (float, float)
-    instead : str
-        What tells it where the pins do not.
+        Standard deviation of its plausible values, in the parameter's unit; relative to its value if ``relative``.
+        relative : bool
+        bounds : (float, float)
+        instead : str
+            Data that determine the parameter if the pins do not.
     """
 
     section: str
@@ -66,7 +66,7 @@ class CameraParameter:
 
 CONTACT = "contact frames, or a fixed value"
 BOARD = "frames of a chequerboard without the tip, or a fixed value"
-# in the order in which they are held, where several cannot be told apart
+# If the pins can't determine several of them separately, parameters are held in this order.
 PARAMETERS = {
     "max_polar_deg": CameraParameter("pins", 5.0, False, (10.0, 88.0), f"{CONTACT} from the tip's drawing"),
     "distance_mm": CameraParameter("camera", 0.1, True, (1.0, 1000.0), f"{CONTACT} measured with a ruler"),
@@ -84,18 +84,18 @@ FREE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg"
 
 @dataclass(frozen=True)
 class CameraReport:
-    """How well the pins are met, and what they tell.
+    """Result of a camera fit: its error, and which parameters were determined.
 
     Attributes
     ----------
     rms_px : float
-        Of the distances between pins and projected caps, raw-frame px.
-    pins : int
-        Pins used.
+        Rms distance between pins and projected caps, raw-frame px.
+        pins : int
+            Number of pins that were used.
     sd : dict of str to float
         Standard deviation of each fitted parameter, in its own unit, from the Jacobian and the residuals.
     held : dict of str to str
-        Parameters that were asked for but are not determined: why, and what to give in addition. They keep the specification's value.
+        Parameters that were asked for but are not determined: the reason, and what data are needed. They keep the specification's value.
     """
 
     rms_px: float
@@ -112,7 +112,7 @@ def fit_camera(
     Parameters
     ----------
     spec : SensorSpec
-        The start, and the value of all that is not free. ``fy_px`` follows ``fx_px`` in proportion.
+        The start of the fit, and the values of all parameters that are not free. The ratio of ``fy_px`` to ``fx_px`` is kept.
     pins_px : (N, 2) float
         Raw-frame px of a no-contact frame, in any order; NaN where not found.
     free : tuple of str
@@ -128,7 +128,7 @@ def fit_camera(
     Raises
     ------
     FrameError
-        An unknown parameter, or too few pins.
+        A parameter is unknown, or there are too few pins.
     """
     if unknown := set(free) - set(PARAMETERS):
         raise FrameError(f"{sorted(unknown)[0]} is not a parameter of the camera's fit; choose of {', '.join(PARAMETERS)}")
@@ -164,9 +164,9 @@ def fit_camera(
 
 
 def nearest_order(spec: SensorSpec, pins_px: np.ndarray) -> np.ndarray:
-    """Index (n,) of the specification's pin that each of the pins (n, 2) is, whatever the camera's place, scale and turn.
+    """Indices (n,) in the specification of pins (n, 2), independent of the camera's place, scale and turn.
 
-    The projected caps are laid over the pins by centre and size, turned until they fit best, and assigned.
+    The projected caps are given the centre and the size of the pins, turned to the best fit, and assigned.
     """
     best_miss, best = np.inf, np.zeros((0, 2))
     for turn in sorted(TURNS_DEG, key=abs):
@@ -181,12 +181,12 @@ def nearest_order(spec: SensorSpec, pins_px: np.ndarray) -> np.ndarray:
 
 
 def _assigned(pins_px: np.ndarray, caps_px: np.ndarray) -> np.ndarray:
-    """Index (n,) of a different cap for each pin, with the least sum of squared distances."""
+    """Indices (n,) of different caps for all pins, with the least sum of squared distances."""
     return linear_sum_assignment(np.sum((pins_px[:, None] - caps_px) ** 2, axis=2))[1]
 
 
 def _with(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
-    """A copy, not validated, with values of ``PARAMETERS``."""
+    """A copy with other values of ``PARAMETERS``. It is not validated."""
     sections: dict[str, dict[str, Any]] = {"camera": {}, "pins": {}}
     for name, value in values.items():
         sections[PARAMETERS[name].section][name] = value
@@ -209,7 +209,7 @@ def _range(name: str, value: float) -> float:
 def _fit(
     spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str], *, rematch: bool = True
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Values (p,), order (n,), residual (2 n,) px and its slopes (2 n, p) by the values, after matching and fitting in turn."""
+    """Match and fit alternately. Returns values (p,), order (n,), residual (2 n,) px and its derivatives (2 n, p) by the values."""
     known = _values(spec, names)
     start = np.array(list(known.values()))
     ranges = np.array([_range(name, value) for name, value in known.items()])
@@ -256,7 +256,7 @@ def _rms(residual: np.ndarray) -> float:
 
 
 def _certainty(residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations (p,) and correlations (p, p) of the values: ``s^2 (J^T J)^-1``; infinite and 1 along what changes nothing."""
+    """Standard deviations (p,) and correlations (p, p) of the values, from ``s^2 (J^T J)^-1``. Without any effect they are inf and 1."""
     scale = np.linalg.norm(slopes, axis=0)
     _, size, axes = np.linalg.svd(slopes / np.maximum(scale, 1e-300), full_matrices=False)
     covariance = (axes.T / np.maximum(size, 1e-9) ** 2) @ axes
@@ -266,7 +266,7 @@ def _certainty(residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _undetermined(known: dict[str, float], sd: np.ndarray, correlation: np.ndarray) -> dict[str, str]:
-    """Parameters that the pins do not determine, and in words why; ``known`` holds the specification's values."""
+    """Parameters that the pins do not determine, with the reasons in words; ``known`` holds the specification's values."""
     doubtful: dict[str, str] = {}
     names = list(known)
     for k, (name, value) in enumerate(known.items()):

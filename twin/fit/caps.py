@@ -1,9 +1,8 @@
-"""The reflectance and the outline of each cap: they differ from cap to cap of a printed sensor.
+"""Fit of the reflectance and the outline of each cap, which differ from cap to cap of a printed sensor.
 
-The reflectance follows from the ratio of real to rendered light at a cap's middle. Light, window and blur drop out of this ratio; its
-median over the frames is not disturbed by bubbles and glints. The outline follows from a Gauss-Newton step on gray levels: if an
-outline of radius r(t) grows by dr(t), the image changes by ``-grad I . dr(t) e(t)``, where e(t) is the outward direction at the
-turn t as the camera sees it.
+The reflectance follows from the ratio of real to rendered light at a cap's middle. Light, window and blur cancel in this ratio, and bubbles
+and glints do not change its median over the frames. The outline follows from a Gauss-Newton step on gray levels: if an outline of radius
+r(t) grows by dr(t), the image changes by ``-grad I . dr(t) e(t)``, where e(t) is the outward direction at the azimuth t in the picture.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,19 +18,19 @@ from twin.judge.pictures.aligned import SATURATED, Aligned, revised, to_light
 
 # Highest order of an outline's harmonics.
 ORDERS = 6
-# Sd of a harmonic before frames are seen, cap radii; and of a gray level that outlines do not explain.
+# Prior standard deviation of a harmonic, cap radii; standard deviation of gray levels that outlines do not explain.
 SHAPE_SD, MISFIT_LEVELS = 0.03, 10.0
-# Pixels within this many cap radii of a cap's middle are compared.
+# Distance from a cap's middle, in cap radii, within which pixels are compared.
 REACH = 1.7
 # Bounds of a cap's relative reflectance, and of a harmonic, cap radii.
 LEVEL_BOUNDS, SHAPE_BOUND = (0.3, 3.0), 0.35
-# Largest change of a harmonic at once, cap radii: the slope of the gray levels holds no farther.
+# Largest change of a harmonic in one step, cap radii, within which the gray levels are nearly linear.
 LARGEST_STEP = 0.1
-# Percentile of the gray levels around a cap that stands for the skin.
+# Percentile of the gray levels around a cap that is taken as the skin's level.
 SKIN_PERCENTILE = 10.0
-# Power with which a correction of the reflectance is applied (damping).
+# Damping: exponent with which a correction factor of the reflectance is applied.
 DAMPING = 0.8
-# Prior of contrast and skin level, which are free: only so large that the equations can be solved.
+# Weight of the prior of contrast and skin level. They are free, so it is only large enough to make the equations solvable.
 FREE = 1e-6
 
 # shoot(spec, frames) gives the captured renders (H, W[, 3]) uint8 of the frames' states, without noise.
@@ -39,7 +38,7 @@ Shoot = Callable[[SensorSpec, list[Aligned]], Sequence[np.ndarray]]
 
 
 def fit_caps(spec: SensorSpec, frames: list[Aligned], shoot: Shoot) -> SensorSpec:
-    """One correction of every cap's reflectance and outline.
+    """Correct the reflectance and the outline of every cap once.
 
     Parameters
     ----------
@@ -51,7 +50,7 @@ def fit_caps(spec: SensorSpec, frames: list[Aligned], shoot: Shoot) -> SensorSpe
     Returns
     -------
     SensorSpec
-        With ``appearance.cap_levels``, ``cap_shapes`` and ``cap_offsets``.
+        The specification with new ``appearance.cap_levels``, ``cap_shapes`` and ``cap_offsets``.
     """
     rendered, look, count = shoot(spec, frames), spec.appearance, spec.pins.count
     level = np.array([_levels(spec.response, f, f.image) / _levels(spec.response, f, r) for f, r in zip(frames, rendered, strict=True)])
@@ -75,8 +74,8 @@ def fit_caps(spec: SensorSpec, frames: list[Aligned], shoot: Shoot) -> SensorSpe
 
 
 def outline_steps(spec: SensorSpec, frames: list[Aligned], rendered: Sequence[np.ndarray]) -> np.ndarray:
-    """Changes (N, 2 ORDERS + 1) of each outline's ``a_0, a_1, b_1, a_2, ...`` that bring renders nearer to the frames, in cap radii."""
-    unknowns = 2 * ORDERS + 3  # the last two: the cap's contrast and the skin's level
+    """Changes (N, 2 ORDERS + 1) of each outline's ``a_0, a_1, b_1, a_2, ...``, in cap radii, that make renders more like the frames."""
+    unknowns = 2 * ORDERS + 3  # the last two are the cap's contrast and the skin's level
     normal, right = np.zeros((spec.pins.count, unknowns, unknowns)), np.zeros((spec.pins.count, unknowns))
     for frame, image in zip(frames, rendered, strict=True):
         for cap, slopes, missing in _changes(spec, frame, image):
@@ -89,7 +88,7 @@ def outline_steps(spec: SensorSpec, frames: list[Aligned], rendered: Sequence[np
 
 
 def _changes(spec: SensorSpec, frame: Aligned, image: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """For each seen cap: index; slopes of its n pixels' gray levels by the unknowns (n, 2 ORDERS + 3); real minus rendered levels (n,)."""
+    """For each found cap: index; derivatives (n, 2 ORDERS + 3) of its n pixels' levels by the unknowns; real minus rendered levels (n,)."""
     state, real, ours = frame.state, gray_levels(frame.image).astype(np.float32), gray_levels(image).astype(np.float32)
     slope = np.stack([cv2.Sobel(ours, cv2.CV_32F, *way, ksize=3) / 8 for way in ((1, 0), (0, 1))], axis=-1)
     u = np.array([1.0, 0.0, 0.0]) - state.axis[:, :1] * state.axis
@@ -97,7 +96,7 @@ def _changes(spec: SensorSpec, frame: Aligned, image: np.ndarray) -> Iterator[tu
     face, radius = state.caps_mm + 0.5 * spec.pins.cap_height_mm * state.axis, 0.5 * spec.pins.cap_diameter_mm
     middle = project(spec.view, face)
     ways = u, np.cross(u, state.axis)
-    plane = np.stack([project(spec.view, face + radius * way) - middle for way in ways], axis=-1)  # px of a cap radius
+    plane = np.stack([project(spec.view, face + radius * way) - middle for way in ways], axis=-1)  # px per cap radius
     others = cKDTree(middle)
     height, width = real.shape
     for cap in np.flatnonzero(np.isfinite(frame.pins_px).all(axis=1)):
@@ -120,7 +119,7 @@ def _changes(spec: SensorSpec, frame: Aligned, image: np.ndarray) -> Iterator[tu
 
 
 def _levels(response: ResponseSpec, frame: Aligned, image: np.ndarray) -> np.ndarray:
-    """Light (N,) of the caps' middles, 3 x 3 px, summed over the channels; NaN where lost or saturated."""
+    """Light (N,) of the caps' middles, 3 x 3 px, summed over the channels; NaN if lost or saturated."""
     image = image if image.ndim == 3 else image[..., None]
     mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)
     seen = np.isfinite(frame.pins_px).all(axis=1)
@@ -131,6 +130,6 @@ def _levels(response: ResponseSpec, frame: Aligned, image: np.ndarray) -> np.nda
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """Median (N,) over the frames (M, N); NaN, without a warning, where no frame has a value."""
+    """Median (N,) over the frames (M, N). If no frame has a value it is NaN, without a warning."""
     some = np.isfinite(values).any(axis=0)
     return np.where(some, np.nanmedian(np.where(some, values, 1.0), axis=0), np.nan)

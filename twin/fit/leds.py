@@ -1,4 +1,4 @@
-"""The LEDs: their azimuths from the glow they throw on the ring, their place and shape from their reflections in the window."""
+"""Fit of the LEDs: azimuths to their glow on the ring, place and shape to their reflections in the window."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -14,46 +14,46 @@ from twin.fit.still import Still, fit_bounded, level_misfit, sampled, subpixel_o
 from twin.judge.pictures.aligned import revised, to_light
 from twin.optics.static_layer import reflections
 
-# Width of the part of the ring whose brightness tells the LEDs' azimuths, as a share of the disc's radius.
+# Width of the part of the ring in whose brightness the LEDs' azimuths are found, as a share of the disc's radius.
 GLOW_SHARE = 0.12
-# Sd of the Gaussian that smooths the brightness over the azimuth, deg.
+# Standard deviation of the Gaussian that smooths the brightness over the azimuth, deg.
 GLOW_SMOOTH_DEG = 4.0
-# A ring of like LEDs looks alike when it is turned by one LED. Of all turns that reach this share of the best one's brightness
-# the smallest is right.
+# Share of the largest brightness that a turn of the LEDs must reach. A ring of equal LEDs looks the same after a turn by one LED, so the
+# smallest of these turns is used.
 ALIKE = 0.97
-# An LED's glow and reflection are looked for this far from its azimuth, deg.
+# Largest difference from an LED's azimuth at which its glow and reflection are searched, deg.
 SECTOR_DEG = 13.0
-# A reflection is looked for outside this share of the disc's radius.
+# Share of the disc's radius outside of which reflections are searched.
 SECTOR_SHARE = 0.88
-# Nothing is looked for this close to the disc's edge, px: the edge itself is blurred.
+# Distance from the disc's edge, px, within which nothing is searched, because the edge is blurred.
 RIM_PX = 3.0
-# Sd of the Gaussian that is laid over the picture before the brightest place is taken, px.
+# Standard deviation of the Gaussian that smooths the picture before the brightest place is searched, px.
 HEART_SMOOTH_PX = 1.5
 # Radius of a reflection's bright middle, px.
 HEART_PX = 6.0
-# A reflection rises by at least this many gray levels above its surroundings.
+# Least difference between a reflection and its surroundings, gray levels.
 LEAST_RISE_LEVELS = 40.0
-# Half a side of the square in which a reflection is compared, px.
+# Half of the side of the square in which a reflection is compared, px.
 PATCH_PX = 11
 # Percentile of the gray levels in that square that is taken as the background.
 BACKGROUND_PERCENTILE = 25
 # Least and largest distance of the LEDs behind the window's back, mm.
 BEHIND_MM = (0.2, 4.0)
-# Bounds of what is fitted, as logarithms: the LED's side in mm, the share of its light outside the core (1 - core_share),
-# the core's sd in mm, and the radius relative to that of the reflections' middles.
+# Bounds of the fitted quantities, whose logarithms are fitted: the LED's side in mm, the share of its light outside the core
+# (1 - core_share), the core's standard deviation in mm, and the radius relative to that of the reflections' middles.
 BOUNDS = {"size_mm": (0.3, 5.0), "rest": (5e-4, 1.0), "core_mm": (0.04, 2.0), "radius": (0.98, 1.02)}
-# Starting values of the first three; each combination is tried, and the best one is refined.
+# Starting values of the first three. All combinations are tried, and the best one is refined.
 START_SIZES_MM = (0.7, 1.0, 1.4, 2.0)
 START_RESTS = (0.005, 0.02, 0.1, 0.4)
 START_CORES_MM = (0.06, 0.2, 0.4)
-# An LED may turn by this much from the azimuth of its reflection's middle, rad.
+# Largest difference between an LED's azimuth and that of its reflection's middle, rad.
 MOST_TURN_RAD = 0.06
 
 
 def turn_leds(spec: SensorSpec, still: Still) -> SensorSpec:
-    """The specification with the LEDs' azimuths as the brightness just outside the disc shows them.
+    """The specification with the LEDs' azimuths from the brightness just outside the disc.
 
-    All LEDs are turned together first; then each goes to the middle of its own glow.
+    First all LEDs are turned together, then each is moved to the middle of its own glow.
     """
     lit = lit_leds(spec.leds)
     glow = _glow_by_degree(still, spec.housing, spec.camera.distance_mm, spec.response)
@@ -81,7 +81,7 @@ def _glow_by_degree(still: Still, housing: HousingSpec, pupil_mm: float, respons
     beyond_mm = np.linalg.norm(out_mm, axis=-1) - housing.aperture_radius_mm
     near = (beyond_mm > 0) & (beyond_mm < GLOW_SHARE * housing.aperture_radius_mm)
     azimuth = np.degrees(np.arctan2(out_mm[near][:, 1], out_mm[near][:, 0])) % 360
-    degree = np.minimum(azimuth.astype(int), 359)  # the remainder of a tiny negative angle rounds to 360
+    degree = np.minimum(azimuth.astype(int), 359)  # a very small negative angle modulo 360 is rounded to 360
     sums = np.bincount(degree, to_light(still.gray[near], response), minlength=360)
     glow = sums / np.maximum(np.bincount(degree, minlength=360), 1)
     return gaussian_filter1d(glow, GLOW_SMOOTH_DEG, mode="wrap")
@@ -89,16 +89,16 @@ def _glow_by_degree(still: Still, housing: HousingSpec, pupil_mm: float, respons
 
 @dataclass(frozen=True)
 class _Reflections:
-    """Reflections of n LEDs that are seen, and what their fit holds fixed.
+    """Visible reflections of n LEDs, and the constants of their fit.
 
     Attributes
     ----------
     leds : list of int
-        Index of each one's LED.
-    azimuth_rad : (n,) float
-        Of each reflection's middle, and so of its LED.
-    radius_mm, z_mm : float
-        Of the LEDs, as the reflections' middles give it; their height, which is held.
+        Index of the LED of each reflection.
+        azimuth_rad : (n,) float
+            Azimuth of each reflection's middle, which is that of its LED.
+        radius_mm, z_mm : float
+            The LEDs' radius from the reflections' middles, and their height, which is held.
     rays : (n, s, s, SUBPIXELS, SUBPIXELS, 2) float
         Tangents in air of the places in the squares that are compared.
     used : (n, s, s) bool
@@ -120,10 +120,10 @@ class _Reflections:
 
 
 def fit_reflections(spec: SensorSpec, still: Still) -> SensorSpec:
-    """The specification with LEDs whose images in the window's back lie where the real ones do, and look like them.
+    """The specification with LEDs whose modelled reflections in the window have the place and the look of the real ones.
 
-    Radius, size, core and azimuths are fitted. An LED that shows no reflection keeps its azimuth; where none shows one,
-    the specification is returned as it is.
+    Radius, size, core and azimuths are fitted. An LED without a visible reflection keeps its azimuth. If no reflection is visible, the
+    specification is returned unchanged.
     """
     seen = _seen_reflections(spec, still)
     if seen is None:
@@ -143,16 +143,16 @@ def fit_reflections(spec: SensorSpec, still: Still) -> SensorSpec:
 
 
 def _seen_reflections(spec: SensorSpec, still: Still) -> _Reflections | None:
-    """The reflections in the still picture; None where there is none.
+    """The reflections in the still picture; None if there are none.
 
-    The mirror image of an LED at height z_led lies at ``2 back - z_led``. A ray of tangent t from the pupil meets that plane
-    at ``t (2 back - z_led + distance)`` from the axis. So only radius over that height is seen: the height is held (behind the
-    window), and the radius follows.
+    The mirror image of an LED at the height z_led is at ``2 back - z_led``. A ray of tangent t from the pupil meets that plane at the
+    distance ``t (2 back - z_led + distance)`` from the axis. Therefore only the ratio of radius to that height can be measured. The height
+    is held (behind the window), and the radius follows.
     """
     lens = spec.lens
     z_mm = float(np.clip(spec.leds.z_mm, lens.back_mm - BEHIND_MM[1], lens.back_mm - BEHIND_MM[0]))
     straight_mm = 2 * lens.back_mm - z_mm + spec.camera.distance_mm
-    disc = lens_disc(spec)
+    disc = lens_disc(spec.view, spec.housing)
     hearts = {k: at for k in lit_leds(spec.leds) if (at := _heart_px(still, disc, spec.leds.azimuth_deg[k])) is not None}
     if not hearts:
         return None
@@ -179,7 +179,7 @@ def _seen_reflections(spec: SensorSpec, still: Still) -> _Reflections | None:
 
 
 def _heart_px(still: Still, disc: Disc, azimuth_deg: float) -> np.ndarray | None:
-    """Place (2,) px of the bright middle of an LED's reflection just inside the rim; None where there is none."""
+    """Place (2,) px of the bright middle of an LED's reflection just inside the rim; None if there is none."""
     smooth = cv2.GaussianBlur(still.gray, (0, 0), HEART_SMOOTH_PX)
     apart = np.degrees(np.arctan2(still.tangents[..., 1], still.tangents[..., 0])) - azimuth_deg
     y, x = np.mgrid[: still.gray.shape[0], : still.gray.shape[1]]
@@ -202,7 +202,7 @@ def _led_shape(seen: _Reflections, values: np.ndarray) -> dict[str, float]:
 
 
 def _reflection_misfit(spec: SensorSpec, seen: _Reflections, values: np.ndarray) -> np.ndarray:
-    """Gray levels by which modelled reflections miss the real ones, over all squares; LED by LED, so that each is judged alone."""
+    """Differences in gray levels of modelled and real reflections in all squares. Each LED is modelled alone."""
     leds, misses = spec.leds, []
     shape = _led_shape(seen, values) | {"off": ()}
     for n, k in enumerate(seen.leds):

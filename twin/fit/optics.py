@@ -1,7 +1,7 @@
-"""A whole calibration of camera and light: from a folder of frames to a specification and a page.
+"""Calibration of camera and light by a folder of frames. The result are a specification and a page.
 
-The calibration runs in stages. Each stage's result is kept, so that an interrupted run goes on where it was. The page shows renders
-before and after the fit, what is left, and what changed.
+The calibration has stages. The result of each stage is stored, so that an interrupted run can be continued. The page shows renders before
+and after the fit, the remaining differences, and the changed values.
 """
 
 from collections.abc import Callable
@@ -22,6 +22,7 @@ from twin.fit.response import fit_blur, fit_focus, fit_noise, fit_response, shar
 from twin.fit.rim import fit_rim
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.fit.surroundings import fit_surroundings
+from twin.frames import distinct_stems
 from twin.frames.images import read_image, write_image
 from twin.judge.pictures.aligned import Aligned, read_frames, revised
 from twin.judge.pictures.images import compare_images, difference_picture
@@ -36,25 +37,27 @@ from twin.store import Item, inputs_digest, kept_arrays, kept_json
 from twin.types import Form, Frame
 
 FRAMES = 6
-"""Number of frames that are fitted, evenly spread over the folder."""
+"""Number of frames that are fitted, spread evenly over the folder."""
 SAMPLES = 16
-"""Samples a pixel of the renders."""
+"""Samples per pixel of the renders."""
 CAP_ROUNDS = 2
-"""Rounds of fitting caps and response in turn."""
+"""Rounds of fitting caps and response alternately."""
 HAZE_SIGMA_PX = 40.0
-"""Width of the haze to start from, px, where the specification has none."""
+"""Width of the haze, px, at the start of the fit if the specification has no haze."""
 LONGEST = 12
-"""The page shows lists of at most this many numbers; it tells the length of longer ones."""
+"""Most numbers of a list that the page shows. Of longer lists it shows only the length."""
 KINDS = {"real": "real", "before": "before", "after": "after", "residual": "what is left, twice amplified about middle gray"}
 """Kinds of pictures of a frame on the page, with their captions."""
+JUDGED = {"psnr_db": "PSNR, dB,", "ssim": "SSIM"}
+"""Figures that a fit may not lower without saying so, with their names."""
 ALWAYS = (
     "the response curve (gamma, black level): held; photograph a gray card at several exposures to know it",
     "LED power, exposure and reflectance: only their product is seen; the caps' brightest channel is taken as white resin",
     "the window's thickness and index, and the skin's thickness: held",
 )
-"""What no set of frames determines."""
+"""Parameters that no set of frames determines."""
 Stage = Callable[[SensorSpec], SensorSpec]
-"""One stage of the fit: from a specification to a better one."""
+"""One stage of the fit: a function from a specification to a better one."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +69,13 @@ class Calibration:
     spec : SensorSpec
         The fitted specification.
     before, after : dict of str to float
-        Image figures over the disc, mean of the frames: ``psnr_db``, ``ssim`` (colour) and so on.
-    notes : list of str
-        What the frames do not determine, and what was left out.
-    frames : list of Aligned
-        Frames to which it was fitted.
+        Image figures over the disc, mean over the frames: ``psnr_db``, ``ssim`` (colour) and others.
+        notes : list of str
+            Parameters that the frames do not determine, and what was left out.
+        frames : list of Aligned
+            The frames of the fit.
     first, last : list of (H, W[, 3]) uint8
-        Renders under the specification at the start and at the end.
+        Renders with the specification at the start and at the end.
     """
 
     spec: SensorSpec
@@ -83,25 +86,35 @@ class Calibration:
     first: list[np.ndarray]
     last: list[np.ndarray]
 
+    @property
+    def warnings(self) -> list[str]:
+        """What is worse than before the fit; empty if nothing is."""
+        return [
+            f"the fit ended worse than it began: {name} {self.before[key]:.4g} -> {self.after[key]:.4g}; look at the page before you use it"
+            for key, name in JUDGED.items()
+            if not self.after[key] >= self.before[key]
+        ]
+
 
 @dataclass(frozen=True)
 class OpticsCalibration:
-    """A fitted specification and the files of it, the ``.toml`` file first."""
+    """A fitted specification and its files, the ``.toml`` file first."""
 
     found: Calibration
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """For people: what the frames could not tell, and how near the twin came."""
+        """The result as lines of text: what the frames did not determine, and the image figures before and after."""
         before, after = self.found.before, self.found.after
         return [
             *(f"note: {note}" for note in self.found.notes),
+            *self.found.warnings,
             f"over the disc: PSNR {before['psnr_db']:.2f} -> {after['psnr_db']:.2f} dB, SSIM {before['ssim']:.3f} -> {after['ssim']:.3f}",
         ]
 
 
 class _Studio:
-    """Renders the states of frames under changing specifications."""
+    """Renders the states of frames with different specifications."""
 
     def __init__(self, bar: Bar, samples: int = SAMPLES) -> None:
         self._bar, self._samples = bar, samples
@@ -125,27 +138,29 @@ def calibrate_optics(
 ) -> OpticsCalibration:
     """Fit camera and light of a specification to a folder of raw frames, and write it.
 
-    Beside the specification a folder ``NAME-calibration`` holds the page and the stages' results: an interrupted run goes on there.
+    The folder ``NAME-calibration`` beside the specification holds the page and the results of the stages, so that an interrupted run can
+    be continued.
 
     Parameters
     ----------
     sensor : SensorSpec
-        Where the fit starts.
-    out : Path
-        The ``.toml`` file to write.
-    limit, no_contact
-        As ``fit_optics`` takes them.
+        The specification at the start of the fit.
+        out : Path
+            The ``.toml`` file to write.
+        limit, no_contact
+            As in ``fit_optics``.
 
     Raises
     ------
     FrameError
-        No frame can be used, or ``out`` is no name of a ``.toml`` file.
+        No frame can be used, or ``out`` is not the name of a ``.toml`` file.
     RenderError
-        Nothing can be rendered, or differentiated, here.
+        The renderer, or its differentiation, does not work on this machine.
     """
     folder = folder_beside(out, "calibration")
     found = fit_optics(frames, sensor, folder, limit=limit, no_contact=no_contact, progress=progress)
-    write_sensor(out, found.spec, f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.")
+    said = [f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.", *found.warnings]
+    write_sensor(out, found.spec, "\n".join(said))
     return OpticsCalibration(found, [out, write_page(folder, sensor, found, frames.name)])
 
 
@@ -165,11 +180,11 @@ def fit_optics(
     folder : Path
         Folder of raw frames.
     spec : SensorSpec
-        Where the fit starts: geometry and camera of the same kind of sensor.
-    work : Path
-        Folder for the stages' results. A second run with the same frames, start and code goes on from there.
-    limit : int
-        Number of frames to fit.
+        The specification at the start of the fit: geometry and camera of the same type of sensor.
+        work : Path
+            Folder for the results of the stages. A second run with the same frames, start and code continues from them.
+        limit : int
+            Number of frames to fit.
     no_contact : Path, optional
         A raw frame without contact, to which the camera is fitted first.
     progress : Progress
@@ -179,7 +194,7 @@ def fit_optics(
     FrameError
         No frame can be used, or their sizes differ.
     RenderError
-        Nothing can be rendered, or differentiated, here.
+        The renderer, or its differentiation, does not work on this machine.
     """
     notes, bar = list(ALWAYS), partial(stage, progress)
     if no_contact is not None:
@@ -190,7 +205,7 @@ def fit_optics(
     log = _Log(work, spec, raw)
     with bar("fit the skin to the pins") as step:
         frames = log.aligned(spec, raw, step)
-    inside, studio = lens_disc(spec).inside, _Studio(bar)
+    inside, studio = lens_disc(spec.view, spec.housing).inside, _Studio(bar)
     first = studio.shots(spec, frames, "render the start")
     for number, fit in enumerate(_stages(frames, inside, studio, bar)):
         spec = log.stage(f"{number:02d}-{fit.__name__}", fit, spec)
@@ -200,7 +215,7 @@ def fit_optics(
 
 
 def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar) -> list[Stage]:
-    """The stages of a fit to frames, in their order; ``inside`` (H, W) bool: the lens disc. A stage's name names its kept result."""
+    """The stages of a fit to frames, in their order; ``inside`` (H, W) bool is the lens disc. A stage's stored result has its name."""
 
     def surroundings(spec: SensorSpec) -> SensorSpec:
         with bar("fit the ring, the reflections, the specks") as step:
@@ -232,7 +247,7 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
 
 
 def _mean_figures(frames: list[Aligned], shots: list[np.ndarray], inside: np.ndarray) -> dict[str, float]:
-    """Image figures of renders against the frames over the lens disc (H, W) bool, mean of the frames."""
+    """Image figures of renders compared with the frames over the lens disc (H, W) bool, mean over the frames."""
     figures = [compare_images(frame.image, image, inside) for frame, image in zip(frames, shots, strict=True)]
     return {name: float(np.mean([getattr(each, name) for each in figures])) for name in vars(figures[0])}
 
@@ -249,19 +264,19 @@ def _pins_at_rest(path: Path, spec: SensorSpec) -> np.ndarray:
 
 
 class _Log:
-    """Results of the stages on disk, each under the digest of what it was made of."""
+    """Results of the stages on disk, each named with the digest of its inputs."""
 
     def __init__(self, work: Path, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
         self._folder, self._inputs = work, inputs_digest(spec, raw)
 
     def aligned(self, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]], progress: Step) -> list[Aligned]:
-        """Frames with their fitted skin, from disk where it is there. ``raw``: names, images, and pins (N, 2) px."""
+        """Frames with their fitted skin, read from disk if it was stored. ``raw`` holds names, images, and pins (N, 2) px."""
         fit: SkinFit | None = None
         frames = []
 
         def fitted(pins_px: np.ndarray) -> dict[str, np.ndarray]:
             nonlocal fit
-            fit = fit or SkinFit(spec)  # it takes seconds to build, and is not needed where all frames are there
+            fit = fit or SkinFit(spec)  # takes seconds to build, and is not needed if all frames were stored
             return vars(fit(pins_px))
 
         for done, (name, image, pins_px) in enumerate(raw):
@@ -272,19 +287,20 @@ class _Log:
         return frames
 
     def stage(self, name: str, run: Stage, spec: SensorSpec) -> SensorSpec:
-        """The stage's result, from disk where it is there."""
+        """The result of a stage, read from disk if it was stored."""
         item = Item(name, (__name__,), [self._inputs, spec])
         return SensorSpec.model_validate(kept_json(self._folder, item, lambda: run(spec).model_dump(mode="json")))
 
 
 def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) -> Path:
-    """Write ``index.html`` and its pictures into ``out``; the page's path."""
+    """Write ``index.html`` and its pictures to the folder ``out``, and return the page's path."""
     rows = _write_pictures(out / "pictures", found)
     lead = (
         f"{len(rows)} frames of {source}. Figures are over the lens disc, of renders without noise, the skin fitted to each frame's pins."
     )
     page = Page(f"Calibration of {found.spec.name}", "twin calibrate", topic="TacTip twin: calibration", lead=lead)
     figures: list[dict[str, object]] = [{"of": "before", **found.before}, {"of": "after", **found.after}]
+    page.notice("Worse than before the fit", found.warnings, tone="bad")
     page.table(figures, [Column("of", ""), *image_columns(mark_best=True)])
     if found.notes:
         page.section("What these frames do not determine")
@@ -300,18 +316,17 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
 
 
 def _write_pictures(folder: Path, found: Calibration) -> list[tuple[str, dict[str, Path]]]:
-    """Write four pictures of each frame (see ``KINDS``); the frame's name, and the pictures' paths by kind."""
+    """Write four pictures of each frame (see ``KINDS``). Returns the frame's name, and the pictures' paths by kind."""
     folder.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for frame, before, after in zip(found.frames, found.first, found.last, strict=True):
+    rows, stems = [], distinct_stems([frame.name for frame in found.frames])
+    for stem, frame, before, after in zip(stems, found.frames, found.first, found.last, strict=True):
         images = {"real": frame.image, "before": before, "after": after, "residual": difference_picture(frame.image, after)}
-        stem = Path(frame.name).stem
         rows.append((frame.name, {kind: write_image(folder / f"{stem}-{kind}.png", image) for kind, image in images.items()}))
     return rows
 
 
 def _changes(before: SensorSpec, after: SensorSpec) -> list[dict]:
-    """Every value that differs: ``name`` as section.key, ``before`` and ``after`` as text."""
+    """All values that differ: ``name`` is section.key, ``before`` and ``after`` are texts."""
     old, new = before.model_dump(), after.model_dump()
     found = []
     for section, values in new.items():

@@ -1,8 +1,8 @@
-"""Lights and colours from the gray levels of caps and skin, by Gauss-Newton on the differentiable renderer.
+"""Fit of lights and colours to the gray levels of caps and skin, by the Gauss-Newton method with the differentiable renderer.
 
-Only the product of LED power, exposure and reflectance is seen. Therefore the caps' largest reflectance is held at ``CAP_ALBEDO``
-(printed white) and the exposure stays as it is; the power follows. Caps that differ from the others count less (robust weights);
-``twin.fit.caps`` finds their own reflectance afterwards.
+Only the product of LED power, exposure and reflectance can be measured. Therefore the caps' largest reflectance is held at ``CAP_ALBEDO``
+(printed white) and the exposure is not changed; the power is fitted. Caps that differ from the others have smaller (robust) weights;
+``twin.fit.caps`` fits their individual reflectance afterwards.
 """
 
 from dataclasses import dataclass
@@ -21,41 +21,41 @@ from twin.progress import Step
 CAP_ALBEDO = 0.8
 """Reflectance of the caps' brightest channel. Assumed: white printing resin."""
 SKIN_SAMPLES = 250
-"""Pixels of bare skin that are taken from a frame."""
+"""Number of pixels of bare skin that are used of a frame."""
 SKIN_CLEARANCE = 0.6
-"""Bare skin is farther from every cap's middle than this share of the pins' spacing."""
+"""Least distance of a pixel of bare skin from every cap's middle, as a share of the pins' spacing."""
 DISC_SHARE = 0.9
-"""Pixels outside this share of the mask's radius are left out: light from the rim reaches them."""
+"""Share of the mask's radius outside of which pixels are left out, because light from the rim reaches them."""
 STEPS = 6
-"""Gauss-Newton steps."""
+"""Number of Gauss-Newton steps."""
 SLOPES_EVERY = 2
-"""Slopes are computed anew at every step of this number only: the light is nearly linear in the unknowns."""
+"""Number of steps after which derivatives are computed anew. The light is nearly linear in the unknowns."""
 ROBUST_LEVELS = 12.0
-"""Residual, gray levels, beyond which a sample counts less (Cauchy)."""
+"""Residual, gray levels, above which a sample has a smaller weight (Cauchy)."""
 BALANCE_SD = 0.3
-"""Sd of the logarithm of an LED's share before the frames are seen."""
+"""Prior standard deviation of the logarithm of an LED's share."""
 LARGEST_STEP = 0.7
 """Largest change of an unknown (a logarithm) in one step."""
 DAMPING = 1e-9
-"""Damping of the normal equations, relative to their trace: keeps them solvable."""
+"""Damping of the normal equations, relative to their trace, which keeps them solvable."""
 MOST_HAZE = 0.5
 """Largest haze that is allowed."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Places in one frame.
+    """Sampled places in one frame.
 
     Attributes
     ----------
     pixels : (n, 2) int
-        x and y.
+        x and y of each place.
     levels : (n, channels) float
         Gray levels.
     veil : (n, channels) float
-        Light of the blurred frame, which haze spreads.
-    caps : (n,) bool
-        Whether the place is a cap; bare skin otherwise.
+        Light of the blurred frame, which the haze adds.
+        caps : (n,) bool
+            Whether the place is on a cap; otherwise it is on bare skin.
     """
 
     pixels: np.ndarray
@@ -83,23 +83,23 @@ class PhotometryFit:
 def sample_frame(
     frame: Aligned, around: tuple[np.ndarray, np.ndarray], response: ResponseSpec, gel: GelSpec, blob: BlobSpec, rng: np.random.Generator
 ) -> Samples:
-    """Caps' middles and bare skin of a frame, each the mean of 3 x 3 px.
+    """Sample the caps' middles and bare skin of a frame. Each sample is the mean of 3 x 3 px.
 
-    The veil is the light that haze spreads: the frame's own light, blurred. Where the static layer covers the gel, the frame is often
-    saturated and the layer's own light is taken instead.
+    The veil is the light that haze adds: the frame's own light, blurred. Where the static layer covers the gel, the frame is often
+    saturated; there the layer's own light is used instead.
 
     Parameters
     ----------
     frame : Aligned
     around : (H, W[, 3]) float, (H, W) float
-        The static layer's light, and the share of the gel's light that it lets through.
+        The static layer's light, and its transmittance for the gel's light.
     response : ResponseSpec
     gel : GelSpec
-        Its haze's width.
-    blob : BlobSpec
-        Its mask.
-    rng : numpy.random.Generator
-        Chooses the pixels of bare skin.
+        Gives the width of the haze.
+        blob : BlobSpec
+            Gives the mask.
+        rng : numpy.random.Generator
+            Generator that chooses the pixels of bare skin.
     """
     image = frame.image if frame.image.ndim == 3 else frame.image[..., None]
     mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)
@@ -118,12 +118,12 @@ def sample_frame(
 
 
 def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> PhotometryFit:
-    """Recover LED powers, colours of caps and skin, and the gel's haze.
+    """Fit LED powers, colours of caps and skin, and the gel's haze.
 
     Parameters
     ----------
     spec : SensorSpec
-        Where the fit starts; its geometry and response stay.
+        The specification at the start of the fit. Geometry and response are not changed.
     frames : list of Aligned
     progress : callable
         ``progress(done, total)``.
@@ -171,7 +171,7 @@ def _rms(residual: np.ndarray) -> float:
 
 
 class _Layout:
-    """The place of each knob in the vector of unknowns: logarithms of the factors on LEDs, skin and caps, then the haze."""
+    """Order of the unknowns in their vector: logarithms of the factors on LEDs, skin and caps, then the haze."""
 
     def __init__(self, leds: int, channels: int) -> None:
         self.leds, self.channels = leds, channels
@@ -179,7 +179,7 @@ class _Layout:
         self.skin, self.caps = slice(leds, leds + channels), slice(leds + channels, leds + 2 * channels)
 
     def start(self, models: list[LightModel], cap_light: np.ndarray, caps: np.ndarray, haze: float) -> np.ndarray:
-        """Unknowns to start from: neutral, but caps (and skin alike) scaled to the median of the real ``cap_light`` (n, channels)."""
+        """Unknowns at the start: neutral, but caps and skin are scaled to the median of the real ``cap_light`` (n, channels)."""
         x = np.zeros(self.count)
         light = np.concatenate([m.light(self.knobs(x)) for m in models])
         ratio = np.median(cap_light, axis=0) / np.median(light[caps], axis=0)
@@ -188,7 +188,7 @@ class _Layout:
         return x
 
     def knobs(self, x: np.ndarray) -> Knobs:
-        """The light model's knobs; stems go with the skin."""
+        """The light model's knobs. The stems have the knob of the skin."""
         skin, caps = (np.broadcast_to(np.exp(x[part]), 3) for part in (self.skin, self.caps))
         return Knobs(np.exp(x[: self.leds]), skin, caps, skin)
 
@@ -205,9 +205,9 @@ class _Layout:
         return result
 
     def move(self, jacobian: np.ndarray, residual: np.ndarray, x: np.ndarray, frames: int) -> np.ndarray:
-        """The Gauss-Newton step (unknowns,) from ``x``, for residuals (n, channels) of so many frames; outliers count less (Cauchy).
+        """The Gauss-Newton step (unknowns,) from ``x`` for residuals (n, channels) of ``frames`` frames, with robust weights (Cauchy).
 
-        The prior of the LEDs' shares counts as much as one of the frames.
+        The prior of the LEDs' shares has the weight of one frame.
         """
         weight = 1 / (1 + (residual / ROBUST_LEVELS) ** 2)
         a = jacobian.reshape(-1, len(x))
@@ -217,7 +217,7 @@ class _Layout:
         return np.linalg.solve(hessian + np.diag(prior + DAMPING * hessian.trace()), a.T @ (weight * residual).ravel() - prior * x)
 
     def applied(self, spec: SensorSpec, x: np.ndarray) -> SensorSpec:
-        """The specification with the unknowns put in; the ring's own look keeps its brightness."""
+        """The specification with the values of the unknowns. The brightness of the visible ring is kept."""
         lit = [k for k in range(len(spec.leds.azimuth_deg)) if k not in spec.leds.off]
         balance = np.array(spec.leds.balance or np.ones(len(spec.leds.azimuth_deg)))
         balance[lit] *= np.exp(x[: self.leds])

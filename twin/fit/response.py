@@ -1,4 +1,4 @@
-"""Sharpness, colour fringes, compression and noise of the camera, from whole frames with the light already right."""
+"""Fit of the camera's sharpness, colour fringes, compression and noise to whole frames, after the light was fitted."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,43 +16,43 @@ from twin.judge.pictures.spectra import bin_of, equal_count_edges, noise_sd
 from twin.judge.pictures.statistics import bare_skin
 from twin.pins.caps import measure_caps
 
-# Least value, largest value and step for slopes of what is fitted: in ``[response]``, ...
+# Fitted quantities in ``[response]``: least value, largest value, and step of the numerical derivatives.
 BOUNDS = {
     "blur_sigma_px": (0.05, 4.0, 0.03),
     "sharpening": (0.0, 4.0, 0.05),
     "sharpening_sigma_px": (0.5, 4.0, 0.05),
 }
-# ... of colour cameras also the softness of colour (``[response]``) and the fringes (``[camera]``).
+# The same for the further quantities of colour cameras: softness of colour (``[response]``) and fringes (``[camera]``).
 CHROMA = {"chroma_sigma_px": (0.05, 4.0, 0.05)}
 FRINGES = {"red_scale": (0.985, 1.015, 0.0003), "blue_scale": (0.985, 1.015, 0.0003)}
 SHIFTS = {f"{colour}_shift_px.{axis}": (-3.0, 3.0, 0.03) for colour in ("red", "blue") for axis in (0, 1)}
-# Least sharpening to start from: without sharpening its width has no effect.
+# Least sharpening at the start, because without sharpening its width has no effect.
 LEAST_SHARPENING = 0.2
-# Columns share their colour if the step inside a pair is less than this share of the step to the next pair.
+# Ratio of the colour step within a pair of columns to the step to the next pair, below which the columns of a pair share their colour.
 SAME_CHROMA = 0.5
 # JPEG qualities that are tried (0: not compressed).
 QUALITIES = (0, 95, 90, 80, 70)
-# Residual, gray levels, beyond which a pixel counts less (soft L1).
+# Residual, gray levels, above which a pixel has a smaller weight (soft L1).
 ROBUST_LEVELS = 10.0
-# Evaluations of the least squares.
+# Most evaluations of the least-squares fit.
 MOST_TRIES = 10
-# Frames that the sharpness is fitted to, and pixels of them: one in this many, in both directions.
+# Most frames that the sharpness is fitted to; one pixel in EVERY is used in each direction.
 MOST_FRAMES, EVERY = 3, 3
-# Largest aperture, mm: a larger one would need more samples a pixel than frames for learning have.
+# Largest aperture, mm. A larger one would need more samples per pixel than the frames for training have.
 MOST_APERTURE_MM = 3.0
-# Range of the focus, relative to the nearest and farthest caps, and values that are tried of focus and aperture.
+# Range of the focus, relative to the distances of the nearest and farthest caps; number of tried values of focus and of aperture.
 FOCUS_RANGE, TRIED = (0.85, 1.15), 31
-# 10-90 % edge width of a Gaussian blur relative to its sd.
+# Ratio of the 10-90 % edge width of a Gaussian blur to its standard deviation.
 GAUSSIAN_WIDTH = 2.563
-# 10-90 % edge width of a uniform disc relative to its diameter.
+# Ratio of the 10-90 % edge width of a uniform disc to its diameter.
 DISC_WIDTH = 0.69
-# Least squared noise of a render, gray levels^2, to divide by; and least share of it that the real noise may have.
+# Least variance of a render's noise, gray levels^2, that is divided by; least ratio of the real noise to it.
 LEAST_NOISE2, LEAST_NOISE_SHARE = 1e-4, 0.01
 
 
 @dataclass(frozen=True)
 class Sharpness:
-    """Cap edge widths (10-90 %, px) by distance to the pupil: real and rendered medians of each of ``distance_mm``'s bins."""
+    """Cap edge widths (10-90 %, px) by distance to the pupil: medians of real and of rendered ones in each bin of ``distance_mm``."""
 
     distance_mm: np.ndarray
     real_px: np.ndarray
@@ -60,7 +60,7 @@ class Sharpness:
 
 
 def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], inside: np.ndarray) -> SensorSpec:
-    """Blur, sharpening and colour fringes by least squares over the disc, then the compression that fits best.
+    """Fit blur, sharpening and colour fringes by least squares over the disc, then choose the compression that fits best.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     real = np.concatenate([f.image[u].astype(float).ravel() for f, u in zip(frames, useful, strict=True)])
     images = [f.image for f in frames]
     stream = {"stream": stream_of(images), "chroma_columns": chroma_columns(images)}
-    flat = revised(spec, response={"jpeg_quality": 0} | stream, gel={"haze": 0.0})  # the light is hazed already
+    flat = revised(spec, response={"jpeg_quality": 0} | stream, gel={"haze": 0.0})  # the light already includes the haze
 
     def with_values(values: np.ndarray) -> SensorSpec:
         return _changed(flat, dict(zip(names, map(float, values), strict=True)))
@@ -121,14 +121,14 @@ def chroma_columns(images: list[np.ndarray]) -> int:
 
 
 def _value(response: ResponseSpec, camera: CameraSpec, name: str) -> float:
-    """Value of what is fitted, by its name in the tables above; ``.0`` and ``.1`` are x and y of a shift."""
+    """Value of a fitted quantity, by its name in the tables above; ``.0`` and ``.1`` are x and y of a shift."""
     field, _, index = name.partition(".")
     value = getattr(response if field in BOUNDS | CHROMA else camera, field)
     return value[int(index)] if index else value
 
 
 def _changed(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
-    """The specification with values of what is fitted."""
+    """The specification with values of the fitted quantities."""
     response = {name: value for name, value in values.items() if name in BOUNDS | CHROMA}
     camera: dict[str, Any] = {name: value for name, value in values.items() if name in FRINGES}
     for name in values.keys() & SHIFTS.keys():
@@ -152,9 +152,9 @@ def sharpness(spec: SensorSpec, frames: list[Aligned], rendered: Sequence[np.nda
 
 
 def fit_blur(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], rounds: int = 3) -> SensorSpec:
-    """The specification with the blur that makes rendered edges as wide as real ones, all caps together.
+    """The specification with the blur for which rendered edges are as wide as real ones, in the mean over all caps.
 
-    Least squares on gray levels would find too much blur, because real and rendered edges do not lie exactly on each other.
+    A least-squares fit to gray levels would give too much blur, because real and rendered edges are not exactly at the same place.
     """
     for _ in range(rounds):
         seen = sharpness(spec, frames, [expose(x, spec.capture) for x in light], bins=1)
@@ -165,10 +165,10 @@ def fit_blur(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], r
 
 
 def fit_focus(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
-    """Aperture and focus whose defocus explains how the edges' width changes with distance.
+    """The specification with the aperture and the focus that explain how the edges' width changes with distance.
 
-    The circle of confusion of a point at d with the focus at d0 is ``f a |1/d - 1/d0|`` px, and squares of widths add. Both values
-    are found on a grid. A part of the width that is the same at all distances is left to the blur.
+    The circle of confusion of a point at the distance d with the focus at d0 is ``f a |1/d - 1/d0|`` px, and the squares of widths add up.
+    Both values are found on a grid. A part of the width that is the same at all distances is attributed to the blur.
     """
     before = defocus_px(spec.camera.fx_px, spec.camera.aperture_mm, spec.camera.focus_mm, seen.distance_mm)
     wanted = seen.real_px**2 - seen.rendered_px**2 + (DISC_WIDTH * before) ** 2
@@ -183,21 +183,22 @@ def fit_focus(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
 
 
 def defocus_px(focal_px: float, aperture_mm: float, focus_mm: float, distance_mm: np.ndarray) -> np.ndarray:
-    """Diameter of the circle of confusion, px, of what lies at ``distance_mm`` from the pupil."""
+    """Diameter of the circle of confusion, px, of points at ``distance_mm`` from the pupil."""
     return focal_px * aperture_mm * np.abs(1 / distance_mm - 1 / focus_mm)
 
 
 def apparent_mm(z_mm: np.ndarray, pupil_mm: float, lens: LensSpec, gel_index: float) -> np.ndarray:
-    """Distance from the pupil, in air, at which what lies at ``z_mm`` in the gel seems to be, near the axis.
+    """Apparent distance from the pupil, in air, of points near the axis at ``z_mm`` in the gel.
 
-    A layer of thickness h and index n looks h / n thick (paraxial). ``pupil_mm``: distance of the pupil from the dome's centre.
+    A layer of thickness h and index n has the apparent thickness h / n (paraxial). ``pupil_mm`` is the distance of the pupil from the
+    dome's centre.
     """
     return lens.back_mm + pupil_mm + lens.thickness_mm / lens.refractive_index + (z_mm - lens.z_mm) / gel_index
 
 
 def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], rounds: int = 3) -> SensorSpec:
-    """The specification with its noise scaled until bare skin is as rough in renders as in the real frames."""
-    disc, scale = lens_disc(spec), 1.0
+    """The specification with its noise scaled so that bare skin has the same noise in renders as in the real frames."""
+    disc, scale = lens_disc(spec.view, spec.housing), 1.0
     bare = [bare_skin(f.image.shape, f.pins_px, disc) for f in frames]
 
     def roughness(images: Iterable[np.ndarray]) -> float:
@@ -213,5 +214,5 @@ def fit_noise(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray], 
 
 
 def _noise(response: ResponseSpec, scale: float) -> dict[str, float]:
-    """Fields of ``[response]`` for its noise with the sd times ``scale``."""
+    """Fields of ``[response]`` for noise whose standard deviation is multiplied by ``scale``."""
     return {"read_noise": response.read_noise * scale, "shot_noise": response.shot_noise * scale**2}

@@ -1,4 +1,4 @@
-"""The light at the edge of the disc that no formula describes (glue, burrs, glare): measured, as a table by azimuth and radius."""
+"""Measurement of the light at the edge of the disc that no formula describes (glue, burrs, glare), as a table by azimuth and radius."""
 
 import numpy as np
 
@@ -9,23 +9,23 @@ from twin.judge.pictures.aligned import SATURATED, Aligned, revised, to_light
 from twin.optics.lens import ray_table
 from twin.optics.static_layer import RIM_UNIT, rim_places, static_layer
 
-# How far the table reaches inwards and outwards from the edge of the housing's opening, mm: no pin comes so near to the edge.
+# Distances from the edge of the housing's opening, inwards and outwards, that the table covers, mm. No pin comes so near to the edge.
 INSIDE_MM, OUTSIDE_MM = 1.75, 0.4
-# Entries of the table. The radius has many for its width, because the light changes steeply at the edge.
+# Number of azimuths and of radii in the table. There are many radii, because the light changes steeply at the edge.
 AZIMUTHS, RADII = 240, 32
-# Rounds of correcting, and the share of what is missing that each adds. Blur and sharpening between table and pixels need several.
+# Rounds of correction, and share of the missing light that each round adds. Several are needed because blur and sharpening follow.
 ROUNDS, GAIN = 3, 0.9
 
 
 def fit_rim(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray]) -> SensorSpec:
-    """The specification with ``housing.rim``: what real frames show beyond rendered ones, mean of the frames.
+    """The specification with ``housing.rim``: the light of real frames minus that of rendered ones, mean over the frames.
 
     A saturated pixel never lowers the light.
 
     Parameters
     ----------
     spec : SensorSpec
-        Everything else already fitted.
+        A specification in which everything else was fitted.
     frames : list of Aligned
     light : list of (H, W, 3) or (H, W) float
         Rendered light of each frame's state.
@@ -59,7 +59,7 @@ def _with_rim(spec: SensorSpec, inner_mm: float, outer_mm: float, table: np.ndar
 
 
 def _missing(spec: SensorSpec, frame: Aligned, light: np.ndarray) -> np.ndarray:
-    """Light of a real frame beyond that of a render, in the renderer's unit."""
+    """Light of a real frame minus that of a render, in the renderer's unit."""
     shown = expose(light, spec.capture)
     lacking = to_light(frame.image, spec.response) - to_light(shown, spec.response)
     return np.where((frame.image >= SATURATED) & (shown >= SATURATED), 0.0, lacking)

@@ -1,6 +1,7 @@
-"""The housing's opening and the bright ring around it, fitted to the still picture.
+"""Fit of the housing's opening and the bright ring around it to the still picture.
 
-First the edge of the disc through which the gel is seen: it tells where the opening lies. Then the light of ring and wall outside it.
+First the edge of the disc through which the gel is seen is found, because it is the edge of the opening. Then the light of ring and wall
+outside of it is fitted.
 """
 
 from dataclasses import dataclass
@@ -17,25 +18,26 @@ from twin.judge.pictures.aligned import revised, to_light
 from twin.optics.static_layer import housing_light
 
 RAYS = 720
-"""Rays from the disc's centre along which the edge is looked for."""
+"""Number of rays from the disc's centre along which the edge is searched."""
 REACHES = ((0.75, 1.3), (0.9, 1.1), (0.9, 1.1))
-"""Where each pass looks for the edge, as shares of the radius found so far. The first pass is wide: the specification may be wrong."""
+"""Range in which each pass searches the edge, relative to the radius found so far. It is wide in the first pass, because the specification
+may be wrong."""
 STEP_PX = 0.25
 """Step along a ray, px."""
 TOP_PX = 4.0
-"""The ring's light is read this far outside the place where the ring begins, px."""
+"""Distance outside the beginning of the ring at which its light is measured, px."""
 RING_BEGINS = 0.9
-"""The ring begins where the mean light along the rays reaches this share of its largest value."""
+"""Share of the largest mean light along the rays at which the ring begins."""
 TOP_HALF_STEPS = 4
-"""Half of the width over which the ring's light is averaged, in steps along a ray."""
+"""Half of the length over which the ring's light is averaged, in steps along a ray."""
 EDGE_PX = 0.5
-"""Residual, px, beyond which a place of the edge counts less. Cables and flaws of the rim stand out by more."""
+"""Residual, px, above which a place of the edge has a smaller weight. Cables and flaws of the rim have larger residuals."""
 LEAST_RAYS = 0.5
 """Least share of the rays that must cross an edge."""
 EVERY = 6
-"""Of this many pixels one is compared, in both directions: the ring's light is smooth."""
+"""One pixel in this many is compared, in each direction, because the ring's light is smooth."""
 RIM_PX = 3.0
-"""Pixels this close to the disc's edge are left out, px, because the edge itself is blurred."""
+"""Distance from the disc's edge, px, within which pixels are left out, because the edge is blurred."""
 BOUNDS = {
     "ambient": (0.01, 50.0),
     "ambient_falloff_mm": (1.0, 300.0),
@@ -51,13 +53,14 @@ BOUNDS = {
 """Least and largest value of each fitted quantity; their logarithms are fitted. ``glow_radius_mm`` is relative to the opening's radius;
 ``red`` and ``blue`` are the wall's reflectance relative to green."""
 START_LIPS_MM = (0.4, 1.0, 2.0, 3.5)
-"""Widths of the lip to start from, mm. The step at the lip makes local optima: each start is tried, and the best one is refined."""
+"""Widths of the lip, mm, at which the fit is started. The step at the lip causes local optima, so all starts are tried and the best one is
+refined."""
 TRIAL_STEPS = 8
-"""Steps of the fit from each of these starts."""
+"""Steps of the fit from each start."""
 SMOOTH_STEPS = 40
 """Steps of the fit without a step at the lip."""
 LEAST_STEP_GAIN = 0.05
-"""There is a step at the lip only if it lowers the misfit by at least this share against the fit without one."""
+"""Least relative decrease of the misfit by a step at the lip, compared with the fit without a step."""
 LEAST_START = 1e-3
 """Least starting value, because its logarithm is taken."""
 NO_STEP = -1e-6
@@ -75,7 +78,7 @@ def fit_disc_edge(spec: SensorSpec, still: Still) -> SensorSpec:
         There is no bright ring around a darker disc.
     """
     light = to_light(still.gray, spec.response)
-    disc = lens_disc(spec)
+    disc = lens_disc(spec.view, spec.housing)
     for reach in REACHES:
         edge_px = _edge_places(light, disc.center_px, disc.radius_px, reach, spec.name)
         x, y, radius = _circle_through(edge_px, [*disc.center_px, disc.radius_px], EDGE_PX)
@@ -115,7 +118,7 @@ def _edge_places(light: np.ndarray, center_px: np.ndarray, radius_px: float, rea
 
 
 def _circle_through(points: np.ndarray, start: list[float], scale: float) -> tuple[float, float, float]:
-    """Centre and radius of the circle through most of the points (n, 2); residuals beyond ``scale`` count less (Cauchy)."""
+    """Centre and radius of the circle fitted to points (n, 2). Residuals above ``scale`` have a smaller weight (Cauchy)."""
     fit = least_squares(lambda c: np.linalg.norm(points - c[:2], axis=1) - c[2], start, loss="cauchy", f_scale=scale)
     x, y, radius = fit.x.tolist()
     return x, y, radius
@@ -123,20 +126,20 @@ def _circle_through(points: np.ndarray, start: list[float], scale: float) -> tup
 
 @dataclass(frozen=True)
 class _Wall:
-    """Pixels of the still picture that are compared, thinned out, and what lies behind their light.
+    """The thinned-out pixels of the still picture that are compared, and the constants of their modelled light.
 
     Attributes
     ----------
     at_mm : (h, w, 2) float
-        Where each pixel's ray meets the housing's plane.
-    wall, compared : (h, w) bool
-        Pixels that show the wall; those whose misfit counts.
-    levels, inside : (h, w, 3) float
-        Gray levels; their light, which stays as it is inside the disc.
-    loss : (h, w, 1) float
-        Vignetting.
-    haze : GelSpec
-        Haze, its width in thinned-out pixels.
+        Place at which each pixel's ray meets the housing's plane.
+        wall, compared : (h, w) bool
+            Pixels that show the wall; pixels whose misfit is fitted.
+        levels, inside : (h, w, 3) float
+            Gray levels; their light, which is not modelled inside the disc.
+        loss : (h, w, 1) float
+            Factor of the vignetting.
+        haze : GelSpec
+            The gel, with the haze's width in thinned-out pixels.
     """
 
     at_mm: np.ndarray
@@ -151,7 +154,7 @@ class _Wall:
 def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
     """The specification with the light of ring and wall outside the disc.
 
-    Only the product of ``housing.albedo`` and light is seen, so the albedo's largest channel stays as it is.
+    Only the product of ``housing.albedo`` and light can be measured, so the largest channel of the albedo is not changed.
     """
     seen, start, names = _thinned(spec, still), _start_values(spec.housing), list(BOUNDS)
     low, high = np.log(np.array(list(BOUNDS.values())).T)
@@ -180,10 +183,10 @@ def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
 
 
 def _thinned(spec: SensorSpec, still: Still) -> _Wall:
-    """What is compared of the still picture."""
+    """Thin out the still picture, and compute the constants of the model."""
     ring, few = spec.housing, (slice(None, None, EVERY),) * 2
     at_mm = still.tangents[few] * (ring.z_mm + spec.camera.distance_mm)
-    margin_mm = RIM_PX * ring.aperture_radius_mm / lens_disc(spec).radius_px
+    margin_mm = RIM_PX * ring.aperture_radius_mm / lens_disc(spec.view, spec.housing).radius_px
     beyond_mm = np.linalg.norm(at_mm - ring.center_mm, axis=-1) - ring.aperture_radius_mm
     return _Wall(
         at_mm=at_mm,
@@ -197,7 +200,7 @@ def _thinned(spec: SensorSpec, still: Still) -> _Wall:
 
 
 def _start_values(ring: HousingSpec) -> dict[str, float]:
-    """The specification's values of what is fitted, in the order of ``BOUNDS``."""
+    """The specification's values of the fitted quantities, in the order of ``BOUNDS``."""
     red, green, blue = ring.albedo
     start = {name: getattr(ring, name) for name in BOUNDS if hasattr(ring, name)} | {"red": red / green, "blue": blue / green}
     return start | {"glow_radius_mm": start["glow_radius_mm"] / ring.aperture_radius_mm}

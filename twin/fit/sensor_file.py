@@ -5,7 +5,7 @@ from pathlib import Path
 
 from scenes.sensor import SensorSpec
 from scenes.write import sensor_files
-from twin.errors import FrameError
+from twin.errors import OptionError
 from twin.store import write_text
 
 
@@ -33,7 +33,7 @@ def folder_beside(out: Path, kind: str) -> Path:
         ``out`` is no name of a ``.toml`` file.
     """
     if out.suffix != ".toml":
-        raise FrameError(f"--out {out}: give the name of a .toml file")
+        raise OptionError(f"--out {out}: give the name of a .toml file")
     folder = out.with_name(f"{out.stem}-{kind}")
     folder.mkdir(parents=True, exist_ok=True)
     return folder

@@ -1,4 +1,4 @@
-"""Specks on the window (bubbles, grains, dust): bright spots that stay where they are while pins pass behind them."""
+"""Fit of specks on the window (bubbles, grains, dust): bright spots that do not move while pins pass behind them."""
 
 from dataclasses import dataclass
 
@@ -14,43 +14,44 @@ from twin.judge.pictures.aligned import revised, to_light
 from twin.judge.pictures.spots import clear_of_pins, pin_spacing_px
 from twin.optics.static_layer import reflections
 
-# Nothing is looked for this close to the disc's edge, px: the edge itself is blurred.
+# Distance from the disc's edge, px, within which nothing is searched, because the edge is blurred.
 RIM_PX = 3.0
-# A place is clear in a frame if every pin's middle is farther from it than this share of the pins' spacing.
+# Least distance of every pin's middle from a place that is clear in a frame, as a share of the pins' spacing.
 CLEAR_SHARE = 0.41
-# A cap is right behind a place if its middle is nearer than this share of the pins' spacing.
+# Distance of a cap's middle, as a share of the pins' spacing, below which the cap is directly behind a place.
 BEHIND_SHARE = 0.28
-# Least number of frames in which a place must be clear, and least number of caps behind a speck that tell its opacity.
+# Least number of frames in which a place must be clear, and least number of caps behind a speck from which its opacity is measured.
 LEAST_FRAMES = 3
-# Neighbours of such a cap whose light stands for that of the cap without the speck.
+# Number of neighbours of such a cap whose light is taken as that of the cap without the speck.
 NEIGHBOURS = 6
-# Side of the median filter, px, that a speck rises above; and gray levels by which it does.
+# Side of the median filter that gives the ground, px; least difference of a speck from the ground, gray levels.
 GROUND_PX, LEAST_RISE_LEVELS = 25, 8.0
 # Least and largest area of a speck, px^2.
 AREA_PX2 = (3, 90)
 # Least area of a speck relative to that of the circle around it.
 LEAST_ROUNDNESS = 0.45
-# Least share of a speck's border where the window is seen.
+# Least share of a speck's border at which the window is visible.
 LEAST_CLEAR_BORDER = 0.7
 # Side of the square by which the LEDs' reflections are grown before they are left out, px.
 REFLECTION_MARGIN_PX = 9
-# Half a side of the square in which a speck is compared, px.
+# Half of the side of the square in which a speck is compared, px.
 PATCH_PX = 6
-# Bounds of a speck's radius, mm, and light; and of its place about the first guess, mm.
+# Bounds of a speck's radius, mm, and of its light; largest distance of its place from the first guess, mm.
 RADIUS_MM, LIGHT, MOST_MOVE_MM = (0.03, 0.6), (1e-4, 3.0), 0.15
 # Starting value of the radius, mm.
 START_RADIUS_MM = 0.15
-# Share of the squared misfit around it that a speck must explain: else it is no soft disc, and is left out.
+# Least share of the squared misfit around a speck that its model must explain. Otherwise it is not a soft disc, and is left out.
 LEAST_GAIN = 0.6
-# Most specks that are kept, the most significant ones first.
+# Most specks that are kept. The most significant ones are kept.
 MOST_SPECKS = 60
-# Opacity where no cap passes behind any speck. (An unmeasured speck otherwise takes that of the speck most like it in brightness.)
+# Opacity of all specks if no cap passes behind any of them. If some were measured, the others have the opacity of the speck with the most
+# similar brightness.
 PLAIN_OPACITY = 0.5
 
 
 @dataclass(frozen=True)
 class _WindowView:
-    """The window as the frames show it where pins leave it clear.
+    """The window, from the frames in which no pin is near a place.
 
     Attributes
     ----------
@@ -58,15 +59,15 @@ class _WindowView:
         All frames.
     pins_px : (M, N, 2) float
     spacing_px : float
-        Of the pins in the first frame.
-    usable : (H, W) bool
-        In the disc, away from the LEDs' reflections, and clear of pins in enough frames.
+        Spacing of the pins in the first frame.
+        usable : (H, W) bool
+            Pixels in the disc that are away from the LEDs' reflections, and clear of pins in enough frames.
     behind : (H, W) float32
-        Median gray level over the frames in which a pixel is clear; 0 where it is not usable.
-    ground : (H, W) float32
-        The same without small bright spots.
-    place_mm : (H, W, 2) float
-        Where each pixel's ray leaves the window into the gel.
+        Median gray level over the frames in which a pixel is clear; 0 if it is not usable.
+        ground : (H, W) float32
+            ``behind`` without small bright spots.
+        place_mm : (H, W, 2) float
+            Place at which each pixel's ray passes from the window into the gel.
     """
 
     gray: np.ndarray
@@ -79,12 +80,12 @@ class _WindowView:
 
     @property
     def rise(self) -> np.ndarray:
-        """(H, W) gray levels above the ground; 0 where it is not usable."""
+        """(H, W) gray levels above the ground; 0 for pixels that are not usable."""
         return np.where(self.usable, self.behind - self.ground, 0)
 
 
 def fit_specks(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.ndarray) -> SensorSpec:
-    """The specification with the specks that frames (M, H, W, 3) uint8 with pins at (M, N, 2) px show."""
+    """The specification with the specks in frames (M, H, W, 3) uint8, whose pins are at (M, N, 2) px."""
     view = _window_view(spec, still, images, pins_px)
     rise, centers = view.rise, _bright_spots(view)
     known = np.array([_measured_opacity(view, center, spec.response) for center in centers])
@@ -99,14 +100,14 @@ def fit_specks(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.n
 
 
 def _window_view(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.ndarray) -> _WindowView:
-    """What the frames show of the window, and where its places lie."""
+    """Compute the window's appearance in the frames, and the places of its pixels."""
     gray = np.array([gray_levels(image) for image in images])
     spacing = pin_spacing_px(pins_px[0])
     clear = np.array([clear_of_pins(gray.shape[1:], pins, CLEAR_SHARE * spacing) for pins in pins_px])
     y, x = np.mgrid[: gray.shape[1], : gray.shape[2]]
-    disc, response, lens = lens_disc(spec), spec.response, spec.lens
+    disc, response, lens = lens_disc(spec.view, spec.housing), spec.response, spec.lens
     u2 = np.sum(still.tangents**2, axis=-1, keepdims=True)
-    in_window = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)  # tangent there, relative to that in air
+    in_window = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)  # tangent in the window / tangent in air
     place_mm = still.tangents * (lens.back_mm + spec.camera.distance_mm + lens.thickness_mm * in_window)
     shine = reflections(spec.view, spec.leds, spec.housing, still.tangents).max(axis=2) * response.exposure
     least_shine = to_light(np.array(response.black_level + LEAST_RISE_LEVELS), response)
@@ -119,14 +120,14 @@ def _window_view(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np
 
 
 def _without_spots(behind: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Gray levels (H, W) without small bright spots: the median around each pixel, gaps filled from beside them first."""
+    """Gray levels (H, W) without small bright spots: the median around each pixel, after gaps were filled from their surroundings."""
     weight = blurred(usable.astype(np.float32), GROUND_PX / 4)
     filled = np.where(usable, behind, blurred(behind, GROUND_PX / 4) / np.maximum(weight, 1e-6))
     return cv2.medianBlur(np.clip(np.rint(filled), 0, 255).astype(np.uint8), GROUND_PX).astype(np.float32)
 
 
 def _bright_spots(view: _WindowView) -> list[np.ndarray]:
-    """Middles (2,) px of round bright spots, the most significant first."""
+    """Middles (2,) px of round bright spots; the most significant comes first."""
     rise = view.rise
     count, labels, stats, centers = cv2.connectedComponentsWithStats((rise > LEAST_RISE_LEVELS).astype(np.uint8), connectivity=8)
     found = []
@@ -141,9 +142,9 @@ def _bright_spots(view: _WindowView) -> list[np.ndarray]:
 
 
 def _measured_opacity(view: _WindowView, center_px: np.ndarray, response: ResponseSpec) -> float:
-    """Share of a cap's light that a speck hides; NaN where too few caps pass behind it.
+    """Share of a cap's light that a speck hides; NaN if too few caps pass behind it.
 
-    A cap right behind the speck is compared with its neighbours in the same frame. What the speck adds of its own light is known from
+    A cap directly behind the speck is compared with its neighbours in the same frame. The light that the speck itself sends is measured in
     the frames in which the place is clear.
     """
     frames, pins = np.nonzero(np.linalg.norm(view.pins_px - center_px, axis=2) < BEHIND_SHARE * view.spacing_px)
@@ -159,13 +160,13 @@ def _measured_opacity(view: _WindowView, center_px: np.ndarray, response: Respon
 
 
 def _neighbours(pins_px: np.ndarray, pin: int) -> np.ndarray:
-    """Indices of the found pins nearest to one of the pins (N, 2), lost ones being NaN."""
+    """Indices of the found pins nearest to one of the pins (N, 2). Lost pins are NaN."""
     nearest = np.argsort(np.linalg.norm(pins_px - pins_px[pin], axis=1))[1 : 1 + NEIGHBOURS]
     return nearest[np.isfinite(pins_px[nearest, 0])]
 
 
 def _opacity_of_the_most_alike(k: int, known: np.ndarray, brightness: np.ndarray) -> float:
-    """Opacity of the k-th speck: its own where it is ``known`` (n,), else that of the speck most like it in brightness."""
+    """Opacity of the k-th speck: its own if it is ``known`` (n,), else that of the speck with the most similar brightness."""
     measured = np.flatnonzero(np.isfinite(known))
     if not len(measured):
         return PLAIN_OPACITY
@@ -173,7 +174,7 @@ def _opacity_of_the_most_alike(k: int, known: np.ndarray, brightness: np.ndarray
 
 
 def _fitted_speck(view: _WindowView, center_px: np.ndarray, opacity: float, response: ResponseSpec) -> SpeckSpec | None:
-    """Place, radius and light of a speck, fitted to the gray levels around it; None where a soft disc does not explain them."""
+    """A speck with place, radius and light fitted to the gray levels around it; None if a soft disc does not explain them."""
     column, row = np.rint(center_px).astype(int)
     top, left = max(row - PATCH_PX, 0), max(column - PATCH_PX, 0)
     patch = slice(top, row + PATCH_PX + 1), slice(left, column + PATCH_PX + 1)
@@ -186,7 +187,7 @@ def _fitted_speck(view: _WindowView, center_px: np.ndarray, opacity: float, resp
 
     def residual(values: np.ndarray) -> np.ndarray:
         away = np.linalg.norm(at_mm - first_mm - values[:2], axis=-1) / np.exp(values[2])
-        disc = np.clip(2 - 2 * away, 0, 1).mean(axis=(2, 3))  # full up to half the radius, then fading out
+        disc = np.clip(2 - 2 * away, 0, 1).mean(axis=(2, 3))  # 1 up to half the radius, then decreasing linearly
         light = blurred((1 - opacity * disc) * dark + np.exp(values[3]) * disc, response.blur_sigma_px)
         return level_misfit(light[used][:, None], real[used][:, None], response)[:, 0]
 

@@ -1,6 +1,6 @@
 """The still picture of many frames, and fits of modelled light to its gray levels.
 
-The still picture is the median of the frames: it holds what stays in place while contacts come and go.
+The still picture is the median of the frames. It shows what does not change with the contact.
 """
 
 from collections.abc import Callable
@@ -16,20 +16,20 @@ from twin.frames.forms import gray_levels
 from twin.judge.pictures.aligned import SATURATED
 
 ROBUST_LEVELS = 16.0
-"""Residual, in gray levels, beyond which a pixel counts less (scale of the soft-L1 loss)."""
+"""Residual, in gray levels, above which a pixel has a smaller weight (scale of the soft-L1 loss)."""
 SLOPE_STEP = 0.01
-"""Step for slopes, as a share of a parameter's range. It is large because the models have small jumps at pixel borders."""
+"""Step of the numerical derivatives, as a share of a parameter's range. It is large, because models have small jumps at pixel borders."""
 BOUND_MARGIN = 0.01
-"""Least squares starts at least this far from its bounds, as a share of the range."""
+"""Least distance of the fit's start from its bounds, as a share of the range."""
 SUBPIXELS = 2
-"""Places inside a pixel, in each direction, over which a model with small details is averaged."""
+"""Number of places inside a pixel, in each direction, over which a model with small details is averaged."""
 Residual = Callable[[np.ndarray], np.ndarray]
-"""From values (p,) to their misfit (n,) in gray levels."""
+"""Function from values (p,) to their misfit (n,) in gray levels."""
 
 
 @dataclass(frozen=True)
 class Still:
-    """Median of the frames, and the direction in which each pixel looks.
+    """Median of the frames, and the direction of each pixel's ray.
 
     Attributes
     ----------
@@ -49,8 +49,8 @@ class Still:
 def median_still(spec: SensorSpec, images: np.ndarray) -> Still:
     """The still picture of frames (M, H, W, 3) uint8 from the camera of ``spec``.
 
-    The ray of a pixel is known in the gel. Index of refraction times sine stays the same at every face of the window
-    (Snell), which gives the tangent in air.
+    The ray of a pixel is computed in the gel. The product of refractive index and sine is the same in all layers (Snell's law), which
+    gives the tangent in air.
     """
     image = np.median(images, axis=0).astype(np.float32)
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
@@ -68,9 +68,9 @@ def sampled(field: np.ndarray, at_px: np.ndarray) -> np.ndarray:
 
 
 def level_misfit(light: np.ndarray, real: np.ndarray, response: ResponseSpec) -> np.ndarray:
-    """Gray levels by which modelled light misses a picture.
+    """Difference of modelled light from a picture, in gray levels.
 
-    A saturated pixel only says "at least this bright": it counts where the light is too little, never where it is too much.
+    A saturated pixel is only a lower limit: it has a misfit if the modelled light is too small, and none if it is too large.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def level_misfit(light: np.ndarray, real: np.ndarray, response: ResponseSpec) ->
 def fit_bounded(residual: Residual, start: np.ndarray, low: np.ndarray, high: np.ndarray, *, most_steps: int = 40) -> np.ndarray:
     """Values (p,) between ``low`` and ``high`` with the least soft-L1 misfit.
 
-    The fit works on shares of each range (0 at ``low``, 1 at ``high``), so that all parameters are of one size.
+    The fit uses the share of each range (0 at ``low``, 1 at ``high``), so that all parameters have the same scale.
     """
     span = high - low
 

@@ -1,7 +1,7 @@
-"""What contact does not change: the disc's edge, the ring and its LEDs' glow, the LEDs' reflections in the window, specks.
+"""Fit of everything that contact does not change: disc edge, ring and LEDs' glow, LEDs' reflections in the window, specks.
 
-All is found in the per-pixel median of the frames, whose gray levels are taken back through the known response curve. LED
-power, gel haze and everything on the gel's side of the window stay as the specification has them.
+All are fitted to the per-pixel median of the frames, whose gray levels are converted to light by the known response curve. LED power, gel
+haze and everything on the gel's side of the window are not changed.
 """
 
 from collections.abc import Callable
@@ -16,30 +16,30 @@ from twin.fit.specks import fit_specks
 from twin.fit.still import Still, median_still
 from twin.progress import Step
 
-# Share of pixels at exactly 0 or 255 above which frames are thresholded. Raw frames saturate on the ring only.
+# Share of pixels at exactly 0 or 255 above which frames count as thresholded. Raw frames are saturated only on the ring.
 MOST_BINARY = 0.6
-# Frames that are used, evenly chosen: more do not make the median better.
+# Most frames that are used, spread evenly. More frames do not improve the median.
 MOST_FRAMES = 40
 
 
 def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, progress: Step | None = None) -> SensorSpec:
-    """The specification with housing, LED places and reflections, and specks as frames of one sensor show them.
+    """The specification with housing, LED places and reflections, and specks fitted to frames of one sensor.
 
     Parameters
     ----------
     spec : SensorSpec
-        Its camera, response, ``leds.power``, ``leds.balance`` and ``gel.haze`` are taken as known.
+        Camera, response, ``leds.power``, ``leds.balance`` and ``gel.haze`` are known and not changed.
     images : (M, H, W, 3) or (M, H, W) uint8
-        Raw frames with differing contacts, RGB or gray.
-    pins_px : (M, N, 2) float
-        Pins in raw-frame px; NaN where not found.
+        Raw frames with different contacts, RGB or gray.
+        pins_px : (M, N, 2) float
+            Pins in raw-frame px; NaN if not found.
     progress : callable, optional
         Called with (done, total).
 
     Raises
     ------
     FrameError
-        Thresholded frames, frames of another size than the camera's, pins outside the picture, or no disc in the frames.
+        The frames are thresholded, do not have the camera's size or show no disc, or pins are outside the picture.
     """
     images, pins_px = np.asarray(images), np.asarray(pins_px, float)
     _require_raw_frames(images, spec.camera, spec.name)
@@ -61,7 +61,7 @@ def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, 
 
 
 def _require_raw_frames(images: np.ndarray, camera: CameraSpec, name: str) -> None:
-    """Raise ``FrameError`` where frames (M, H, W[, 3]) are not of the camera's size, or thresholded."""
+    """Raise ``FrameError`` if frames (M, H, W[, 3]) do not have the camera's size, or are thresholded."""
     height, width = images.shape[1:3]
     if (height, width) != (camera.height_px, camera.width_px):
         raise FrameError(f"frames are {width} x {height} px, the camera of {name} has {camera.width_px} x {camera.height_px}")
@@ -73,9 +73,9 @@ def _require_raw_frames(images: np.ndarray, camera: CameraSpec, name: str) -> No
 
 
 def _require_pins_inside(pins_px: np.ndarray, camera: CameraSpec) -> None:
-    """Raise ``FrameError`` where a found pin of (M, N, 2) lies outside the picture; lost ones are NaN."""
+    """Raise ``FrameError`` if a found pin of (M, N, 2) is outside the picture; lost pins are NaN."""
     last = np.array([camera.width_px, camera.height_px]) - 1
-    outside = ((np.rint(pins_px) < 0) | (np.rint(pins_px) > last)).any(axis=2)  # NaN compares false
+    outside = ((np.rint(pins_px) < 0) | (np.rint(pins_px) > last)).any(axis=2)  # comparisons with NaN are false
     if outside.any():
         frame, pin = np.argwhere(outside)[0].tolist()
         x, y = pins_px[frame, pin]

@@ -1,12 +1,11 @@
 """Recorded frames from disk: a picture, a folder, a video, or a recording with its table and metadata.
 
-Understands the folder formats of the sensor's users: ``frames_bw/`` with ``init_0.png``, ``images/``, and ``sensor_images/`` or
-``processed_images/``, each with ``targets.csv`` and JSON metadata. Whatever is odd in them is listed, and what is readable is
-read.
+It reads the folder formats of the sensor's users: ``frames_bw/`` with ``init_0.png``, ``images/``, and ``sensor_images/`` or
+``processed_images/``, each with ``targets.csv`` and JSON metadata. Irregularities are listed; everything that can be read is read.
 """
 
-from twin.frames.folders import natural_key
+from twin.frames.folders import distinct_stems, natural_key
 from twin.frames.images import read_image
 from twin.frames.recording import Recording, evenly_read, frames_at, open_recording
 
-__all__ = ["Recording", "evenly_read", "frames_at", "natural_key", "open_recording", "read_image"]
+__all__ = ["Recording", "distinct_stems", "evenly_read", "frames_at", "natural_key", "open_recording", "read_image"]

@@ -24,6 +24,12 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part.lower()) for part in re.split(r"(\d+)", name)]
 
 
+def distinct_stems(names: list[str]) -> list[str]:
+    """The frames' names without suffix, to name files after them; with the suffix where another frame has the same stem."""
+    stems = [Path(name).stem for name in names]
+    return [stem if stems.count(stem) == 1 else Path(name).name for stem, name in zip(stems, names, strict=True)]
+
+
 def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
     found = (p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith("."))
     return sorted(found, key=lambda p: natural_key(p.name))

@@ -1,4 +1,4 @@
-"""The two forms of a sensor's frames: their sizes, the way between their pixel coordinates, and which form a frame has.
+"""The two forms of a sensor's frames: their sizes, the conversion of pixel coordinates between them, and recognition of a frame's form.
 
 A recording is the camera's frame cropped, thresholded and resized at capture. With the crop (x0, y0, x1, y1) and the recorded
 size (w, h), and pixel centres at integers, ``x_rec = (x_raw - x0 + 0.5) w / (x1 - x0) - 0.5``; likewise for y.
@@ -18,13 +18,13 @@ from twin.errors import FrameError
 from twin.frames.images import bits_used, decode, to_eight_bits
 from twin.types import Form
 
-# Share of black and white pixels above which a frame was thresholded. It is below 1, because resizing leaves grays at the edges.
+# Share of black and white pixels above which a frame counts as thresholded. It is below 1, because resizing leaves gray edges.
 TWO_LEVEL_SHARE = 0.9
-# Least share of black and of white pixels in a thresholded frame: both occur.
+# Least share of black pixels, and least share of white pixels, in a thresholded frame.
 LEAST_OF_EACH_LEVEL = 0.005
 # Gray levels below which a pixel counts as black, and above which it counts as white.
 BLACK_BELOW, WHITE_ABOVE = 16, 239
-# Frames that decide on a recording's size and form.
+# Number of frames by which the size and form of a recording are recognised.
 VOTES = 25
 
 Thing = TypeVar("Thing", bound=Hashable)
@@ -90,14 +90,14 @@ def gray_levels(image: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class KnownFrames:
-    """What the frames of a sensor look like: its name, and (width, height) px of each form that it has."""
+    """A sensor's name, and (width, height) in px of its frames of each form."""
 
     sensor: str
     size_px: Mapping[Form, tuple[int, int]]
 
 
 def known_frames(spec: SensorSpec) -> KnownFrames:
-    """The frames of the sensor that a specification describes."""
+    """Name and frame sizes of the sensor that a specification describes."""
     sizes = {Form.RAW: (spec.camera.width_px, spec.camera.height_px)}
     if spec.recording:
         sizes[Form.RECORDING] = (spec.recording.width_px, spec.recording.height_px)
@@ -106,7 +106,7 @@ def known_frames(spec: SensorSpec) -> KnownFrames:
 
 @dataclass(frozen=True)
 class FrameKind:
-    """What the frames of a recording have in common.
+    """Common properties of the frames of a recording.
 
     Attributes
     ----------
@@ -128,18 +128,18 @@ def times(size_px: Sequence[int]) -> str:
 
 
 def is_two_level(image: np.ndarray) -> bool:
-    """Whether a picture was thresholded at capture: nearly all of it is black or white, and both occur."""
+    """Whether a picture was thresholded at capture: nearly all of its pixels are black or white, and there are some of each."""
     low, high = float(np.mean(image < BLACK_BELOW)), float(np.mean(image > WHITE_ABOVE))
     return low + high > TWO_LEVEL_SHARE and min(low, high) > LEAST_OF_EACH_LEVEL
 
 
 def tell_form(known: KnownFrames, image: np.ndarray) -> Form:
-    """Form of a sensor's frame, by its size; where both forms have that size, by its content.
+    """Recognise the form of a sensor's frame by its size. If both forms have this size, the content decides.
 
     Raises
     ------
     FrameError
-        It has neither form's size.
+        The frame has the size of neither form.
     """
     size = _size_px(image)
     fitting = [form for form, expected in known.size_px.items() if expected == size]
@@ -152,12 +152,12 @@ def tell_form(known: KnownFrames, image: np.ndarray) -> Form:
 
 
 def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form | None) -> Form:
-    """Form of a frame: the given one if its size allows that, else told by size and content.
+    """Form of a frame: the given one if the frame has its size; if none is given, the form is recognised by size and content.
 
     Raises
     ------
     FrameError
-        The size is not one of the sensor's, or not that of the given form.
+        The frame's size is not one of the sensor's, or not that of the given form.
     """
     if form is not None:
         form = Form(form)
@@ -179,7 +179,7 @@ def form_of(image: np.ndarray, name: str, known: KnownFrames | None, form: Form 
 
 
 def common_kind(files: list[Path], known: KnownFrames | None, form: Form | None) -> FrameKind:
-    """Kind of most of a recording's frames, by up to ``VOTES`` usable ones spread over it; on a tie that of the first.
+    """The most frequent kind among up to ``VOTES`` usable frames spread over a recording; if two are equally frequent, the first.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def common_kind(files: list[Path], known: KnownFrames | None, form: Form | None)
 
 
 def _corner_and_scale(recording: RecordingSpec | None) -> tuple[np.ndarray, np.ndarray]:
-    """First pixel (x, y) of the crop in the camera's frame, and recorded pixels for one of the camera's, in x and y."""
+    """First pixel (x, y) of the crop in the camera's frame, and number of recorded pixels for one pixel of the camera, in x and y."""
     if recording is None:
         raise FrameError("the sensor has no recording form ([recording]): its recordings are raw frames; use the raw form")
     x0, y0, x1, y1 = recording.crop_px

@@ -1,7 +1,7 @@
-"""One picture from a file, as 8-bit levels, and back to a file.
+"""Reading one picture from a file as 8-bit levels, and writing one.
 
-The libraries below OpenCV print their messages to the process's stderr, where no Python code can catch them. `quiet` turns stderr away
-for the length of one decoder call.
+The libraries that OpenCV uses print messages to the process's stderr, where Python code can't catch them. `quiet` redirects stderr
+during one decoder call.
 """
 
 import contextlib
@@ -27,13 +27,13 @@ LARGEST_BYTES = 500_000_000
 SEVERAL_FROM_START = (b"II*\0", b"MM\0*", b"RIFF")
 """First bytes of TIFF and WebP files, which may hold several pictures."""
 DEPTHS = (8, 10, 12, 14, 16)
-"""Numbers of bits that cameras deliver in 16-bit files."""
+"""Bit depths that cameras deliver in 16-bit files."""
 STDERR = 2
 """File descriptor of the process's stderr."""
 
 _lock = threading.Lock()
-_inside = 0  # number of calls that keep stderr turned away
-_kept: int | None = None  # the real stderr while it is turned away
+_inside = 0  # number of calls that currently need stderr redirected
+_kept: int | None = None  # the original stderr while it is redirected
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET; OpenCV reads it when it opens its first video
 
@@ -44,8 +44,7 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
     Parameters
     ----------
     bits : int
-        At least this many bits of a 16-bit file are in use: the recording that it belongs to shows it. The file's own levels may show
-        more.
+        Least number of bits in use in a 16-bit file, as found in other frames of its recording. The file's own levels may need more.
 
     Raises
     ------
@@ -61,7 +60,7 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
 
 
 def write_image(path: Path, image: np.ndarray) -> Path:
-    """Write a gray or RGB frame as PNG, whole or not at all; the path.
+    """Write a gray or RGB frame as PNG, whole or not at all, and return the path.
 
     Raises
     ------
@@ -137,7 +136,7 @@ def _png_fault(data: bytes) -> str:
 
 
 def bits_used(image: np.ndarray) -> int:
-    """Smallest usual bit depth that holds the brightest level; 0 for 8-bit pictures."""
+    """Smallest bit depth of ``DEPTHS`` that can hold the brightest level; 0 for 8-bit pictures."""
     if image.dtype == np.uint8:
         return 0
     brightest = int(image.max())
@@ -153,7 +152,7 @@ def to_eight_bits(image: np.ndarray, bits: int = 0) -> tuple[np.ndarray, str]:
 
 
 def _turn_away() -> None:
-    """Send stderr to nowhere, unless another call has done so already."""
+    """Redirect stderr to the null device, unless another call has already done so."""
     global _inside, _kept
     with _lock:
         _inside += 1
@@ -161,7 +160,7 @@ def _turn_away() -> None:
             return
         try:
             _kept = os.dup(STDERR)
-        except OSError:  # no stderr at all
+        except OSError:  # the process has no stderr
             return
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, STDERR)
@@ -169,7 +168,7 @@ def _turn_away() -> None:
 
 
 def _turn_back() -> None:
-    """Bring stderr back when the last call inside has ended."""
+    """Restore stderr when the last call that needs it redirected has ended."""
     global _inside, _kept
     with _lock:
         _inside -= 1
@@ -181,7 +180,7 @@ def _turn_back() -> None:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Drop what any thread prints to stderr inside. Use it for the length of one decoder call only."""
+    """Context that drops what any thread prints to stderr. Use it for one decoder call only."""
     _turn_away()
     try:
         yield

@@ -47,7 +47,7 @@ def frames_at(path: str | Path, table: Path | None = None, no_contact: Path | No
 
 
 class BadFrame(TypedDict):
-    """A frame that could not be used, and why."""
+    """A frame that could not be used, and the reason."""
 
     image_name: str
     reason: str
@@ -55,7 +55,7 @@ class BadFrame(TypedDict):
 
 @dataclass
 class Recording:
-    """Recorded frames, read one at a time when asked for.
+    """Recorded frames. Each is read when it is needed.
 
     Iterating gives the readable frames in order. A frame that cannot be read is added to ``failed`` and skipped.
 
@@ -64,9 +64,9 @@ class Recording:
     path : Path
     form : Form
     names : list of str
-        Base names of the frames, in the table's order, those without a row last; naturally sorted without a table.
+        Base names of the frames in the order of the table; frames without a row come last. Without a table they are sorted naturally.
     size_px : (int, int)
-        Width and height every frame must have.
+        Width and height that every frame must have.
     labels : dict of str to (M,) array
         The table's columns, in the order of ``names``. A column is float if all its cells are numbers, else text. A frame without
         a row has NaN or "". There are no columns without a table.
@@ -75,9 +75,9 @@ class Recording:
     reference : Frame or None
         The no-contact frame (``init_*``).
     problems : list of str
-        What was odd, one line each.
-    failed : list of BadFrame
-        Each frame that could not be read so far, and why.
+        Irregularities, one line each.
+        failed : list of BadFrame
+            Frames that could not be read so far, and the reasons.
     """
 
     path: Path
@@ -108,12 +108,12 @@ class Recording:
                 self.failed.append({"image_name": name, "reason": str(error).removeprefix(f"{name}: ")})
 
     def read(self, index: int) -> Frame:
-        """Frame ``index`` of ``names`` (of a video: by seeking through it).
+        """Read frame ``index`` of ``names``. In a video this is done by seeking.
 
         Raises
         ------
         FrameError
-            It can't be read, or has another size than the recording's.
+            The frame can't be read, or its size differs from the recording's.
         """
         if not self._files:
             for frame in self._video_frames():
@@ -157,7 +157,7 @@ class Recording:
             capture.release()
 
     def take_reference(self, candidates: list[Path]) -> None:
-        """Take the first readable picture of the frames' size as the no-contact frame."""
+        """Use the first readable picture of the frames' size as the no-contact frame."""
         for candidate in candidates:
             try:
                 image = self._image(candidate)
@@ -204,7 +204,7 @@ def _next_image(capture: cv2.VideoCapture) -> np.ndarray | None:
 
 
 def _count_frames(path: Path) -> tuple[int, int, np.ndarray]:
-    """Frames that can be decoded, frames that the file promises, and the first (RGB)."""
+    """Number of frames that can be decoded, number of frames that the file states, and the first frame (RGB)."""
     with quiet():
         capture = cv2.VideoCapture(str(path))
     try:

@@ -1,15 +1,18 @@
 """B-splines, the basis of the skin and the gel.
 
-A quadratic basis of m elements has m + 2 functions and is C1, a linear one m + 1 and C0; both
-interpolate their first and last coefficient (open knot vector; Piegl & Tiller, "The NURBS Book", ch. 2).
+A quadratic basis of m elements has m + 2 functions and is C1; a linear basis has m + 1 functions and is C0. At both ends a spline
+equals its first and last coefficient (open knot vector; Piegl & Tiller, "The NURBS Book", ch. 2).
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.interpolate import BSpline
 
 from twin.types import FloatArray, IntArray
+
+_legendre = cache(np.polynomial.legendre.leggauss)
 
 
 @dataclass(frozen=True)
@@ -35,13 +38,13 @@ class Basis:
 
     @property
     def greville(self) -> FloatArray:
-        """(count,) Greville points, means of ``degree`` neighbouring knots: a linear function's coefficients are its values there."""
+        """(count,) Greville points: the means of ``degree`` neighbouring knots. A linear function's coefficients are its values there."""
         knots = self._knots
         return np.array([knots[i + 1 : i + 1 + self.degree].mean() for i in range(self.count)])
 
     def values(self, at: FloatArray, *, derivative: int = 0) -> FloatArray:
         """(k, count) values, or a derivative's, of all functions at points (k,)."""
-        splines = BSpline(self._knots, np.eye(self.count), self.degree)
+        splines = BSpline.construct_fast(self._knots, np.eye(self.count), self.degree)
         return (splines.derivative(derivative) if derivative else splines)(np.clip(at, self.breaks[0], self.breaks[-1]))
 
     def element_of(self, at: FloatArray) -> IntArray:
@@ -50,6 +53,6 @@ class Basis:
 
     def gauss(self, points: int) -> tuple[FloatArray, FloatArray]:
         """Gauss points and weights (elements, points) of every element."""
-        local, weights = np.polynomial.legendre.leggauss(points)
+        local, weights = _legendre(points)
         half = np.diff(self.breaks)[:, None] / 2
         return (self.breaks[1:] + self.breaks[:-1])[:, None] / 2 + half * local, half * weights

@@ -3,7 +3,7 @@
 A place on the dome is a point w of the unit disc (as a complex number): its radius is the polar angle
 over the largest one, its azimuth the azimuth. A ``Focus`` turns and stretches the square's image:
 
-    (u, v) -> w1 (squared disc) -> w2 = w1 s(|w1|) / |w1| -> w = e^(i phi) (w2 + a) / (1 + a w2)
+    (u, v) -> w1 (squared disc) -> w2 = e^(i turn) w1 s(|w1|) / |w1| -> w = (w2 + a) / (1 + conj(a) w2)
 
 The elliptical map x = u sqrt(1 - v^2 / 2), y = v sqrt(1 - u^2 / 2) makes a disc of the square without
 collapsing an element (Fong, "Analytical methods for squaring the disc", 2015). The function s(r) = c r + (1 - c) r^5
@@ -21,8 +21,8 @@ _POWER = 5
 """Power in s(r) = c r + (1 - c) r^5: the higher it is, the more evenly the lines lie within the focus."""
 _FINE = 0.75
 """Share of the square's half side whose image is the focus."""
-_LARGEST_SHIFT = 0.6
-"""Largest shift a of the Moebius transformation: it bounds how far the elements opposite the focus are stretched."""
+_LARGEST_SHIFT = 0.45
+"""Largest shift a of the Moebius transformation. Beyond 0.5 elements at the rim turn inside out for some turns of the grid."""
 _LEAST_SLOPE = 0.2
 """Smallest c: it bounds how small the elements at the centre of the focus get."""
 
@@ -37,11 +37,14 @@ class Focus:
         Direction of the centre.
     radius_rad : float
         Angle around it that the fine part covers.
+    turn_rad : float
+        Turn of the grid's rows about the centre; at the apex it is their azimuth.
     """
 
     polar_rad: float = 0.0
     azimuth_rad: float = 0.0
     radius_rad: float = float(np.radians(50.0))
+    turn_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -52,12 +55,13 @@ class Chart:
     largest_polar_rad: float
 
     @property
-    def _shift(self) -> float:
-        return min(self.focus.polar_rad / self.largest_polar_rad, _LARGEST_SHIFT)
+    def _shift(self) -> complex:
+        size = min(self.focus.polar_rad / self.largest_polar_rad, _LARGEST_SHIFT)
+        return complex(size * np.exp(1j * self.focus.azimuth_rad))
 
     @property
     def _centre_slope(self) -> float:
-        share = self.focus.radius_rad / self.largest_polar_rad / (1 - self._shift**2)
+        share = self.focus.radius_rad / self.largest_polar_rad / (1 - abs(self._shift) ** 2)
         return float(np.clip((share - _FINE**_POWER) / (_FINE - _FINE**_POWER), _LEAST_SLOPE, 1.0))
 
     def disc(self, square: FloatArray) -> ComplexArray:
@@ -66,15 +70,14 @@ class Chart:
         w = u * np.sqrt(1 - v * v / 2) + 1j * v * np.sqrt(1 - u * u / 2)
         r = np.minimum(np.abs(w), 1.0)
         c = self._centre_slope
-        w = w * (c + (1 - c) * r ** (_POWER - 1))
+        w = w * (c + (1 - c) * r ** (_POWER - 1)) * np.exp(1j * self.focus.turn_rad)
         a = self._shift
-        return (w + a) / (1 + a * w) * np.exp(1j * self.focus.azimuth_rad)
+        return (w + a) / (1 + a.conjugate() * w)
 
     def square(self, disc: ComplexArray) -> FloatArray:
         """Square points (k, 2) of complex disc points (k,)."""
-        w = disc * np.exp(-1j * self.focus.azimuth_rad)
         a = self._shift
-        w = (w - a) / (1 - a * w)
+        w = (disc - a) / (1 - a.conjugate() * disc) * np.exp(-1j * self.focus.turn_rad)
         wanted = np.minimum(np.abs(w), 1.0)
         c, r = self._centre_slope, np.sqrt(wanted)
         low, high = np.zeros_like(r), np.ones_like(r)

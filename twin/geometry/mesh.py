@@ -1,7 +1,7 @@
-"""The sensor's body as hexahedra, for views, files and the renderer: the same nodes for every contact.
+"""The sensor's body as hexahedra, for views, files and the renderer. The mesh is the same for every contact.
 
-The nodes stand on a square grid that is bent over the dome (``chart``), in straight columns through the skin and
-the gel down to the lens. The spline solid (``solid``) computes how they move; `NodeView` carries its motion to the nodes.
+A square grid is bent over the dome (``chart``). At each of its points a straight column of nodes runs through the skin and the gel to
+the lens. The mechanics are computed with the spline solid (``solid``); `NodeView` gives the nodes' places from it.
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ _SKIN_LAYERS = 1
 _GEL_LAYERS = 4
 """Layers of elements in the gel."""
 _FOCUS_SHARE = 0.62
-"""The mesh is fine within this share of the largest polar angle, around the apex."""
+"""Share of the largest polar angle within which, around the apex, the mesh is fine."""
 _HEX_CORNERS = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1))
 """Corners of a hexahedron in VTK's order, as steps along the grid."""
 
@@ -33,8 +33,8 @@ _HEX_CORNERS = ((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1)
 class SensorMesh:
     """Volume mesh of skin and gel at rest, in the sensor frame.
 
-    Nodes are numbered layer by layer from the outside in (layer 0 is the outer surface, layer
-    ``skin_layers`` the skin's inside, the last one the lens), each layer row by row over the square grid.
+    Nodes are numbered layer by layer from the outside inwards (layer 0 is the outer surface, layer ``skin_layers`` the skin's inside,
+    the last one the lens), and each layer row by row over the square grid.
 
     Attributes
     ----------
@@ -45,12 +45,12 @@ class SensorMesh:
     material : (m,) int
         ``SKIN`` or ``GEL``.
     inner_quads : (q, 4) int
-        Inside of the skin, one quad for each column of elements. The corners run counter-clockwise seen from *outside* the dome:
-        normals point away from the dome's centre, so the camera sees the back of these quads.
+        Inside of the skin, one quad for each column of elements. Seen from *outside* the dome the corners run counter-clockwise, so
+        normals point away from the dome's centre and the camera sees the back of these quads.
     disc : (k,) complex
-        Where on the dome each column of nodes stands (see ``chart``).
-    grid : (3,) int
-        Layers of nodes, and nodes along each side of the square.
+        Place of each column of nodes on the dome (see ``chart``).
+        grid : (3,) int
+            Number of layers of nodes, and of nodes along each side of the square.
     skin_layers : int
     """
 
@@ -76,7 +76,7 @@ def build_mesh(geometry: GeometrySpec) -> SensorMesh:
     quads = np.stack([c[0] for c in cells[:4]], axis=-1).reshape(-1, 4)
     return SensorMesh(
         nodes_mm=np.concatenate([body_points(geometry, disc, depth) for depth in depths]),
-        # layers run inwards: swap the two faces, so that the first four corners are the inner ones
+        # layers are numbered inwards: the two faces are swapped, so that the first four corners are the inner ones
         hexes=np.stack(cells[4:] + cells[:4], axis=-1).reshape(-1, 8),
         material=np.repeat(np.where(np.arange(layers) < _SKIN_LAYERS, SKIN, GEL), (side - 1) ** 2),
         inner_quads=quads + _SKIN_LAYERS * side * side,
@@ -124,7 +124,7 @@ def skin_surface(
 
 @dataclass(frozen=True)
 class NodeView:
-    """Linear map from the solid's controls to the mesh's nodes.
+    """Linear map from the spline solid's controls to the mesh's nodes.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class NodeView:
     fine, coarse : (k, side^2), (k, coarse_side^2) float
         Values of the splines at the k nodes of a layer.
     skin, gel : (layers, functions) float
-        Values through the depth at the layers of nodes in the skin and below it.
+        Values of the splines through the depth, at the layers of nodes in the skin and in the gel.
     """
 
     mesh: SensorMesh

@@ -1,14 +1,14 @@
-"""The sensor's body as a spline solid: what the mechanics computes with.
+"""The sensor's body as a spline solid, with which the mechanics are computed.
 
-A square grid of columns is bent over the dome (``chart``). Each column runs through the skin and the gel down
-to the lens. Shape and displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell
-& Bazilevs 2005): quadratic and C1 over the dome, linear through the skin, quadratic through the gel. A
-skin bent by contact is smooth and needs fewer unknowns than with trilinear elements. What the gel does
-inside is smoother still: below its surface it has a grid of half the lines, nested in the skin's.
+A square grid of columns is bent over the dome (``chart``). Each column runs through the skin and the gel to the lens. Shape and
+displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell & Bazilevs 2005): quadratic and C1 over the dome,
+linear through the skin, quadratic through the gel. Because a skin bent by contact is smooth, splines need fewer unknowns than trilinear
+elements. The displacement inside the gel is even smoother: below the gel's surface its grid has half as many lines as the skin's, and is
+nested in it.
 """
 
-from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,18 +16,15 @@ from scenes.sensor import GeometrySpec
 from twin.geometry.bspline import Basis
 from twin.geometry.chart import Chart, Focus, disc_points, dome_points
 from twin.geometry.pins import rest_pins
-from twin.store import cached_arrays
 from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-_CELL_PARTS = ("controls", "gradients", "weights_mm3")
-"""Arrays of ``Cells``, as they are named on disk."""
 _GEL_GRADING = 1.5
 """Boundary k of n elements through the gel lies at the depth (k / n)^1.5: elements are thin below the skin."""
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """How fine the solid is.
+    """Number of elements of a solid.
 
     Attributes
     ----------
@@ -53,11 +50,11 @@ class Cells:
     Attributes
     ----------
     controls : (m, b) int
-        By depth, row and column (the last runs fastest).
-    gradients : (m, 8, 3, b) float
-        Shape functions' gradients at 2x2x2 Gauss points, the first four on the outer level, in 1/mm at rest.
-    weights_mm3 : (m, 8) float
-        Rest volume of each Gauss point.
+        Indices of the b controls of each element, in the order depth, row, column (the column varies fastest).
+        gradients : (m, 8, 3, b) float
+            Gradients of the shape functions at rest at 2x2x2 Gauss points, 1/mm. The first four points are the outer ones.
+        weights_mm3 : (m, 8) float
+            Volume at rest that each Gauss point stands for.
     """
 
     controls: IntArray
@@ -69,30 +66,30 @@ class Cells:
 class Solid:
     """Skin and gel at rest, in the sensor frame.
 
-    The body is given by coefficients ("controls") of its splines: ``skin_layers + 1`` layers of ``side^2``
-    from the outside to the inside of the skin, row by row, then the gel's below, ``coarse_side^2`` each.
+    The body is given by the coefficients ("controls") of its splines: first ``skin_layers + 1`` layers of ``side^2`` controls from the
+    outside to the inside of the skin, row by row; then the layers of the gel with ``coarse_side^2`` controls each.
 
     Attributes
     ----------
     control_mm : (n, 3) float
     fixed : (n,) bool
-        Clamped: rim, wall and lens.
-    skin, gel_top, gel_deep : Cells
-        The skin's elements layer by layer from the outside; the gel's first layer of elements, which has
-        the skin's grid above and the coarse one below; and the rest of the gel.
+        Clamped controls: at the rim, the wall and the lens.
+        skin, gel_top, gel_deep : Cells
+            The skin's elements, layer by layer from the outside; the gel's first layer of elements, whose outer side has the skin's grid
+            and whose inner side has the coarse one; the other elements of the gel.
     boxes : tuple of (m, 4) int
-        For each kind of cells: first and last row, first and last column (exclusive) on the skin's grid.
+        For each kind of cells: first and last row, first and last column (last: exclusive) on the skin's grid.
     chart : Chart
     basis, coarse, through : Basis
-        Along the square's sides for skin and gel, and through the gel (1 at the skin, 2 at the lens).
-    inner : slice
-        Controls of the skin's inside.
-    pin_value, pin_slope_u, pin_slope_v : (N, side^2) float
-        Position and derivatives of the skin's inside at the pins' feet, from its layer of controls.
-    pin_base_mm, pin_axis : (N, 3) float
-        Feet and axes at rest.
-    pin_cap_length_mm : float
-        Foot to cap centre.
+        Splines along the square's sides in the skin and in the gel, and through the gel (depth 1 at the skin, 2 at the lens).
+        inner : slice
+            Controls of the skin's inside.
+        pin_value, pin_slope_u, pin_slope_v : (N, side^2) float
+            Coefficients by which the controls of the skin's inside give place and derivatives of the skin's inside at the pins' feet.
+        pin_base_mm, pin_axis : (N, 3) float
+            Feet and axes of the pins at rest.
+        pin_cap_length_mm : float
+            Distance from a pin's foot to the centre of its cap.
     """
 
     control_mm: FloatArray
@@ -120,61 +117,16 @@ class Solid:
         return foot, np.linalg.inv(frame)
 
 
-def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None, focus: Focus | None = None, keep: bool = True) -> Solid:
-    """The body of a sensor, its grid fine around a focus (default: around the apex).
-
-    It depends on the sensor's geometry alone, and is kept on disk (see ``twin.store``) if ``keep``.
-    """
+def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None, focus: Focus | None = None) -> Solid:
+    """Build the body of a sensor. Its grid is fine around a focus (default: around the apex)."""
     resolution, focus = resolution or Resolution(), focus or Focus()
     inner_mm = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm
     basis = Basis(np.linspace(-1, 1, resolution.across + 1))
     chart = Chart(focus, float(np.arccos(geometry.skin.rim_z_mm / inner_mm)))
     coarse = Basis(basis.breaks[::2])
     through = Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING)
-    shape_of_skin = ("outer_radius_mm", "thickness_mm", "rim_z_mm")
-    key = {
-        "skin": {name: getattr(geometry.skin, name) for name in shape_of_skin},
-        "lens_mm": geometry.lens.z_mm,
-        "pins": geometry.pins.model_dump(mode="json"),
-        "resolution": asdict(resolution),
-        "focus": asdict(focus),
-    }
-    arrays = partial(_arrays, geometry, resolution, chart, basis, coarse, through)
-    kept = cached_arrays("solid", key, arrays) if keep else arrays()
-    upper = basis.count**2
-    return Solid(
-        control_mm=kept["control_mm"],
-        fixed=kept["fixed"],
-        skin=_kept_cells(kept, "skin"),
-        gel_top=_kept_cells(kept, "gel_top"),
-        gel_deep=_kept_cells(kept, "gel_deep"),
-        boxes=(kept["boxes_0"], kept["boxes_1"], kept["boxes_2"]),
-        chart=chart,
-        basis=basis,
-        coarse=coarse,
-        through=through,
-        pin_value=kept["pin_value"],
-        pin_slope_u=kept["pin_slope_u"],
-        pin_slope_v=kept["pin_slope_v"],
-        pin_base_mm=kept["pin_base_mm"],
-        pin_axis=kept["pin_axis"],
-        inner=slice(resolution.skin_layers * upper, (resolution.skin_layers + 1) * upper),
-        pin_cap_length_mm=geometry.pins.length_mm + geometry.pins.cap_height_mm / 2,
-    )
-
-
-def _kept_cells(kept: dict[str, np.ndarray], name: str) -> Cells:
-    """One kind of cells from the arrays that ``_arrays`` gives."""
-    return Cells(kept[f"{name}_controls"], kept[f"{name}_gradients"], kept[f"{name}_weights_mm3"])
-
-
-def _arrays(
-    geometry: GeometrySpec, resolution: Resolution, chart: Chart, basis: Basis, coarse: Basis, through: Basis
-) -> dict[str, np.ndarray]:
-    """The arrays of a ``Solid``, by name."""
-    inner_mm, layers = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm, resolution.skin_layers
+    layers, side, coarse_side = resolution.skin_layers, basis.count, coarse.count
     through_skin = Basis(np.linspace(0, 1, layers + 1), degree=1)
-    side, coarse_side = basis.count, coarse.count
 
     fine = [_fit(basis, chart, geometry, depth) for depth in through_skin.greville]
     deep = [_fit(coarse, chart, geometry, depth) for depth in through.greville[1:]]
@@ -189,30 +141,35 @@ def _arrays(
     skin_parts = [[(index[e + d], basis, _local(through_skin, e, d)) for d in (0, 1)] for e in range(layers)]
     top = [(index[-1], basis, _local(through, 0, 0))] + [(below[d - 1], coarse, _local(through, 0, d)) for d in (1, 2)]
     deep_parts = [[(below[e + d - 1], coarse, _local(through, e, d)) for d in range(3)] for e in range(1, resolution.gel_layers)]
-    cells = {
-        "skin": joined_cells([spline_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)]),
-        "gel_top": spline_cells(basis, top, through, 0, control),
-        "gel_deep": joined_cells([spline_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
-    }
     pins = rest_pins(geometry)
     value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, geometry.skin.rim_z_mm)))
-    return {
-        **{f"{name}_{part}": getattr(kind, part) for name, kind in cells.items() for part in _CELL_PARTS},
-        "boxes_0": np.tile(_boxes(resolution.across, 1), (layers, 1)),
-        "boxes_1": _boxes(resolution.across, 1),
-        "boxes_2": np.tile(_boxes(resolution.across // 2, 2), (resolution.gel_layers - 1, 1)),
-        "control_mm": control,
-        "fixed": np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
-        "pin_value": value,
-        "pin_slope_u": slope_u,
-        "pin_slope_v": slope_v,
-        "pin_base_mm": pins.base_mm,
-        "pin_axis": pins.axis,
-    }
+    return Solid(
+        control_mm=control,
+        fixed=np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
+        skin=joined_cells([spline_cells(basis, parts, through_skin, e, control) for e, parts in enumerate(skin_parts)]),
+        gel_top=spline_cells(basis, top, through, 0, control),
+        gel_deep=joined_cells([spline_cells(coarse, parts, through, e + 1, control) for e, parts in enumerate(deep_parts)]),
+        boxes=(
+            np.tile(_boxes(resolution.across, 1), (layers, 1)),
+            _boxes(resolution.across, 1),
+            np.tile(_boxes(resolution.across // 2, 2), (resolution.gel_layers - 1, 1)),
+        ),
+        chart=chart,
+        basis=basis,
+        coarse=coarse,
+        through=through,
+        pin_value=value,
+        pin_slope_u=slope_u,
+        pin_slope_v=slope_v,
+        pin_base_mm=pins.base_mm,
+        pin_axis=pins.axis,
+        inner=slice(layers * side**2, (layers + 1) * side**2),
+        pin_cap_length_mm=geometry.pins.length_mm + geometry.pins.cap_height_mm / 2,
+    )
 
 
 def surface_operators(basis: Basis, square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows (k, side^2) that give value, d/du and d/dv of a layer at points (k, 2) of the square from its controls."""
+    """Matrices (k, side^2) by which a layer's controls give its value, d/du and d/dv at points (k, 2) of the square."""
     u, v = square.T
     u0, u1, v0, v1 = basis.values(u), basis.values(u, derivative=1), basis.values(v), basis.values(v, derivative=1)
 
@@ -225,10 +182,9 @@ def surface_operators(basis: Basis, square: FloatArray) -> tuple[FloatArray, Flo
 def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Feet, axes and cap centres of the pins on a deformed skin.
 
-    The tangents and unit normal of the skin's inside at a foot, at rest and deformed, give
-    F = [t_u t_v n] [T_u T_v N]^-1; the pin turns with the rotation of F's polar decomposition, which
-    takes N to n. At rest this is exactly ``rest_pins``; a rigid motion of the body is a rigid motion of
-    the pins.
+    With the tangents and the unit normal of the skin's inside at a foot, deformed (t_u, t_v, n) and at rest (T_u, T_v, N), the
+    deformation is F = [t_u t_v n] [T_u T_v N]^-1. The pin turns by the rotation of F's polar decomposition, which maps N to n. At rest
+    the result equals ``rest_pins``, and a rigid motion of the body moves the pins rigidly.
 
     Parameters
     ----------
@@ -249,7 +205,7 @@ def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def body_points(geometry: GeometrySpec, disc: ComplexArray, depth: float) -> FloatArray:
-    """Places (k, 3) of the body at rest: depth 0 outside of the skin, 1 its inside, 2 the lens; straight lines between."""
+    """Places (k, 3) of the body at rest: depth 0 is the skin's outside, 1 its inside, 2 the lens, with straight lines between them."""
     skin = geometry.skin
     inner_mm = skin.outer_radius_mm - skin.thickness_mm
     inner = dome_points(disc, inner_mm, skin.rim_z_mm)
@@ -270,7 +226,7 @@ def _fit(basis: Basis, chart: Chart, geometry: GeometrySpec, depth: float) -> Fl
 
 
 def _local(through: Basis, element: int, function: int) -> tuple[FloatArray, FloatArray]:
-    """Value and slope (2,) at an element's Gauss points of one of the functions that live there."""
+    """Value and slope (2,), at an element's two Gauss points, of one of the functions that are not zero there."""
     at = through.gauss(2)[0][element]
     return through.values(at)[:, element + function], through.values(at, derivative=1)[:, element + function]
 
@@ -280,7 +236,7 @@ def spline_cells(
 ) -> Cells:
     """Elements of one layer over the intervals of ``grid``.
 
-    ``parts``: for each function through the depth, its controls (side, side), their basis, and its values and slopes.
+    ``parts`` holds for each function through the depth: its controls (side, side), their basis, its values and slopes.
     """
     at, weights = grid.gauss(2)
     shape_parts, control_parts = [], []
@@ -290,7 +246,7 @@ def spline_cells(
         f0, f1 = (
             np.take_along_axis(basis.values(at.ravel(), derivative=d).reshape(*at.shape, -1), window[:, None, :], axis=2) for d in (0, 1)
         )
-        # derivatives by (row, column, depth): right-handed, as depth runs inwards
+        # derivatives by (row, column, depth), a right-handed order because depth increases inwards
         factors = ((value, f1, f0), (value, f0, f1), (slope, f0, f0))
         shape_parts.append(np.stack([np.einsum("p,rqj,csk->rcpqsjk", *f).reshape(-1, 8, 9) for f in factors], axis=2))
         control_parts.append(index[window[:, None, :, None], window[None, :, None, :]].reshape(-1, 9))
@@ -305,10 +261,10 @@ def spline_cells(
 
 
 def joined_cells(parts: list[Cells]) -> Cells:
-    """The elements of several layers as one list; no layers give a list of no elements with 27 controls each, as the gel's have."""
+    """The elements of several layers as one list. Without layers it has no elements, and the shape for 27 controls, as in the gel."""
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
-    return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in _CELL_PARTS))
+    return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("controls", "gradients", "weights_mm3")))
 
 
 def _boxes(count: int, size: int) -> IntArray:

@@ -78,6 +78,8 @@ class LoadState:
         Friction's anchors in the object's frame; meaningful where ``held (p,)``.
     slid_mm : (p,) float
         Slip since the point last stuck.
+    limit_n : (p,) float
+        Largest friction force that each point could bear.
     penalty_mpa_mm : float
     T : (4, 4) float
         The object's pose before it gave way.
@@ -90,6 +92,7 @@ class LoadState:
     anchor_mm: FloatArray
     held: BoolArray
     slid_mm: FloatArray
+    limit_n: FloatArray
     penalty_mpa_mm: float
     T: FloatArray
     elastic_nmm: float = 0.0

@@ -1,9 +1,8 @@
 """Many contacts of one sensor, in parallel processes."""
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
@@ -13,8 +12,7 @@ from twin.mechanics.balance import Friction
 from twin.mechanics.path import ContactPath, ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.types import ContactState
-
-_solver: SkinSolver | None = None
+from twin.workers import in_processes
 
 
 @dataclass(frozen=True)
@@ -58,37 +56,24 @@ def press_many(
     spec : SensorSpec
     jobs : sequence of ContactJob
     processes : int
-        1: in this process. More: fresh (spawned) processes.
+        Of this machine (see ``in_processes``).
+
+    Raises
+    ------
+    ValueError
+        ``processes`` is less than 1.
+    WorkersError
+        Processes were lost again and again.
     """
-    if processes < 1:
-        raise ValueError(f"processes must be at least 1, got {processes}")
-    if processes == 1:
-        solver = SkinSolver(spec, resolution=resolution)
-        for number, job in enumerate(jobs):
-            yield _solve(solver, number, job)
-        return
-    with ProcessPoolExecutor(processes, get_context("spawn"), _start, (spec, resolution)) as pool:
-        waiting = {pool.submit(_work, number, job) for number, job in enumerate(jobs)}
-        try:
-            while waiting:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in done:
-                    yield future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+    yield from in_processes(_begin, (spec, resolution), list(enumerate(jobs)), processes=processes)
 
 
-def _start(spec: SensorSpec, resolution: Resolution | None) -> None:
-    global _solver
-    _solver = SkinSolver(spec, resolution=resolution)
+def _begin(spec: SensorSpec, resolution: Resolution | None) -> Callable[[tuple[int, ContactJob]], ContactOutcome]:
+    return partial(_solve, SkinSolver(spec, resolution=resolution))
 
 
-def _work(number: int, job: ContactJob) -> ContactOutcome:
-    assert _solver is not None, "the process was not started by press_many"
-    return _solve(_solver, number, job)
-
-
-def _solve(solver: SkinSolver, number: int, job: ContactJob) -> ContactOutcome:
+def _solve(solver: SkinSolver, task: tuple[int, ContactJob]) -> ContactOutcome:
+    number, job = task
     try:
         states = [state for _, state in solver.path(job.touched, job.pose, friction=job.friction)]
     except (ContactError, MeshError) as error:

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from scipy.linalg import blas, lapack
 
+from twin.compiled import compiled
 from twin.mechanics.balance import FORCE_FLOOR_N, Balance, Problem
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
 from twin.mechanics.linear import Eliminated
@@ -220,7 +220,7 @@ class SmallContact:
         return lapack.sgetrs(factors, pivots, right_side.astype(np.float32))[0].astype(float)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _moved(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatArray, T: FloatArray, yielded: float) -> FloatArray:
     """Points (q, 3) in the object's frame after moves ``y`` of their controls."""
     controls = (len(y) - 2) // 3
@@ -239,7 +239,7 @@ def _moved(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatArray, 
     return out
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _residual(
     matrix: FloatArray,
     y: FloatArray,

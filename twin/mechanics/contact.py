@@ -14,9 +14,9 @@ delta, and no point ever leaves Coulomb's cone. Everything here is in the object
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from twin.compiled import compiled
 from twin.geometry.solid import Solid
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
@@ -82,7 +82,7 @@ def contact_points(solid: Solid, radius_mm: float) -> ContactPoints:
     )
 
 
-@numba.njit(cache=True)
+@compiled()
 def positions(controls: IntArray, weights: FloatArray, lift: FloatArray, control: FloatArray) -> FloatArray:
     """Places (p, 3) of points carried by nine controls each."""
     out = lift.copy()
@@ -156,7 +156,7 @@ def contact_forces(
     return ContactForces(normal, force, normal_n, depth, slipping, stiffness, anchors)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _law(
     at: FloatArray,
     distance: FloatArray,
@@ -234,7 +234,7 @@ def _law(
     return force, pressing, depth, slipping, k, moved
 
 
-@numba.njit(cache=True)
+@compiled()
 def spread_forces(controls: IntArray, weights: FloatArray, force: FloatArray, out: FloatArray) -> None:
     """Add point forces (p, 3) to the controls that carry the points, (n, 3)."""
     for p in range(len(controls)):
@@ -244,7 +244,7 @@ def spread_forces(controls: IntArray, weights: FloatArray, force: FloatArray, ou
                     out[controls[p, a], i] += weights[p, a] * force[p, i]
 
 
-@numba.njit(cache=True)
+@compiled()
 def spread_stiffness(controls: IntArray, weights: FloatArray, stiffness: FloatArray, out: FloatArray) -> None:
     """Add point stiffnesses (p, 3, 3) to a matrix of the controls' unknowns, (3 n, 3 n); controls from n on are left out."""
     count = len(out) // 3

@@ -21,9 +21,9 @@ membrane and shear locking, and leave no mode without stiffness, since the splin
 
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 
+from twin.compiled import compiled
 from twin.geometry.solid import Cells
 from twin.mechanics.material import distortion, distortion_stiffness, invariants
 from twin.types import FloatArray, IntArray
@@ -98,7 +98,7 @@ class Elements:
         return self.cells.controls, self.cells.gradients, self.cells.weights_mm3, self.law, self.difference_mpa
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _kinematics(
     x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatArray, g: FloatArray, det: FloatArray
 ) -> tuple[float, float, float, float]:
@@ -123,7 +123,7 @@ def _kinematics(
     return r0, r1, v0, v1
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _forces(
     elements: IntArray,
     gradients: FloatArray,
@@ -176,7 +176,7 @@ def _forces(
     return energy
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _stiffness(
     elements: IntArray,
     gradients: FloatArray,
@@ -240,7 +240,7 @@ def _stiffness(
                     out[m, p, a, b] = product[count * p + a, b] + size * swell[0, _K[p], b] + lean_size * swell[1, _K[p], b]
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _distortion_stress(elements: IntArray, gradients: FloatArray, weights: FloatArray, law: FloatArray, control: FloatArray) -> FloatArray:
     count = elements.shape[1]
     x = np.zeros((3, count))
@@ -261,7 +261,7 @@ def _distortion_stress(elements: IntArray, gradients: FloatArray, weights: Float
     return out
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _half_difference(elements: IntArray, gradients: FloatArray, weights: FloatArray, control: FloatArray) -> FloatArray:
     count = elements.shape[1]
     x = np.zeros((3, count))

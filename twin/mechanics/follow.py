@@ -6,13 +6,12 @@ import numpy as np
 
 from scenes.object import ObjectSpec
 from twin.errors import ContactError
-from twin.geometry.chart import Focus
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.ongoing import OngoingContact
 from twin.mechanics.path import ContactPath, carried, deepest_mm, dome_directions
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
-from twin.types import ContactState, FloatArray
+from twin.types import ContactState
 
 STEP_MM = 1.2  # largest motion across the contact in one load step
 FINE_STEP_MM = 0.6  # the same beside wires: a longer step carries skin past a wire's middle, where it then hooks
@@ -20,7 +19,6 @@ LARGEST_MOVE_MM = 30.0  # largest motion between two poses in contact; beyond it
 SETTLED_MM = 0.005  # most that the dome still has to move where the arm has given way: 0.02 px in the shipped cameras
 _MOST_SETTLING = 8  # load steps until an arm that gives way stands; one or two are usual
 _DIRECTIONS = 2000  # directions on the whole sphere, in which the object is looked for
-_KNOWN_RAD = np.radians(7.0)  # the solver is ready for a pressed direction this near to one that was pressed before
 _BACK_MM = 1.0  # stride of the search for a free pose
 _WHERE = "following the object"  # what an error names
 
@@ -51,7 +49,6 @@ class Follower:
         self._dome_mm = self._radius_mm * dome_directions(solver.spec.skin, _DIRECTIONS)
         self._rest = solver.rest()
         self._contact: OngoingContact | None = None
-        self._reached: FloatArray = np.zeros((0, 3))
         self._T: np.ndarray | None = None
         self._time_s = 0.0
         self._state = self._rest
@@ -128,11 +125,7 @@ class Follower:
         way = ContactPath(np.stack([start, stop]), np.array([start_s, max(stop_s, start_s + 1e-3)]))
         pressed = self._gaps(stop) < 0
         if self._contact is None:
-            self._reached = self._dome_mm[pressed] / self._radius_mm
-            self._contact = self._solver.begin(self._field, self._law, self._reached, start, focus=Focus())
-        elif not self._provided(self._dome_mm[pressed]):
-            self._reached = self._dome_mm[pressed] / self._radius_mm
-            self._solver.reach(self._contact, self._field, self._law, self._reached)
+            self._contact = self._solver.begin(self._field, self._law, start, focus=self._solver.focus(self._field, way))
         moved = np.linalg.norm(carried(self._dome_mm[pressed], start, stop), axis=1).max()
         count = max(1, int(np.ceil(moved / self._step_mm)))
 
@@ -154,9 +147,6 @@ class Follower:
             for _, state in contact.advance(way.at, 0.0, 1.0, lambda progress: 0.0, _WHERE):
                 self._state = state
         raise ContactError("the arm gives way without an end under the contact's force; use less turn_compliance_deg_per_n or indentation")
-
-    def _provided(self, pressed_mm: np.ndarray) -> bool:
-        return bool((((pressed_mm / self._radius_mm) @ self._reached.T).max(axis=1) > np.cos(_KNOWN_RAD)).all())
 
 
 def _step_of(touched: ObjectSpec) -> float:

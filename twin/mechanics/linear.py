@@ -10,10 +10,10 @@ fronts; the order is found once per path. Some unknowns can be kept: a dense mat
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-import numba
 import numpy as np
 from scipy.linalg import blas, lapack
 
+from twin.compiled import compiled
 from twin.mechanics.elements import PAIRS
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -233,7 +233,7 @@ def _inside(boxes: IntArray, box: Box) -> BoolArray:
     return (boxes[:, 0] >= box[0]) & (boxes[:, 1] <= box[1]) & (boxes[:, 2] >= box[2]) & (boxes[:, 3] <= box[3])
 
 
-@numba.njit(cache=True)
+@compiled()
 def whole(lower: FloatArray, shift: float) -> FloatArray:
     """A symmetric matrix from its lower triangle, plus a shift on the diagonal."""
     out = np.empty_like(lower)
@@ -252,7 +252,7 @@ def _runs(places: IntArray, own: int) -> IntArray:
     return np.column_stack([first, places[first], np.diff(first, append=len(places))])
 
 
-@numba.njit(cache=True)
+@compiled()
 def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
     """Add symmetric blocks to a front's lower triangle."""
     own, count = len(head), elements.shape[2]
@@ -278,7 +278,7 @@ def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: Flo
                         head[high, low] += block[p, a, b]
 
 
-@numba.njit(cache=True)
+@compiled()
 def _extend(update: FloatArray, runs: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
     """Add what an earlier front leaves, (border, border), to a front; all transposed, so that columns lie in one piece."""
     own = len(head)
@@ -296,7 +296,7 @@ def _extend(update: FloatArray, runs: IntArray, head: FloatArray, below: FloatAr
                     _add(source[row : row + count], rest[low - own, place - own : place - own + count])
 
 
-@numba.njit(cache=True)
+@compiled()
 def _add(values: FloatArray, out: FloatArray) -> None:
     for k in range(len(values)):
         out[k] += values[k]

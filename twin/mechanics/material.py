@@ -9,10 +9,10 @@ c10 and c01, Yeoh c10, c20 and c30. At small strain the shear modulus is 2 (c10 
 modulus kappa.
 """
 
-import numba
 import numpy as np
 
 from scenes.sensor import MaterialSpec
+from twin.compiled import compiled
 from twin.types import FloatArray
 
 
@@ -29,7 +29,7 @@ def law_coefficients(spec: MaterialSpec, *, layer: bool) -> FloatArray:
     return np.array([half * (1 - share), half * share, half * spec.c20_c10, half * spec.c30_c10, kappa, difference])
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def invariants(f: FloatArray, g: FloatArray) -> float:
     """det F and, into ``g`` (3, 3), F^-T; det F <= 0 leaves ``g`` alone."""
     g00 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
@@ -48,7 +48,7 @@ def invariants(f: FloatArray, g: FloatArray) -> float:
     return det
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def distortion(law: FloatArray, f: FloatArray, det: float, g: FloatArray, stress: FloatArray) -> float:
     """Energy density of the part of the law without kappa; its derivative by F into ``stress`` (3, 3), MPa."""
     trace, scale, first = _first_invariant(f, det)
@@ -67,7 +67,7 @@ def distortion(law: FloatArray, f: FloatArray, det: float, g: FloatArray, stress
     return energy
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def distortion_stiffness(law: FloatArray, f: FloatArray, det: float, g: FloatArray, out: FloatArray) -> None:
     """Second derivative of ``distortion`` by F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
     trace, scale, first = _first_invariant(f, det)
@@ -86,7 +86,7 @@ def distortion_stiffness(law: FloatArray, f: FloatArray, det: float, g: FloatArr
         _add_second_stiffness(law[1] * scale * scale, f, g, trace, out)
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _add_second_stiffness(factor: float, f: FloatArray, g: FloatArray, trace: float, out: FloatArray) -> None:
     """Add the c01 part of ``distortion_stiffness``."""
     second, slopes = _second_invariant(f, trace)
@@ -105,7 +105,7 @@ def _add_second_stiffness(factor: float, f: FloatArray, g: FloatArray, trace: fl
                     out[i, j, k, m] += factor * (curve - 4 / 3 * (slopes[i, j] * g[k, m] + g[i, j] * slopes[k, m]))
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _first_invariant(f: FloatArray, det: float) -> tuple[float, float, float]:
     """tr C, J^(-2/3) and I1 - 3."""
     trace = 0.0
@@ -116,7 +116,7 @@ def _first_invariant(f: FloatArray, det: float) -> tuple[float, float, float]:
     return trace, scale, scale * trace - 3
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _second_invariant(f: FloatArray, trace: float) -> tuple[float, FloatArray]:
     """I2 of C and its derivative 2 (tr C F - F C) by F."""
     c = f.T @ f

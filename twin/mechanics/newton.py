@@ -8,7 +8,6 @@ exactly on the small dense problem that remains: which points touch, stick or sl
 
 import numpy as np
 
-from twin.errors import ContactError
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
@@ -18,7 +17,7 @@ from twin.types import BoolArray, FloatArray, IntArray
 
 GAP_BOUND_MM = 0.01
 """No contact point ends deeper inside the object than this."""
-RESIDUAL_TOLERANCE = 1e-6
+RESIDUAL_TOLERANCE = 1e-5
 """A step is solved when the norm of the residual is at most this share of the sum of the contact forces."""
 _PENALTY_GROWTH = 4.0
 """Factor on the penalty when a point ends too deep."""
@@ -30,14 +29,18 @@ _INNER_ITERATIONS = 400
 """Most inner iterations of one solution, all outer ones together. Where contact flickers for longer, shorter load steps are faster."""
 _WORSE = 2.0
 """A move that makes the residual larger than this many times is refused."""
-_KEEP_TANGENT = 0.3
+_KEEP_TANGENT = 0.8
 """An old tangent is kept as long as it lowers the residual to this share or less."""
+_SECANTS = 6
+"""Most earlier residuals that the outer iteration combines."""
 _SMALLEST_SHIFT_N_MM = 0.01
 """First shift on the diagonal of a tangent that leads to refused moves, or is not positive definite (N/mm)."""
 _SHIFT_GROWTH = 8
 """Factor from one shift to the next."""
 _LARGEST_SHIFT_N_MM = 50.0
 """With a shift beyond this (N/mm) the step counts as not solved."""
+_PROVIDED_MM = 1.0
+"""Skin that is nearer to the object than this is kept in the elimination, so that it need not be prepared anew in the next load steps."""
 _REACH_MM = 0.15
 """Contact points farther than this from the object are left out of the equations; at the end it is checked that none of them touches."""
 
@@ -50,30 +53,51 @@ class NoConvergence(Exception):
         self.relative = relative
 
 
+class _Secants:
+    """What the outer iteration has learnt about the error of a tangent that it keeps (Anderson 1965).
+
+    With a tangent K the body is K x + c, and each iteration solves the contact for the last c. At the solution x the elastic force
+    says c + r, r being the residual. The next c is the combination of those seen so far whose residuals, combined alike, are smallest.
+    """
+
+    def __init__(self) -> None:
+        self._offset: FloatArray | float = 0.0
+        self._seen: list[tuple[FloatArray, FloatArray]] = []
+
+    def mend(self, residual: FloatArray) -> FloatArray | float:
+        """What to add to the elastic force at the present state, whose residual is given, (unknowns,)."""
+        offset = self._offset + residual
+        mend: FloatArray | float = 0.0
+        if self._seen:
+            errors = np.column_stack([residual - old for _, old in self._seen])
+            shares = np.linalg.lstsq(errors, residual, rcond=1e-6)[0]
+            mend = -np.column_stack([offset - old for old, _ in self._seen]) @ shares
+        self._seen = [*self._seen[1 - _SECANTS :], (offset, residual)]
+        self._offset = offset + mend
+        return mend
+
+
 class LoadStepper:
     """Solves load steps of one contact.
 
     Parameters
     ----------
     body : Body
-    frontal : FrontalSolver
-        Keeps the controls that the object may touch.
+    boxes : list of (m, 4) int
+        Where each element of each kind lies (see ``FrontalSolver``).
     field : ObjectField
     friction : Friction
     compliance_mm_per_n : float
     """
 
-    def __init__(self, body: Body, frontal: FrontalSolver, field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
-        self._body, self._frontal, self._field, self._friction = body, frontal, field, friction
+    def __init__(self, body: Body, boxes: list[IntArray], field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
+        self._body, self._boxes, self._field, self._friction = body, boxes, field, friction
         self._compliance = compliance_mm_per_n
         shapes = [(len(kind.cells.controls), 6, *2 * kind.cells.controls.shape[1:]) for kind in body.kinds]
         self._blocks = [np.empty(shape, np.float32) for shape in shapes]
-        local = np.full(len(body.free), -1)  # place of each control among the kept ones
-        kept_controls = np.flatnonzero(np.isin(frontal.unknown[:, 0], frontal.kept))
-        local[kept_controls] = np.arange(len(kept_controls))
-        self._local = local[body.points.controls]
-        # a point may be carried by kept and by clamped controls only
-        self._reachable: BoolArray = np.all((self._local >= 0) | ~body.free[body.points.controls], axis=1)
+        self._frontal: FrontalSolver | None = None
+        self._kept: BoolArray = np.zeros(len(body.free), bool)
+        self._local: IntArray = np.zeros((0, 9), int)
         self._tangent: Tangent | None = None
         self._shift = 0.0
         self._near: tuple[Tangent, IntArray, Near] | None = None
@@ -97,7 +121,8 @@ class LoadStepper:
         control, border = self._extrapolate(state, T)
         before, after = self._seen(state.control_mm, state.border, state.T), self._seen(control, border, T)
         gap_before, gap = self._field.distance(before), self._field.distance(after)
-        looked = np.flatnonzero(self._reachable & (gap < _REACH_MM) | state.held)
+        looked = np.flatnonzero((gap < _REACH_MM) | state.held)
+        self._provide(looked, gap)
         # a point that is driven into the object is anchored where it meets the surface on the way
         driven = (gap_before > 0) & (gap < 0)
         share = np.where(driven, gap_before / np.where(driven, gap_before - gap, 1.0), 0.0)[:, None]
@@ -120,16 +145,28 @@ class LoadStepper:
             left_out = np.setdiff1d(np.arange(len(gap)), looked, assume_unique=True)
             missed = left_out[self._field.distance(self._seen(control, border, T)[left_out]) < 0]
             if len(missed):
-                if not self._reachable[missed].all():
-                    raise ContactError(
-                        "skin far from where the rigid object would press has come to touch it; use less indentation or shear"
-                    )
                 looked = np.sort(np.concatenate([looked, missed]))
+                self._provide(looked, gap)
             elif balance.contact.penetration_mm.max(initial=0.0) > GAP_BOUND_MM:
                 penalty *= _PENALTY_GROWTH
             else:
                 return self._accepted(state, problem, control, border, balance), balance, looked
         raise NoConvergence(balance.relative)
+
+    def _provide(self, looked: IntArray, gap: FloatArray) -> None:
+        """Prepare the elimination for contact at the points looked at (q,); ``gap`` (p,) in mm are the distances of all points."""
+        controls, free = self._body.points.controls, self._body.free
+        needed = np.zeros(len(free), bool)
+        needed[controls[looked]] = True
+        needed &= free
+        if self._frontal is not None and not (needed & ~self._kept).any():
+            return
+        kept = needed.copy()
+        kept[controls[gap < _PROVIDED_MM]] = True
+        self._kept = kept & free
+        self._frontal = FrontalSolver([kind.cells.controls for kind in self._body.kinds], self._boxes, ~free, self._kept)
+        self._local = np.where(self._kept, np.cumsum(self._kept) - 1, -1)[controls]
+        self._tangent = self._near = None
 
     def _extrapolate(self, state: LoadState, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Controls and border to start from: the last step continued, or the present state if the object moves another way now.
@@ -151,13 +188,14 @@ class LoadStepper:
     def _accepted(self, state: LoadState, problem: Problem, control: FloatArray, border: FloatArray, balance: Balance) -> LoadState:
         contact, looked, count = balance.contact, problem.looked, len(state.held)
         self._last = state
-        held, anchor, slid = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count)
+        held, anchor, slid, limit = np.zeros(count, bool), np.zeros((count, 3)), np.zeros(count), np.zeros(count)
         held[looked], anchor[looked] = contact.penetration_mm > 0, contact.anchor_mm
+        limit[looked] = np.minimum(problem.friction * contact.normal_n, problem.bound_n)
         moved = np.linalg.norm(contact.anchor_mm - problem.anchor_mm, axis=1)
         slid[looked] = np.where(contact.slipping, state.slid_mm[looked] + moved, 0.0)
-        tangential = np.linalg.norm(contact.force_n - contact.normal_n[:, None] * contact.normal, axis=1)
-        lost = float((tangential * moved)[contact.slipping].sum())
-        return LoadState(control, border, anchor, held, slid, problem.penalty, problem.T, balance.elastic_nmm, lost)
+        # a point that slips bears the limit of friction, which changes in the step with its normal force and its slip
+        lost = float(((state.limit_n + limit)[looked] / 2 * moved)[contact.slipping].sum())
+        return LoadState(control, border, anchor, held, slid, limit, problem.penalty, problem.T, balance.elastic_nmm, lost)
 
     def _seen(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
         """All contact points in the object's frame, (p, 3)."""
@@ -171,6 +209,7 @@ class LoadStepper:
             raise NoConvergence(np.inf)
         astray = False
         tangent, fresh, shift, last, accepted = self._tangent, False, 0.0, np.inf, 0
+        secants: _Secants | None = None
         most_inner = self.inner_iterations + _INNER_ITERATIONS
         for _ in range(_ITERATIONS):
             if balance.relative <= RESIDUAL_TOLERANCE:
@@ -180,18 +219,20 @@ class LoadStepper:
             self.iterations += 1
             if tangent is None or (not fresh and balance.absolute > _KEEP_TANGENT * last) or shift != self._shift:
                 self._tangent = tangent = self._linearise(problem, control, border, shift)
-                self._shift, fresh = shift, True
+                self._shift, fresh, secants = shift, True, None
             else:
                 fresh = False
+            mend = secants.mend(balance.residual) if secants else 0.0
+            secants = secants or _Secants()
             soften = astray or not (accepted or extrapolated)
-            move, border_move = self._contact_move(problem, tangent, control, border, balance, soften)
+            move, border_move = self._contact_move(problem, tangent, control, border, balance, balance.elastic + mend, soften)
             size = min(1.0, LARGEST_MOVE_MM / max(np.abs(move).max(), 1e-300))
             new, new_border = control.copy(), border + size * border_move
             new[self._body.free] += size * move.reshape(-1, 3)
             trial = problem.balance(new, new_border)
             # the first move takes up the object's motion, and its residual may be of any size; no later one may
             if trial is None or size < 1 or (accepted and trial.absolute > _WORSE * balance.absolute):
-                astray = True
+                astray, secants = True, None
                 if not fresh:
                     last = 0.0  # first the old tangent is suspected: make a new one
                 else:
@@ -208,6 +249,7 @@ class LoadStepper:
 
     def _linearise(self, problem: Problem, control: FloatArray, border: FloatArray, shift: float) -> Tangent:
         """The body's tangent at a state, plus a shift on the diagonal."""
+        assert self._frontal is not None, "provide first"
         self.eliminations += 1
         self._tangent = None  # its memory is overwritten below
         problem.stiffness(control, border, self._blocks)
@@ -230,12 +272,19 @@ class LoadStepper:
         return Tangent(eliminated, matrix, column, -float(column[inner] @ column[inner]))
 
     def _contact_move(
-        self, problem: Problem, tangent: Tangent, control: FloatArray, border: FloatArray, balance: Balance, soften: bool
+        self,
+        problem: Problem,
+        tangent: Tangent,
+        control: FloatArray,
+        border: FloatArray,
+        balance: Balance,
+        elastic: FloatArray,
+        soften: bool,
     ) -> tuple[FloatArray, FloatArray]:
         """The move (unknowns,) and (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept
-        forward = eliminated.forward(balance.elastic)
+        forward = eliminated.forward(elastic)
         volume_residual = balance.border_residual[1]
         if tangent.volume_column is not None:
             inner = np.ones(len(forward), bool)

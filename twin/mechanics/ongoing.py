@@ -46,6 +46,7 @@ class OngoingContact:
     Parameters
     ----------
     setting : Setting
+    stepper : LoadStepper
     T : (4, 4) float
         The object's pose at the start, free of contact.
     one_thread : callable
@@ -57,9 +58,8 @@ class OngoingContact:
         The last converged one, of all controls.
     """
 
-    def __init__(self, setting: Setting, T: FloatArray, one_thread: Callable[[], AbstractContextManager]) -> None:
-        self.setting, self._one_thread = setting, one_thread
-        self.stepper: LoadStepper | None = None  # set before the first step
+    def __init__(self, setting: Setting, stepper: LoadStepper, T: FloatArray, one_thread: Callable[[], AbstractContextManager]) -> None:
+        self.setting, self.stepper, self._one_thread = setting, stepper, one_thread
         body = setting.body
         count = len(body.points.area_mm2)
         self.load = LoadState(
@@ -68,6 +68,7 @@ class OngoingContact:
             anchor_mm=np.zeros((count, 3)),
             held=np.zeros(count, bool),
             slid_mm=np.zeros(count),
+            limit_n=np.zeros(count),
             penalty_mpa_mm=_PENALTY_MPA_MM,
             T=T,
         )
@@ -78,8 +79,6 @@ class OngoingContact:
         """The converged state with the object at ``T`` (4, 4), ``span_s`` later; after ``NoConvergence`` the contact is where it was."""
         kinds = self.setting.body.kinds
         now = [p.before(kind, term, span_s) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
-        if self.stepper is None:
-            raise RuntimeError("this contact has no stepper yet; SkinSolver.begin gives it one")
         with self._one_thread():
             self.stepper.follow(replace(self.setting.body, kinds=tuple(kind for kind, _ in now)))
             self.load, balance, looked = self.stepper.step(self.load, T, [given for _, given in now])

@@ -18,7 +18,6 @@ from twin.mechanics.balance import Body, Friction
 from twin.mechanics.contact import contact_points
 from twin.mechanics.elements import Elements
 from twin.mechanics.law import ContactLaw
-from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
 from twin.mechanics.ongoing import OngoingContact, Setting
@@ -32,12 +31,24 @@ _LOOK_MM = 2.0
 """Largest motion between two poses of the path at which the solver looks where the object will press."""
 _FOCUS_POINTS = 2000
 """Directions on the whole sphere in which the solver looks where the object will press."""
-_FOCUS_POLAR_DEG = 5.0
-"""The focus's polar angle is rounded to multiples of this, so that similar contacts share a solid."""
-_FOCUS_AZIMUTH_DEG = 15.0
-"""The focus's azimuth is rounded to multiples of this."""
-_MARGIN_RAD = np.radians(15.0)
-"""Skin within this angle of a direction that the rigid object would pass through may come to touch it."""
+_FOCUS_GAP_MM = 0.5
+"""At a first touch a direction counts for the focus with exp(-gap / this): the object's local shape decides, not how deep it will press."""
+
+_GRID_TURN_RAD = np.radians(30.0)
+"""Turn of the grid's rows against the object's x axis. Rows along an edge would all cross it at the same moment."""
+_LEAST_FOCUS_RAD = np.radians(28.0)
+"""Least angle around the focus that the grid is fine in."""
+_LARGEST_FOCUS_RAD = np.radians(50.0)
+"""Largest such angle."""
+_COARSE_FOCUS_RAD = np.radians(2.4)
+"""On a grid of fewer than 16 elements across the least angle grows by this for each that is missing: the elements at the rim would turn
+inside out."""
+_FOCUS_SPREADS = 1.5
+"""The fine part reaches beyond its least angle by this many root mean square angles of the weights."""
+_TOUCH_MM = 1e-4
+"""The object counts as just touching when its distance to the dome is at most this."""
+_MOST_LIFTS = 60
+"""Most steps in which the object is brought to its first touch; it usually takes three."""
 _START_INSIDE_MM = 0.05
 """A path may begin with the object this deep inside the undeformed dome: rounding of a first touch."""
 
@@ -49,12 +60,10 @@ class SkinSolver:
     ----------
     spec : SensorSpec
     resolution : Resolution, optional
-    keep : bool
-        Whether what depends on the geometry is kept on disk; not for geometries that are used once.
     """
 
-    def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None, keep: bool = True) -> None:
-        self.spec, self.resolution, self._keep = spec, resolution or Resolution(), keep
+    def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None) -> None:
+        self.spec, self.resolution = spec, resolution or Resolution()
         self.mesh = build_mesh(spec.geometry)
         self._blas = ThreadpoolController()
         self._setting = lru_cache(maxsize=32)(self._set_up)
@@ -131,7 +140,7 @@ class SkinSolver:
             yield 1.0, self.rest(T_sensor_object=plan.at(1.0))
             return
         reached = self._reached(field, plan)
-        contact = self.begin(field, law, reached, plan.at(0.0), focus=_focus(reached))
+        contact = self.begin(field, law, plan.at(0.0), focus=self.focus(field, plan))
         stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
         force_n: FloatArray = np.zeros(3)
 
@@ -144,25 +153,12 @@ class SkinSolver:
                 force_n = state.force_n
                 yield float(at / stops[-1]), state
 
-    def begin(self, field: ObjectField, law: ContactLaw, reached: FloatArray, T: FloatArray, *, focus: Focus) -> OngoingContact:
-        """A contact at its start, the object at ``T`` and free of the skin.
-
-        Parameters
-        ----------
-        reached : (k, 3) float
-            Directions of the dome that the object may come to press, and ``focus``: where the solid is fine.
-        """
+    def begin(self, field: ObjectField, law: ContactLaw, T: FloatArray, *, focus: Focus) -> OngoingContact:
+        """A contact at its start, the object at ``T`` (4, 4) and free of the skin; the solid is fine at ``focus``."""
         with self._one_thread():
             setting = self._setting(focus)
-        contact = OngoingContact(setting, T, self._one_thread)
-        self.reach(contact, field, law, reached)
-        return contact
-
-    def reach(self, contact: OngoingContact, field: ObjectField, law: ContactLaw, reached: FloatArray) -> None:
-        """Prepare the contact for an object that comes to press other directions (k, 3) of the dome than before."""
-        with self._one_thread():
-            frontal = self._frontal(contact.setting, reached)
-            contact.stepper = LoadStepper(contact.setting.body, frontal, field, law.friction, law.compliance_mm_per_n)
+        stepper = LoadStepper(setting.body, list(setting.solid.boxes), field, law.friction, law.compliance_mm_per_n)
+        return OngoingContact(setting, stepper, T, self._one_thread)
 
     def _one_thread(self) -> AbstractContextManager[object]:
         """BLAS on one thread: the matrices are small, and the result must not depend on the number of cores."""
@@ -170,7 +166,7 @@ class SkinSolver:
 
     def _set_up(self, focus: Focus) -> Setting:
         spec = self.spec
-        solid = build_solid(spec.geometry, resolution=self.resolution, focus=focus, keep=self._keep)
+        solid = build_solid(spec.geometry, resolution=self.resolution, focus=focus)
         gel = law_coefficients(spec.gel, layer=False)
         kinds = (
             Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True),
@@ -181,16 +177,6 @@ class SkinSolver:
         body = Body(kinds, points, ~solid.fixed, spec.gel.sealed)
         relaxation = spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation
         return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
-
-    def _frontal(self, setting: Setting, reached: FloatArray) -> FrontalSolver:
-        """Elimination of all but the outer controls that may be touched: those that carry points around the reached directions."""
-        solid, points = setting.solid, setting.body.points
-        directions = points.positions(solid.control_mm) / self.spec.skin.outer_radius_mm
-        near = (directions @ reached.T).max(axis=1) > np.cos(_MARGIN_RAD)
-        keep = np.zeros(len(solid.fixed), bool)
-        keep[points.controls[near]] = True
-        groups = [kind.cells.controls for kind in setting.body.kinds]
-        return FrontalSolver(groups, list(solid.boxes), solid.fixed, keep & ~solid.fixed)
 
     def _reached(self, field: ObjectField, plan: ContactPath) -> FloatArray:
         """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""
@@ -211,14 +197,56 @@ class SkinSolver:
         pressed = deepest < 0
         return directions[pressed] if pressed.any() else directions[[deepest.argmin()]]
 
+    def focus(self, field: ObjectField, plan: ContactPath) -> Focus:
+        """Where the solid is fine for a path: around the places that the object touches first.
 
-def _focus(reached: FloatArray) -> Focus:
-    """Where the object presses, rounded, so that similar contacts share a solid."""
-    middle = reached.mean(axis=0)
-    polar = np.degrees(np.arctan2(np.hypot(middle[0], middle[1]), middle[2]))
-    polar = _FOCUS_POLAR_DEG * np.round(polar / _FOCUS_POLAR_DEG)
-    azimuth = _FOCUS_AZIMUTH_DEG * np.round(np.degrees(np.arctan2(middle[1], middle[0])) / _FOCUS_AZIMUTH_DEG) if polar else 0.0
-    return Focus(float(np.radians(polar)), float(np.radians(azimuth)))
+        At every place of the path the object is brought along the sensor's z to its first touch. A direction of the dome whose gap
+        is g then weighs exp(-g / 0.5 mm) times the depth there over the path's largest depth; its largest weight counts. The rows of
+        the grid turn with the object. So the focus is a continuous function of the poses, it turns with the scene, and it does not
+        depend on how deep the object is pressed.
+        """
+        radius = self.spec.skin.outer_radius_mm
+        directions = dome_directions(self.spec.skin, _FOCUS_POINTS)
+        turn = plan.poses[0][:3, :3]
+        about_z = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])  # the directions turn with the object, too
+        cosine, sine = np.cos(about_z), np.sin(about_z)
+        directions = directions @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+        depths, gaps = [], []
+        for at in _stops(plan, directions, radius, _LOOK_MM):
+            depth, gap = _gaps_at_touch(field, plan.at(at), radius * directions)
+            depths.append(depth)
+            gaps.append(gap)
+        deepest = max(depths)
+        share = np.maximum(depths, 0) / deepest if deepest > 0 else np.equal(depths, deepest)
+        weights = (share[:, None] * np.exp(-np.array(gaps) / _FOCUS_GAP_MM)).max(axis=0)
+        middle = weights @ directions
+        middle /= np.linalg.norm(middle)
+        spread = np.sqrt(weights @ np.sum((directions - middle) ** 2, axis=1) / weights.sum())
+        least = _LEAST_FOCUS_RAD + _COARSE_FOCUS_RAD * max(16 - self.resolution.across, 0)
+        radius_rad = float(max(least, min(_LEAST_FOCUS_RAD + _FOCUS_SPREADS * spread, _LARGEST_FOCUS_RAD)))
+        polar, azimuth = float(np.arctan2(np.hypot(*middle[:2]), middle[2])), float(np.arctan2(middle[1], middle[0]))
+        return Focus(polar, azimuth, radius_rad, _turn(turn, polar, azimuth) + _GRID_TURN_RAD)
+
+
+def _gaps_at_touch(field: ObjectField, T: FloatArray, points_mm: FloatArray) -> tuple[float, FloatArray]:
+    """How far the object at ``T`` is inside points (k, 3), and their gaps (k,) where it just touches them, moved along the sensor's z."""
+    T = T.copy()
+    first = gap = field.distance((points_mm - T[:3, 3]) @ T[:3, :3])
+    for _ in range(_MOST_LIFTS):
+        if abs(gap.min()) <= _TOUCH_MM:
+            break
+        T[2, 3] -= gap.min()
+        gap = field.distance((points_mm - T[:3, 3]) @ T[:3, :3])
+    return -float(first.min()), gap - gap.min()
+
+
+def _turn(turn: FloatArray, polar: float, azimuth: float) -> float:
+    """Angle in the disc at a direction at which the object's x axis, seen along its z, lies there; ``turn`` (3, 3) is the object's."""
+    to_rim = np.array([np.cos(polar) * np.cos(azimuth), np.cos(polar) * np.sin(azimuth), -np.sin(polar)])
+    around = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    stretch = polar / np.sin(polar) if polar > 0 else 1.0  # of the disc's circles against its radii
+    along_x, along_y = (axis @ to_rim + 1j * stretch * (axis @ around) for axis in turn.T[:2])
+    return float(np.angle((along_x - 1j * along_y) * np.exp(1j * azimuth)))
 
 
 def _stops(plan: ContactPath, directions: FloatArray, radius_mm: float, step_mm: float) -> FloatArray:

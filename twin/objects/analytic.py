@@ -1,7 +1,7 @@
 """Exact signed distances of simple solids.
 
-Every solid has ``probe`` (so ``distance`` and ``gradient``) and ``unroll``: two coordinates (k, 2) in mm along the
-surface below a point, with their gradients (k, 2, 3) and Hessians (k, 2, 3, 3) in 1/mm, on which a texture is wrapped.
+Every solid has ``probe`` (and therefore ``distance`` and ``gradient``) and ``unroll``, which gives texture coordinates: two lengths
+(k, 2) in mm along the surface below a point, with their gradients (k, 2, 3) and their Hessians (k, 2, 3, 3) in 1/mm.
 """
 
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ class Cylinder(Wrapped):
 
 @dataclass(frozen=True)
 class Edge(Wrapped):
-    """Quarter space x >= 0, z >= 0, its edge rounded by a fillet (which takes the edge back from the origin)."""
+    """Quarter space x >= 0, z >= 0 with an edge rounded by a fillet. The rounded edge lies a little behind the origin."""
 
     fillet_mm: float
 
@@ -72,11 +72,10 @@ class Edge(Wrapped):
 
 @dataclass(frozen=True)
 class Prism(Wrapped):
-    """Regular polygon in x-z extruded along y, edges rounded, faces leaning by a taper about x.
+    """Regular polygon in x-z extruded along y, with rounded edges, and faces tilted by a taper about x.
 
-    Face 0 passes through the origin and looks to -z; with a positive taper its normal leans to +y
-    (the prism narrows towards +y). The rounded solid is the polyhedron moved in by the fillet,
-    grown by the fillet.
+    Face 0 passes through the origin and faces -z. With a positive taper its normal tilts towards +y (the prism narrows towards +y). The
+    rounded solid is made by moving all faces inwards by the fillet radius, and adding all points within this radius of the smaller solid.
     """
 
     sides: int

@@ -1,12 +1,12 @@
-"""From an object's specification to its signed-distance field, with a wire mesh wrapped on it where it has one."""
+"""The signed-distance field of an object from its specification, including a wire mesh on its surface if it has one."""
 
 from dataclasses import dataclass
 from typing import Protocol
 
-import numba
 import numpy as np
 
 from scenes.object import CylinderShape, EdgeShape, MeshShape, ObjectSpec, PlaneShape, PrismShape, SphereShape
+from twin.compiled import compiled
 from twin.objects.analytic import Cylinder, Edge, Plane, Prism, Sphere
 from twin.objects.level_set import Probe, Probed, Wrapped, unit_normals
 from twin.objects.mesh_field import load_mesh_field
@@ -15,7 +15,7 @@ from twin.types import FloatArray
 _BLEND = 0.15
 """Length over which wires and base are blended into each other, as a share of the wire's diameter."""
 _CREASE_MM = 1e-3
-"""Nearer to a wire's axis than this the field counts as not curved."""
+"""Distance from a wire's axis below which the field's curvature counts as 0, because it has no limit there."""
 
 
 class ObjectField(Protocol):
@@ -32,8 +32,8 @@ class ObjectField(Protocol):
     def probe(self, points_mm: FloatArray) -> Probe:
         """Distance (k,), gradient (k, 3) and Hessian (k, 3, 3) in 1/mm, in one evaluation.
 
-        The Hessian is the second derivative of the distance: symmetric, with the gradient in its null space, zero across
-        creases. Where a field is no exact distance it is the derivative of the unit gradient along the level set.
+        The Hessian is the second derivative of the distance. It is symmetric, the gradient is in its null space, and it is zero across
+        creases. If a field is not an exact distance, it is the derivative of the unit gradient along the level set.
         """
         ...
 
@@ -44,7 +44,7 @@ def build_field(spec: ObjectSpec) -> ObjectField:
     Raises
     ------
     MeshError
-        If a mesh file is not closed, in the wrong unit, empty or unreadable.
+        A mesh file is not closed, in the wrong unit, empty or unreadable.
     """
     shape = spec.shape
     base: Wrapped
@@ -70,9 +70,9 @@ def build_field(spec: ObjectSpec) -> ObjectField:
 class WireMesh(Probed):
     """Round wires that lie on the base's surface in two crossing families; one wire of each family passes over the origin.
 
-    A wire's distance is sqrt((D - d/2)^2 + s^2) - d/2 with the base's distance D, the wire's
-    diameter d and the distance s along the surface to the nearest wire; base and wires are joined
-    by the polynomial smooth minimum (Quilez), which only adds material.
+    The distance to a wire is sqrt((D - d/2)^2 + s^2) - d/2, where D is the base's distance, d the wire's diameter and s the distance
+    along the surface to the nearest wire. Base and wires are joined by the polynomial smooth minimum (Quilez), which only adds
+    material.
     """
 
     base: Wrapped
@@ -87,7 +87,7 @@ class WireMesh(Probed):
         return distance, slope, hessian
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _lay_wires(
     distance: FloatArray,
     slope: FloatArray,
@@ -110,7 +110,7 @@ def _lay_wires(
         for family in range(2):
             s = along[k, family] - pitch * np.floor(along[k, family] / pitch + 0.5)
             away = max(np.sqrt(lift * lift + s * s), 1e-9)
-            # smooth minimum of a, b: (1 - w) a + w b - blend w (1 - w), w = (1 + (a - b) / blend) / 2 kept in 0..1
+            # smooth minimum of a and b: (1 - w) a + w b - blend w (1 - w), where w = (1 + (a - b) / blend) / 2 is clipped to 0..1
             w = min(0.5 + (distance[k] - away + radius) / (2 * blend), 1.0)
             if w <= 0:
                 continue

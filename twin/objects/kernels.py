@@ -4,24 +4,24 @@ Around a point, a sphere or a straight line at a distance r, the Hessian of the 
 with the normal n and the line's direction a (none for a point); over a flat face it is zero.
 """
 
-import numba
 import numpy as np
 
+from twin.compiled import compiled
 from twin.objects.level_set import Probe, Triple
 from twin.types import FloatArray
 
 _CREASE_MM = 1e-3
-"""A surface with a smaller radius of curvature counts as a crease, which has no Hessian."""
+"""Radius of curvature below which a surface counts as a crease. The Hessian of a crease is set to 0."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _results(count: int) -> Probe:
     return np.empty(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple, radius: float) -> None:
-    """Point k's normal n and (I - n n - a a) / radius; plain numbers, since slices of arrays cost more than the sums."""
+    """Write point k's normal n and Hessian (I - n n - a a) / radius. Plain numbers are used, because slices of arrays would be slower."""
     normal[k, 0], normal[k, 1], normal[k, 2] = n
     if radius > _CREASE_MM:
         r = 1 / radius
@@ -33,7 +33,7 @@ def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple
         hessian[k, 1, 2] = hessian[k, 2, 1] = -r * (n[1] * n[2] + a[1] * a[2])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def plane(points: FloatArray) -> Probe:
     distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
@@ -42,7 +42,7 @@ def plane(points: FloatArray) -> Probe:
     return distance, normal, hessian
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def round_solid(points: FloatArray, radius: float, along_y: float) -> Probe:
     """Ball, or cylinder along y (``along_y`` 1.0, for the ball 0.0), behind the origin."""
     distance, normal, hessian = _results(len(points))
@@ -55,11 +55,11 @@ def round_solid(points: FloatArray, radius: float, along_y: float) -> Probe:
     return distance, normal, hessian
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def edge(points: FloatArray, fillet: float) -> Probe:
     distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
-        # how far the point lies in front of the faces moved in by the fillet
+        # distances of the point in front of the faces, which are moved inwards by the fillet
         x, z = fillet - points[k, 0], fillet - points[k, 2]
         if x > 0 and z > 0:
             away = np.sqrt(x * x + z * z)
@@ -72,17 +72,18 @@ def edge(points: FloatArray, fillet: float) -> Probe:
     return distance, normal, hessian
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _sector(x: float, z: float, sides: int) -> int:
     """Number of the nearest face around the axis."""
     return int(np.floor(np.arctan2(x, -z) * sides / (2 * np.pi) + 0.5))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper: float) -> Probe:
-    """A point is folded into the sector of its nearest face, into coordinates out, along the face, y.
+    """Prism. Each point is rotated into the sector of its nearest face, with the coordinates: outwards, along the face, y.
 
-    There the nearest point of the polyhedron moved in by the fillet lies on that face or on the edge between two faces.
+    In this sector the nearest point of the polyhedron, whose faces are moved inwards by the fillet, is on that face or on the edge
+    between two faces.
     """
     distance, normal, hessian = _results(len(points))
     lean_out, lean_y = np.cos(taper), np.sin(taper)
@@ -114,7 +115,7 @@ def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper:
     return distance, normal, hessian
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def unroll_cylinder(points: FloatArray, radius: float) -> Probe:
     along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
     for k in range(len(points)):
@@ -129,7 +130,7 @@ def unroll_cylinder(points: FloatArray, radius: float) -> Probe:
     return along, slope, bend
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def unroll_prism(points: FloatArray, sides: int, inradius: float) -> Probe:
     along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
     width = 2 * inradius * np.tan(np.pi / sides)

@@ -1,19 +1,19 @@
-"""What all signed-distance fields share: distance and gradient from one probe, and unit normals of fields that are no exact distance."""
+"""The base of all signed-distance fields: distance and gradient from one probe, and unit normals of fields that are not exact distances."""
 
 from abc import ABC, abstractmethod
 from typing import TypeAlias
 
-import numba
 import numpy as np
 
+from twin.compiled import compiled
 from twin.types import FloatArray
 
 Probe: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-"""Distance (k,) in mm, unit gradient (k, 3) and Hessian (k, 3, 3) in 1/mm at k points (or texture coordinates and their derivatives)."""
+"""Distance (k,) in mm, unit gradient (k, 3) and Hessian (k, 3, 3) in 1/mm at k points; or texture coordinates and their derivatives."""
 Triple: TypeAlias = tuple[float, float, float]
 
 _FLAT = 1e-12
-"""Slope below which a field counts as having no direction."""
+"""Length of a field's gradient below which it has no usable direction."""
 
 
 class Probed(ABC):
@@ -41,15 +41,15 @@ class Wrapped(Probed):
 
 
 def rows(points_mm: FloatArray) -> FloatArray:
-    """Points as the kernels take them: C-ordered float64, so that each kernel is compiled once."""
+    """Points as C-ordered float64, which the kernels take. With one type of array each kernel is compiled only once."""
     return np.ascontiguousarray(points_mm, dtype=np.float64)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def unit_normals(slope: FloatArray, hessian: FloatArray) -> None:
     """Turn, in place, a field's slope g (k, 3) into the unit normal n and its second derivative H (k, 3, 3) into P H P / |g|, P = I - n n.
 
-    That is the derivative of n along the level set: it is symmetric, and H n = 0. It leaves out how n turns along n itself, which is
+    The result is the derivative of n along the level set: it is symmetric, and H n = 0. It leaves out the change of n along n, which is
     zero for an exact distance. A place without slope gets the normal -z and no curvature.
     """
     for k in range(len(slope)):

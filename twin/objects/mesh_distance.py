@@ -1,32 +1,33 @@
-"""Exact signed distance to a closed triangle mesh, by a tree of boxes over its triangles.
+"""Exact signed distance to a closed triangle mesh, computed with a tree of boxes over its triangles.
 
-The triangles are halved along the longest side of their centres' box, again and again: the boxes form a complete binary
-tree (node i has children 2 i and 2 i + 1) over leaves of equally many triangles. The sign is that of the angle-weighted normal of the
-nearest face, edge or corner (Baerentzen & Aanaes, "Signed distance computation using the angle weighted pseudonormal", 2005).
+The triangles are divided into halves repeatedly, each time along the longest side of the box around their centres. The boxes form a
+complete binary tree (node i has the children 2 i and 2 i + 1), whose leaves have equally many triangles. The sign follows from the
+angle-weighted normal of the nearest face, edge or corner (Baerentzen & Aanaes, "Signed distance computation using the angle weighted
+pseudonormal", 2005).
 """
 
-import numba
 import numpy as np
 import trimesh
 
+from twin.compiled import compiled
 from twin.objects.level_set import Triple
 from twin.types import FloatArray, IntArray
 
 _LEAF = 4
 """Most triangles in a leaf of the tree."""
 _FLAT_MM2 = 1e-12
-"""A triangle with a smaller area is left out: it has no inside, and its neighbours cover it."""
+"""Area below which a triangle is left out. It has no usable normal, and its neighbours cover the same place."""
 
 
 def signed_distance(mesh: trimesh.Trimesh, points_mm: FloatArray) -> FloatArray:
-    """Distance of points to a closed mesh wound outwards.
+    """Distance of points to a closed mesh whose faces are wound outwards.
 
     Parameters
     ----------
     mesh : trimesh.Trimesh
         In mm.
     points_mm : (k, 3) float
-        Fastest where neighbours in the list are near each other.
+        The search is fastest if neighbours in the list are near each other in space.
 
     Returns
     -------
@@ -45,9 +46,9 @@ def signed_distance(mesh: trimesh.Trimesh, points_mm: FloatArray) -> FloatArray:
 
 
 def _feature_normals(triangles: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Normals (f, 7, 3), not unit, of each triangle, its corners a, b, c and its edges ab, bc, ca; and the triangles' areas (f,).
+    """Normals (f, 7, 3), not normalised, of each triangle, its corners a, b, c and its edges ab, bc, ca; and the areas (f,).
 
-    All from the corners: the normals that trimesh keeps come from the file, and stay as they were when a mesh is inverted.
+    They are computed from the corners. The normals that trimesh stores come from the file, and do not change when a mesh is inverted.
     """
     face = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     size = np.linalg.norm(face, axis=1)
@@ -62,9 +63,9 @@ def _feature_normals(triangles: FloatArray, faces: IntArray) -> tuple[FloatArray
 
 
 def _halved(centres: FloatArray) -> tuple[IntArray, int]:
-    """Indices of points (f, 3) so that each half, quarter, ... of the list keeps together, and the number of leaves.
+    """Indices of points (f, 3) in an order in which each half, quarter, ... of the list is compact, and the number of leaves.
 
-    Some points come twice, which fills the leaves.
+    Some points occur twice, so that all leaves are full.
     """
     leaves = 1
     while leaves * _LEAF < len(centres):
@@ -93,20 +94,20 @@ def _boxes(triangles: FloatArray, leaves: int) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _dot(p: Triple, q: Triple) -> float:
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _minus(p: Triple, q: Triple, s: float, u: Triple, t: float, v: Triple) -> Triple:
     """p - q - s u - t v"""
     return p[0] - q[0] - s * u[0] - t * v[0], p[1] - q[1] - s * u[1] - t * v[1], p[2] - q[2] - s * u[2] - t * v[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _from_triangle(p: Triple, corners: FloatArray, k: int) -> tuple[Triple, int]:
-    """The way from triangle k's nearest point to p, and where that is: 0 face, 1-3 corner, 4-6 edge (Ericson 2005, section 5.1.5)."""
+    """Vector from triangle k's nearest point to p, and the kind of that point: 0 face, 1-3 corner, 4-6 edge (Ericson 2005, 5.1.5)."""
     a = (corners[k, 0, 0], corners[k, 0, 1], corners[k, 0, 2])
     ab = (corners[k, 1, 0] - a[0], corners[k, 1, 1] - a[1], corners[k, 1, 2] - a[2])
     ac = (corners[k, 2, 0] - a[0], corners[k, 2, 1] - a[1], corners[k, 2, 2] - a[2])
@@ -135,7 +136,7 @@ def _from_triangle(p: Triple, corners: FloatArray, k: int) -> tuple[Triple, int]
     return _minus(p, a, vb / (va + vb + vc), ab, vc / (va + vb + vc), ac), 0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _from_box(p: Triple, low: FloatArray, high: FloatArray, k: int) -> float:
     """Squared distance of p to box k."""
     x = max(low[k, 0] - p[0], p[0] - high[k, 0], 0.0)
@@ -144,7 +145,7 @@ def _from_box(p: Triple, low: FloatArray, high: FloatArray, k: int) -> float:
     return x * x + y * y + z * z
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _search(triangles: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray, points: FloatArray) -> FloatArray:
     leaves = len(low) // 2
     leaf = len(triangles) // leaves
@@ -153,7 +154,7 @@ def _search(triangles: FloatArray, normals: FloatArray, low: FloatArray, high: F
     nearest = 0
     for k in range(len(points)):
         p = (points[k, 0], points[k, 1], points[k, 2])
-        # the last point's triangle is a good first guess: most boxes are out of reach at once
+        # the start is the triangle nearest to the last point, so that most boxes are too far away from the beginning
         way, feature = _from_triangle(p, triangles, nearest)
         best = _dot(way, way)
         stack[0], bound[0], size = 1, 0.0, 1

@@ -1,6 +1,7 @@
 """Closed triangle meshes from files as smooth signed-distance fields.
 
-A mesh is read, checked, scaled to mm and put down on the origin. Its distance is sampled once; a tricubic spline reads it.
+A mesh is read, checked, scaled to mm and placed at the origin. Its distance is sampled once on a grid, and interpolated by a tricubic
+spline.
 """
 
 import hashlib
@@ -22,28 +23,29 @@ from twin.store import cached_arrays
 from twin.types import FloatArray
 
 _UNIT_REMEDY = "scale the file to mm, or name its unit in a TOML: shape = { kind = 'mesh', file = ..., unit = ... } (mm, cm, m or inch)"
-"""What to do where a file's size suggests another unit."""
+"""Advice in the message for a file whose size suggests another unit."""
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 """Length of each unit of a file, mm."""
 _SMALLEST_MM = 1.0
-"""An object whose largest side is shorter was most likely given in another unit."""
+"""Length of an object's largest side below which the file is most likely in another unit."""
 _LARGEST_MM = 2000.0
-"""An object whose largest side is longer was most likely given in another unit."""
+"""Length of an object's largest side above which the file is most likely in another unit."""
 _REACH_MM = 40.0
-"""The mesh is sampled up to this far from the origin along each axis: the dome, and how far it is sheared."""
+"""Distance from the origin along each axis up to which the mesh is sampled: the dome's radius and its largest shear."""
 _MARGIN_MM = 4.0
-"""The grid goes on this far beyond the sampled part of the mesh."""
+"""Width of the part of the grid around the sampled part of the mesh."""
 _NODES = 250_000
-"""Nodes of the grid: sampling takes about 1 s, and the grid 2 MB."""
+"""Number of nodes of the grid. Sampling takes about 1 s, and the grid 2 MB of memory."""
 _FINEST_MM = 0.25
-"""The grid's lines are never closer than this."""
+"""Least spacing of the grid."""
 
 
 @dataclass(frozen=True)
 class MeshField(Wrapped):
     """Signed distance on a regular grid, interpolated by the tricubic B-spline through its nodes (C2).
 
-    Outside the grid the distance to the grid is added: positive, and never too small.
+    Outside the grid, the distance to the grid is added to the value at its border. The result is positive and not smaller than the
+    true distance.
 
     Attributes
     ----------
@@ -71,12 +73,12 @@ class MeshField(Wrapped):
 
 
 def load_mesh_field(shape: MeshShape) -> MeshField:
-    """Read, check, place and sample a mesh; the same file and placement is sampled only once, and kept on disk.
+    """Read, check, place and sample a mesh. Samples of the same file and placement are stored on disk and used again.
 
     Raises
     ------
     MeshError
-        If the file is unreadable, empty, not closed, or its size suggests another unit.
+        If the file is unreadable, empty, not closed, has another content than ``shape`` says, or its size suggests another unit.
     """
     path = Path(shape.file)
     if not path.is_file():
@@ -85,6 +87,10 @@ def load_mesh_field(shape: MeshShape) -> MeshField:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise MeshError(f"{path}: not readable ({error.strerror}); give a file that may be read") from error
+    if shape.sha256 not in ("", digest):
+        raise MeshError(
+            f"{path}: has changed since it was loaded or simulated; put the former file back, or give the object and --out anew"
+        )
     return _sampled(str(path), digest, shape.unit, shape.rotation_deg)
 
 
@@ -117,10 +123,10 @@ def sample_mesh(mesh: trimesh.Trimesh) -> MeshField:
 
 
 def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:
-    """A closed mesh in mm, faces wound outwards; errors as ``load_mesh_field``."""
+    """Read a closed mesh in mm with faces wound outwards; raises as ``load_mesh_field``."""
     try:
         mesh = trimesh.load(file, force="mesh", process=True)
-    except Exception as error:  # trimesh's readers raise whatever their parsers raise
+    except Exception as error:  # trimesh's readers raise exceptions of any type
         raise MeshError(f"{file}: not readable as a triangle mesh ({error}); give an STL, OBJ or PLY file") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise MeshError(f"{file}: no triangles in it; export a closed surface")
@@ -144,9 +150,9 @@ def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:
 
 
 def place_mesh(mesh: trimesh.Trimesh, *, rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
-    """Turn a mesh (intrinsic x, y, z), then centre it in x and y and put its lowest point over x = y = 0 at the origin.
+    """Turn a mesh (intrinsic x, y, z), centre it in x and y, and move it so that its lowest point on the z axis is the origin.
 
-    A mesh with a hole there is put down on its lowest vertex.
+    If the mesh has a hole there, its lowest vertex is moved to z = 0.
     """
     mesh = mesh.copy()
     x, y, z = np.radians(rotation_deg)

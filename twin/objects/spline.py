@@ -1,47 +1,47 @@
-"""The tricubic B-spline on a regular grid: value, slope and second derivative in one pass.
+"""Tricubic B-splines on a regular grid: value, slope and second derivative in one pass.
 
-Loops over tuples and plain numbers: slices of arrays would cost more than the sums.
+The code loops over tuples and plain numbers, because slices of arrays would take more time than the sums.
 """
 
 from typing import TypeAlias
 
-import numba
 import numpy as np
 
+from twin.compiled import compiled
 from twin.types import FloatArray
 
 Four: TypeAlias = tuple[float, float, float, float]
 
 _SUMS = {"contract", "reassoc"}
-"""What the compiler may do with sums: reorder them and fuse products. This nearly halves the time, and NaN stays NaN."""
+"""Permissions for the compiler: to reorder sums and to fuse products. They nearly halve the time. NaN stays NaN."""
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _cell(at: float, count: int) -> tuple[int, float]:
-    """Node below ``at`` (in nodes) that has a neighbour before it and two behind, and the way from it."""
+    """The node below ``at`` (in nodes), limited so that it has one neighbour before it and two after it, and ``at``'s distance from it."""
     cell = min(max(int(np.floor(at)), 1), count - 3)
     return cell, at - cell
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _weights(t: float) -> Four:
-    """Shares of the four nodes around a place ``t`` after the second."""
+    """Weights of four nodes at the place ``t`` (0 to 1) between the second and the third."""
     s = 1 - t
     return s**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * s**2 + 3 * s**3) / 6, t**3 / 6
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _slopes(t: float) -> Four:
     s = 1 - t
     return -(s**2) / 2, (3 * t - 4) * t / 2, (4 - 3 * s) * s / 2, t**2 / 2
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _bends(t: float) -> Four:
     return 1 - t, 3 * t - 2, 1 - 3 * t, t
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _line(weights: Four, values: FloatArray, i: int, j: int, k: int) -> float:
     """Weighted sum over four nodes along the last axis."""
     return (
@@ -52,27 +52,27 @@ def _line(weights: Four, values: FloatArray, i: int, j: int, k: int) -> float:
     )
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _step_in(point: float, low: float, spacing: float, count: int) -> tuple[float, float]:
-    """Where a coordinate lies in the grid, in nodes, and how far it lies outside of it, in mm."""
+    """A coordinate in units of nodes, limited to the grid, and its distance outside of the grid in mm."""
     inside = min(max(point, low + 2 * spacing), low + (count - 3) * spacing)
     return (inside - low) / spacing, point - inside
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _place(
     points: FloatArray, k: int, corner: FloatArray, spacing: float, counts: tuple[int, ...]
 ) -> tuple[tuple[int, float], tuple[int, float], tuple[int, float], tuple[float, float, float]]:
-    """The cells of point k along the three axes, and how far it lies outside of the grid along each, in mm."""
+    """The cells of point k along the three axes, and its distances outside of the grid along these axes, mm."""
     x, away_x = _step_in(points[k, 0], corner[0], spacing, counts[0])
     y, away_y = _step_in(points[k, 1], corner[1], spacing, counts[1])
     z, away_z = _step_in(points[k, 2], corner[2], spacing, counts[2])
     return _cell(x, counts[0]), _cell(y, counts[1]), _cell(z, counts[2]), (away_x, away_y, away_z)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def spline_value(coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray) -> FloatArray:
-    """Values (k,) at points (k, 3); outside the grid the distance to it is added."""
+    """Values (k,) at points (k, 3). Outside the grid the distance to the grid is added."""
     value = np.empty(len(points))
     counts = coefficients.shape
     for k in range(len(points)):
@@ -86,11 +86,11 @@ def spline_value(coefficients: FloatArray, corner: FloatArray, spacing: float, p
     return value
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def spline_probe(
     coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Values (k,), slopes (k, 3) and second derivatives (k, 3, 3) at points (k, 3); outside the grid the distance to it is added."""
+    """Values (k,), slopes (k, 3) and second derivatives (k, 3, 3) at points (k, 3). Outside the grid the distance to it is added."""
     value, slope, hessian = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3, 3))
     counts, per_mm = coefficients.shape, 1 / spacing
     for k in range(len(points)):
@@ -122,9 +122,12 @@ def spline_probe(
     return value, slope, hessian
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@compiled(error_model="numpy", fastmath=_SUMS)
 def _add_gap(slope: FloatArray, hessian: FloatArray, away: tuple[float, float, float]) -> float:
-    """Beyond the grid the spline is constant along ``away``'s axes, and the distance to the grid, returned, grows along them."""
+    """Change slope and Hessian of a point outside the grid, by ``away`` along each axis, in place; returns the distance to the grid.
+
+    Outside the grid the spline is constant along these axes, and the distance to the grid is added to it.
+    """
     gap = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
     for i in range(3):
         if away[i] != 0:

@@ -1,35 +1,35 @@
-"""Light that the lamps behind the window send to places in the gel, in closed forms without shadows.
+"""Light from the lamps behind the window at places in the gel, in closed form and without shadows.
 
 The ray equation is that of ``twin.camera.projection``.
 """
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 
 from scenes.sensor import GelSpec, LensSpec
+from twin.compiled import compiled
 from twin.optics.lights import Patch
 from twin.optics.window import NEWTON_STEPS, fresnel
 from twin.types import FloatArray
 
 RING_PLACES = 24
-"""Points that stand for the housing's ring."""
+"""Number of point lights that approximate the housing's ring."""
 ON_AXIS_MM = 1e-4
-"""A point that is closer to the vertical through the light than this is lit straight along it."""
+"""Distance from the vertical line through a light, below which a point is lit along this line."""
 
-_reflectance = numba.njit(cache=True, error_model="numpy")(fresnel)
+_reflectance = compiled(error_model="numpy")(fresnel)
 
 
 class DirectLight:
-    """Irradiance in the gel of all LEDs and of the housing's ring, each a point (the ring: many).
+    """Irradiance in the gel from all LEDs and the housing's ring. An LED is approximated by one point light, the ring by many.
 
     Parameters
     ----------
     lens : LensSpec
     gel : GelSpec
     patches : sequence of Patch
-        What lights the gel (see ``twin.optics.lights.lights``).
+        The lights of the gel (see ``twin.optics.lights.lights``).
     """
 
     def __init__(self, lens: LensSpec, gel: GelSpec, patches: Sequence[Patch]) -> None:
@@ -45,14 +45,14 @@ class DirectLight:
         self._places, self._powers = np.concatenate(places or [np.zeros((0, 3))]), np.concatenate(powers or [np.zeros((0, 3))])
 
     def __call__(self, points_mm: FloatArray, normals: FloatArray, bump: float = 0.0) -> FloatArray:
-        """Irradiance times ``1 / n^2`` of the gel: a matt place then sends ``albedo / pi`` times this into the air.
+        """Irradiance divided by n^2 of the gel. The radiance of a matt surface in air is ``albedo / pi`` times this.
 
         Parameters
         ----------
         points_mm, normals : (n, 3) float
-            In the gel, sensor frame; the normals point into the gel.
+            Places in the gel and unit normals that point into the gel, in the sensor frame.
         bump : float
-            Share of the light taken as a ball would, whatever its direction (``AppearanceSpec.cap_bump``).
+            Share of the light that a place receives as a ball does, from any direction (``AppearanceSpec.cap_bump``).
 
         Returns
         -------
@@ -62,11 +62,11 @@ class DirectLight:
         return _irradiance(points_mm, normals, bump, self._places, self._powers, self._window, self._absorption)
 
     def ways(self, points_mm: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Unit directions (n, 3) in the gel, from points (n, 3), of the ways to a place (3,) in the air; lengths (n,) in the gel."""
+        """Refracted rays from points (n, 3) to a place (3,) in the air: unit directions (n, 3) and lengths (n,) in the gel."""
         return _ways(points_mm, np.asarray(place_mm, float), self._window)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _irradiance(
     points: FloatArray, normals: FloatArray, bump: float, places: FloatArray, powers: FloatArray, window: FloatArray, absorption: FloatArray
 ) -> FloatArray:
@@ -84,7 +84,7 @@ def _irradiance(
     return result
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _ways(points: FloatArray, place: FloatArray, window: FloatArray) -> tuple[FloatArray, FloatArray]:
     toward, lengths = np.empty((len(points), 3)), np.empty(len(points))
     for i in range(len(points)):
@@ -92,10 +92,13 @@ def _ways(points: FloatArray, place: FloatArray, window: FloatArray) -> tuple[Fl
     return toward, lengths
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _way(point: FloatArray, place: FloatArray, window: FloatArray) -> tuple[float, float, float, float, float]:
-    """The refracted way from a point in the gel to a place in the air: direction in the gel, length there, and the solid
-    angle at the point per area at the place (facing +z) times transmittance, ``d omega = sin d(theta) d(phi)``."""
+    """The refracted ray from a point in the gel to a place in the air: direction and length in the gel, and a factor of the light.
+
+    The factor is the solid angle at the point (``d omega = sin d(theta) d(phi)``) per area at the place, whose normal is +z, times
+    the transmittance.
+    """
     back, front, n_window, n_gel = window
     air, glass, gel = back - place[2], front - back, point[2] - front
     across_x, across_y = place[0] - point[0], place[1] - point[1]

@@ -1,6 +1,6 @@
 """Rays of the raw frame's pixels through lens and window into the gel.
 
-A table tells which way each place of the film looks. It is exact for any distortion, and cheap to look up on Dr.Jit's side.
+A table holds the direction of the ray of each place on the film. It is exact for any distortion, and fast to read in Dr.Jit.
 """
 
 from functools import lru_cache
@@ -17,7 +17,7 @@ from twin.optics.window import Window
 from twin.types import FloatArray
 
 FIELD_MARGIN = 0.97
-"""Share of the fold's radius up to which the distortion model is used. Beyond it the model means nothing: the table goes on linearly."""
+"""Share of the radius of the distortion's fold up to which the distortion model is used. Beyond it the table is extrapolated linearly."""
 WIDEST_FIELD = 6.0
 """Largest tangent of a perspective camera (80 deg off its axis)."""
 WIDEST_FISHEYE = 57.0
@@ -25,7 +25,7 @@ WIDEST_FISHEYE = 57.0
 
 
 def valid_radius(camera: CameraSpec) -> float:
-    """Tangent up to which the radial distortion grows without folding back (inf: everywhere)."""
+    """Tangent up to which the distorted radius increases (inf: it never folds back)."""
     fisheye = camera.projection == "fisheye"
     radius = np.linspace(0, np.pi / 2 if fisheye else WIDEST_FIELD, 6001)
     slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4
@@ -39,7 +39,7 @@ def ray_table(camera: CameraSpec, window_px: tuple[int, int, int, int]) -> Float
     """Unit directions (H + 1, W + 1, 3) in the camera frame, in air, at the corners of a window's pixels.
 
     ``window_px`` = (x0, y0, x1, y1), end exclusive; corner (j, i) is at pixel (x0 + i - 0.5, y0 + j - 0.5).
-    Beyond the distortion's valid field the tangents continue linearly outwards. The array is shared: it can't be written to.
+    Beyond the distortion's valid field the tangents are extrapolated linearly. The array is shared and can't be written to.
     """
     return _ray_table(camera, tuple(window_px))
 
@@ -73,7 +73,7 @@ def subpixel_rays(corners: FloatArray, across: int) -> FloatArray:
 
 
 class CameraRays:
-    """A thin lens with the camera's distortion, looking through the window.
+    """Rays of a thin lens with the camera's distortion, through the window.
 
     Parameters
     ----------
@@ -99,14 +99,14 @@ class CameraRays:
         Returns
         -------
         place : mi.Point3f
-            On the window's gel side.
-        direction : mi.Vector3f
-            Unit vectors in the gel.
+            Places on the window's gel side.
+            direction : mi.Vector3f
+                Unit vectors in the gel.
         transmittance : mi.Float
         """
         x, y = mi.Float(pixel % self._columns), mi.Float(pixel // self._columns)
         at = random.next_2d()
-        # texel centres lie at (i + 0.5) / n; the table's nodes are the pixels' corners
+        # centres of texels are at (i + 0.5) / n; the table's nodes are the corners of pixels
         uv = mi.Point2f((x + at.x + 0.5) / (self._columns + 1), (y + at.y + 0.5) / (self._rows + 1))
         direction = mi.Vector3f(self._directions.eval(uv))
         pupil = mi.Point3f(0.0)

@@ -1,6 +1,6 @@
 """Light in the gel at chosen pixels as a differentiable function of LEDs and reflectances.
 
-The derivatives come from the renderer itself: Dr.Jit differentiates the paths of light in forward mode.
+The derivatives are those of the renderer: Dr.Jit differentiates the light paths in forward mode.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ SAMPLES = 32
 
 @dataclass(frozen=True)
 class Knobs:
-    """Factors on the specification's light and reflectances, (3,) linear RGB where coloured.
+    """Factors on the specification's lights and reflectances. Those with a colour are linear RGB (3,).
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class LightModel:
     Parameters
     ----------
     renderer : Renderer
-        Renders the whole frame of the specification whose light has neutral knobs. Its variant must be able to differentiate.
+        Renderer of the whole frame of the specification for which all knobs are 1. Its variant must be able to differentiate.
     state : PinState
         Pins as ``Renderer.render`` takes them.
     pixels : (n,) int
@@ -52,7 +52,7 @@ class LightModel:
     Raises
     ------
     RenderError
-        Only the scalar variant works on this machine; it cannot differentiate.
+        Only the scalar variant, which can't differentiate, works on this machine.
     """
 
     def __init__(self, renderer: Renderer, state: PinState, pixels: IntArray, seed: int) -> None:
@@ -77,14 +77,15 @@ class LightModel:
         return self._led_count
 
     def light(self, knobs: Knobs) -> FloatArray:
-        """Light (n, channels) of the gel on the film."""
+        """Light (n, channels) from the gel on the film."""
         self._turn(knobs, {})
         return np.array(self._view.trace(self._pixels, SAMPLES, self._seed)).T
 
     def slopes(self, knobs: Knobs) -> dict[str, FloatArray]:
         """Derivatives (n, channels) by the logarithm of each knob: ``led0``..., ``skin``, ``caps``, ``stems``.
 
-        A coloured knob acts on each channel alone, so that one pass serves all channels; all passes share one kernel.
+        A coloured knob changes each channel independently, so that one pass gives the derivatives of all channels. All passes have the
+        same kernel.
         """
         mi, dr = self._mi, self._dr
         names = [*(f"led{k}" for k in range(self._led_count)), "skin", "caps", "stems"]
@@ -100,7 +101,7 @@ class LightModel:
         return found
 
     def _turn(self, knobs: Knobs, steps: dict[str, DrJit]) -> None:
-        """Set the knobs, each with its step (zero, but with a gradient) in its logarithm."""
+        """Set the knobs. The logarithm of each knob has a step added, which is zero but carries a gradient."""
         mi, dr, tracer = self._mi, self._dr, self._view.tracer
 
         def factor(knob: str, value: DrJit) -> DrJit:

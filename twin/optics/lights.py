@@ -1,4 +1,4 @@
-"""The lights behind the window: LEDs as squares and the bright ring as an annulus, all flat and shining along +z."""
+"""The lights behind the window: LEDs as squares, and the bright ring as an annulus. All are flat and face +z."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from scenes.sensor import HousingSpec, LedRingSpec
 from twin.types import FloatArray
 
 LED_FLUX = 640.0
-"""Radiance times area (mm^2) of an LED of power 1. A white cap then sends about 1, which is the unit of the linear image."""
+"""Radiance times area (mm^2) of an LED of power 1. With it a white cap's radiance is about 1, the unit of the linear image."""
 
 
 @dataclass(frozen=True)
@@ -19,9 +19,9 @@ class Patch:
     ----------
     center_mm : (3,) float
     half_mm : (2, 2) float
-        Half edges of a square in x and y; zero for the annulus.
-    radii_mm : (2,) float
-        Inner and outer radius of an annulus; zero for a square.
+        Half of a square's edge vectors in x and y; zero for the annulus.
+        radii_mm : (2,) float
+            Inner and outer radius of an annulus; zero for a square.
     radiance : (3,) float
         Linear RGB.
     """
@@ -39,7 +39,7 @@ class Patch:
 
 
 def led_patches(leds: LedRingSpec) -> list[Patch]:
-    """The LEDs, dead ones with no radiance, in the order of ``leds.azimuth_deg``."""
+    """The LEDs in the order of ``leds.azimuth_deg``. Dead ones have no radiance."""
     turn = np.radians(leds.azimuth_deg)
     balance = np.array(leds.balance or np.ones(len(turn)))
     balance[[k for k in leds.off if k < len(turn)]] = 0
@@ -53,7 +53,7 @@ def led_patches(leds: LedRingSpec) -> list[Patch]:
 
 
 def lights(leds: LedRingSpec, ring: HousingSpec) -> list[Patch]:
-    """All that lights the gel: the lit LEDs and, where it has a ``fill``, the housing's ring."""
+    """All lights of the gel: the lit LEDs, and the housing's ring if it has a ``fill``."""
     found = [patch for patch in led_patches(leds) if patch.radiance.any()]
     if ring.fill > 0:
         lit = len(found) / len(leds.azimuth_deg)

@@ -1,8 +1,8 @@
-"""A fast picture of the sensor for interaction and control loops: drawn, not traced.
+"""A fast picture of the sensor for interaction and control loops. It is drawn instead of path-traced.
 
-Skin, stems and caps are projected through the window, shaded with the lamps' direct light (no shadows), and drawn from
-far to near, the pins with exact coverage. Light that comes by way of other surfaces is described by a gain and an offset for
-each material; `Preview.calibrate` fits them to a path-traced frame.
+Skin, stems and caps are projected through the window, shaded with the lamps' direct light (without shadows), and drawn from far to near.
+Pins are drawn with exact coverage of pixels. Shadows, and light that other surfaces reflect, are approximated by a gain and an offset
+for each material; `Preview.calibrate` fits these to a path-traced frame.
 """
 
 from collections.abc import Callable
@@ -30,22 +30,22 @@ from twin.optics.window import Window
 from twin.types import FloatArray, IntArray, PinState
 
 Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
-"""Irradiance (n, 3), over n^2 of the gel, at points (n, 3) in mm with normals (n, 3)."""
+"""Function that gives the irradiance (n, 3), divided by n^2 of the gel, at points (n, 3) in mm with normals (n, 3)."""
 
 SKIN, STEM, SIDE, FACE = range(4)
-"""Materials: the skin, and a pin's stem, cap side and cap face."""
+"""Indices of the materials: the skin, and a pin's stem, cap side and cap face."""
 BELT_STEP_RAD = np.radians(8.0)
-"""Largest step of polar angle between corners of the skin from the outermost pins to the rim."""
+"""Largest step of polar angle between circles of corners of the skin, from the outermost pins to the rim."""
 BELT_PLACES = 48
-"""Corners of the skin around each of these circles."""
+"""Number of corners of the skin on each of these circles."""
 DARK = 1e-3
-"""Linear light below which all errors have the same weight in a fit."""
+"""Linear light below which an error has the same weight in a fit, whatever the light is."""
 TRUST = 3e-3
-"""Weight of the guess "direct light alone", relative to the material that is seen best. It decides for what is hardly seen at all."""
+"""Weight of the assumption "direct light alone" in a fit, relative to the most visible material. It decides for hardly visible ones."""
 NEAR_PX = 4.0
-"""Sd of the Gaussian neighbourhood in which traced and drawn light of the skin are compared."""
+"""Standard deviation, px, of the Gaussian neighbourhood in which traced and drawn light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
-"""Largest gain of a corner of the skin."""
+"""Largest gain of one corner of the skin."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Shading:
     gain, offset : (4, C) float
         C is 1, or 3 for red, green and blue.
     skin : (v, 1) float
-        Gain of each of the skin's corners on top of that (or one for all): pins shade it.
+        Further gain of each of the skin's corners (or one gain for all), because pins cast shadows on the skin.
     """
 
     gain: FloatArray = field(default_factory=lambda: np.ones((4, 1)))
@@ -67,18 +67,19 @@ class Shading:
 
 @dataclass(frozen=True)
 class _Drawing:
-    """A state on the film.
+    """A state of the sensor, projected to the film.
 
     Attributes
     ----------
     corners_px : (v, 2) float
-        Of the skin, px of the window.
-    outlines_px : (s, K, 2) float
-        What is seen of stems, sides and faces, from far to near.
-    seen : (s,) int
-        Which row each of them is of the pins' lights (3 N): stem, side and face of the first pin, of the second, ...
-    direct, ambient : list of (v, 3) or (N, 3) float
-        Irradiance of each material and that of unit light from everywhere, both times what the gel lets through to the camera.
+        Corners of the skin, px of the window.
+        outlines_px : (s, K, 2) float
+            Outlines of the visible stems, sides and faces, from far to near.
+        seen : (s,) int
+            Row of each outline in the pins' lights (3 N), whose order is: stem, side and face of the first pin, of the second pin, ...
+        direct, ambient : list of (v, 3) or (N, 3) float
+            Irradiance of each material by the lamps, and by unit light from all directions. Both are multiplied by the gel's transmittance
+            to the camera.
     """
 
     corners_px: FloatArray
@@ -97,11 +98,12 @@ class Preview:
     window_px : (x0, y0, x1, y1), optional
         Part of the raw frame, end exclusive; the whole frame by default.
     light : callable, optional
-        Irradiance (n, 3), over n^2 of the gel, from points (n, 3) in mm and normals (n, 3); `DirectLight` by default.
+        Function that gives the irradiance (n, 3), divided by n^2 of the gel, at points (n, 3) in mm with normals (n, 3); `DirectLight` by
+        default.
     shading : Shading, optional
-        Direct light alone by default.
-    static : (light, cover), optional
-        What `static_layer` gives, which is the default.
+        By default direct light alone.
+        static : (light, cover), optional
+            Static layer; by default the result of `static_layer`.
     """
 
     def __init__(
@@ -142,7 +144,7 @@ class Preview:
         Parameters
         ----------
         state : ContactState or PinRest, optional
-            Anything with ``base_mm``, ``axis`` and ``caps_mm``, (N, 3) each. At rest by default.
+            Any object with ``base_mm``, ``axis`` and ``caps_mm``, (N, 3) each. At rest by default.
 
         Returns
         -------
@@ -152,33 +154,33 @@ class Preview:
         Raises
         ------
         RenderError
-            If the state has another number of pins.
+            The state has another number of pins.
         """
         drawing = self._drawing(self._rest if state is None else state)
         film = self._shine + self._through * self._gel(drawing, self.shading)
         return film if self._color else film[..., 0]
 
     def calibrate(self, renderer: Renderer) -> Shading:
-        """Fit the shading to a path-traced frame at rest, and use it from here on.
+        """Fit the shading to a path-traced frame at rest, and use it for all following frames.
 
-        Least squares over the film, weighted so that an error counts about as it does in gray levels.
+        It is a least-squares fit over the film. The weights make an error count about as much as in gray levels.
 
         Parameters
         ----------
         renderer : Renderer
-            Of the same sensor and window.
+            Renderer of the same sensor and window.
 
         Raises
         ------
         RenderError
-            If the renderer has another window.
+            The renderer has another window.
         """
         if renderer.window_px != self.window_px:
             raise RenderError(f"the renderer's window_px is {renderer.window_px}, the preview's {self.window_px}: build both alike")
         traced = renderer.render().reshape(self._shine.shape)
         drawing = self._drawing(self._rest)
         gel, weight = traced - self._shine, (np.maximum(traced, 0) + DARK) ** -0.5
-        alone = np.eye(8).reshape(8, 2, 4, 1)  # each gain, then each offset, by itself
+        alone = np.eye(8).reshape(8, 2, 4, 1)  # shadings in which one gain, or one offset, is 1 and all others are 0
         parts = np.stack([weight * self._through * self._gel(drawing, Shading(*only)) for only in alone], axis=-1)
         fitted = [_fit(parts[..., c, :].reshape(-1, 8), (weight * gel)[..., c].ravel()) for c in range(gel.shape[2])]
         fit = Shading(*np.stack(fitted, axis=-1).reshape(2, 4, -1))
@@ -186,7 +188,7 @@ class Preview:
         return self.shading
 
     def _skin_gain(self, drawing: _Drawing, fit: Shading, gel: FloatArray) -> FloatArray:
-        """Traced light (H, W, C) over that of a fit, near each of the skin's corners, where there is no pin: (v, 1)."""
+        """Gain (v, 1) of each corner of the skin: ratio of traced light (H, W, C) to the fit's, in its neighbourhood without pins."""
         bare = np.array([[1.0], [0.0], [0.0], [0.0]])
         pins = self._gel(drawing, Shading(1 - bare, 1 - bare)).max(axis=2)
         free = (cv2.dilate(pins, np.ones((3, 3))) == 0) & (self._through[..., 0] > 0.5 * self._through.max())
@@ -198,7 +200,7 @@ class Preview:
         return np.clip(at_corners, 0, MOST_SKIN_GAIN)
 
     def _cap_light(self, places_mm: FloatArray, normals: FloatArray) -> FloatArray:
-        """Irradiance of caps, which take light as balls do (``cap_bump``) where the lamps are the sensor's own."""
+        """Irradiance of caps. With the sensor's own lamps a share of the light (``cap_bump``) is received as by balls."""
         if self._light is self._direct:
             return self._direct(places_mm, normals, self.spec.appearance.cap_bump)
         return self._light(places_mm, normals)
@@ -226,7 +228,7 @@ class Preview:
         return _Drawing(corners_px, outlines_px.reshape(3 * len(base), -1, 2)[rows] - self.window_px[:2], rows, direct, kept)
 
     def _gel(self, drawing: _Drawing, shading: Shading) -> FloatArray:
-        """Light (H, W, C) of skin and pins, before it goes through the window."""
+        """Light (H, W, C) of skin and pins before it passes the window."""
         image = np.zeros(self._shine.shape, np.float32)
         offset = shading.offset * self._mean_light
         parts = zip(self._albedo, shading.gain, drawing.direct, offset, drawing.ambient, strict=True)
@@ -237,7 +239,7 @@ class Preview:
         return image
 
     def _kept(self, points_mm: FloatArray, pupil_mm: FloatArray) -> FloatArray:
-        """Share (n, 3) of light that the gel lets through from points (n, 3) to the camera."""
+        """Transmittance (n, 3) of the gel from points (n, 3) to the camera."""
         absorption = np.array(self.spec.gel.absorption_per_mm)
         if not absorption.any():
             return np.ones_like(points_mm)
@@ -249,14 +251,14 @@ class Preview:
 
 
 def _fit(parts: FloatArray, target: FloatArray) -> FloatArray:
-    """Gains and offsets (8,) for which parts (m, 8) best sum to a target (m,): not negative; direct light alone where it hardly matters."""
+    """Non-negative gains and offsets (8,) with which parts (m, 8) sum best to a target (m,). Those of hardly visible parts are 1 and 0."""
     trust = TRUST * np.linalg.norm(parts, axis=0).max()
     plain = np.repeat([1.0, 0.0], 4)
     return nnls(np.concatenate([parts, trust * np.eye(8)]).astype(float), np.concatenate([target, trust * plain]).astype(float))[0]
 
 
 def _belt(geometry: GeometrySpec, feet_mm: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Points (b, 3) of the skin at rest from the outermost pins to the rim, and triangles (t, 3) over the feet (N, 3) and them."""
+    """Points (b, 3) of the skin at rest from the outermost pins to the rim, and triangles (t, 3) over the feet (N, 3) and these points."""
     skin = geometry.skin
     inner_mm = skin.outer_radius_mm - skin.thickness_mm
     start, end = np.radians(geometry.pins.max_polar_deg), np.arccos(np.clip(skin.rim_z_mm / inner_mm, -1, 1))
@@ -270,7 +272,7 @@ def _belt(geometry: GeometrySpec, feet_mm: FloatArray) -> tuple[FloatArray, IntA
 
 
 def _transmittance(view: ViewSpec, window_px: tuple[int, int, int, int]) -> FloatArray:
-    """Share (H, W) of radiance that the window lets through to each pixel."""
+    """Transmittance (H, W) of the window for the radiance of each pixel."""
     corners = (ray_table(view.camera, window_px) @ sensor_to_camera(view.camera)[:3, :3])[..., 2]
     cos_air = np.clip(0.25 * (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]), 1e-6, 1)
     cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (view.lens.refractive_index, view.gel_index))

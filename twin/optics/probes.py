@@ -1,7 +1,8 @@
-"""Proofs, each in a process of its own, that a Dr.Jit backend runs here; and the library that Dr.Jit needs and does not bring.
+"""Tests whether a Dr.Jit backend works on this machine, each in a separate process; and loading of libatomic, which Dr.Jit needs.
 
-A backend with an unsuitable LLVM or driver ends the process instead of raising, so it is tried in a child. Verdicts are kept in the
-cache folder (see ``twin.store``), keyed by everything that could change them. Where the cache is off, every process probes for itself.
+A backend with an unsuitable LLVM or driver kills the process instead of raising an exception. Therefore it is tried in a child process.
+Results are stored in the cache folder (see ``twin.store``) with a key of everything that could change them. If the cache is off, every
+process makes its own test.
 """
 
 import ctypes
@@ -20,13 +21,13 @@ from twin.errors import StoreError
 from twin.store import cache_folder, fingerprint, write_json
 
 PRIVATE_FOLDER = Path(sys.prefix) / "lib" / "private"
-"""Where 'make setup' puts its own copies of libraries if it may not install them."""
+"""Folder for the copies of libraries that 'make setup' makes if it has no permission to install them."""
 REMEDY = "install it (Debian, Ubuntu: apt-get install libatomic1)"
-"""What to do where libatomic is missing."""
+"""Advice in the message that libatomic is missing."""
 PROBE_TIMEOUT_S = 60.0
-"""A probe that takes longer than this, s, has failed."""
+"""Time after which a probe counts as failed, s."""
 
-# The empty home keeps Dr.Jit from answering with a kernel it compiled (with another LLVM) before.
+# Dr.Jit gets an empty home folder, so that it does not use a kernel that it compiled before with another LLVM.
 _PROBE = """
 import drjit as dr
 from drjit.{backend} import Float
@@ -47,12 +48,12 @@ except ImportError:
 
 
 def load_needed_libraries(folder: Path = PRIVATE_FOLDER) -> str:
-    """Load libatomic, the system's or else the private copy in ``folder``, so that Dr.Jit finds it.
+    """Load libatomic so that Dr.Jit finds it: the system's, else the private copy in ``folder``.
 
     Returns
     -------
     str
-        "" if it is there, else what is missing and the remedy.
+        "" if it was loaded, else what is missing and the remedy.
     """
     if not sys.platform.startswith("linux"):
         return ""
@@ -67,7 +68,7 @@ def load_needed_libraries(folder: Path = PRIVATE_FOLDER) -> str:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a probe found: ``ok``, the backend's ``version`` ("" if it does not tell) and why not."""
+    """Result of a probe: ``ok``, the backend's ``version`` ("" if unknown), and the reason if it does not work."""
 
     ok: bool
     version: str
@@ -75,7 +76,7 @@ class Verdict:
 
 
 def probe(backend: str, library: Path, *, remember_failure: bool = True) -> Verdict:
-    """Run a tiny kernel on ``backend`` ("llvm" or "cuda") with ``library``, or recall the last verdict."""
+    """Run a tiny kernel on ``backend`` ("llvm" or "cuda") with ``library``, or return the stored result."""
     key = "|".join(
         [
             backend,
@@ -127,14 +128,14 @@ def _run(backend: str, library: Path) -> Verdict:
 
 def _read(store: Path) -> dict:
     try:
-        known = json.loads(store.read_text())
+        known = json.loads(store.read_text(encoding="utf-8"))
         return known if isinstance(known, dict) else {}
     except (OSError, ValueError):
         return {}
 
 
 def _write(store: Path, verdicts: dict) -> None:
-    """Best effort: without a writable cache every start probes again."""
+    """Store the verdicts. If the cache can't be written, no error is raised and the next start probes again."""
     with suppress(OSError, StoreError):
         store.parent.mkdir(parents=True, exist_ok=True)
         write_json(store, verdicts)

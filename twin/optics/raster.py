@@ -1,36 +1,36 @@
-"""Outlines of pins on the film, and polygons and triangles drawn into float images.
+"""Outlines of pins on the film, and drawing of polygons and triangles into float images.
 
-Polygons are drawn with exact coverage, triangles with smooth shading. Places are (x, y) in px of the raw frame, integers at pixel
-centres; images are (H, W, C) and are drawn into.
+Polygons are drawn with exact coverage of pixels, triangles with smooth shading. Places are (x, y) in px of the raw frame, with integers at
+pixel centres. Images are (H, W, C) and are changed in place.
 """
 
-import numba
 import numpy as np
 
 from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.camera.projection import project
+from twin.compiled import compiled
 from twin.optics.surfaces import CAP_BEVEL, cap_outlines
 from twin.types import BoolArray, FloatArray, IntArray
 
 SIDES = 16
 """Corners of an outline's polygon."""
 RIM_PLACES = 6
-"""Places of a rim that are projected. The image of a rim is smooth, so that they determine it."""
+"""Number of places of a cap's rim that are projected. The image of the rim is smooth, so these places determine it."""
 EVENLY = np.sqrt(np.sin(np.pi / 12) / (np.pi / 12) * (2 * np.pi / SIDES) / np.sin(2 * np.pi / SIDES))
-"""Factor on the radius that gives the polygon the area of its round outline."""
+"""Factor on the radius with which the polygon has the area of the round outline that it approximates."""
 TURN = np.arange(SIDES) * 2 * np.pi / SIDES
-"""Azimuths of an outline's corners (rad)."""
+"""Azimuths of an outline's corners, rad."""
 ON_EDGE = 1e-9
-"""A pixel whose centre is this close to an edge, px, belongs to both triangles, so that no gap opens between them."""
+"""Distance in px of a pixel's centre from an edge up to which the pixel belongs to both triangles, so that there is no gap between them."""
 
 
 class PinOutlines:
     """Projects the pins of one sensor.
 
-    A cap's rim is projected at `RIM_PLACES` places t. The part of its image that is odd under half a turn grows with the
-    radius, the even part with the square of the radius. That gives every outline about the same axis: with f the radius relative
-    to the rim's, it is ``centre + f(t) odd(t) + f(t)^2 even(t)``. The image of a disc further along the axis is taken to be the
-    same image, shifted.
+    A cap's rim is projected at `RIM_PLACES` places t. The part of its image that is odd under half a turn is proportional to the radius,
+    the even part to the square of the radius. Therefore the image of every outline about the same axis is
+    ``centre + f(t) odd(t) + f(t)^2 even(t)``, where f is its radius relative to the rim's. The image of a disc at another place on the
+    axis is approximated by the same image, shifted.
     """
 
     def __init__(self, view: ViewSpec, pins: PinsSpec, appearance: AppearanceSpec) -> None:
@@ -46,7 +46,7 @@ class PinOutlines:
         pins = self._pins
         radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
         bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
-        u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis  # where an outline starts (`surfaces`)
+        u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis  # direction in which an outline starts (`surfaces`)
         u /= np.linalg.norm(u, axis=1, keepdims=True)
         places = np.arange(RIM_PLACES) * 2 * np.pi / RIM_PLACES
         rim = caps_mm + radius * (np.cos(places)[:, None, None] * u + np.sin(places)[:, None, None] * np.cross(u, axis))
@@ -66,7 +66,7 @@ class PinOutlines:
 
 
 def _hull(*discs: FloatArray) -> FloatArray:
-    """Outline (N, K, 2) around similar closed outlines (N, K, 2) each: its point k is the one of their points k that lies furthest out."""
+    """Outline (N, K, 2) around similar closed outlines (N, K, 2) each: its point k is the outermost of their points k."""
     tangent = np.roll(discs[0], -1, axis=1) - np.roll(discs[0], 1, axis=1)
     outward = np.stack([tangent[..., 1], -tangent[..., 0]], axis=-1)
     arm = discs[0] - discs[0].mean(axis=1, keepdims=True)
@@ -78,12 +78,12 @@ def _hull(*discs: FloatArray) -> FloatArray:
     return hull
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def draw_polygons(image: FloatArray, polygons: FloatArray, light: FloatArray, inner: BoolArray) -> None:
-    """Paint closed polygons (P, K, 2) of one light (P, C) each over the image, in the order given.
+    """Draw closed polygons (P, K, 2), each with one light (P, C), over the image in the given order.
 
-    A pixel takes the share of the light that the polygon covers of its square. A polygon that is ``inner`` (P,) lies
-    within the one before it and replaces that one's light: edges they share are not blended twice.
+    A pixel gets a share of the light, equal to the share of its area that the polygon covers. A polygon that is ``inner`` (P,) lies
+    within the polygon before it and replaces the light of that one, so that common edges are not blended twice.
     """
     height, width, channels = image.shape
     for p in range(len(polygons)):
@@ -103,11 +103,11 @@ def draw_polygons(image: FloatArray, polygons: FloatArray, light: FloatArray, in
                         image[y, x, c] += share * (light[p, c] - (light[p - 1, c] if inner[p] else image[y, x, c]))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _cover(polygon: FloatArray, x0: int, y0: int, width: int, height: int) -> FloatArray:
-    """Covered share of the pixels of a box from (x0, y0), two columns wider than asked for.
+    """Covered share of the pixels in a box from (x0, y0); the result has two additional columns.
 
-    Each edge adds, row by row, the area to its right that it bounds; the running sum of the row is the cover.
+    Each edge adds to each row the area on its right. The cumulative sum of a row is the coverage.
     """
     cover = np.zeros((height, width + 2))
     count = len(polygon)
@@ -131,9 +131,9 @@ def _cover(polygon: FloatArray, x0: int, y0: int, width: int, height: int) -> Fl
     return cover
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _add_edge(row: FloatArray, start: float, end: float, rise: float) -> None:
-    """Add to a row of differences an edge that crosses it from x = start to end while it rises by ``rise``."""
+    """Add an edge to a row of differences. Within the row the edge goes from x = start to x = end and rises by ``rise``."""
     left, right = min(start, end), max(start, end)
     first, last = int(left), int(right)
     if first == last:
@@ -150,9 +150,9 @@ def _add_edge(row: FloatArray, start: float, end: float, rise: float) -> None:
         row[x + 1] += part * beyond
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def draw_triangles(image: FloatArray, corners: FloatArray, light: FloatArray, faces: IntArray) -> None:
-    """Fill triangles ``faces (m, 3)`` over corners (v, 2), lights (v, C) interpolated linearly, where pixel centres lie inside."""
+    """Fill the pixels whose centres lie in triangles ``faces (m, 3)`` over corners (v, 2) with linearly interpolated lights (v, C)."""
     height, width, channels = image.shape
     at = np.empty(channels)
     for f in range(len(faces)):
@@ -163,7 +163,7 @@ def draw_triangles(image: FloatArray, corners: FloatArray, light: FloatArray, fa
         area = bx * cy - cx * by
         if not abs(area) > 0:
             continue
-        # weights of j and k are linear: s = sx (x - ax) + sy (y - ay), t likewise
+        # the weights of corners j and k are linear: s = sx (x - ax) + sy (y - ay), and t in the same way
         sx, sy, tx, ty = cy / area, -cx / area, -by / area, bx / area
         top = max(int(np.ceil(ay + min(0.0, by, cy) - ON_EDGE)), 0)
         bottom = min(int(np.floor(ay + max(0.0, by, cy) + ON_EDGE)), height - 1)
@@ -184,7 +184,7 @@ def draw_triangles(image: FloatArray, corners: FloatArray, light: FloatArray, fa
                     image[y, x, c] = at[c] + step * (x - x0)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _inside(slope: float, at_zero: float, low: float, high: float) -> tuple[float, float]:
     """The part of [low, high] where ``at_zero + slope x >= 0``."""
     if slope > 0:

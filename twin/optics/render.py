@@ -24,19 +24,19 @@ from twin.optics.window import Window
 from twin.types import FloatArray, IntArray, PinState
 
 Quality = Literal["preview", "standard", "high"]
-"""How many samples a render takes."""
+"""Names of the numbers of samples of a render."""
 SAMPLES = {"preview": 4, "standard": 16, "high": 64}
 """Samples per pixel, by quality."""
 SCALAR_SAMPLES = {"preview": 1, "standard": 4, "high": 16}
 """Samples per pixel of the scalar variant, which is several times slower."""
 BOUNCES = 2
-"""Scatterings of a path after its first. The skin is dark: a third one changes no gray level."""
+"""Number of scatterings of a light path after the first. Because the skin is dark, a third one changes no gray level."""
 MOST_SAMPLES_AT_ONCE = 6_000_000
-"""Samples of one pass: this bounds the memory it needs."""
+"""Most samples of one pass. The number bounds the memory that a pass needs."""
 
 
 class Renderer:
-    """Renders one sensor; builds its scene once and then only moves vertices.
+    """Renders one sensor. The scene is built once; for each state only vertices are moved.
 
     Parameters
     ----------
@@ -45,14 +45,14 @@ class Renderer:
         As `twin.optics.variant.choose_variant` takes it; by default the best variant that works.
     quality : {"preview", "standard", "high"}
     mesh : SensorMesh, optional
-        The mechanics' mesh (``nodes_mm``, ``inner_quads``). With it the skin follows the nodes on its
-        inside, without it the feet of the pins.
+        The mechanics' mesh (``nodes_mm``, ``inner_quads``). With a mesh the skin follows the nodes on its inside, without one it follows
+        the feet of the pins.
     window_px : (x0, y0, x1, y1), optional
         Part of the raw frame to render, end exclusive; the whole frame by default.
     spp : int, optional
-        Samples per pixel where pins are, instead of the quality's; bare skin gets a quarter (`twin.optics.sampling`).
-    bounces : int
-        Scatterings of a path after its first.
+        Samples of a pixel that shows a pin, instead of the quality's number. Pixels of bare skin get a quarter (`twin.optics.sampling`).
+        bounces : int
+            Number of scatterings of a light path after the first.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Renderer:
 
     @cached_property
     def static(self) -> tuple[FloatArray, FloatArray]:
-        """Light (H, W, 3) or (H, W) of the static layer, and the share (H, W) of the gel's light that it lets through."""
+        """Light (H, W, 3) or (H, W) of the static layer, and its transmittance (H, W) for the gel's light."""
         light, cover = static_layer(self.spec, self.window_px)
         mono = self.spec.camera.channels == "mono"
         return (luminance(light).astype(np.float32) if mono else light), 1 - cover
@@ -97,8 +97,8 @@ class Renderer:
         Parameters
         ----------
         state : ContactState or PinRest, optional
-            Anything with ``base_mm``, ``axis`` and ``caps_mm``, (N, 3) each, and, where the renderer
-            has a mesh, ``nodes_mm``. At rest by default.
+            Any object with ``base_mm``, ``axis`` and ``caps_mm``, (N, 3) each, and ``nodes_mm`` if the renderer has a mesh. At rest by
+            default.
         seed : int
             The same seed gives the same image.
 
@@ -138,7 +138,7 @@ class Renderer:
 
 
 class GelView:
-    """The gel seen through lens and window by the vectorised variants.
+    """The gel as seen through lens and window, rendered by the vectorised variants.
 
     Parameters
     ----------
@@ -167,12 +167,12 @@ class GelView:
         move_meshes(self.params, surfaces)
 
     def gel_light(self, pixels: IntArray, spp: int, seed: int, state: PinState) -> FloatArray:
-        """Mean light (n, 3) or (n, 1) of the given pixels (n,) of the window, numbered row by row; fewer samples on bare skin."""
+        """Mean light (n, 3) or (n, 1) of pixels (n,) of the window, numbered row by row. Bare skin gets fewer samples."""
         mi, dr = self._mi, self._dr
         pins = near_pins(self._spec.view, self._spec.pins, self._spec.appearance, state, self._window_px).ravel()[pixels]
         passes, each, few = 1, spp, -(-spp // SKIN_SAVING)
         while each > 1 and each * len(pixels) > MOST_SAMPLES_AT_ONCE:
-            passes, each, few = 2 * passes, -(-each // 2), -(-few // 2)  # halves: nets of powers of two are even
+            passes, each, few = 2 * passes, -(-each // 2), -(-few // 2)  # half as many samples: a net with a power of two is most uniform
         counts = np.where(pins, each, few)
         rows = np.repeat(np.arange(len(pixels), dtype=np.uint32), counts)
         index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -186,14 +186,14 @@ class GelView:
         return total / (passes * counts[:, None])
 
     def trace(self, pixels: DrJit, spp: int, seed: int) -> DrJit:
-        """Mean light of pixels as a spectrum of Dr.Jit, differentiable in what the tracer and the scene hold."""
+        """Mean light of pixels as a spectrum of Dr.Jit. It can be differentiated by the values in the tracer and the scene."""
         mi, dr = self._mi, self._dr
         number = dr.arange(mi.UInt32, len(pixels) * spp)
         light = self._light(dr.gather(mi.UInt32, pixels, number // spp), number % spp, spp, seed)
         return mi.Spectrum(*(dr.block_sum(channel, spp) / spp for channel in light))
 
     def _light(self, pixel: DrJit, number: DrJit, spp: int, seed: int) -> DrJit:
-        """Light of samples, given the pixel of each and its number in the pixel, below ``spp``."""
+        """Light of samples, given the pixel of each sample and its number in this pixel, which is below ``spp``."""
         mi, dr = self._mi, self._dr
         random = PixelSamples(mi, dr, pixel, number, spp, seed)
         place, direction, transmittance = self.rays.sample(mi, dr, pixel, random)

@@ -1,6 +1,6 @@
-"""How pixels are sampled: which ones need many samples, and well-distributed random numbers for them on Dr.Jit's side.
+"""Sampling of pixels: which pixels need many samples, and well-distributed random numbers in Dr.Jit.
 
-Pixels of pins need many samples, because their edges are noisy. Dark bare skin is even after a few.
+Pixels that show pins need many samples, because edges are noisy. Dark bare skin is free of noise after few samples.
 """
 
 from types import ModuleType
@@ -14,13 +14,13 @@ from twin.optics.variant import DrJit
 from twin.types import BoolArray, PinState
 
 SKIN_SAVING = 4
-"""Samples of a pixel that may show a pin for every sample of one that shows bare skin only."""
+"""Ratio of the samples of a pixel that may show a pin to those of a pixel that shows only bare skin."""
 MARGIN_PX = 2.0
-"""Added to the radius of each pin: the estimate of where its edge is may be wrong by this."""
+"""Length in px that is added to the radius of each pin, because the estimated place of its edge may be wrong by this much."""
 SUBPIXEL_BITS = 4
-"""OpenCV draws lines with places in units of 1 / 16 px."""
+"""Number of fractional bits of the places of lines that OpenCV draws: the unit is 1 / 16 px."""
 GOLDEN = 0x9E3779B9
-"""2^32 over the golden ratio: spreads consecutive dimensions over the seeds of the hash."""
+"""2^32 divided by the golden ratio. Multiples of it give the hash very different seeds for consecutive dimensions."""
 
 
 def near_pins(
@@ -39,7 +39,7 @@ def near_pins(
     fine = np.rint(ends * (1 << SUBPIXEL_BITS)).astype(np.int32)
     width = np.ceil(2 * radius).astype(int)
     for wide in np.unique(width):
-        cv2.polylines(mask, list(fine[width == wide]), False, 1, int(wide), cv2.LINE_8, SUBPIXEL_BITS)  # their ends are round
+        cv2.polylines(mask, list(fine[width == wide]), False, 1, int(wide), cv2.LINE_8, SUBPIXEL_BITS)  # the lines have round ends
     return mask.astype(bool)
 
 
@@ -50,9 +50,10 @@ def _largest_outline(appearance: AppearanceSpec) -> float:
 
 
 class PixelSamples:
-    """Numbers for ``spp`` samples in each of many pixels: every dimension a scrambled (0, 2)-net over a pixel's samples.
+    """Random numbers for ``spp`` samples in each of many pixels. In each dimension a pixel's samples form a scrambled (0, 2)-net.
 
-    Dimensions are decorrelated by scrambles and orders of their own (padding; Kollig and Keller 2002).
+    Each dimension has its own scramble and its own order of samples, so that dimensions are not correlated (padding; Kollig and Keller
+    2002).
 
     Parameters
     ----------
@@ -68,10 +69,10 @@ class PixelSamples:
 
     def __init__(self, mi: ModuleType, dr: ModuleType, pixel: DrJit, index: DrJit, spp: int, seed: int) -> None:
         self._mi, self._dr, self._pixel, self._index, self._spp = mi, dr, pixel, index, spp
-        self._seed, self._dimension = dr.opaque(mi.UInt32, seed), 0  # not a constant: a new seed needs no new kernel
+        self._seed, self._dimension = dr.opaque(mi.UInt32, seed), 0  # opaque, so that another seed uses the same kernel
 
     def of(self, chosen: DrJit) -> "PixelSamples":
-        """The further numbers of some samples only."""
+        """The remaining random numbers of some of the samples."""
         part = PixelSamples.__new__(PixelSamples)
         part.__dict__.update(self.__dict__)
         part._pixel, part._index = (self._dr.gather(self._mi.UInt32, values, chosen) for values in (self._pixel, self._index))

@@ -1,7 +1,8 @@
-"""The gel seen by the scalar variant, which runs anywhere: an approximation with Mitsuba's own path tracer.
+"""The gel as seen by the scalar variant, which works on every machine. It is an approximation with Mitsuba's own path tracer.
 
-Its camera is a pinhole in the gel, at the point that fits the caps' rays best. Its LEDs stand in the gel where the caps see them.
-The picture is then warped, with the depth of the caps, to where the window shows it. The window reflects nothing.
+The camera is a pinhole in the gel, at the point nearest to the caps' rays. The LEDs are in the gel, at the places where they appear
+from the caps. The picture is then warped to the places at which the window shows it, with the depth of the caps. The window reflects no
+light.
 """
 
 from collections.abc import Sequence
@@ -21,15 +22,15 @@ from twin.optics.variant import DrJit
 from twin.types import FloatArray, IntArray, PinState
 
 OVERSAMPLING = 1.3
-"""Pixels of the pinhole camera's image for each pixel of the frame, along a side."""
+"""Number of pixels of the pinhole camera's image for one pixel of the frame, along a side."""
 COARSE = 8
-"""Distance in px of the places at which the caps' depth is interpolated."""
+"""Spacing in px of the places at which the caps' depth is interpolated."""
 DEPTH_NEIGHBOURS = 24
-"""Number of nearest caps that give the depth of a place."""
+"""Number of nearest caps from which the depth of a place is interpolated."""
 
 
 class ScalarView:
-    """As ``GelView``, for scalar variants."""
+    """The counterpart of ``GelView`` for scalar variants."""
 
     def __init__(
         self, mi: ModuleType, spec: SensorSpec, window_px: tuple[int, int, int, int], surfaces: dict[str, Surface], bounces: int
@@ -63,7 +64,7 @@ class ScalarView:
         return np.stack([map_coordinates(channel, at[:, ::-1].T, order=3, mode="nearest") for channel in np.moveaxis(image, 2, 0)], axis=1)
 
     def _places(self, state: PinState) -> FloatArray:
-        """Where in the ideal image each pixel of the window looks (H W, 2): along its ray to the depth of the caps about it."""
+        """Place (H W, 2) in the pinhole image that each pixel of the window shows: its ray's point at the depth of nearby caps."""
         caps_mm = state.caps_mm
         x0, y0, x1, y1 = self._window_px
         coarse = [np.arange(lo, hi + COARSE, COARSE) for lo, hi in ((x0, x1), (y0, y1))]
@@ -84,13 +85,13 @@ def nearest_point(place: FloatArray, direction: FloatArray) -> FloatArray:
 
 
 def _refined(values: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """A grid with COARSE px between its places, at every pixel."""
+    """Values at every pixel from those on a grid with a spacing of COARSE px."""
     rows, columns = (np.arange(n) / COARSE for n in shape)
     return map_coordinates(values, np.meshgrid(rows, columns, indexing="ij"), order=3, mode="nearest")
 
 
 def _apparent_lights(mi: ModuleType, view: ViewSpec, patches: Sequence[Patch], caps_mm: FloatArray) -> dict[str, DrJit]:
-    """An emitter for every LED, at the point in the gel from which its light seems to come, as bright there."""
+    """An emitter for every LED, at the point in the gel from which its light seems to come, with the brightness that it has there."""
     made, unseen = {}, mi.load_dict({"type": "null"})
     for k, patch in enumerate(p for p in patches if p.half_mm.any()):
         place, direction, gain = _seen_from(view, patch, caps_mm)

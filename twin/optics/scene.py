@@ -1,4 +1,4 @@
-"""Skin, stems and caps in Mitsuba's terms; the only module that names its plugins."""
+"""The Mitsuba scene of skin, stems and caps. This is the only module that names Mitsuba's plugins."""
 
 from collections.abc import Mapping
 from types import ModuleType
@@ -12,7 +12,8 @@ from twin.optics.tracer import luminance
 from twin.optics.variant import DrJit
 from twin.types import FloatArray
 
-SKIN_INDEX = 1.52  # acrylate rubber
+# Refractive index of the skin and the caps (acrylate rubber).
+SKIN_INDEX = 1.52
 
 PAINT = {"type": "mesh_attribute", "name": "vertex_paint"}
 
@@ -20,7 +21,7 @@ PAINT = {"type": "mesh_attribute", "name": "vertex_paint"}
 def build_scene(
     mi: ModuleType, look: AppearanceSpec, gel_index: float, surfaces: Mapping[str, Surface], *, extra: dict[str, DrJit] | None = None
 ) -> DrJit:
-    """A Mitsuba scene of what is in the gel, without camera or lights.
+    """A Mitsuba scene of the surfaces in the gel, without camera or lights.
 
     Parameters
     ----------
@@ -29,7 +30,7 @@ def build_scene(
     surfaces : mapping of str to Surface
         By the names ``skin``, ``stems`` and ``caps``.
     extra : dict, optional
-        More of the scene's dictionary: lights, an integrator.
+        Further entries of the scene's dictionary, for example lights and an integrator.
 
     Returns
     -------
@@ -50,10 +51,10 @@ def build_scene(
 
 
 def build_pinhole_camera(mi: ModuleType, to_world: FloatArray, half_field: float, size_px: int, spp: int) -> DrJit:
-    """An ideal square pinhole camera that sees tangents within +-half_field.
+    """An ideal square pinhole camera for tangents within +-half_field.
 
-    ``to_world`` is the pose (4, 4) of a frame with z ahead, x right and y down: pixel (i, j) sees
-    ``((i + 0.5) / size_px * 2 - 1) * half_field`` in each.
+    ``to_world`` is the pose (4, 4) of a frame with z forwards, x right and y down. The tangent of pixel (i, j) along x is
+    ``((i + 0.5) / size_px * 2 - 1) * half_field``, and along y the same with j.
     """
     film = {"type": "hdrfilm", "width": size_px, "height": size_px, "rfilter": {"type": "box"}, "component_format": "float32"}
     return mi.load_dict(
@@ -64,7 +65,7 @@ def build_pinhole_camera(mi: ModuleType, to_world: FloatArray, half_field: float
             "far_clip": 1e4,
             "to_world": mi.ScalarTransform4f(
                 to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])
-            ),  # Mitsuba's image x and y run against its camera's
+            ),  # Mitsuba's image x and y have the opposite directions of its camera's x and y
             "film": film | {"pixel_format": "luminance" if mi.variant().endswith("mono") else "rgb"},
             "sampler": {"type": "multijitter", "sample_count": spp},
         }
@@ -72,7 +73,7 @@ def build_pinhole_camera(mi: ModuleType, to_world: FloatArray, half_field: float
 
 
 def mesh(mi: ModuleType, name: str, surface: Surface, bsdf: DrJit, *, smooth: bool, emitter: DrJit | None = None) -> DrJit:
-    """A Mitsuba mesh of that id; its paint becomes a vertex attribute."""
+    """A Mitsuba mesh with the id ``name``. The surface's paint becomes a vertex attribute."""
     props = mi.Properties()
     props["bsdf"] = bsdf
     props["face_normals"] = not smooth
@@ -91,14 +92,14 @@ def mesh(mi: ModuleType, name: str, surface: Surface, bsdf: DrJit, *, smooth: bo
 
 
 def move_meshes(params: DrJit, surfaces: dict[str, Surface]) -> None:
-    """Move the vertices of a scene's meshes, given its traversed parameters and surfaces by the meshes' ids."""
+    """Move the vertices of a scene's meshes; ``params`` are the scene's traversed parameters, ``surfaces`` has the meshes' ids as keys."""
     for name, surface in surfaces.items():
         params[f"{name}.vertex_positions"] = with_room(surface.vertices_mm.ravel(), np.float32)
     params.update()
 
 
 def _rubber(mi: ModuleType, reflectance: Mapping[str, object], gloss: float, roughness: float, gel_index: float) -> DrJit:
-    """Matt, with a rough specular lobe of weight ``gloss`` where it meets the gel."""
+    """A matt material with a rough specular lobe of weight ``gloss`` at its boundary to the gel."""
     if gloss == 0:
         return mi.load_dict({"type": "diffuse", "reflectance": reflectance})
     return mi.load_dict(

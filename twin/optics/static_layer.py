@@ -1,9 +1,10 @@
-"""What the camera sees besides the gel: the housing, the LEDs' reflections in the window, specks.
+"""The static layer: everything that the camera sees besides the gel. This is the housing, the LEDs' reflections, and specks.
 
-No contact changes this layer. It is computed once, without noise.
+Contacts do not change this layer. It is computed once, without noise.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -17,13 +18,13 @@ from twin.optics.window import fresnel
 from twin.types import FloatArray
 
 ACROSS = 4
-"""Places along each side of a pixel at which it is evaluated if its corners differ."""
+"""Number of places along each side of a pixel at which the layer is evaluated if the pixel's corners differ."""
 EVEN = 0.02
-"""If the corners of a pixel differ by less than this share, their mean is the pixel."""
+"""Relative difference of a pixel's corners up to which their mean is the pixel's value."""
 RIM_UNIT = 1000.0
-"""The numbers in ``RimSpec.light`` are thousandths."""
+"""Value in ``RimSpec.light`` that stands for the light 1: its numbers are thousandths."""
 SMALL = 1e-3
-"""Light and cover below this need no relative precision."""
+"""Least light or cover to which a difference within a pixel is compared. Smaller values need no relative precision."""
 
 
 def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:
@@ -32,36 +33,38 @@ def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tupl
     Returns
     -------
     light : (H, W, 3) float32
-        Linear RGB that reaches the film whatever the gel does.
+        Linear RGB that reaches the film independently of the gel.
     cover : (H, W) float32
         Share of the gel's light that is hidden: the film gets ``light + (1 - cover) * gel``.
     """
     table = ray_table(spec.camera, window_px) @ sensor_to_camera(spec.camera)[:3, :3]
-    at_corners = np.concatenate([part.reshape(*part.shape[:2], -1) for part in _seen(spec, table)], axis=2)
+    seen = partial(_seen, spec.view, spec.leds, spec.housing, spec.appearance.specks)
+    at_corners = np.concatenate([part.reshape(*part.shape[:2], -1) for part in seen(table)], axis=2)
     around = np.stack([at_corners[:-1, :-1], at_corners[:-1, 1:], at_corners[1:, :-1], at_corners[1:, 1:]])
     both = around.mean(axis=0)
     uneven = (np.ptp(around, axis=0) > EVEN * np.maximum(both, SMALL)).any(axis=2)
     rows, columns = np.nonzero(cv2.dilate(uneven.astype(np.uint8), np.ones((3, 3), np.uint8)))
     corners = np.stack([[table[rows + j, columns + i] for i in (0, 1)] for j in (0, 1)])
-    light, hidden = _seen(spec, subpixel_rays(corners, ACROSS))
+    light, hidden = seen(subpixel_rays(corners, ACROSS))
     both[rows, columns] = np.concatenate([light, hidden[..., None]], axis=2).mean(axis=1)
     return both[..., :3].astype(np.float32), both[..., 3].astype(np.float32)
 
 
-def _seen(spec: SensorSpec, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Light (..., 3) and cover (...) along rays (..., 3) from the pupil, sensor frame, of any length."""
-    camera, ring = spec.camera, spec.housing
+def _seen(
+    view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, specks: Sequence[SpeckSpec], rays: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Light (..., 3) and cover (...) along rays from the pupil, whose directions (..., 3) are in the sensor frame and of any length."""
     tangents = rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)
-    at_ring = tangents * (ring.z_mm + camera.distance_mm)
+    at_ring = tangents * (ring.z_mm + view.camera.distance_mm)
     wall = np.linalg.norm(at_ring - ring.center_mm, axis=-1) >= ring.aperture_radius_mm
-    light = np.where(wall[..., None], housing_light(spec.leds, ring, at_ring), reflections(spec.view, spec.leds, ring, tangents))
-    hidden, shine = _specks(spec.view, spec.appearance.specks, tangents)
+    light = np.where(wall[..., None], housing_light(leds, ring, at_ring), reflections(view, leds, ring, tangents))
+    hidden, shine = _specks(view, specks, tangents)
     light = np.where(wall[..., None], light, light + shine) + rim_light(ring, at_ring)
     return light, np.where(wall, 1.0, hidden)
 
 
 def rim_light(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
-    """Light (..., 3) measured on top of the formulas at places (..., 2) of the housing's plane; linear in azimuth and radius."""
+    """Light (..., 3) that was measured in addition to the formulas, at places (..., 2) of the housing's plane; bilinear interpolation."""
     if ring.rim is None:
         return np.zeros((*at_mm.shape[:-1], 3))
     table = np.array(ring.rim.light, np.float32) / RIM_UNIT
@@ -78,7 +81,7 @@ def rim_light(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
 def rim_places(
     ring: HousingSpec, inner_mm: float, outer_mm: float, shape: tuple[int, int], at_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Row and column (...) in a rim's table, of ``shape`` azimuths and radii, of places (..., 2) of the housing's plane."""
+    """Row and column (...) of places (..., 2) of the housing's plane in a rim's table, which has ``shape`` azimuths and radii."""
     place = at_mm - ring.center_mm
     turn = np.arctan2(place[..., 1], place[..., 0]) % (2 * np.pi) / (2 * np.pi) * shape[0]
     along = (np.linalg.norm(place, axis=-1) - inner_mm) / (outer_mm - inner_mm) * (shape[1] - 1)
@@ -106,7 +109,7 @@ def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> Fl
 
 
 def reflections(view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, tangents: FloatArray) -> FloatArray:
-    """Radiance (..., 3) of the lights mirrored in both faces of the window, for tangents (..., 2) of rays in air."""
+    """Radiance (..., 3) of the lights that both faces of the window reflect, for tangents (..., 2) of rays in air."""
     lens, distance = view.lens, view.camera.distance_mm
     u2 = np.sum(tangents**2, axis=-1)
     cos_air = 1 / np.sqrt(1 + u2)
@@ -116,7 +119,7 @@ def reflections(view: ViewSpec, leds: LedRingSpec, ring: HousingSpec, tangents: 
     outer = fresnel(1 / lens.refractive_index, cos_air, cos_window)
     inner = fresnel(lens.refractive_index / view.gel_index, cos_window, cos_gel)
     from_front = (1 - outer) ** 2 * inner / (1 - outer * inner)
-    # tan(window) / tan(air): the detour through the window and back
+    # length of the detour through the window and back, with tan(window) / tan(air)
     detour = 2 * lens.thickness_mm * cos_air / (lens.refractive_index * cos_window)
     total: FloatArray = np.zeros((*u2.shape, 3))
     for patch in lights(leds, ring):
@@ -147,7 +150,7 @@ def _specks(view: ViewSpec, specks: Sequence[SpeckSpec], tangents: FloatArray) -
     at = tangents * (lens.back_mm + view.camera.distance_mm + lens.thickness_mm * within)
     for speck in specks:
         away = np.linalg.norm(at - [speck.x_mm, speck.y_mm], axis=-1) / speck.radius_mm
-        disc = np.clip(2 - 2 * away, 0, 1)  # full up to half the radius
+        disc = np.clip(2 - 2 * away, 0, 1)  # 1 up to half the radius
         hidden = 1 - (1 - hidden) * (1 - speck.opacity * disc)
         shine = shine + (disc * speck.light)[..., None]
     return hidden, shine

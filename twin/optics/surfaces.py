@@ -1,7 +1,7 @@
 """Fine triangle surfaces for rendering: skin, stems, caps.
 
-Topology depends on the specification alone, so that between states only vertex positions
-change. All positions are in the sensor frame, mm.
+The topology depends on the specification alone, so only vertex positions differ between states. All positions are in the sensor frame,
+mm.
 """
 
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ SKIN_POLAR_STEPS = 40
 SKIN_AZIMUTH_STEPS = 80
 """Vertices on each circle."""
 STEM_SIDES = 8
-"""Sides of a stem."""
+"""Number of sides of a stem."""
 CAP_SIDES = 16
-"""Sides of a cap."""
+"""Number of sides of a cap."""
 CAP_BEVEL = 0.25
-"""Bevel of a cap's edge as a share of the cap's height: printed edges are never sharp."""
+"""Bevel of a cap's edge as a share of the cap's height, because printed edges are not sharp."""
 STEM_ROOT_MM = 0.3
-"""Stems start this deep inside the skin, so that no gap opens where the skin bends."""
+"""Depth inside the skin at which stems start, so that there is no gap where the skin bends."""
 MOST_CONTROL_POINTS = 1200
-"""More control points than this are thinned out: the interpolation solves a dense system of their number, once."""
+"""Most control points that are used. The interpolation solves a dense linear system of this size once."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +38,16 @@ class Surface:
 
 
 class SkinSurface:
-    """The skin's inside as a fine dome grid that follows scattered displacements smoothly.
+    """The skin's inside as a fine grid over the dome, whose displacement is interpolated smoothly between control points.
 
-    The displacement of the fine grid is the thin-plate spline (Duchon 1977) through the control
-    points' displacements in the dome's azimuthal equidistant chart; with the control points
-    fixed it is one constant matrix.
+    The displacement of the fine grid is the thin-plate spline (Duchon 1977) through the control points' displacements in the dome's
+    azimuthal equidistant chart. Because the control points' places at rest are fixed, it is one constant matrix.
 
     Parameters
     ----------
     skin : SkinSpec
     control_mm : (n, 3) float
-        Rest positions, on the inside of the skin, at which displacements will be given.
+        Control points at rest on the inside of the skin.
     """
 
     def __init__(self, skin: SkinSpec, control_mm: FloatArray) -> None:
@@ -61,7 +60,7 @@ class SkinSurface:
         outward = np.concatenate([apex, np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)])
         self.rest_mm = inner_mm * outward
         self.faces = _fan_grid(SKIN_POLAR_STEPS, SKIN_AZIMUTH_STEPS)
-        # The rim is clamped: fixed points there keep the spline still where no control point is.
+        # The rim is clamped: fixed points on it keep the spline at rest there, because the rim has no control points.
         self._keep = np.unique(np.linspace(0, len(control_mm) - 1, min(len(control_mm), MOST_CONTROL_POINTS)).astype(int))
         chart = _chart(control_mm[self._keep])
         rim_chart = _chart(self.rest_mm[-SKIN_AZIMUTH_STEPS::4])
@@ -78,14 +77,14 @@ class SkinSurface:
 
 
 def stems(pins: PinsSpec, base_mm: FloatArray, axis: FloatArray) -> Surface:
-    """All pin stems, one surface: cylinders from the skin to the cap."""
+    """All pin stems as one surface: cylinders from the skin to the cap."""
     length = pins.length_mm
     profile = np.array([[0.5 * pins.diameter_mm, -STEM_ROOT_MM], [0.5 * pins.diameter_mm, length]])
     return _lathe(profile, base_mm, axis, STEM_SIDES)
 
 
 def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: FloatArray) -> Surface:
-    """All caps, one surface: bevelled discs, or of their own outlines, about their centres; open below, where nothing is seen of them."""
+    """All caps as one surface: bevelled discs, or shapes with measured outlines, about their centres. The invisible underside is open."""
     radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
     bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
     radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
@@ -97,14 +96,14 @@ def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: 
 
 
 def cap_albedo(look: AppearanceSpec, count: int) -> FloatArray:
-    """Reflectance (N, 3) of each cap: measured, or drawn."""
+    """Reflectance (N, 3) of each cap: the measured one, else one drawn at random."""
     drawn = 1 + look.cap_variation * np.random.default_rng(look.cap_pattern).standard_normal(count)
     each = np.array(look.cap_levels) if look.cap_levels else drawn
     return np.clip(each[:, None] * np.array(look.cap_albedo), 0, 1)
 
 
 def cap_outlines(look: AppearanceSpec, sides: int) -> FloatArray | None:
-    """Radius (N, sides) of each cap's outline relative to its circle's, or None where all are round."""
+    """Radius (N, sides) of each cap's outline relative to its circle's; None if all caps are round."""
     if not look.cap_shapes and not look.cap_offsets:
         return None
     shapes, offsets = np.array(look.cap_shapes or [[0.0]]), np.array(look.cap_offsets or [[0.0, 0.0]])
@@ -115,7 +114,7 @@ def cap_outlines(look: AppearanceSpec, sides: int) -> FloatArray | None:
 
 
 def _chart(points_mm: FloatArray) -> FloatArray:
-    """Azimuthal equidistant chart (n, 2), rad, of points seen from the dome's centre."""
+    """Azimuthal equidistant chart (n, 2), rad, of the directions of points from the dome's centre."""
     unit = points_mm / np.linalg.norm(points_mm, axis=1, keepdims=True)
     polar = np.arccos(np.clip(unit[:, 2], -1, 1))
     rho = np.hypot(unit[:, 0], unit[:, 1])
@@ -137,9 +136,10 @@ def _ring_grid(bands: int, around: int) -> IntArray:
 
 
 def _lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: int, outlines: FloatArray | None = None) -> Surface:
-    """Copies of a turned body, profile (k, 2) of (radius, height), at each origin along its axis; normals outwards.
+    """Copies of a body of revolution with the profile (k, 2) of (radius, height), at each origin along its axis; normals outwards.
 
-    The turn starts where the sensor's x falls onto the body's plane, towards y. ``outlines`` (N, sides) scale the radius.
+    The azimuth starts at the projection of the sensor's x onto the body's plane and increases towards y. ``outlines`` (N, sides) scale
+    the radius.
     """
     u = np.array([1.0, 0.0, 0.0]) - axis[:, :1] * axis
     u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -153,6 +153,6 @@ def _lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: 
     each = len(profile) * sides
     one = _ring_grid(len(profile) - 1, sides)
     corners = profile[one // sides, 0] == 0
-    one = one[corners.sum(axis=1) < 2]  # at a point each quad is one triangle; v runs against u x axis: the turn is clockwise
+    one = one[corners.sum(axis=1) < 2]  # a quad with a radius of 0 at one end is one triangle; v is opposite to u x axis (clockwise)
     faces = (np.arange(len(origin_mm))[:, None, None] * each + one[None]).reshape(-1, 3)
     return Surface(vertices.reshape(-1, 3), faces)

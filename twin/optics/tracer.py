@@ -1,8 +1,8 @@
 """Path tracing on the gel's side of the window.
 
-At every vertex the light of all patches through the window is computed without shadows, as a sum of closed forms. Then one
-patch, drawn in proportion to what it would give, is tested for a shadow. Where nothing is in the way, this choice causes no
-noise. Paths that leave towards the window are reflected by it (with total reflection) or lost in the housing.
+At every vertex the light of all patches through the window is computed in closed form, without shadows. Then one patch is drawn with a
+probability proportional to its light and tested for a shadow. If there is no shadow, this random choice causes no noise. Paths that leave
+towards the window are reflected by it (including total reflection) or lost in the housing.
 """
 
 from dataclasses import dataclass, field
@@ -18,16 +18,16 @@ from twin.optics.window import Window
 from twin.types import FloatArray
 
 SURVIVAL_GAIN = 4.0
-"""A path goes on with a probability of this times its weight (Russian roulette), at most 1."""
+"""Ratio of the probability that a path continues to the path's weight (Russian roulette). The probability is at most 1."""
 LEAST_SURVIVAL = 0.05
-"""A path goes on at least with this probability."""
+"""Least probability that a path continues."""
 NEVER = 1e-12
-"""Probability that counts as 0."""
+"""Probability below which it counts as 0."""
 
 
 @dataclass(frozen=True)
 class Emitters:
-    """Patches as arrays for Dr.Jit, radiances as its spectra so that they can carry gradients."""
+    """Patches as arrays for Dr.Jit. Radiances are spectra of Dr.Jit, so that they can have gradients."""
 
     patches: list[Patch]
     radiance: list[DrJit]
@@ -35,7 +35,7 @@ class Emitters:
 
 @dataclass
 class GelTracer:
-    """Light that reaches the camera's side of the window along rays in the gel.
+    """Light that arrives at the camera's side of the window along rays in the gel.
 
     Attributes
     ----------
@@ -46,11 +46,11 @@ class GelTracer:
     absorption : tuple of float
         Beer-Lambert coefficients, 1/mm.
     bounces : int
-        Scatterings of a path after its first vertex.
+        Number of scatterings of a path after its first vertex.
     bump : float
         ``AppearanceSpec.cap_bump`` of the shape ``caps``.
     tints : list of (mi.ShapePtr, mi.Spectrum)
-        Factors on what shapes reflect, which can carry gradients.
+        Factors on the reflectances of shapes; they can have gradients.
     """
 
     scene: DrJit
@@ -64,16 +64,17 @@ class GelTracer:
 
     @classmethod
     def of(cls, mi: ModuleType, spec: SensorSpec, scene: DrJit, bounces: int) -> "GelTracer":
-        """For a sensor, its gel-side scene and a number of bounces."""
+        """The tracer of a sensor, from its scene in the gel and a number of bounces."""
         patches = lights(spec.leds, spec.housing)
         emitters = Emitters(patches, [spectrum(mi, p.radiance) for p in patches])
         caps = next(mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == "caps")
         return cls(scene, Window.of(spec.view), emitters, spec.gel.absorption_per_mm, bounces, spec.appearance.cap_bump, caps)
 
     def radiance(self, mi: ModuleType, dr: ModuleType, place: DrJit, direction: DrJit, random: PixelSamples) -> DrJit:
-        """Radiance in the gel, divided by n^2, along rays that start at the window's gel side.
+        """Radiance in the gel, divided by n^2, along rays that start on the window's gel side.
 
-        Few paths go on after the first vertex (the skin is dark): they are gathered, so that the others cost nothing.
+        Because the skin is dark, few paths continue after the first vertex. They are gathered in shorter arrays, so that ended paths take
+        no time.
 
         Parameters
         ----------
@@ -117,7 +118,7 @@ class GelTracer:
         return result / self.window.gel_index**2
 
     def _follow(self, mi: ModuleType, dr: ModuleType, ray: DrJit, weight: DrJit, random: PixelSamples) -> tuple[DrJit, DrJit, DrJit, DrJit]:
-        """The next vertices of rays within the gel; those that miss everything on their way to the window come back from it."""
+        """The next vertices of rays in the gel. Rays that meet nothing on their way to the window are reflected by it."""
         first = self.scene.ray_intersect_preliminary(ray, coherent=False)
         up = ~first.is_valid() & (ray.d.z < -1e-6)
         far = dr.select(up, (self.window.front - ray.o.z) / dr.minimum(ray.d.z, -1e-6), 0.0)
@@ -172,7 +173,7 @@ class GelTracer:
 
 
 def _taken(dr: ModuleType, cosine: DrJit, bump: DrJit) -> DrJit:
-    """Cosine law of a flat place, and of a ball: half of what arrives, averaged over the side that is seen."""
+    """Received share of light: by the cosine law of a flat place, mixed with that of a ball (one half, averaged over its visible side)."""
     return dr.select(cosine > 0, (1 - bump) * cosine + 0.5 * bump, 0.0)
 
 

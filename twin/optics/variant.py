@@ -1,8 +1,8 @@
-"""The one owner of Mitsuba variants and of the LLVM library behind them.
+"""The only module that chooses and sets Mitsuba variants, and the LLVM library that they use.
 
-Dr.Jit loads whichever libLLVM it finds first. LLVM 15 and older abort the whole process at
-the first kernel (no instruction for IEEE fminimum), so a library is chosen and proved here,
-before Dr.Jit looks for one. Nothing is imported or set until `use_variant` is called.
+Dr.Jit loads the first libLLVM that it finds. LLVM 15 and older abort the whole process at the first kernel (they have no instruction for
+IEEE fminimum). Therefore a library is chosen and tested here, before Dr.Jit searches for one. Nothing is imported or set before
+`use_variant` is called.
 """
 
 import ctypes.util
@@ -25,7 +25,7 @@ DrJit: TypeAlias = Any
 """A value of Dr.Jit or an object of Mitsuba. Their classes belong to the variant, which is chosen while the program runs."""
 
 OLDEST_LLVM = 16
-"""Versions 14 and 15 abort the process at the first kernel."""
+"""Oldest usable major version of LLVM: versions 14 and 15 abort the process at the first kernel."""
 BACKENDS = ("cuda", "llvm", "scalar")
 REMEDY = "install LLVM 16 or newer (Debian, Ubuntu: apt-get install libllvm19), or point DRJIT_LIBLLVM_PATH to its library"
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -34,7 +34,7 @@ _VARIANT_VARIABLE = "TACTIP_VARIANT"
 
 @dataclass(frozen=True)
 class LlvmLibrary:
-    """One libLLVM found on this machine; ``reason`` says why it is not used ("" where it is)."""
+    """One libLLVM found on this machine; ``reason`` states why it is not used ("" if it is used)."""
 
     path: str
     version: str
@@ -44,7 +44,7 @@ class LlvmLibrary:
 
 @dataclass(frozen=True)
 class LlvmSearch:
-    """The result of `find_llvm`: the proved library or None, and all that were looked at."""
+    """The result of `find_llvm`: the library that works (or None), and all candidates."""
 
     library: LlvmLibrary | None
     candidates: tuple[LlvmLibrary, ...]
@@ -52,7 +52,7 @@ class LlvmSearch:
 
 @dataclass(frozen=True)
 class VariantChoice:
-    """A Mitsuba variant that works here, why it was taken, and the LLVM it needs (None: none)."""
+    """A Mitsuba variant that works on this machine, the reason for its choice, and the LLVM library that it needs (None: none)."""
 
     variant: str
     reason: str
@@ -65,7 +65,7 @@ class VariantChoice:
 
     @property
     def mono(self) -> bool:
-        """Whether the variant carries one channel instead of three."""
+        """Whether the variant renders one channel instead of three."""
         return self.variant.endswith("mono")
 
 
@@ -75,7 +75,7 @@ def find_llvm(search: Sequence[Path] | None = None) -> LlvmSearch:
     Parameters
     ----------
     search : sequence of Path, optional
-        Library files to consider instead of the usual places.
+        Library files to consider instead of those in the usual places.
     """
     looked_at = []
     wish = os.environ.get(_LLVM_VARIABLE)
@@ -100,21 +100,21 @@ def find_cuda() -> tuple[bool, str]:
 
 
 def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_search: Sequence[Path] | None = None) -> VariantChoice:
-    """The fastest Mitsuba variant that is proved to work on this machine.
+    """The fastest Mitsuba variant that works on this machine, as tests show.
 
     Parameters
     ----------
     channels : {"color", "mono"}
-        What the camera delivers.
-    prefer : {"cuda", "llvm", "scalar", "auto"} or a full variant name, optional
-        Insist on a backend; the environment variable TACTIP_VARIANT overrides it.
+        Channels of the camera.
+        prefer : {"cuda", "llvm", "scalar", "auto"} or a full variant name, optional
+            The backend that must be used; the environment variable TACTIP_VARIANT takes precedence.
     llvm_search : sequence of Path, optional
         As for `find_llvm`.
 
     Raises
     ------
     RenderError
-        For an unknown name, or where the backend insisted on does not work.
+        The name is unknown, or the backend that must be used does not work.
     """
     override = os.environ.get(_VARIANT_VARIABLE)
     wish, source = override or prefer or "auto", _VARIANT_VARIABLE if override else "variant"
@@ -148,7 +148,7 @@ def use_variant(choice: VariantChoice) -> ModuleType:
 
 @contextmanager
 def one_thread(choice: VariantChoice) -> Iterator[None]:
-    """``choice`` renders on one thread: for processes that share a machine, where more threads only wait for each other."""
+    """Context in which ``choice`` renders on one thread. In processes that share a machine, more threads would only wait for each other."""
     use_variant(choice)
     import drjit as dr
 
@@ -171,16 +171,16 @@ def available_variants() -> tuple[str, ...]:
 
 
 class RenderReport(TypedDict):
-    """What a diagnosis prints about rendering on a machine."""
+    """The part of a diagnosis that is about rendering on a machine."""
 
     variants: list[str]
     """Variants compiled into the installed Mitsuba."""
     used: dict[str, dict[str, str | None]]
-    """For "color" and "mono" cameras: ``variant`` (None where nothing works), ``reason``, ``llvm_path``."""
+    """For "color" and "mono" cameras: ``variant`` (None if no variant works), ``reason``, ``llvm_path``."""
     llvm: dict[str, str | bool] | None
     """The LLVM library in use, as `LlvmLibrary`."""
     llvm_rejected: list[dict[str, str | bool]]
-    """Libraries that were looked at and do not work."""
+    """Libraries that were found and do not work."""
     gpu: bool
     gpu_reason: str
     override: str | None
@@ -190,7 +190,7 @@ class RenderReport(TypedDict):
 
 
 def report() -> RenderReport:
-    """What a diagnosis prints about rendering on this machine."""
+    """The part of a diagnosis that is about rendering on this machine."""
     llvm = find_llvm()
     gpu, gpu_reason = find_cuda()
     used: dict[str, dict[str, str | None]] = {}
@@ -212,7 +212,7 @@ def report() -> RenderReport:
 
 
 def _name(backend: str, channels: str) -> str:
-    """The compiled variant for a camera; a wheel without scalar_mono renders colour, reduced to luminance later."""
+    """The compiled variant for a camera. If scalar_mono was not compiled, colour is rendered and converted to luminance later."""
     prefix = backend if backend == "scalar" else f"{backend}_ad"
     mono = f"{prefix}_mono"
     return mono if channels == "mono" and mono in available_variants() else f"{prefix}_rgb"
@@ -246,7 +246,7 @@ def _judge(path: Path, *, asked_for: bool = False) -> LlvmLibrary:
 
 
 def _version(path: Path) -> str:
-    """Version told by a library's resolved name or folder ("" where neither tells)."""
+    """Version according to a library's resolved name or folder; "" if neither states it."""
     for text in (path.resolve().name, path.name, str(path.resolve().parent)):
         match = re.search(r"(?:libLLVM[-.](?:so\.)?|llvm[-@]?)(\d+(?:\.\d+)*)", text)
         if match:

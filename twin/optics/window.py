@@ -1,4 +1,4 @@
-"""The plane window between camera, LEDs and gel, in Dr.Jit's terms (see ``twin.camera.projection`` for the ray's equation)."""
+"""The plane window between camera, LEDs and gel, computed in Dr.Jit (see ``twin.camera.projection`` for the equation of rays)."""
 
 from dataclasses import dataclass
 from types import ModuleType
@@ -27,16 +27,16 @@ class Window:
         return cls(lens.back_mm, lens.z_mm, lens.refractive_index, view.gel_index, lens.radius_mm)
 
     def enter(self, dr: ModuleType, mi: ModuleType, origin: DrJit, direction: DrJit) -> tuple[DrJit, DrJit, DrJit]:
-        """A ray in the air, ``direction.z > 0``, followed to the window's gel side.
+        """Follow a ray in the air, with ``direction.z > 0``, to the window's gel side.
 
         Returns
         -------
         place : mi.Point3f
-            On the gel side of the window.
-        inward : mi.Vector3f
-            Unit direction in the gel.
-        transmittance : mi.Float
-            Of radiance, without the factor n^2 of the denser medium.
+            Place on the gel side of the window.
+            inward : mi.Vector3f
+                Unit direction in the gel.
+            transmittance : mi.Float
+                Transmittance for radiance, without the factor n^2 of the denser medium.
         """
         place = origin + direction * ((self.back - origin.z) / direction.z)
         in_window = _bent(dr, mi, direction, 1 / self.window_index)
@@ -45,17 +45,17 @@ class Window:
         return place, in_gel, self.transmittance(dr, direction.z, in_window.z, in_gel.z)
 
     def connect(self, dr: ModuleType, mi: ModuleType, point: DrJit, light: DrJit) -> tuple[DrJit, DrJit, DrJit]:
-        """The refracted way from points in the gel to points of a light in the air whose normal is +z.
+        """The refracted ray from points in the gel to points of a light in the air whose normal is +z.
 
         Returns
         -------
         toward : mi.Vector3f
-            Unit direction in the gel from the point to where the way leaves it.
-        length : mi.Float
-            That far (mm).
-        factor : mi.Float
-            Solid angle at the point per area of light, times transmittance and n^2: with the light's radiance in air
-            and the cosine at the point it gives irradiance per area. Zero for light behind.
+            Unit direction in the gel, from the point to the place at which the ray leaves the gel.
+            length : mi.Float
+                Length of the ray in the gel, mm.
+            factor : mi.Float
+                Solid angle at the point per area of the light, times transmittance and n^2. Times the light's radiance in air and the
+                cosine at the point, it is the irradiance per area of the light. Light from behind has the factor zero.
         """
         across = mi.Vector2f(light.x - point.x, light.y - point.y)
         rho2 = dr.squared_norm(across)
@@ -79,14 +79,14 @@ class Window:
         return toward, (point.z - self.front) / cos_gel, factor
 
     def transmittance(self, dr: ModuleType, cos_air: DrJit, cos_window: DrJit, cos_gel: DrJit) -> DrJit:
-        """Of the slab, unpolarised at each face, with the light that goes to and fro in it."""
+        """Transmittance of the slab for light that is unpolarised at each face, including multiple reflections within the slab."""
         outer, inner = fresnel(1 / self.window_index, cos_air, cos_window), self._inner_face(cos_gel, cos_window)
         return (1 - outer) * (1 - inner) / (1 - outer * inner)
 
     def mirror(self, dr: ModuleType, mi: ModuleType, place: DrJit, direction: DrJit, choice: DrJit) -> tuple[DrJit, DrJit, DrJit]:
-        """A ray that reaches the window's gel side at ``place`` from within the gel, reflected.
+        """Reflect a ray that reaches the window's gel side at ``place`` from the gel.
 
-        One of both faces is chosen by the uniform number ``choice``; at the back the ray is displaced.
+        The uniform random number ``choice`` decides which face reflects the ray. The back face also displaces it.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""The pipeline over a whole recording, written to a folder: pins, a summary, and pictures of what the pipeline saw."""
+"""The pipeline applied to a whole recording. The results are files in a folder: pins, a summary, and pictures of the found pins."""
 
 from collections.abc import Callable
 from itertools import chain, count
@@ -43,7 +43,7 @@ FARTHEST_PX = 1e4
 HALF, BRIGHTEST, DARKEST = 127.0, 98.0, 24.0
 """In a picture this percentile of a frame's levels (at least the third number) is shown at half white, so that what is drawn is seen."""
 UNMEASURED = "specification"
-"""Stands in place of a no-contact frame's name where the specification's layout is the reference."""
+"""Text instead of the name of a no-contact frame if the reference is the specification's layout."""
 
 
 def preprocess_recording(
@@ -54,16 +54,16 @@ def preprocess_recording(
     overlay: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
-    """Observe every frame of a recording and write ``pins.npz``, ``summary.json`` and, if asked, ``overlay/``.
+    """Observe every frame of a recording and write ``pins.npz``, ``summary.json`` and, with ``overlay``, the pictures ``overlay/``.
 
-    A frame is valid if its pins were found.
+    A frame is valid if its pins were found. Irregularities are listed in the summary.
 
     Parameters
     ----------
     path : path
         Anything ``open_recording`` takes.
     form : Form, optional
-        Told by size and content if not given.
+        Recognised by size and content if not given.
     progress : callable, optional
         Called with (done, total).
 
@@ -77,7 +77,7 @@ def preprocess_recording(
     Raises
     ------
     FrameError
-        No frame was readable, or none was valid (the files are written all the same).
+        No frame was readable, or none was valid. In the second case the files are written nevertheless.
     StoreError
         The folder can't be written to.
     """
@@ -122,13 +122,15 @@ def preprocess_recording(
 def _observed(
     recording: Recording, pipeline: Pipeline, pictures_dir: Path | None, progress: Callable[[int, int], None] | None
 ) -> tuple[list[str], list[Observation], list[BadFrame]]:
-    """Names and observations of a recording's frames, and the frames that do not suit the pipeline; pictures where there is a folder."""
+    """Names and observations of a recording's frames, and the frames that do not suit the pipeline. Writes pictures to a given folder."""
     names: list[str] = []
     observations: list[Observation] = []
     unfit: list[BadFrame] = []
     pictures: set[str] = set()
     for frame in recording:
         try:
+            if not observations:
+                pipeline(frame)  # loads or compiles code, which is no part of a frame's time
             observation = pipeline(frame)
         except FrameError as error:
             unfit.append({"image_name": frame.name, "reason": str(error).removeprefix(f"{frame.name}: ")})
@@ -143,7 +145,7 @@ def _observed(
 
 
 def recording_reference(spec: SensorSpec, recording: Recording, problems: list[str]) -> tuple[Reference, str]:
-    """The recording's own no-contact layout and its frame's name; without a usable no-contact frame the specification's layout.
+    """The layout in the recording's no-contact frame and this frame's name; without a usable one the specification's layout.
 
     The reason why a no-contact frame cannot be used is added to ``problems``.
     """
@@ -160,7 +162,7 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
 
 
 def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: the frame, its graph, found pins (green), predicted places of lost ones (red), rejected blobs (yellow)."""
+    """Picture (H, W, 3) uint8 RGB: frame, graph, found pins (green), predicted places of lost pins (red), rejected blobs (yellow)."""
     gray = cv2.resize(gray_levels(frame.image), None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
     light = HALF / max(float(np.percentile(gray, BRIGHTEST)), DARKEST)  # a dark frame is shown lighter
     canvas = cv2.cvtColor(np.minimum(gray * light, HALF).astype(np.uint8), cv2.COLOR_GRAY2RGB)
@@ -180,13 +182,14 @@ def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> n
         cv2.circle(canvas, px, 5, LOST_RGB, 1, cv2.LINE_AA)
     for px in place(observation.extra_px):
         cv2.circle(canvas, px, 6, EXTRA_RGB, 1, cv2.LINE_AA)
-    text = f"{frame.name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
+    name = frame.name.encode("ascii", "replace").decode()  # OpenCV's font has no other letters, and some end the process
+    text = f"{name}  {observation.found}/{len(observation.pins_px)}  {observation.reason}"
     cv2.putText(canvas, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
     return canvas
 
 
 def overlay_name(frame_name: str, taken: set[str]) -> str:
-    """File name for a frame's picture, distinct from those in ``taken`` (in lower case), to which it is added."""
+    """File name for a frame's picture that is not in ``taken`` (in lower case) yet; it is added to ``taken``."""
     stem = Path(frame_name).stem
     tries = chain((f"{stem}.png", f"{frame_name}.png"), (f"{stem}_{k}.png" for k in count(2)))
     name = next(name for name in tries if name.casefold() not in taken)
@@ -195,16 +198,15 @@ def overlay_name(frame_name: str, taken: set[str]) -> str:
 
 
 def _timing(observations: list[Observation]) -> dict[str, dict[str, float]]:
-    """Median, 95 and 99 % of the milliseconds of each stage, without the first frame, which also loads the compiled code."""
+    """Median, 95 and 99 % of the milliseconds of each stage."""
     if not observations:
         return {}
-    warm = observations[1:] or observations
-    stages = {stage: [o.ms[stage] for o in warm] for stage in observations[0].ms}
+    stages = {stage: [o.ms[stage] for o in observations] for stage in observations[0].ms}
     return {s: dict(zip(("p50", "p95", "p99"), np.percentile(ms, (50, 95, 99)).round(4).tolist(), strict=True)) for s, ms in stages.items()}
 
 
 def _arrays(names: list[str], observations: list[Observation], n: int) -> dict[str, np.ndarray]:
-    """What ``pins.npz`` holds of M frames with ``n`` pins."""
+    """The arrays of ``pins.npz`` for M frames with ``n`` pins."""
     none = np.full(n, np.nan)
     areas = [none if o.graph is None else o.graph.area_px2 for o in observations]
     return {

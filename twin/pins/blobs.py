@@ -4,35 +4,36 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 
 from scenes.sensor import BlobSpec
+from twin.compiled import compiled
 from twin.pins.bumps import find_bumps
 
 GROWTH_PX = 4
-"""A component is grown by at most this much beyond its bounding box, px."""
+"""Largest distance, px, by which a component is grown beyond its bounding box."""
 SPECK_LEVELS = 48
-"""A pixel that differs from the median of its 3 x 3 neighbourhood by more gray levels than this is a fault of the chip."""
+"""Difference of a pixel from the median of its 3 x 3 neighbourhood, gray levels, above which it counts as a hot or dead pixel."""
 SPECK_USUAL = 0.8
-"""Share of the pixels by which a frame's usual difference from the median is told. In a noisy frame the limit above rises with it."""
+"""Quantile of all differences from the median that is a frame's usual difference. In noisy frames the limit of ``SPECK_LEVELS`` is
+raised according to it."""
 SPECK_RATIO = 4.0
-"""A fault differs by more than this many times the usual difference."""
+"""Least ratio of the difference of a hot or dead pixel to the usual difference."""
 MOST_ABOVE = 98
-"""Percentile of the levels above the local mean. Brighter levels (glare, LEDs) are set to it before Otsu's method."""
+"""Percentile of the levels above the local mean to which brighter levels (glare, LEDs) are reduced before Otsu's method."""
 NOISE_SIGMA_PX = 0.7
-"""Sd of the smoothing before an adaptive threshold, px. It halves white noise and leaves a cap of 6 px its edge."""
+"""Standard deviation of the smoothing before an adaptive threshold, px. It halves white noise and keeps the edge of a 6 px cap."""
 LEAST_FILL = 0.25
-"""Least share of its bounding box that a cap fills. Arcs of the housing fill less."""
+"""Least share of its bounding box that a cap fills. Arcs of the housing fill a smaller share."""
 
 
 @dataclass(frozen=True)
 class Mask:
-    """A disc in a frame, and the window of the frame that holds it.
+    """A disc in a frame, and the window of the frame that contains it.
 
     Attributes
     ----------
     window : (slice, slice)
-        Rows and columns of the frame that are looked at.
+        Rows and columns of the frame.
     corner_px : (2,) float
         (x, y) of the window's first pixel.
     disc : (h, w) uint8
@@ -64,17 +65,17 @@ class Blobs:
     px : (K, 2) float
         Centroids, px of the frame.
     area_px2 : (K,) float
-        Pixels of each component, as thresholded (before erosion).
+        Number of pixels of each component after the threshold and before erosion.
     elongation : (K,) float
         Ratio of the larger to the smaller variance along the component's axes (1 for a disc).
     label : (K,) int
         Each blob's value in ``labels``.
     label_area_px2 : (L,) float
-        Area of every component, the rejected ones too.
+        Area of every component, including rejected ones.
     label_box : (L, 4) int
         Every component's left, top, width, height in the window, before it is grown.
     labels : (h, w) uint16
-        Components grown over what belongs to them, in the mask's window.
+        Components, grown over the pixels that belong to them, in the mask's window.
     gray : (h, w) uint8
         The window's gray levels.
     corner_px : (2,) float
@@ -101,7 +102,7 @@ class Blobs:
 
 
 def despeckled(gray: np.ndarray) -> np.ndarray:
-    """Gray levels (h, w) uint8 in which hot and dead pixels take the median of their neighbourhood. Other pixels, noisy ones too, stay."""
+    """Gray levels (h, w) uint8 in which hot and dead pixels are replaced by the median of their neighbourhood. Noisy pixels are kept."""
     median = cv2.medianBlur(gray, 3)
     away = cv2.absdiff(gray, median)
     usual = int(np.searchsorted(np.cumsum(cv2.calcHist([away], [0], None, [256], [0, 256])), SPECK_USUAL * gray.size))
@@ -129,9 +130,9 @@ def own_threshold(gray: np.ndarray, disc: np.ndarray, blob: BlobSpec) -> float:
 
 
 def _smoothed(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
-    """A window (h, w) ready for an adaptive threshold: smoothed, and without what lies outside the disc.
+    """A window (h, w) prepared for an adaptive threshold: smoothed, and uniform outside the disc.
 
-    Housing and LEDs are set to the median inside the disc. Otherwise their light would raise the local mean near the rim.
+    Pixels outside the disc (housing and LEDs) are set to the median inside it. Otherwise they would raise the local mean near the rim.
     """
     histogram = cv2.calcHist([gray], [0], disc, [256], [0, 256]).ravel()
     median = int(np.searchsorted(np.cumsum(histogram), histogram.sum() / 2))
@@ -140,7 +141,7 @@ def _smoothed(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
     return smooth
 
 
-@njit(cache=True)
+@compiled()
 def _centroids(gray: np.ndarray, labels: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, count: int) -> np.ndarray:
     """Sums (count, 7) over the pixels of each label: weight, weight x, weight y, bright pixels, weight xx, weight xy, weight yy.
 
@@ -177,9 +178,8 @@ def _centroids(gray: np.ndarray, labels: np.ndarray, grown: np.ndarray, ringed: 
 def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: float) -> Blobs:
     """Blobs of the window ``gray`` (h, w) uint8 between ``blob.min_area_px2`` and ``max_area_px2``.
 
-    Components are those of the eroded bright image. A centroid weighs the pixels of the component, grown back over
-    the erosion and one pixel more, by their level above the mean of the ring around. In a two-level image it is
-    the plain centroid of the bright pixels.
+    Components are those of the eroded bright image. Each is grown back over the erosion and one pixel more. The weight of a pixel in the
+    centroid is its level above the mean of the ring around the component. In a two-level image all bright pixels have the same weight.
     """
     bright = threshold(gray, mask.disc, blob)
     eroded = bright

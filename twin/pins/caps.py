@@ -1,7 +1,7 @@
-"""What each cap looks like in a frame: level, contrast, size, shape and the sharpness of its edge.
+"""Measurement of each cap in a frame: level, contrast, size, shape and sharpness of its edge.
 
-All is measured against the cap's own half level, midway between its own plateau and the skin around it, in a patch
-interpolated four times as fine, within the cap's Voronoi cell.
+A cap's outline is where the gray level is half way between the cap's plateau and the skin around it (its half level). It is measured in
+a patch interpolated four times as fine, within the cap's Voronoi cell.
 """
 
 from dataclasses import dataclass, fields
@@ -10,21 +10,21 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-# Interpolated pixels for each pixel, each way.
+# Number of interpolated pixels for one pixel, in each direction.
 FINE = 4
-# Half a side of a cap's patch, as a share of the distance to the nearest neighbour.
+# Half of the side of a cap's patch, as a share of the distance to the nearest neighbour.
 REACH = 0.65
-# Percentile of a cell's levels outside the cap that stands for the skin: stems and neighbours are brighter.
+# Percentile of a cell's levels outside the cap that is taken as the skin's level, because stems and neighbours are brighter.
 SKIN_PERCENTILE = 20.0
-# Rounds in which plateau and half level are found in turn: each depends on the other.
+# Rounds of finding plateau and half level alternately, because each depends on the other.
 HALF_ROUNDS = 3
-# A pixel at least this deep in the cap, relative to its deepest one, belongs to the plateau.
+# Least depth of a pixel of the plateau inside the cap's outline, relative to the deepest pixel.
 PLATEAU = 0.5
-# Reach of the edge's profile to both sides, and width of its bins, px.
+# Length of the edge's profile on each side of the outline, and width of its bins, px.
 EDGE_PX, EDGE_BIN_PX = 4.0, 0.25
 # Levels of the edge, as shares of the contrast, between which its width is measured.
 EDGE_LOW, EDGE_HIGH = 0.1, 0.9
-# Pins, a cap's own included, that bound its cell.
+# Number of pins, including the cap's own, from which its cell is computed.
 NEIGHBOURS = 7
 
 
@@ -35,14 +35,14 @@ class Caps:
     Attributes
     ----------
     level, contrast, skin : (N,) float
-        Gray levels: of the plateau, of the plateau above the skin around, and of that skin.
-    diameter_px : float
-        Of the disc with the area above half level.
-    eccentricity : float
-        Of the ellipse with the second moments of that area: 0 a circle, towards 1 a bar.
-    edge_px : float
-        From 10 to 90 % of the contrast, along the distance to the half-level line, mean around the cap.
-        A straight edge blurred by a Gaussian: 2.563 sigma.
+        Gray levels: of the plateau, of the plateau minus the skin around it, and of that skin.
+        diameter_px : float
+            Diameter of the disc whose area is that above half level.
+        eccentricity : float
+            Eccentricity of the ellipse with the second moments of that area: 0 for a circle, near 1 for a bar.
+        edge_px : float
+            Distance in which the mean profile across the outline falls from 90 to 10 % of the contrast. For a straight edge blurred by a
+            Gaussian it is 2.563 sigma.
     """
 
     level: np.ndarray
@@ -71,7 +71,7 @@ def measure_caps(gray: np.ndarray, pins_px: np.ndarray) -> Caps:
 
 
 def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int) -> tuple[float, ...] | None:
-    """The measures, in the order of ``MEASURES``, of a cap in a patch of ``half`` a side; None where there is none."""
+    """The measures of a cap in the order of ``MEASURES``, in a patch with the side ``2 half``; None if there is no cap."""
     x, y = np.rint(pin_px).astype(int)
     if x < half or y < half or x + half >= gray.shape[1] or y + half >= gray.shape[0]:
         return None
@@ -81,7 +81,7 @@ def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int
     fine = cv2.remap(patch, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     corner = pin_px - [x - half, y - half]
     cell = np.ones(fine.shape, bool)
-    for u, v in others - pin_px:  # nearer to the pin than to this neighbour
+    for u, v in others - pin_px:  # keep pixels that are nearer to the pin than to this neighbour
         cell &= (columns - corner[0]) * u + (rows - corner[1]) * v < (u * u + v * v) / 2
     row, column = np.rint(corner[::-1] * FINE).astype(int).tolist()
     middle = row, column
@@ -107,7 +107,7 @@ def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int
 
 
 def _edge_px(inwards_px: np.ndarray, share: np.ndarray) -> float:
-    """Distance between the places where the mean profile crosses 10 and 90 %, searched outwards from the half-level line."""
+    """Distance between the places where the mean profile crosses 10 and 90 %; both are searched from the half-level line."""
     bins = np.rint(inwards_px / EDGE_BIN_PX).astype(int)
     reach = int(EDGE_PX / EDGE_BIN_PX)
     near = np.abs(bins) <= reach

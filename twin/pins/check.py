@@ -1,7 +1,7 @@
-"""A sensor's state of health, told from a few of its frames.
+"""Check of a sensor's condition by a few of its frames.
 
-Light, focus, pins, glare and the camera's place are compared with what the sensor's specification promises. How far the camera has moved
-since its calibration is told from the outermost pins, because a contact moves them least.
+Light, focus, pins, glare and the camera's place are compared with those expected from the sensor's specification. The camera's
+displacement since its calibration is measured by the outermost pins, because a contact moves them least.
 """
 
 from dataclasses import dataclass
@@ -27,20 +27,20 @@ from twin.progress import Step
 from twin.types import Form, Frame, Observation
 
 LEAST_RIM = 0.5
-"""Least share of the outermost pins that must be seen."""
+"""Least share of the outermost pins that must be found."""
 BULGE = 1.0
-"""Relative growth of the rim, for a unit of the pins' rms motion in the rim's mean radius. Measured: 0.90, 0.98 and 1.09 in recordings
-of three sensors, 0.7 to 1.4 in the twin."""
+"""Relative growth of the rim by a contact, divided by the pins' rms motion relative to the rim's mean radius. Measured: 0.90, 0.98 and
+1.09 in recordings of three sensors, 0.7 to 1.4 in the twin."""
 SATURATED_LEVEL = 250
-"""Gray level from which on a pixel counts as white."""
+"""Least gray level of a saturated pixel."""
 STEADY = 0.5
-"""A pin that is lost, or a spot that is seen, in this share of the frames is a fault of the sensor, not of a contact."""
+"""Share of the frames from which on a lost pin, or a bright spot, counts as a fault of the sensor and not as an effect of contacts."""
 SAME_SPOT = 0.3
-"""Spots nearer to each other than this many spacings are the same."""
+"""Distance in spacings below which spots in two frames are the same spot."""
 CAPS_MEASURED = 3
-"""Most frames in which caps are measured, evenly spread: light and focus hardly differ between frames."""
+"""Most frames in which caps are measured. They are spread evenly; light and focus hardly differ between frames."""
 LEAST_DEFORMED = 0.3
-"""The camera's place is told from this share of the frames: those with the least contact."""
+"""Share of the frames, those with the least contact, by which the camera's place is measured."""
 TOLD_BULGE = 0.002
 """A contact that changes the rim's size by less than this share is not mentioned."""
 LAYOUT_JUDGED = 4
@@ -48,15 +48,15 @@ LAYOUT_JUDGED = 4
 LISTED = 8
 """Most pins that a sentence lists by number."""
 BRIGHT_PERCENTILE = 99
-"""Percentile of the disc's gray levels that stands for the caps where no pin is found."""
+"""Percentile of the disc's gray levels that is taken as the caps' level if no pin is found."""
 USUAL_CAP_PX = 8.0
-"""Diameter of a cap, px, where none can be measured."""
+"""Assumed diameter of a cap, px, if none can be measured."""
 GLARE_CAPS = 2
-"""A white patch larger than this many caps is glare."""
+"""Area in caps above which a white patch is glare."""
 
 
 class Grade(StrEnum):
-    """How good a finding is."""
+    """Grade of a finding."""
 
     GOOD = "good"
     WATCH = "watch"
@@ -65,18 +65,18 @@ class Grade(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at.
+    """The result of one check.
 
     Attributes
     ----------
     name : str
     verdict : Grade
     value : float
-        The figure that is compared with the check's limits; NaN where it cannot be told.
-    text : str
-        What was seen, with the figure and what was expected.
-    remedy : str
-        What to do; "" if nothing.
+        The number that is compared with the check's limits; NaN if it can't be measured.
+        text : str
+            Description of the result, with the number and what was expected.
+        remedy : str
+            What to do; "" if nothing.
     """
 
     name: str
@@ -87,20 +87,20 @@ class Finding:
 
 
 def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None = None, *, progress: Step | None = None) -> list[Finding]:
-    """Findings on frames of one form, with or without contact.
+    """Check a sensor by frames of one form, with or without contact.
 
     Parameters
     ----------
     frames : list of Frame
     spec : SensorSpec
-        What the sensor should look like.
-    detector : DetectorSpec, optional
-        What ``twin tune`` found for method ``twin``; the specification's own pipeline by default.
+        The specification that the frames are compared with.
+        detector : DetectorSpec, optional
+            Parameters that ``twin tune`` found for the method ``twin``; by default those of the specification.
 
     Raises
     ------
     FrameError
-        A frame is not one of this sensor's.
+        A frame is not of this sensor.
     """
     form = frames[0].form
     detector = detector or shipped_detector(spec, form)
@@ -116,17 +116,17 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
 
 @dataclass(frozen=True)
 class Drift:
-    """The similarity that carries the calibrated rim of pins to the one seen.
+    """The similarity that maps the calibrated rim of pins to the observed one.
 
     Attributes
     ----------
     shift_px : (2,) float
         Shift of the rim's centre.
     turn_deg : float
-        From x towards y.
+        Turn from x towards y.
     scale : float
     contact : float
-        Rms of the pins' motion that the similarity leaves, in the rim's mean radius: how much a contact deforms the skin.
+        Rms motion of the pins without the similarity, relative to the rim's mean radius. It measures how much a contact deforms the skin.
     """
 
     shift_px: np.ndarray
@@ -136,14 +136,14 @@ class Drift:
 
     @property
     def scale_at_rest(self) -> float:
-        """The scale without the contact's part: the gel keeps its volume, so it bulges at the rim when it is pressed in the middle."""
+        """The scale without the effect of a contact. The gel keeps its volume, so it bulges at the rim when it is pressed in the middle."""
         return self.scale / (1 + BULGE * self.contact)
 
 
 def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray) -> Drift | None:
-    """Drift by least squares over the outermost pins (m,) of pins (N, 2), NaN where lost; None where too few are seen.
+    """Drift by least squares over the outermost pins (m,) of pins (N, 2), which are NaN if lost. None if too few are found.
 
-    With complex coordinates about the means: ``a = sum conj(r) p / sum |r|^2`` (Horn 1987, in the plane).
+    With complex coordinates about the means, the similarity is ``a = sum conj(r) p / sum |r|^2`` (Horn 1987, in the plane).
     """
     rim = outmost[np.isfinite(pins_px[outmost, 0])]
     if len(rim) < LEAST_RIM * len(outmost):
@@ -159,7 +159,7 @@ def drift_of(pins_px: np.ndarray, rest_px: np.ndarray, outmost: np.ndarray) -> D
 
 
 def _verdict(value: float, watch: float, bad: float) -> Grade:
-    """Grade of a value by two limits. If ``bad`` is above ``watch``, large values are bad; else small ones. NaN is bad."""
+    """Grade of a value by two limits. If ``bad`` is larger than ``watch``, large values are bad, else small ones. NaN is bad."""
     sign = 1 if bad > watch else -1
     if not np.isfinite(value) or sign * value > sign * bad:
         return Grade.BAD
@@ -167,7 +167,7 @@ def _verdict(value: float, watch: float, bad: float) -> Grade:
 
 
 def _finding(name: str, value: float, limits: tuple[float, float], text: str, remedy: str) -> Finding:
-    """A finding with its verdict by the limits (watch, bad); the remedy is left out where all is good."""
+    """A finding with its verdict by the limits (watch, bad). If the verdict is good, there is no remedy."""
     verdict = _verdict(value, *limits)
     return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
 
@@ -185,7 +185,7 @@ def _layout(frames: list[Frame], spec: SensorSpec) -> Finding:
 
 
 def _pins(seen: list[Observation]) -> Finding:
-    """Pins that are lost, and those lost in most frames."""
+    """Finding about lost pins, and pins that are lost in most frames."""
     lost = np.isnan(np.stack([o.pins_px[:, 0] for o in seen]))
     steady = np.flatnonzero(lost.mean(axis=0) >= STEADY)
     text = f"{100 * lost.mean():.2f} % of the pins lost; {sum(o.valid for o in seen)} of {len(seen)} frames can be used"
@@ -201,7 +201,7 @@ def _pins(seen: list[Observation]) -> Finding:
 
 
 def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
-    """Bright spots among the pins that are no pins and stay in place from frame to frame."""
+    """Finding about bright spots among the pins that are not pins and are at the same place in most frames."""
     within = SAME_SPOT * float(np.mean(pipeline.reference.spacing_px))
     radius = np.linalg.norm(pipeline.reference.pins_px - pipeline.reference.pins_px[0], axis=1).max()
     places = [o.extra_px[np.linalg.norm(o.extra_px - pipeline.reference.pins_px[0], axis=1) < radius] for o in seen]
@@ -214,7 +214,7 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
 
 
 def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
-    """Place of the rim of pins against the ``nominal`` one of the specification's camera, in the frames with the least contact."""
+    """Findings about the camera's place: the rim of pins, in the frames with the least contact, is compared with the ``nominal`` one."""
     pitch = float(np.mean(nominal.spacing_px))
     found = [d for o in seen if o.valid and (d := drift_of(o.pins_px, nominal.pins_px, nominal.outmost))]
     if not found:
@@ -235,7 +235,7 @@ def _place(seen: list[Observation], nominal: Reference) -> list[Finding]:
 
 
 def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: Mask) -> list[Finding]:
-    """Brightness, saturation, focus and glare of raw frames inside the mask, against the ``expected`` caps."""
+    """Findings about brightness, saturation, focus and glare of raw frames inside the mask, compared with the ``expected`` caps."""
     looked = list(zip(frames, seen, strict=True))[:: -(-len(frames) // CAPS_MEASURED)]
     caps = [measure_caps(gray_levels(f.image), o.pins_px) for f, o in looked if np.isfinite(o.pins_px).any()]
     windows = [gray_levels(np.ascontiguousarray(f.image[mask.window])) for f in frames]
@@ -274,7 +274,7 @@ def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: M
 
 @lru_cache(maxsize=2)
 def promised_caps(spec: SensorSpec) -> Caps:
-    """The caps of the twin's own frame at rest."""
+    """The caps measured in the twin's frame at rest."""
     twin = expose(Preview(spec).render(), spec.capture)
     return measure_caps(gray_levels(twin), Pipeline(spec, Form.RAW)(Frame(twin, Form.RAW)).pins_px)
 

@@ -1,6 +1,6 @@
-"""Each way to find pins behind one call: a frame goes in; claimed places, pins by name and a graph come out.
+"""Detectors: objects that find pins in a frame. All have the same interface, which gives places, labelled pins and a graph.
 
-The ways are this program's pipeline, the published method, and plain blob detectors of OpenCV and scikit-image.
+There are this program's pipeline, the published method, and plain blob detectors of OpenCV and scikit-image.
 """
 
 from dataclasses import dataclass
@@ -26,13 +26,13 @@ from twin.pins.reference import Reference, nominal_reference
 from twin.types import Form, Frame, PinGraph
 
 LEVELS = 255.0
-"""Gray levels of full contrast."""
+"""Difference in gray levels of full contrast."""
 LOG_STEPS = 3
-"""Number of sizes, from the smallest to the largest, that the scale-space detectors look for."""
+"""Number of blob sizes, from the smallest to the largest, that the scale-space detectors search."""
 LOG_PEAK = 0.5
-"""Response of scikit-image's blob_log (and blob_dog) to a disc of its own size and contrast 1, roughly."""
+"""Approximate response of scikit-image's blob_log and blob_dog to a disc of the searched size with contrast 1."""
 DOH_PEAK = 0.05
-"""Response of blob_doh to such a disc; it grows with the contrast squared."""
+"""Approximate response of blob_doh to such a disc. It is proportional to the square of the contrast."""
 DOG_RATIO = 1.4
 """Ratio of neighbouring sizes of blob_dog."""
 OVERLAP = 0.3
@@ -42,14 +42,14 @@ SIMPLE_STEP = 10.0
 SIMPLE_HIGHEST = 240.0
 """Highest first threshold of SimpleBlobDetector, gray levels."""
 MOST_CAPS = 4
-"""Largest area of a blob, in areas of the largest cap."""
+"""Largest area of a blob, in units of the largest cap's area."""
 MOST_BLOBS = 4
-"""A frame with more than this many blobs for each pin is refused as clutter."""
+"""Number of blobs for each pin above which a frame is refused as clutter."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a detector claims to see in one frame.
+    """What a detector found in one frame.
 
     Attributes
     ----------
@@ -81,18 +81,19 @@ class Detector(Protocol):
     def __call__(self, frame: Frame) -> Found: ...
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph | None:
-        """The graph that the method makes of pins (N, 2) in the specification's order; areas are in the method's own unit."""
+        """The method's graph of pins (N, 2) in the specification's order. Areas are in the method's own unit."""
 
 
 def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bool = True) -> Detector:
-    """A detector ready for frames.
+    """Make a detector from its parameters.
 
-    ``second_look`` as `Pipeline` takes it. Set it to False to judge thresholds: a second look hides what a threshold loses.
+    ``second_look`` as for `Pipeline`. It must be False if thresholds are compared, because a second look finds pins that a threshold
+    loses.
 
     Raises
     ------
     FrameError
-        The method does not suit the frames' form, or the pins are another sensor's.
+        The method can't be used for the frames' form, or the parameters are those of a sensor with another number of pins.
     """
     if detector.pins_px and len(detector.pins_px) != sensor.pins.count:
         raise FrameError(
@@ -123,7 +124,7 @@ class TwinDetector:
 
 
 class PlainDetector:
-    """A plain blob detector. Its blobs are matched to the pins as the pipeline's are, so that only the way to find blobs differs."""
+    """A plain blob detector. Its blobs are matched to the pins as in the pipeline, so that only the method of finding blobs differs."""
 
     def __init__(self, size_px: tuple[int, int], spec: DetectorSpec, reference: Reference) -> None:
         self.spec, self._reference = spec, reference
@@ -149,7 +150,7 @@ class PlainDetector:
 
 
 class LegacyDetector:
-    """The published method; raw frames go through the published recorder first."""
+    """The published method. Raw frames are first converted by the published recorder."""
 
     def __init__(self, pins: PinsSpec, recording: RecordingSpec | None, spec: DetectorSpec) -> None:
         recording = spec.recording or recording
@@ -237,7 +238,7 @@ FINDERS = {"adaptive": _components, "fixed": _components, "simple": _simple, "lo
 
 
 def named(graph: PinGraph, claims_px: np.ndarray, pins_px: np.ndarray) -> PinGraph:
-    """A graph over claims (N, 2) in the order of the pins (N, 2) that they are nearest to."""
+    """A graph over found places (N, 2), reordered to the order of the pins (N, 2) that they are nearest to."""
     _, order = cKDTree(claims_px).query(pins_px)
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))

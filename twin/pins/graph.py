@@ -1,4 +1,4 @@
-"""Graphs over the pins: nearest neighbours, Delaunay, Voronoi; and the features of their nodes."""
+"""Graphs over the pins (nearest neighbours, Delaunay, Voronoi), and the features of their nodes."""
 
 from typing import Literal
 
@@ -15,23 +15,23 @@ KNN = 6
 
 
 def knn_edges(nodes_px: np.ndarray, k: int = KNN) -> np.ndarray:
-    """(k N, 2) directed edges from each node to its ``k`` nearest others."""
+    """(k N, 2) directed edges from each node to the ``k`` nearest other nodes."""
     n = len(nodes_px)
     k = min(k, n - 1)
     if k < 1:
         return np.zeros((0, 2), int)
     _, index = cKDTree(nodes_px).query(nodes_px, k=min(k + 1, n))
     others = index != np.arange(n)[:, None]
-    others[others.all(axis=1), -1] = False  # where nodes coincide, a node may not find itself: drop the last one instead
+    others[others.all(axis=1), -1] = False  # if nodes coincide, a node may not be its own nearest: then the farthest is dropped
     return np.stack([np.repeat(np.arange(n), k), index[others].ravel()], axis=1)
 
 
 def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | None = None) -> PinGraph:
     """A graph over nodes (N, 2).
 
-    ``knn``: the 6 nearest others of each node. ``delaunay``: both directions of every side of the nodes' Delaunay
-    triangles. ``voronoi``: the same edges, with clipped Voronoi areas and cells (``outmost`` as in ``voronoi``).
-    Nodes without a triangulation (collinear, coincident) fall back to nearest-neighbour edges.
+    ``knn``: edges to the 6 nearest other nodes. ``delaunay``: both directions of every side of the nodes' Delaunay triangles.
+    ``voronoi``: the same edges, with clipped Voronoi areas and cells (``outmost`` as in ``voronoi``). If the nodes have no
+    triangulation, because they are collinear or coincide, the edges are those of ``knn``.
     """
     none = np.full(len(nodes_px), np.nan)
     if kind == "knn":
@@ -49,9 +49,9 @@ def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | N
 def features(graph: PinGraph, reference: Reference, kind: Literal["relative", "pixels"] = "relative") -> np.ndarray:
     """Node features (N, F) of a graph.
 
-    ``relative``, free of the image's scale: x and y, centred on their medians, and the displacement from rest in x and
-    y, all in mean rest spacings; with a tessellation also the area relative to the pin's area at rest.
-    Columns x, y, dx, dy[, area]. ``pixels``, as published: x, y (px) centred on their medians[, area (px^2)].
+    ``relative``: columns x, y, dx, dy[, area], independent of the image's scale. x and y are centred on their medians, dx and dy are the
+    displacement from rest, all in mean rest spacings. A graph with a tessellation also has the area relative to the area at rest.
+    ``pixels``: as published, x and y in px centred on their medians[, area in px^2].
     """
     centred = graph.nodes_px - np.median(graph.nodes_px, axis=0)
     areas = graph.kind == "voronoi"

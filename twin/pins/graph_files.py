@@ -1,4 +1,4 @@
-"""Graphs of a frame, of many frames or of found pins, written as arrays and pictures."""
+"""Graphs of a frame, of many frames or of found pins, and their files: arrays and pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes.files import require_regular
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError
+from twin.errors import FrameError, OptionError
 from twin.frames import open_recording
 from twin.frames.forms import frame_size
 from twin.pins.batch import recording_reference
@@ -42,7 +42,7 @@ class Graphs:
         Names of the frames that have a graph.
     graphs : list of PinGraph
     left_out : list of str
-        Frames without a graph, and why.
+        Frames without a graph, and the reasons.
     written : list of Path
     notes : list of str
         What was odd in the recording.
@@ -64,24 +64,24 @@ class Graphs:
 def write_graphs_of(
     path: Path, sensor: SensorSpec, out: Path, *, kind: GraphKind = "voronoi", form: Form | None = None, legacy: bool = False
 ) -> Graphs:
-    """Build the graphs of what lies at a path and write them to an existing folder.
+    """Build the graphs of the frames or pins at a path, and write them to an existing folder.
 
     Parameters
     ----------
     path : Path
         A frame, anything that ``open_recording`` takes, or a ``pins.npz`` of found pins.
     form : Form, optional
-        Form of the frames; by default it is told by their size and content.
+        Form of the frames; by default it is recognised by their size and content.
     legacy : bool
-        Use the published release's own method and boundary. It makes Voronoi graphs of frames only.
+        Use the method and the boundary of the published release, which makes only Voronoi graphs of frames.
 
     Raises
     ------
     FrameError
-        No frame has a graph, the file is no ``pins.npz`` of this sensor, or ``legacy`` is asked for where it does not apply.
+        No frame has a graph, the file is not a ``pins.npz`` of this sensor, or ``legacy`` does not apply to the input.
     """
     if legacy and (kind != "voronoi" or path.suffix == PINS):
-        raise FrameError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
+        raise OptionError("--legacy makes Voronoi graphs of frames; leave --kind out and give frames")
     if path.suffix == PINS:
         found, nodes_px = read_pins(path, sensor.pins.count)
         names = list(found)
@@ -101,7 +101,7 @@ def write_graphs_of(
 
 @dataclass(frozen=True)
 class _RecordingGraphs:
-    """Graphs of the good frames of a recording, their reference, and which frames were left out and why."""
+    """Graphs of the valid frames of a recording, their reference, and the frames that were left out with the reasons."""
 
     names: list[str]
     graphs: list[PinGraph]
@@ -113,12 +113,12 @@ class _RecordingGraphs:
 
 
 def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None, *, legacy: bool = False) -> _RecordingGraphs:
-    """The graphs of what ``open_recording`` takes, by the pipeline or by the published release's method.
+    """The graphs of a recording, by the pipeline or by the method of the published release.
 
     Raises
     ------
     FrameError
-        If no frame has a graph.
+        No frame has a graph.
     """
     recording = open_recording(path, spec, form)
     left_out: list[str] = []
@@ -145,12 +145,12 @@ def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Fo
 def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Names (M,) and node positions (M, N, 2) of the valid frames of a ``pins.npz`` with ``count`` pins N.
 
-    Lost pins take their predicted place.
+    The place of a lost pin is the predicted one.
 
     Raises
     ------
     FrameError
-        If the file is no ``pins.npz``, belongs to a sensor with another number of pins, or has no valid frame.
+        The file is not a ``pins.npz``, belongs to a sensor with another number of pins, or has no valid frame.
     """
     try:
         names, pins, predicted, valid = _arrays_of(path, ("image_name", "pins_px", "predicted_px", "valid"))
@@ -202,7 +202,7 @@ def _arrays_of(path: Path, names: Sequence[str]) -> list[np.ndarray]:
 
 
 def form_of_pins(spec: SensorSpec, nodes_px: np.ndarray) -> Form:
-    """The form of frames that found pins (M, N, 2) come from: the one whose rest layout lies nearer. Their file holds pixels only."""
+    """Form of the frames in which pins (M, N, 2) were found: the one whose layout at rest is nearer. The file does not state the form."""
     if spec.recording is None:
         return Form.RAW
     center = np.median(nodes_px.reshape(-1, 2), axis=0)
@@ -213,8 +213,8 @@ def form_of_pins(spec: SensorSpec, nodes_px: np.ndarray) -> Form:
 def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) -> Path:
     """Write M graphs to ``graph.npz``.
 
-    Arrays: ``image_name (M,)``, ``nodes_px (M, N, 2)``, ``area_px2 (M, N)``, and the directed edges of all graphs one after
-    the other, ``edges (E, 2)``, those of graph k being ``edges[edge_start[k]:edge_start[k + 1]]``.
+    Arrays: ``image_name (M,)``, ``nodes_px (M, N, 2)``, ``area_px2 (M, N)``, and the directed edges of all graphs in one array
+    ``edges (E, 2)``: those of graph k are ``edges[edge_start[k]:edge_start[k + 1]]``.
     """
     arrays = {
         "image_name": np.asarray(names, dtype=np.str_),
@@ -229,9 +229,9 @@ def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) ->
 def draw_graph_pictures(
     out: Path, title: str, size_px: tuple[int, int], graph: PinGraph, reference: Reference, image: np.ndarray | None
 ) -> list[Path]:
-    """Draw ``graph.png``, and for a Voronoi graph ``surface.png`` against the reference; the files.
+    """Draw ``graph.png``, and for a Voronoi graph ``surface.png``, which compares it with the reference. Returns the files.
 
-    The graph lies over the frame (H, W[, 3]), or on black of ``size_px`` (width, height) where there is none.
+    The graph is drawn over the frame (H, W[, 3]). Without a frame it is drawn on black of ``size_px`` (width, height).
     """
     if image is None:
         image = np.zeros(size_px[::-1], np.uint8)
@@ -249,7 +249,7 @@ def draw_graph_pictures(
 
 
 def draw_bare_graph(out: Path, graph: PinGraph) -> list[Path]:
-    """Draw ``graph.png`` without a frame, for nodes that are not in a frame's pixels; the file."""
+    """Draw ``graph.png`` without a frame, for nodes that are not in a frame's pixels, and return the file."""
     figure, (ax,) = new_figure(1, panel_inch=PICTURE_INCH)
     ax.set_facecolor("#101418")
     draw_graph(ax, graph)

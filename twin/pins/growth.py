@@ -6,7 +6,8 @@ chosen, not derived.
 """
 
 import numpy as np
-from numba import njit
+
+from twin.compiled import compiled
 
 NEIGHBOURS = 18
 """Places around a place that its prediction is made from: two rings of a triangular lattice."""
@@ -24,7 +25,7 @@ ROUNDS = 3
 """Rounds in which labels that their neighbours do not bear out are taken back, and the labelling grows again."""
 
 
-@njit(cache=True)
+@compiled()
 def predict_place(i: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndarray, px: np.ndarray) -> tuple[float, float, float, int]:
     """Where place ``i`` is seen, by the labelled places around it: x, y, local spacing (px), and how many there are.
 
@@ -66,7 +67,7 @@ def predict_place(i: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndar
     return fx[0], fy[0], np.sqrt(max(size2 / 2 - root, 0.0)), count
 
 
-@njit(cache=True)
+@compiled()
 def _nearest(
     x: float, y: float, reach: float, px: np.ndarray, head: np.ndarray, after: np.ndarray, grid: np.ndarray, owner: np.ndarray
 ) -> int:
@@ -84,7 +85,7 @@ def _nearest(
     return best
 
 
-@njit(cache=True)
+@compiled()
 def _cells(px: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Spots by square cell: first spot of each cell, next spot in the same cell, and (x0, y0, cell, columns, rows)."""
     x0, y0 = px[:, 0].min(), px[:, 1].min()
@@ -97,7 +98,7 @@ def _cells(px: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     return head, after, np.array([x0, y0, cell, columns, rows])
 
 
-@njit(cache=True)
+@compiled()
 def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndarray, cell: float) -> np.ndarray:
     """A labelling: the spot (M,) of each place of a lattice, -1 for none.
 

@@ -1,8 +1,8 @@
-"""The published method, step by step, as the Tac-VGNN release (Apache-2.0) does it. It is here to compare with.
+"""The published method as in the Tac-VGNN release (Apache-2.0), step by step. It is used for comparison.
 
-Its peculiarities are kept on purpose: resizing to a fixed size, a mask about the image's centre, OpenCV's SimpleBlobDetector,
-centring by one scalar median over x and y together, hull vertices scaled about that origin, and refusing a frame whose count is
-not exactly the sensor's. Nodes come in the detector's order.
+The following properties of the release are kept: frames are resized to a fixed size; the mask is about the image's centre; pins are found
+by OpenCV's SimpleBlobDetector; nodes are centred by one scalar median over x and y together; the hull's vertices are scaled about that
+origin; a frame is refused if the number of blobs is not exactly the sensor's; nodes have the detector's order.
 """
 
 from dataclasses import dataclass
@@ -19,27 +19,27 @@ from twin.frames.forms import gray_levels
 from twin.pins.voronoi import directed_edges
 from twin.types import Form, Frame, PinGraph
 
-# The hull's vertices are scaled by this about the origin (release).
+# Factor by which the hull's vertices are scaled about the origin (release).
 HULL_SCALE = 1.1
 
 
 @dataclass(frozen=True)
 class LegacyParameters:
-    """The release's constants for one layout; lengths in px of its resized image.
+    """The release's constants for one layout. Lengths are in px of the resized image.
 
     Attributes
     ----------
     size_px : int
         Side of the square that a frame is resized to.
     threshold : int
-        Gray level.
-    mask_offset_px : (int, int)
-        Of the mask's centre from the image's, x and y.
-    mask_margin_px : int
-        Between the mask and the image's border.
+        Threshold of the detector, gray levels.
+        mask_offset_px : (int, int)
+            Offset of the mask's centre from the image's centre, x and y.
+        mask_margin_px : int
+            Distance between the mask and the image's border.
     min_area_px2 : float
     virtual_rotations_deg, virtual_scales : tuple of float
-        Turn and scale of the copies of the hull that fill a hexagon's inward-bowed sides.
+        Turns and scales of the copies of the hull that fill the concave sides of a hexagon.
     """
 
     size_px: int
@@ -74,18 +74,20 @@ def legacy_parameters(layout: Layout) -> LegacyParameters:
 
 @dataclass(frozen=True)
 class LegacyObservation:
-    """What the published method makes of a frame.
+    """The result of the published method for a frame.
 
     Attributes
     ----------
     nodes_px : (K, 2) float
         Blobs in the detector's order, px of the input frame.
-    found : int
-    valid : bool
-        Exactly the sensor's number of pins was found.
-    reason : str
-    graph : PinGraph or None
-        Its nodes, cells and areas are in the release's units: px of its resized image, centred by the scalar median.
+        found : int
+            Number of blobs.
+        valid : bool
+            Whether exactly the sensor's number of pins was found.
+        reason : str
+            Why the frame is not valid; empty if it is.
+        graph : PinGraph or None
+            Nodes, cells and areas are in the release's unit: px of the resized image, centred by the scalar median.
     ms : dict of str to float
     """
 
@@ -111,7 +113,7 @@ def legacy_detector(parameters: LegacyParameters) -> cv2.SimpleBlobDetector:
 
 
 def boundary_nodes(nodes: np.ndarray, parameters: LegacyParameters) -> np.ndarray:
-    """The hull's vertices, enlarged, and for a hexagon turned and scaled copies of them, which fill its inward-bowed sides."""
+    """The enlarged vertices of the hull. For a hexagon also turned and scaled copies of them, which fill its concave sides."""
     bound = HULL_SCALE * nodes[ConvexHull(nodes).vertices]
     nodes_around = [bound]
     for degrees, scale in zip(parameters.virtual_rotations_deg, parameters.virtual_scales, strict=True):
@@ -123,7 +125,8 @@ def boundary_nodes(nodes: np.ndarray, parameters: LegacyParameters) -> np.ndarra
 def legacy_graph(nodes: np.ndarray, parameters: LegacyParameters) -> PinGraph:
     """Delaunay edges and Voronoi areas of centred nodes (N, 2), as published (Algorithm 1 of the paper).
 
-    A convex layout's edges are its own; a hexagon's are those among its nodes in the triangulation with the boundary nodes.
+    The edges of a convex layout are those of its triangulation. For a hexagon, nodes and boundary nodes are triangulated together, and the
+    edges between nodes are used.
     """
     n = len(nodes)
     extended = np.concatenate([nodes, boundary_nodes(nodes, parameters)])
@@ -150,7 +153,7 @@ class LegacyPipeline:
     Parameters
     ----------
     pins : PinsSpec
-        The layout chooses the release's constants; the count is the number of blobs that it accepts.
+        The layout decides which of the release's constants are used; the count is the only accepted number of blobs.
     recording : RecordingSpec or None
 
     Raises

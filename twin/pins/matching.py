@@ -1,13 +1,13 @@
-"""Which blob is which pin: grow a consistent labelling over the rest layout from a seed, keep the best of several.
+"""Labelling of blobs by pins: labellings are grown over the layout at rest from several starts, and the best one is used.
 
-A pin may move by more than the distance to its neighbour, so the nearest blob is not always the right one. But neighbours
-move alike. A labelling starts from one pair of pin and blob. The local affine motion of the pairs found so far predicts the
-place of the next pin, and the labelling grows over the layout. From a wrong pair it soon finds no blobs, or only blobs far
-from the prediction. The start that explains most blobs wins.
+A pin may move by more than the distance to its neighbour, so the nearest blob is not always the right one. But the motions of neighbours
+are similar. A labelling starts from one pair of pin and blob. The local affine motion of the pairs found so far predicts the place of the
+next pin, and so the labelling grows over the layout. If the first pair is wrong, it soon finds no blobs, or only blobs far from the
+predictions. The start that explains most blobs is used.
 
-One wrong labelling is nearly as smooth as the true one: each ring of pins is shifted along itself by one pin. Ring i has
-6 i pins, so it is turned by 60 / i degrees, and only the innermost rings, which turn most, fall apart. Therefore each labelling
-is unwound: its rings are shifted back by the number of pins with which they turn most alike, before it is judged.
+One wrong labelling is nearly as smooth as the true one: each ring of pins is shifted along itself by one pin. Ring i has 6 i pins, so it
+is turned by 60 / i degrees, and only the innermost rings, which turn most, are inconsistent. Therefore each labelling is unwound before
+it is judged: its rings are shifted back by the number of pins with which the turns of all rings are most similar.
 
 Distances are in local spacings: the distance of a pin at rest to its nearest neighbour. All limits were chosen, not derived.
 """
@@ -17,62 +17,62 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.optimize import linear_sum_assignment
 
+from twin.compiled import compiled
 from twin.pins.reference import Reference
 
 RIDGE = 0.25
-"""Pull of the local gradient towards zero: as strong as this many neighbours at one spacing."""
+"""Penalty of the local gradient, which draws it towards zero. It is equivalent to this many neighbours at a distance of one spacing."""
 GROW_GATES = (0.30, 0.45)
-"""Largest distance from a prediction to its blob while a labelling grows: strict first, then looser."""
+"""Largest distance from a prediction to its blob while a labelling grows: in the first pass, and in the second."""
 FINAL_GATE = 0.40
 """Largest distance from a prediction to its blob in the final assignment."""
 ADOPT_GATE = 0.7
-"""Largest distance from the prediction of a lost pin to a free blob, if each is the other's nearest."""
+"""Largest distance from the prediction of a lost pin to a free blob that it gets, if each is the other's nearest."""
 ADOPT_AREA_RATIO = 2.0
-"""Largest ratio, either way, of the area of a blob that is given to a lost pin to that of the pin's neighbours."""
+"""Largest ratio of the area of a blob that is given to a lost pin to the area of the pin's neighbours, and of the second to the first."""
 MOST_ADOPTED = 0.2
-"""Lost pins are given free blobs only if at most this share of the pins is lost."""
+"""Largest share of lost pins at which lost pins are given free blobs."""
 SOFT_RESIDUAL = 0.15
 """Distance of a pair from the prediction at which its weight is halved."""
 AREA_LOG_WEIGHT = 0.02
-"""Cost of a squared log ratio of areas of 1, against a squared distance in spacings."""
+"""Cost of a squared logarithm of the ratio of areas of 1, in units of a squared distance in spacings."""
 MIN_AREA_RATIO = 0.2
-"""A blob smaller than this share of its neighbours' mean area is a speck, not a pin."""
+"""Least area of a pin's blob, relative to the mean area of its neighbours. Smaller blobs are specks."""
 NO_PAIR_COST = 10.0
-"""Cost that stands for "no pair": far above any cost of a pair, so that pairing more pins always pays."""
+"""Cost of a pin without a blob. It is far above the cost of any pair, so that more pairs always have a smaller cost."""
 REFINE_ROUNDS = 4
-"""Most rounds of predicting and assigning; they end when nothing changes."""
+"""Most rounds of predicting and assigning. They end earlier if nothing changes."""
 NEARLY_ALL = 0.985
-"""A labelling that holds this share of the pins is refined at once. So is one that holds the square of this share of the blobs, if it
-holds MIN_SETTLED of the pins."""
+"""Share of the pins that a labelling must hold to be refined at once. One that holds at least the square of this share of the blobs, and
+MIN_SETTLED of the pins, is also refined at once."""
 MIN_SETTLED = 0.7
-"""Least share of the pins that a labelling must hold to be refined at once because it holds nearly all blobs."""
+"""Least share of the pins of a labelling that is refined at once because it holds nearly all blobs."""
 SETTLED = 0.94
-"""No further start is tried after a labelling whose score is at least this share of its number of pins."""
+"""Least ratio of a labelling's score to the number of pins after which no further start is tried."""
 TURN_WEIGHT = 1.5
 """Weight in the score, for each pin, of the rings' mean turn (1 minus its cosine)."""
 MAX_WINDING = 3
-"""Rings may be shifted along themselves by this many pins either way."""
+"""Largest shift of rings along themselves, in pins in each direction."""
 BROKEN_RINGS = 2
-"""This many innermost rings are left out when the shift is found, because they do not hold together in a shifted labelling."""
+"""Number of innermost rings that are left out when the shift is found, because they are inconsistent in a shifted labelling."""
 EXTENT_MARGIN = 0.02
-"""Share of the points that is left out on each side of their extent. The extent's middle tells how far the whole view is displaced."""
+"""Share of the points that is left out on each side of their extent. The middle of the extent is used as the place of the whole view."""
 RIM_SEEDS = 12
-"""Number of pins around the rim from which labellings start."""
+"""Number of pins at the rim from which labellings start."""
 INSIDE_SEEDS = 6
-"""Number of pins inside the rim from which labellings start, about."""
+"""Approximate number of pins inside the rim from which labellings start."""
 SEED_RANKS = 3
-"""Nearest blobs that are tried for each of these pins."""
+"""Number of nearest blobs that are tried for each of these pins."""
 REFINED = 4
-"""Labellings that are refined where none settles."""
+"""Number of labellings that are refined if none reaches ``SETTLED``."""
 NEAR = 6
-"""First the labels of this many neighbours of a lost pin are forgotten and grown anew, then those of all its neighbours."""
+"""Number of neighbours of a lost pin whose labels are removed and grown anew first. After that the same is done with all neighbours."""
 LEAST_KEPT = 0.5
-"""Labels are grown anew only if at least this share of the pins stays labelled."""
+"""Least share of the pins that must stay labelled for labels to be grown anew."""
 MOST_REGROWN = 0.3
-"""Labels are grown anew only if less than this share of the pins is lost."""
+"""Share of lost pins above which labels are not grown anew."""
 Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
 """Blobs by square cell: first blob of each cell, next blob in the same cell, x0, y0, columns, rows (see ``_buckets``)."""
 
@@ -124,7 +124,7 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
     Returns
     -------
     Match
-        The best labelling found; it may be poor: see its score.
+        The best labelling that was found. Its score states how good it is.
     """
     n = len(reference.pins_px)
     nothing = Match(np.full(n, -1), np.full((n, 2), np.nan), -1.0)
@@ -161,21 +161,21 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
 
 
 def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np.ndarray) -> Match:
-    """Settle a labelling ``blob`` (N,) of nearly all pins on a slightly different set of blobs, as ``match`` would."""
+    """Refine a labelling ``blob`` (N,) of nearly all pins for a slightly different set of blobs, in the way that ``match`` does."""
     px = np.ascontiguousarray(px)
     cell = float(np.median(reference.spacing_px))
     layout = _layout(reference)
     return _refine(layout, px, area_px2, blob, _buckets(px, cell), cell)
 
 
-@njit(cache=True)
+@compiled()
 def predict(
     i: int, rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray
 ) -> tuple[float, float, int]:
-    """Displacement of pin ``i`` from that of its neighbours alone, and how many neighbours counted.
+    """Displacement of pin ``i`` as predicted from its neighbours alone, and the number of neighbours that were used.
 
-    Weighted least squares of u(x) = a + G (x - x_i) over the neighbours with ``weight`` > 0. The gradient
-    G is lightly pulled to zero, so that one neighbour is enough.
+    u(x) = a + G (x - x_i) is fitted by weighted least squares to the neighbours with ``weight`` > 0. A small penalty of the gradient G
+    makes the solution unique even with one neighbour.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def predict(
     moved : (N, 2) float
         Current positions, px.
     weight : (N,) float
-        Trust in each current position, 0 where there is none.
+        Weight of each current position; 0 if it is unknown.
 
     Returns
     -------
@@ -230,9 +230,9 @@ def predict(
     return (c00 * bx0 + c01 * bx1 + c02 * bx2) / det, (c00 * by0 + c01 * by1 + c02 * by2) / det, count
 
 
-@njit(cache=True)
+@compiled()
 def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, moved: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Each pin's position (N, 2) as its neighbours predict it; NaN where no neighbour counts."""
+    """Each pin's position (N, 2) as predicted from its neighbours; NaN if no neighbour has a weight."""
     out = np.empty_like(rest)
     for i in range(len(rest)):
         ux, uy, count = predict(i, rest, neighbours, spacing, moved, weight)
@@ -241,7 +241,7 @@ def predict_all(rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, m
     return out
 
 
-@njit(cache=True)
+@compiled()
 def _buckets(px: np.ndarray, cell: float) -> Buckets:
     """Blobs by square cell: (first blob of each cell, next blob in the same cell, x0, y0, columns, rows)."""
     x0, y0 = px[:, 0].min(), px[:, 1].min()
@@ -256,7 +256,7 @@ def _buckets(px: np.ndarray, cell: float) -> Buckets:
     return head, following, x0, y0, columns, rows
 
 
-@njit(cache=True)
+@compiled()
 def _nearest(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray, buckets: Buckets, cell: float) -> tuple[int, float]:
     """Nearest free blob within ``reach`` of (x, y): (index or -1, squared distance)."""
     head, following, x0, y0, columns, rows = buckets
@@ -273,11 +273,11 @@ def _nearest(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray
     return best, best_d2
 
 
-@njit(cache=True)
+@compiled()
 def _grow(
     rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, start: np.ndarray, buckets: Buckets, cell: float
 ) -> np.ndarray:
-    """Grow a labelling (N,), from ``start`` (N,) with at least one pair, round by round over the pins next to labelled ones."""
+    """Grow a labelling (N,) from ``start`` (N,), which has at least one pair. Each round labels pins next to labelled ones."""
     n = len(rest)
     blob = start.copy()
     moved = np.zeros((n, 2))
@@ -293,7 +293,7 @@ def _grow(
             labelled += 1
     claim = np.full(len(px), -1)
     claim_cost = np.zeros(len(px))
-    tried = np.full(n, -1)  # neighbours that counted when a pin was last tried
+    tried = np.full(n, -1)  # number of labelled neighbours when a pin was last tried
     for level in range(len(GROW_GATES)):
         tried[:] = -1
         least = 3 if level == 0 else 2
@@ -332,7 +332,7 @@ def _grow(
     return blob
 
 
-@njit(cache=True)
+@compiled()
 def _ring_turns(
     rest: np.ndarray, px: np.ndarray, blob: np.ndarray, slots: np.ndarray, ring_ends: np.ndarray, winding: int
 ) -> tuple[np.ndarray, int]:
@@ -361,11 +361,11 @@ def _ring_turns(
     return turns, known
 
 
-@njit(cache=True)
+@compiled()
 def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, slots: np.ndarray, ring_ends: np.ndarray) -> np.ndarray:
     """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
 
-    The innermost rings lose their labels where anything is shifted.
+    If anything is shifted, the innermost rings lose their labels.
     """
     best, most_alike = 0, abs(_ring_turns(rest, px, blob, slots, ring_ends, 0)[0][BROKEN_RINGS:].sum())
     for winding in range(-MAX_WINDING, MAX_WINDING + 1):
@@ -384,11 +384,11 @@ def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, slots: np.ndarr
     return out
 
 
-@njit(cache=True)
+@compiled()
 def _trust(
     rest: np.ndarray, neighbours: np.ndarray, spacing: np.ndarray, px: np.ndarray, blob: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 2) of the pairs, and their weights (N,): less the farther a pair is from where its neighbours predict it."""
+    """Positions (N, 2) of the pairs, and their weights (N,), which decrease with the distance from the place predicted by neighbours."""
     n = len(rest)
     moved, weight = np.zeros((n, 2)), np.zeros(n)
     for i in range(n):
@@ -405,7 +405,7 @@ def _trust(
     return moved, weight
 
 
-@njit(cache=True)
+@compiled()
 def _candidates(
     predicted: np.ndarray,
     neighbours: np.ndarray,
@@ -416,9 +416,9 @@ def _candidates(
     buckets: Buckets,
     cell: float,
 ) -> tuple[list[int], list[int], list[float], bool]:
-    """Gated pairs: arrays of pin, blob, cost; and whether some pin or blob is in more than one."""
+    """Possible pairs within the gate (pins, blobs, costs), and whether a pin or blob is in more than one of them."""
     n = len(predicted)
-    # empty lists of a known type, which numba needs
+    # numba needs lists of a known type, also empty ones
     pins: list[int] = [0 for _ in range(0)]
     blobs: list[int] = [0 for _ in range(0)]
     costs: list[float] = [0.0 for _ in range(0)]
@@ -455,7 +455,7 @@ def _candidates(
 
 
 def _assign(n: int, blob_count: int, pins_list: list[int], blobs_list: list[int], costs_list: list[float], contested: bool) -> np.ndarray:
-    """One-to-one assignment (N,) over the gated pairs: most pairs, then least cost."""
+    """One-to-one assignment (N,) of possible pairs: as many pairs as possible, with the least cost."""
     blob = np.full(n, -1)
     pins, blobs, costs = np.array(pins_list, int), np.array(blobs_list, int), np.array(costs_list, float)
     if not contested:
@@ -492,7 +492,7 @@ def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, 
 
 
 def _adopt(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Give lost pins free blobs of a cap's size a little outside the gate: at the rim the prediction extrapolates and is less exact."""
+    """Give lost pins free blobs of a cap's size slightly outside the gate. Predictions at the rim are extrapolated and less precise."""
     neighbours, spacing = layout.neighbours, layout.spacing
     lost = np.flatnonzero((blob < 0) & np.isfinite(predicted[:, 0]))
     free = np.setdiff1d(np.arange(len(px)), blob)
@@ -540,7 +540,7 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buckets: Buckets, cell: float) -> Match:
-    """Forget the labels around the lost pins and grow them anew from the others."""
+    """Remove the labels around lost pins, and grow them anew from the others."""
     rest, neighbours = layout.rest, layout.neighbours
     for reach in (NEAR, neighbours.shape[1]):
         doubtful = np.zeros(len(rest), bool)

@@ -1,7 +1,7 @@
-"""From a frame to an observation, in one way for rendered, recorded and live frames.
+"""The pipeline: observation of the pins in a frame, the same for rendered, recorded and live frames.
 
-The limits of an observation were chosen, not derived. A frame that should show no contact is refused where its pins move in a way that
-no camera could make (`require_untouched`).
+The limits of an observation were chosen, not derived. A frame that is meant to show no contact is refused if its pins are displaced in a
+way that no displacement of the camera explains (`require_untouched`).
 """
 
 from time import perf_counter
@@ -26,30 +26,31 @@ AT_BORDER = 1.0
 CUT = 0.35
 """A cap is cut off by the border if its middle is less than this many spacings inside it."""
 MAX_EXTRA = 0.35
-"""Most blobs among the pins that are no pins, as a share of the number of pins, in a frame in which pins are missing."""
+"""Most blobs among the pins that are not pins, as a share of the number of pins, in a frame in which pins are missing."""
 NEARLY_ALL = 0.97
-"""No pin counts as missing if at least this share is found. Then there may be as many further blobs as pins."""
+"""Share of found pins from which on no pin counts as missing. There may then be as many further blobs as pins."""
 MAX_FOLDED = 0.02
-"""Largest share of the reference's triangles that may be turned over: more is a wrong labelling."""
+"""Largest share of the reference's triangles that may be turned over. More of them mean that the labelling is wrong."""
 MAX_RIM_SCALE = 1.2
-"""Largest ratio of the rim's radius to that at rest, either way. The rim is clamped: contact changes it by some percent."""
+"""Largest ratio of the rim's radius to that at rest, and of the radius at rest to the rim's. The rim is clamped: contacts change it by
+a few percent."""
 MAX_SHIFT = 0.5
-"""Largest displacement of the layout, in its radii: a frame displaced further is not this sensor's view."""
+"""Largest displacement of the layout, in its radii. A frame with a larger one is not of this sensor."""
 MAX_BLOB_PITCHES2 = 3.0
-"""Largest area of a blob, in squared mean spacings: larger ones are housing or glare."""
+"""Largest area of a blob, in squared mean spacings. Larger ones are housing or glare."""
 SPLIT_ROUNDS = 3
-"""Rounds of splitting caps that touch: each split corrects the predictions for the next."""
+"""Rounds of splitting caps that touch. Each split improves the predictions for the next."""
 ENOUGH = 0.985
-"""The frame is looked at again if a smaller share of the pins than this is found, or more than MAX_EXTRA further blobs."""
+"""Share of found pins below which further thresholds are tried. They are also tried if there are more than MAX_EXTRA further blobs."""
 OWN_SHARES = (1.0, 0.3)
-"""Thresholds of these further looks, relative to the frame's own threshold between caps and skin. The low one finds caps much darker
-than most."""
+"""Further thresholds, relative to the frame's own threshold between caps and skin. The low one finds caps that are much darker than
+most."""
 EXTRA_COST = 0.05
-"""Cost of a blob that is no pin, in pins, where looks are compared: noise and clutter make hundreds of blobs."""
+"""Cost of a blob that is not a pin, in pins, when the results of several thresholds are compared. Noise and clutter make hundreds."""
 REMASK_PX = 2.0
-"""The mask is displaced with the whole view if that is displaced by at least this, px, and a pin is close to the mask's edge."""
+"""Least displacement of the whole view, px, with which the mask is displaced, if a pin is close to the mask's edge."""
 MASK_MARGIN = 0.5
-"""A pin this close to the mask's edge, in spacings, may be cut off."""
+"""Distance from the mask's edge, in spacings, below which a pin may be cut off."""
 PLAUSIBLE = 0.5
 """Share of the pins above which a labelling is taken as a basis for further steps."""
 NEAREST, DARKER, BRIGHT, LEAST_ABOVE = 6, 35, 75, 0.15
@@ -60,11 +61,11 @@ MOST_BETWEEN = 0.2
 LEAST_COMPARED = 12
 """Fewest pins of which that is asked."""
 PREDICTED_WEIGHT = 0.1
-"""Weight of a predicted pin in the prediction of the next one: pins in a gap are predicted from the gap's edge inwards."""
+"""Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
 MOST_DENT = 0.008
-"""Largest dent, in the rim's mean radius, of a sensor at rest. Measured: 0.0026 to 0.0041 at rest in three real sensors, 0.005 with a
-camera tilted by 2 deg; in real contacts at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A touch of less than
-about 2 mm is not noticed: it moves the pins less than cameras differ."""
+"""Largest dent of a sensor at rest, relative to the rim's mean radius. Measured at rest: 0.0026 to 0.0041 in three real sensors, 0.005
+with a camera tilted by 2 deg. Measured in real contacts: at least 0.003 from about 1 mm on, 0.009 from 2 mm, 0.012 from 3 mm. A contact
+of less than about 2 mm is not noticed, because it moves the pins less than the differences between cameras do."""
 
 
 class Pipeline:
@@ -74,12 +75,12 @@ class Pipeline:
     ----------
     spec : SensorSpec
     form : Form
-        Form of the frames it will be given.
-    reference : Reference, optional
-        No-contact layout; by default the specification's own.
-    graph : {"voronoi", "delaunay", "knn"}
-    second_look : bool
-        Where an adaptive threshold loses pins, or finds much that is no pin, look again with thresholds from the frame's own contrast.
+        Form of the frames.
+        reference : Reference, optional
+            Layout without contact; by default that of the specification.
+        graph : {"voronoi", "delaunay", "knn"}
+        second_look : bool
+            If an adaptive threshold loses pins, or finds many other blobs, also try thresholds from the frame's own contrast.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class Pipeline:
         self._at_border = self._inside_px(self.reference.pins_px) < AT_BORDER * self.reference.spacing_px
 
     def __call__(self, frame: Frame) -> Observation:
-        """Observe one frame; a frame without (enough) pins gives ``valid=False`` and why.
+        """Observe one frame. If it does not show enough pins, the result has ``valid=False`` and the reason.
 
         Raises
         ------
@@ -138,7 +139,7 @@ class Pipeline:
         return Observation(pins_px, predicted_px, int(paired.sum()), expected, not reason, reason, graph, extra_px, ms)
 
     def check(self, frame: Frame) -> None:
-        """Raise ``FrameError`` where a frame is not of this sensor and form: size, type, form."""
+        """Raise ``FrameError`` if the size, type or form of a frame is not that of this sensor and form."""
         image, (width, height) = frame.image, self.size_px
         where = frame.name or "frame"
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
@@ -152,7 +153,7 @@ class Pipeline:
             raise FrameError(f"{where}: expected a {self.form} frame, got a {frame.form} one; make a Pipeline of that form for it")
 
     def _look(self, frame: Frame, blob: BlobSpec, ms: dict[str, float]) -> tuple[Blobs, Match]:
-        """Blobs and their labelling, by one threshold; times of the stages go into ``ms``."""
+        """Blobs and their labelling with one threshold. The times of the stages are added to ``ms``."""
         started = perf_counter()
         blobs = self._detect(frame, self.mask, blob)
         ms["detect"], now = _since(started)
@@ -165,7 +166,7 @@ class Pipeline:
         return blobs, found
 
     def _with_own_threshold(self, frame: Frame, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
-        """Look again with thresholds from this frame's own contrast until nearly all pins are found; the best labelling of all looks."""
+        """Try thresholds from this frame's own contrast until nearly all pins are found. Returns the best labelling of all."""
         own = own_threshold(self._window(frame, self.mask), self.mask.disc, self.blob_spec)
         best = blobs, found
         for share in OWN_SHARES:
@@ -176,12 +177,12 @@ class Pipeline:
         return best
 
     def _clear(self, blobs: Blobs, found: Match) -> bool:
-        """Whether nearly all pins are found, and little else."""
+        """Whether nearly all pins and few other blobs are found."""
         n = len(found.blob)
         return bool((found.blob >= 0).sum() >= ENOUGH * n) and _extra(blobs, found) <= MAX_EXTRA * n
 
     def _window(self, frame: Frame, mask: Mask) -> np.ndarray:
-        """Gray levels (h, w) of the mask's window, without hot and dead pixels where the threshold is adaptive."""
+        """Gray levels (h, w) of the mask's window. For an adaptive threshold hot and dead pixels are removed."""
         window = gray_levels(np.ascontiguousarray(frame.image[mask.window]))
         return despeckled(window) if self.blob_spec.threshold_block_px else window
 
@@ -196,7 +197,7 @@ class Pipeline:
         return bool((found.blob >= 0).sum() > PLAUSIBLE * len(found.blob))
 
     def _with_displaced_mask(self, frame: Frame, blob: BlobSpec, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
-        """Look again with a displaced mask, if the whole view is displaced so far that the mask cuts pins off, or nearly."""
+        """If the whole view is displaced so far that the mask may cut pins off, detect again with a displaced mask."""
         paired = found.blob >= 0
         rim = self.reference.outmost[paired[self.reference.outmost]]
         away = np.linalg.norm(found.predicted_px - self.blob_spec.mask_center_px, axis=1)
@@ -211,7 +212,7 @@ class Pipeline:
         return (displaced, again) if again.score > found.score else (blobs, found)
 
     def _with_split_caps(self, blobs: Blobs, found: Match) -> tuple[Blobs, Match]:
-        """Split caps that touch. Each split corrects the predictions for the next."""
+        """Split caps that touch. Each split improves the predictions for the next."""
         for _ in range(SPLIT_ROUNDS):
             parts = split_merged(self.reference, blobs, found)
             if parts is blobs:
@@ -225,7 +226,7 @@ class Pipeline:
         return blobs, found
 
     def _complete(self, pins_px: np.ndarray) -> np.ndarray:
-        """Pins (N, 2); a lost pin takes the place that its neighbours' motion predicts."""
+        """Pins (N, 2) in which lost pins are at the places that their neighbours' motion predicts."""
         reference = self.reference
         found = np.isfinite(pins_px[:, 0])
         if found.all():
@@ -294,7 +295,7 @@ def _levels(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
 
 
 def _extra(blobs: Blobs, found: Match) -> int:
-    """Number of blobs that are no pins."""
+    """Number of blobs that are not pins."""
     return len(blobs.px) - int((found.blob >= 0).sum())
 
 
@@ -304,13 +305,13 @@ def _mean_radius(px: np.ndarray) -> float:
 
 
 def _since(start: float) -> tuple[float, float]:
-    """Milliseconds since a time of ``perf_counter``, and the time now."""
+    """Time in ms since a value of ``perf_counter``, and its present value."""
     now = perf_counter()
     return 1e3 * (now - start), now
 
 
 def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
-    """The reference that a no-contact frame shows; lost pins are filled in from their neighbours.
+    """The reference from a no-contact frame. Lost pins are predicted from their neighbours.
 
     Raises
     ------
@@ -326,11 +327,11 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
 
 
 def dent_of(pins_px: np.ndarray, reference: Reference) -> float:
-    """Largest motion of neighbouring pins that another camera cannot explain, in the rim's mean radius.
+    """Largest motion of neighbouring pins that no change of the camera explains, relative to the rim's mean radius.
 
-    Another place, tilt, focal length or radial distortion of the camera moves the reference, to first order, by
-    ``u = t + G x + (h . x) x + k |x|^2 x``. This motion is fitted by least squares and taken away. The rest is averaged over each
-    pin and its neighbours, because the tolerances of a print differ from pin to pin and shall not count.
+    To first order, another place, tilt, focal length or radial distortion of the camera moves the reference by
+    ``u = t + G x + (h . x) x + k |x|^2 x``. This motion is fitted by least squares and subtracted. The rest is averaged over each pin and
+    its neighbours, because tolerances of the print, which are independent from pin to pin, must not count as a dent.
 
     Parameters
     ----------
@@ -354,12 +355,12 @@ def dent_of(pins_px: np.ndarray, reference: Reference) -> float:
 
 
 def require_untouched(spec: SensorSpec, form: Form, frame: Frame, remedy: str) -> None:
-    """Refuse a frame that is meant to show no contact if its pins show one. A frame in which the pins are not found passes.
+    """Refuse a frame that is meant to show no contact if its pins show one. A frame whose pins are not found is accepted.
 
     Raises
     ------
     FrameError
-        Ends with ``remedy``: what to do.
+        The pins are dented. The message ends with ``remedy``: what to do.
     """
     pipeline = Pipeline(spec, form, graph="delaunay")
     seen = pipeline(frame)

@@ -1,4 +1,4 @@
-"""Where the pins of a sensor are in a frame without contact, and which pins are neighbours there."""
+"""The reference: places of the pins of a sensor in a frame without contact, and their neighbours."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from twin.geometry.pins import pin_lattice, rest_pins
 from twin.pins.voronoi import voronoi
 from twin.types import Form
 
-# Neighbours of a pin: two rings of a triangular lattice, enough for a local affine fit without the pin itself.
+# Number of neighbours of a pin: two rings of a triangular lattice. They are enough for a local affine fit without the pin itself.
 NEIGHBOURS = 18
 # Pins spread at least so far in every direction (smallest singular value of their places), px. Those of the shipped sensors: 460 to 1600.
 LEAST_SPREAD_PX = 1.0
@@ -24,17 +24,17 @@ FARTHEST_PX = 1e6
 
 @dataclass(frozen=True)
 class Reference:
-    """The no-contact layout in px of one form of frame, in the specification's pin order.
+    """The layout without contact in px of one form of frame, in the specification's pin order.
 
     Attributes
     ----------
     pins_px : (N, 2) float
     neighbours : (N, k) int
-        Other pins by increasing distance.
+        The k nearest other pins, by increasing distance.
     spacing_px : (N,) float
         Distance to the nearest other pin.
     triangles : (t, 3) int
-        Delaunay triangles, all of the same orientation, without those of three outmost pins.
+        Delaunay triangles, all with the same orientation. Those of three outmost pins are left out.
     outmost : (m,) int
         The outmost pins, in order around the layout.
     area_px2 : (N,) float
@@ -102,5 +102,5 @@ def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def folded_fraction(reference: Reference, nodes_px: np.ndarray) -> float:
-    """Share of the reference's triangles that turn over when the pins move to ``nodes_px`` (N, 2)."""
+    """Share of the reference's triangles whose orientation is reversed when the pins move to ``nodes_px`` (N, 2)."""
     return float(np.mean(_double_areas(nodes_px, reference.triangles) <= 0))

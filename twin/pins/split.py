@@ -1,4 +1,4 @@
-"""Caps that touch and have merged into one component: split into one disc each, where the pixels allow it."""
+"""Splitting of components that consist of several touching caps into one disc for each cap, if the pixels allow it."""
 
 from dataclasses import replace
 
@@ -9,36 +9,37 @@ from twin.pins.matching import Match
 from twin.pins.reference import Reference
 
 # All limits were chosen, not derived.
-# A component may be claimed by a pin whose predicted place is this near to it, in spacings.
+# Largest distance from a pin's predicted place to a component that the pin may claim, in spacings.
 REACH = 0.4
-# Least area of a component, as a share of the areas expected of all its claimants: less is one cap, not several.
+# Least area of a component that is split, relative to the sum of the areas expected of all pins that claim it. A smaller one is one cap.
 MIN_AREA_SHARE = 0.65
 # Least distance of two parts, in cap diameters.
 MIN_SEPARATION = 0.6
-# Least weight of the smallest part, relative to an equal share.
+# Least weight of the smallest part, relative to the mean weight of the parts.
 MIN_PART = 0.4
 # Rounds of k-means.
 ROUNDS = 12
-# Parts from which on a component is a net made by scratches or glare. It is large and each round is slow, so there are fewer rounds.
+# Number of parts from which on a component is a net of scratches or glare, and number of rounds of k-means for it. There are fewer
+# rounds, because such a component is large and each round is slow.
 MANY, ROUNDS_OF_MANY = 24, 3
-# Shift of the parts' centres, px, below which k-means has settled.
+# Shift of the parts' centres, px, below which k-means ends.
 SETTLED_PX = 1e-3
-# Least elongation of a chain of caps. Two touching discs have 5.
+# Least elongation of a chain of caps. Two touching discs have an elongation of 5.
 MIN_ELONGATION = 2.0
-# Least elongation of a chain, relative to the median of the blobs around it: near the rim all caps are long.
+# Least elongation of a chain, relative to the median of the blobs around it, because near the rim all caps are elongated.
 ODD_ELONGATION = 1.5
 # Least and largest area of a chain, in median areas of the blobs around it.
 MIN_CAPS, MAX_CAPS = 1.35, 5.0
-# Largest width of a neck, relative to that of the narrower part beside it.
+# Largest width of a neck, relative to the narrower one of the parts beside it.
 NECK = 0.7
 # Least area of a chain with a neck, in median areas of the blobs around it.
 MIN_CAPS_NECKED = 1.0
-# Blobs over which these medians are taken, the chain itself included.
+# Number of blobs, including the chain itself, over which these medians are taken.
 AROUND = 13
 
 
 def _label_near(blobs: Blobs, px: np.ndarray, reach_px: float) -> int:
-    """Label of the component at a place (2,) in the frame, or of the nearest within reach; 0 for none."""
+    """Label of the component at a place (2,) in the frame, or of the nearest one within reach; 0 if there is none."""
     column, row = np.round(px - blobs.corner_px).astype(int)
     reach = int(np.ceil(reach_px))
     height, width = blobs.labels.shape
@@ -54,17 +55,17 @@ def _label_near(blobs: Blobs, px: np.ndarray, reach_px: float) -> int:
 
 
 def _weight(level: np.ndarray) -> np.ndarray:
-    """Weights (p,) of pixels: their levels above the darkest one; 1 where all are alike."""
+    """Weights (p,) of pixels: their levels above the darkest one; 1 if all levels are equal."""
     return level - float(level.min()) if np.ptp(level) else np.ones(len(level))
 
 
 def _neck(along: np.ndarray, weight: np.ndarray) -> float | None:
-    """Place along a component's axis where it is narrow between two wide parts; None where there is no such neck.
+    """Place along a component's axis at which it is narrow between two wide parts; None if there is no such neck.
 
-    ``along`` (p,): places of its pixels along the axis, px; ``weight`` (p,).
+    ``along`` (p,) are the places of its pixels along the axis, px; ``weight`` (p,) their weights.
     """
     low = np.floor(along.min())
-    width = np.convolve(np.bincount((along - low).astype(int), weight), [0.25, 0.5, 0.25])[1:-1]  # by px along the axis, smoothed
+    width = np.convolve(np.bincount((along - low).astype(int), weight), [0.25, 0.5, 0.25])[1:-1]  # smoothed, for each px of the axis
     inner = np.arange(2, len(width) - 2)
     if not len(inner):
         return None
@@ -83,7 +84,7 @@ def _parts(blobs: Blobs, label: int, seeds_px: np.ndarray) -> tuple[np.ndarray, 
     centers = seeds_px - seeds_px.mean(axis=0)
     share: np.ndarray = np.zeros(len(centers))
     for _ in range(ROUNDS if len(centers) < MANY else ROUNDS_OF_MANY):
-        owner = ((centers**2).sum(axis=1) - 2 * pixels @ centers.T).argmin(axis=1)  # nearest; a large component has many of both
+        owner = ((centers**2).sum(axis=1) - 2 * pixels @ centers.T).argmin(axis=1)  # nearest centre, by an array of only (p, n)
         share = np.bincount(owner, weight, len(centers))
         if (share <= 0).any():
             break
@@ -95,7 +96,7 @@ def _parts(blobs: Blobs, label: int, seeds_px: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _with_parts(blobs: Blobs, split: list[int], px: list[np.ndarray], area_px2: list[float], label: list[int]) -> Blobs:
-    """The blobs, with those of the labels ``split`` replaced by parts: places (2,), areas and labels."""
+    """The blobs, in which those with the labels ``split`` are replaced by parts with places (2,), areas and labels."""
     rest = ~np.isin(blobs.label, split)
     return replace(
         blobs,
@@ -107,13 +108,13 @@ def _with_parts(blobs: Blobs, split: list[int], px: list[np.ndarray], area_px2: 
 
 
 def _both_sides(pixels: np.ndarray, weight: np.ndarray, beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (2, 2) and shares of the weight (2,) of the pixels (p, 2) before and ``beyond`` (p,) a neck."""
+    """Centres (2, 2) and shares of the weight (2,) of the pixels (p, 2) on both sides of a neck; ``beyond`` (p,) is the second side."""
     share = np.array([weight[~beyond].sum(), weight[beyond].sum()]) / weight.sum()
     return np.stack([np.average(pixels[part], axis=0, weights=weight[part]) for part in (~beyond, beyond)]), share
 
 
 def split_chains(blobs: Blobs) -> Blobs:
-    """The blobs; each one that is as long and large as two or more of its neighbours is replaced by that many parts."""
+    """Split each blob that is as long and as large as two or more of its neighbours into that many parts. Returns the new blobs."""
     long = np.flatnonzero(blobs.elongation > MIN_ELONGATION)
     if not len(long) or len(blobs.px) < AROUND:
         return blobs
@@ -149,10 +150,10 @@ def split_chains(blobs: Blobs) -> Blobs:
 
 
 def split_merged(reference: Reference, blobs: Blobs, found: Match) -> Blobs:
-    """The blobs; each component that several pins claim is replaced by as many parts.
+    """Split each component that several pins claim into as many parts. Returns the new blobs.
 
-    A pin claims a component if the component, or a part of it, was matched to the pin, or if the pin is lost and predicted there.
-    The component is split if it is large enough for all claimants and falls into as many parts of a cap's size.
+    A pin claims a component if the component or a part of it was matched to the pin, or if the pin is lost and its predicted place is
+    there. The component is split if it is large enough for all pins that claim it, and its parts have the size of caps.
     """
     labelled = found.blob >= 0
     claims: dict[int, list[int]] = {}

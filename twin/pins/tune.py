@@ -1,4 +1,4 @@
-"""Parameters of a detector, found from frames and the pins' layout alone."""
+"""Tuning: the parameters of a detector are found from frames and the pins' layout alone."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -19,21 +19,23 @@ from twin.pins.reference import Reference, make_reference
 from twin.progress import Step
 from twin.types import Form, Frame
 
-# Frames that are tuned on, evenly spread: with more the parameters hardly change.
+# Number of frames that are used, spread evenly. With more frames the parameters hardly change.
 TUNED_ON = 12
-# Methods that take about a second a frame, and the number of frames for them.
+# Methods that take about a second for a frame, and number of frames that are used for them.
 SLOW, SLOW_TUNED_ON = ("log", "dog", "doh"), 3
-# Distance of the mask's edge from the outermost pins seen, in spacings at the rim.
+# Distance of the mask's edge from the outermost pins, in spacings at the rim.
 MASK_SPACINGS = 0.85
-# Sides of adaptive thresholds that are tried, in median spacings; of the published recorder's threshold; erosions, px.
+# Values that are tried: sides of the block of an adaptive threshold, in median spacings; the same for the published recorder's
+# threshold; erosions, px.
 BLOCK_PITCHES, RECORDER_BLOCKS_PITCHES, EROSIONS_PX = (2.0, 3.0, 4.5), (2.0, 4.5), (1, 2)
-# Thresholds that are tried, as shares of the caps' contrast; and the least contrast that is assumed, gray levels.
+# Thresholds that are tried, as shares of the caps' contrast; least contrast that is assumed, gray levels.
 STRICTNESS, LEAST_CONTRAST = (0.04, 0.07, 0.1, 0.15, 0.22, 0.3, 0.4, 0.55), 4.0
-# Fixed thresholds that are tried, gray levels: on thresholded frames, and on raw ones.
+# Fixed thresholds that are tried, gray levels: on thresholded frames, and on raw frames.
 BINARY_LEVELS, RAW_LEVELS = (60.0, 80.0, 100.0, 127.0, 150.0, 175.0), tuple(float(level) for level in np.linspace(20, 220, 21))
-# One frame in this many shows which settings are hopeless: those whose exact rate and found share, added, are worse by HOPELESS.
+# First, all settings are tried on one frame in GLANCE. Settings whose sum of exact rate and found share is smaller than the best one by
+# more than HOPELESS are not tried on the other frames.
 GLANCE, HOPELESS = 4, 0.3
-# Thresholds whose rate is lower by no more than this belong to the plateau.
+# Largest difference from the best rate of a threshold that belongs to the plateau.
 NEAR = 0.02
 # Least area of a pin's blob, as a share of the caps' median area.
 LEAST_AREA = 0.2
@@ -43,7 +45,8 @@ CAP_RADII = (0.6, 1.4)
 RECORDER_BLOCK_PX, RECORDER_OFFSET = 61, -5.0
 # Standard normal quantile of a two-sided 90 % interval.
 Z_90 = 1.645
-# A tuning is sure if the lower end of its exact rate is at least the first, and its threshold may move by the second, gray levels.
+# A tuning is sure if the lower end of the interval of its exact rate is at least SURE_LOW_RATE, and its threshold may change by
+# SURE_SLACK gray levels.
 SURE_LOW_RATE, SURE_SLACK = 0.8, 1.0
 # A layout that explains less than this share of what the frames show is not seen in them; another one is named if it explains more by this.
 LEAST_SHOWN, MORE_EXPLAINED = 0.6, 0.02
@@ -59,7 +62,7 @@ Rate = tuple[float, float]
 
 
 class RateRow(TypedDict):
-    """A setting that was tried, and how it did."""
+    """A setting that was tried, and its result."""
 
     block_px: int
     threshold: float
@@ -69,13 +72,13 @@ class RateRow(TypedDict):
 
 @dataclass(frozen=True)
 class Tuned:
-    """What a tuning found.
+    """The result of a tuning.
 
     Attributes
     ----------
     detector : DetectorSpec
     rates : list of RateRow
-        Every setting tried.
+        All settings that were tried.
     notes : list of str
         Reasons to doubt the result, and what to do.
     """
@@ -208,7 +211,7 @@ def caps_in(gray: np.ndarray, pins_px: np.ndarray, spacing_px: np.ndarray) -> tu
 def _start(
     size_px: tuple[int, int], reference: Reference, layout: Candidate, area: float, method: Method, form: Form, kind: Layout
 ) -> DetectorSpec:
-    """Mask and caps' size; no threshold yet."""
+    """A detector with the mask and the caps' size, before a threshold is chosen."""
     rim = reference.pins_px[reference.outmost]
     center = (rim.max(axis=0) + rim.min(axis=0)) / 2
     reach = max(np.nanmax(np.linalg.norm(s.pins_px - center, axis=1)) for s in layout.seen if s.explained >= LEAST_SHOWN)
@@ -292,12 +295,12 @@ def _rate(detect: Callable[[Frame], Found], frames: list[Frame]) -> Rate:
 
 
 def _block(detector: DetectorSpec) -> int:
-    """Side of the adaptive threshold, px: the recorder's where there is one."""
+    """Side of the adaptive threshold's block, px; the recorder's if there is one."""
     return detector.recording.threshold_block_px if detector.recording is not None else detector.blob.threshold_block_px
 
 
 def _threshold(detector: DetectorSpec) -> float:
-    """Threshold, gray levels: the recorder's where there is one."""
+    """Threshold, gray levels; the recorder's if there is one."""
     return detector.recording.threshold_offset if detector.recording is not None else detector.blob.threshold
 
 
@@ -313,7 +316,7 @@ def _series(tried: list[DetectorSpec], k: int) -> list[int]:
 
 
 def _plateau(tried: list[DetectorSpec], rates: list[Rate], k: int) -> list[int]:
-    """The k-th setting and those with neighbouring thresholds that do nearly as well."""
+    """Indices of the k-th setting and of those with neighbouring thresholds whose rates are nearly as good."""
     series = _series(tried, k)
     at = series.index(k)
     low = high = at
@@ -326,7 +329,7 @@ def _plateau(tried: list[DetectorSpec], rates: list[Rate], k: int) -> list[int]:
 
 
 def _middle_of_plateau(tried: list[DetectorSpec], rates: list[Rate]) -> int:
-    """The best setting, as far as possible from the thresholds that fail: in the middle of the widest plateau."""
+    """Index of the best setting in the middle of the widest plateau, which is as far as possible from thresholds that fail."""
     score = np.array([exact + share for exact, share in rates])
     spots = np.array([d.blob.spot_sigma_px > 0 for d in tried])
     if (~spots).any():
@@ -340,7 +343,7 @@ def _middle_of_plateau(tried: list[DetectorSpec], rates: list[Rate]) -> int:
 def _evidence(
     tried: list[DetectorSpec], rates: list[Rate], best: int, frames: list[Frame], reference: Reference, start: DetectorSpec
 ) -> Evidence:
-    """How sure the best setting is: its rate with a 90 % interval (Wilson 1927), and how far threshold and mask are from failing."""
+    """Evidence for the best setting: its rate with a 90 % interval (Wilson 1927), and the slack of threshold and mask."""
     exact, n = rates[best][0], len(frames)
     spread = Z_90 * np.sqrt(exact * (1 - exact) / n + Z_90**2 / (4 * n * n))
     low = max((exact + Z_90**2 / (2 * n) - spread) / (1 + Z_90**2 / n), 0.0)

@@ -1,22 +1,23 @@
-"""Parameters of the pin detection, from a folder of a user's own frames to a file."""
+"""Tuning of the pin detection on a folder of a user's own frames; the parameters are written to a file."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from scenes import SensorSpec
-from twin.errors import FrameError
+from twin.errors import OptionError
 from twin.frames import evenly_read, open_recording
 from twin.pins.detector_spec import Evidence, Method, write_detector
 from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
 from twin.types import Form
 
-LIMIT = 12  # frames that are looked at
+# Most frames that are used if no other number is given.
+LIMIT = 12
 
 
 @dataclass(frozen=True)
 class TunedOnFrames:
-    """What was found.
+    """The result of a tuning on a user's frames.
 
     Attributes
     ----------
@@ -38,7 +39,7 @@ class TunedOnFrames:
     odd: list[str]
 
     def lines(self) -> list[str]:
-        """How sure it is, the parameters, and what speaks against them; for people."""
+        """The result as lines of text: how reliable it is, the parameters, and reasons to doubt them."""
         detector, evidence = self.tuned.detector, self.evidence
         blob, exact, low = detector.blob, 100 * evidence.exact_rate, 100 * evidence.low_rate
         (x, y), radius, slack = blob.mask_center_px, blob.mask_radius_px, evidence.mask_slack_px
@@ -66,7 +67,7 @@ def tune_on_frames(
     limit: int = LIMIT,
     progress: Progress = silent,
 ) -> TunedOnFrames:
-    """Find the parameters from at most ``limit`` frames, evenly spread over what lies at a path.
+    """Find the parameters from at most ``limit`` frames, spread evenly over those at a path.
 
     Parameters
     ----------
@@ -78,16 +79,16 @@ def tune_on_frames(
     Raises
     ------
     FrameError
-        No frame shows the layout, or ``out`` is no name of a ``.toml`` file.
+        No frame shows the layout, or ``out`` is not the name of a ``.toml`` file.
     """
     if out is not None and out.suffix != ".toml":
-        raise FrameError(f"--out {out}: give the name of a .toml file")
+        raise OptionError(f"--out {out}: give the name of a .toml file")
     recording = open_recording(path, None, form)
     frames = evenly_read(recording, limit)
     with stage(progress, "tuning") as step:
         found = tune(frames, sensor, method, progress=step)
     evidence = found.detector.evidence
-    assert evidence is not None  # whoever tunes says how sure it is
+    assert evidence is not None  # ``tune`` always gives evidence
     if out is not None:
         write_detector(out, found.detector, f"Found by 'twin tune' from {len(frames)} frames of {path.name}; {evidence.sure}.")
     return TunedOnFrames(found, evidence, sensor.pins.count, [] if out is None else [out], recording.problems)

@@ -1,24 +1,25 @@
-"""Voronoi areas of the pins, clipped to an enlarged outline of the outmost ones.
+"""Voronoi areas of the pins, clipped to the enlarged outline of the outmost pins.
 
-The boundary. The release adds the convex hull's pins, scaled by 1.1 about the centre, as further sites, so its outer
-cells end half way, at 1.05; its hexagon, which isn't convex, needs virtual sites for that. Here the cells are clipped
-to the polygon through the outmost pins (in the layout's order, so it follows the hexagon's inward-bowed sides),
-scaled by 1.05 about its centroid: the same place without virtual sites, and it doesn't jump when
-a pin joins or leaves the convex hull. Without a usable outline, the convex hull takes its place.
+Boundary: the release adds the pins of the convex hull, scaled by 1.1 about the centre, as further sites. Its outer cells therefore end
+half way, at 1.05. Its hexagon is not convex and needs additional virtual sites. Here the cells are clipped to the polygon through the
+outmost pins, scaled by 1.05 about its centroid. The polygon has the layout's order, so it follows the concave sides of a hexagon. The
+boundary is at the same place as in the release, but needs no virtual sites, and does not change suddenly when a pin joins or leaves the
+convex hull. If the polygon is not usable, the convex hull is used.
 
-A cell is what is left of the region after cutting it at the bisectors to the pin's Delaunay neighbours. Cutting is
-additive, so the cells tile the region to rounding, whatever its shape.
+A cell is the part of the region on the pin's side of the bisectors to all its Delaunay neighbours. Signed areas add up under cutting, so
+the areas of the cells sum to that of the region up to rounding errors, for a region of any shape.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.spatial import ConvexHull, Delaunay, QhullError
+
+from twin.compiled import compiled
 
 # The outline is enlarged by this about its centroid: half way to the release's further sites, which stand at 1.1.
 BOUNDARY_SCALE = 1.05
-# Sides of the strip that stands for the hull of nodes on a line: its margin as a share of the length, and its least width, px.
+# The strip that replaces the hull of nodes on a line: its margin as a share of the length, and its least margin, px.
 STRIP_SHARE, LEAST_STRIP_PX = 0.05, 1.0
 
 
@@ -30,9 +31,9 @@ class Tessellation:
     ----------
     area_px2 : (N,) float
     cells : list of (k, 2) float
-        Cell polygons (nodes at one place share one cell: each lists it, and counts an equal part of its area).
-    region_px : (m, 2) float
-        The polygon the cells tile.
+        Cell polygons. Nodes at the same place have the same cell, and each has an equal part of its area.
+        region_px : (m, 2) float
+            The polygon that the cells tile.
     """
 
     area_px2: np.ndarray
@@ -41,7 +42,7 @@ class Tessellation:
 
 
 def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
-    """Delaunay triangles (t, 3) of the nodes (N, 2); None where they have none (collinear, coincident, fewer than 3)."""
+    """Delaunay triangles (t, 3) of the nodes (N, 2); None if there are none (nodes are collinear, coincide, or are fewer than 3)."""
     if len(nodes_px) < 3:
         return None
     try:
@@ -51,9 +52,9 @@ def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
     return None if len(mesh.coplanar) else mesh.simplices
 
 
-@njit(cache=True)
+@compiled()
 def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
-    """(E, 2) both directions of each triangle side of a triangulation of ``n`` nodes, sorted."""
+    """Directed edges (E, 2), sorted: both directions of each side of the triangles over ``n`` nodes."""
     start = np.zeros(n + 1, np.int64)
     for t in range(len(triangles)):
         for k in range(3):
@@ -72,7 +73,7 @@ def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
     for i in range(n):
         last = -1
         for j in np.sort(ends[start[i] : start[i + 1]]):
-            if j != last:  # a side of two triangles comes twice
+            if j != last:  # a side of two triangles occurs twice
                 edges[count, 0] = i
                 edges[count, 1] = j
                 count += 1
@@ -80,9 +81,9 @@ def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
     return edges[:count]
 
 
-@njit(cache=True)
+@compiled()
 def polygon_area(polygon: np.ndarray, count: int) -> float:
-    """Signed area (shoelace) of the first ``count`` vertices, about the first one: far from the origin digits would cancel."""
+    """Signed area (shoelace) of the first ``count`` vertices, relative to the first, because far from the origin digits would cancel."""
     total = 0.0
     x0, y0 = polygon[0, 0], polygon[0, 1]
     for k in range(1, count - 1):
@@ -90,7 +91,7 @@ def polygon_area(polygon: np.ndarray, count: int) -> float:
     return 0.5 * total
 
 
-@njit(cache=True)
+@compiled()
 def _cut(polygon: np.ndarray, count: int, a: float, b: float, c: float, out: np.ndarray) -> int:
     """The part of a polygon with a x + b y <= c (Sutherland and Hodgman 1974); returns its vertex count."""
     kept = 0
@@ -112,7 +113,7 @@ def _cut(polygon: np.ndarray, count: int, a: float, b: float, c: float, out: np.
     return kept
 
 
-@njit(cache=True)
+@compiled()
 def _cell(
     i: int, nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, count: int, here: np.ndarray, there: np.ndarray
 ) -> tuple[int, np.ndarray, np.ndarray]:
@@ -128,9 +129,9 @@ def _cell(
     return count, here, there
 
 
-@njit(cache=True)
+@compiled()
 def _inner_radius2(region: np.ndarray, x0: float, y0: float) -> float:
-    """Squared distance of a point from the nearest of a polygon's sides."""
+    """Squared distance of a point from the nearest side of a polygon."""
     least = np.inf
     for k in range(len(region)):
         ax, ay = region[k - 1, 0] - x0, region[k - 1, 1] - y0
@@ -141,12 +142,12 @@ def _inner_radius2(region: np.ndarray, x0: float, y0: float) -> float:
     return least
 
 
-@njit(cache=True)
+@compiled()
 def _cells(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Area of every cell and its vertices, end to end.
+    """Area of every cell, the vertices of all cells in one array, and where each cell's vertices begin.
 
-    Cutting starts from the region's bounding box. The region is known to hold a disc; a cell that leaves this disc is
-    cut again, from the region itself.
+    Cutting starts from the region's bounding box, which has few vertices. The region contains a disc about the centre; only a cell that
+    extends beyond this disc is cut again, starting from the region itself.
     """
     n, m = len(nodes), len(region)
     x0, y0 = region[:, 0].mean(), region[:, 1].mean()
@@ -177,7 +178,7 @@ def _cells(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region:
 
 
 def _star_shaped(polygon: np.ndarray) -> bool:
-    """Whether a closed polygon about the origin winds once and always forwards (or always backwards)."""
+    """Whether a closed polygon about the origin winds around it once, always in the same direction."""
     ahead = np.roll(polygon, -1, axis=0)
     cross = polygon[:, 0] * ahead[:, 1] - polygon[:, 1] * ahead[:, 0]
     turn = np.arctan2(cross, (polygon * ahead).sum(axis=1))
@@ -185,7 +186,7 @@ def _star_shaped(polygon: np.ndarray) -> bool:
 
 
 def _outline_region(nodes: np.ndarray, outmost: np.ndarray | None) -> np.ndarray | None:
-    """The outmost nodes' polygon, enlarged and counter-clockwise (y up); None where it isn't usable."""
+    """The outmost nodes' polygon, enlarged and counter-clockwise (y up); None if it is not usable."""
     if outmost is None or len(outmost) < 3:
         return None
     polygon = nodes[outmost]
@@ -197,7 +198,7 @@ def _outline_region(nodes: np.ndarray, outmost: np.ndarray | None) -> np.ndarray
 
 
 def _hull_region(nodes: np.ndarray) -> np.ndarray:
-    """The enlarged convex hull; for nodes on a line, a strip about them as wide as a twentieth of its length (1 px at least)."""
+    """The enlarged convex hull; for nodes on a line, a strip around them."""
     center = nodes.mean(axis=0)
     spread = nodes - center
     _, size, axes = np.linalg.svd(spread, full_matrices=True)
@@ -214,7 +215,7 @@ def _hull_region(nodes: np.ndarray) -> np.ndarray:
 
 
 def _with_all_pairs(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbours of each node where all others are: start (n + 1,) of each one's part, and the neighbours end to end."""
+    """Neighbours of each node if all others are its neighbours: start (n + 1,) of each node's part, and all neighbours in one array."""
     n = len(nodes)
     other = np.broadcast_to(np.arange(n), (n, n))[~np.eye(n, dtype=bool)]
     return np.arange(n + 1) * (n - 1), np.ascontiguousarray(other)
@@ -230,7 +231,7 @@ def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, edges: n
     outmost : (m,) int, optional
         The outmost nodes, in order around the layout; their polygon is used if it is star-shaped.
     edges : (E, 2) int, optional
-        The nodes' Delaunay edges as ``directed_edges`` gives them, where the caller has them.
+        The nodes' Delaunay edges as ``directed_edges`` gives them, if the caller has them.
     """
     nodes_px = np.ascontiguousarray(nodes_px, float)
     if nodes_px.ndim != 2 or not len(nodes_px) or not np.isfinite(nodes_px).all():

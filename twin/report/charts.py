@@ -1,4 +1,4 @@
-"""One style for all charts, drawn once for each theme of the pages."""
+"""The style of all charts. Each chart is drawn once for each theme of the pages."""
 
 import io
 from collections.abc import Callable, Iterator
@@ -19,21 +19,23 @@ from twin.report.themes import DARK, LIGHT, SERIES, Theme
 from twin.store import write_bytes
 
 DPI = 140
-SHADES = 256  # of a colour map
-FEW_DECADES = 100.0  # largest over smallest value of an axis whose powers of ten alone make no scale
+# Number of colours of a colour map.
+SHADES = 256
+# Ratio of an axis' largest to its smallest value below which labels at powers of ten alone are too few.
+FEW_DECADES = 100.0
 
 _theme: ContextVar[Theme] = ContextVar("theme", default=LIGHT)
 
 
 def new_figure(columns: int, rows: int = 1, *, panel_inch: float = 4.0, projection: str | None = None) -> tuple[Figure, np.ndarray]:
-    """A figure of square panels without any window, in the theme that is drawn, and its axes as a flat array."""
+    """A figure of square panels in the current theme, without a window, and its axes as a flat array."""
     return sized_figure((columns * panel_inch, rows * panel_inch), columns, rows, projection=projection)
 
 
 def sized_figure(
     size_inch: tuple[float, float], columns: int = 1, rows: int = 1, *, projection: str | None = None
 ) -> tuple[Figure, np.ndarray]:
-    """The same of a given width and height."""
+    """A figure of a given width and height in the current theme, without a window, and its axes as a flat array."""
     with rc_context(_style(_theme.get())):
         figure = Figure(figsize=size_inch, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": projection})
@@ -41,14 +43,14 @@ def sized_figure(
 
 
 def write_chart(path: Path, draw: Callable[[], Figure], *, dpi: int = DPI) -> Path:
-    """Draw a chart in the light theme to ``path`` and in the dark one beside it (`dark_of`); the path.
+    """Draw a chart in the light theme to ``path``, and in the dark theme to `dark_of` this path. Returns the path.
 
     Parameters
     ----------
     path : Path
-        Of a PNG file.
-    draw : callable
-        Makes the figure, by `new_figure` or `sized_figure`. It is called once for each theme.
+        A PNG file.
+        draw : callable
+            Makes the figure with `new_figure` or `sized_figure`. It is called once for each theme.
     dpi : int
     """
     for theme, target in ((LIGHT, path), (DARK, dark_of(path))):
@@ -58,20 +60,20 @@ def write_chart(path: Path, draw: Callable[[], Figure], *, dpi: int = DPI) -> Pa
 
 
 def save_figure(path: Path, figure: Figure, *, dpi: int = DPI) -> Path:
-    """Write a figure that no page shows, in the theme that it was made in, as PNG; the path."""
+    """Write a figure that is not part of a page as PNG, in the theme that it was made in, and return the path."""
     content = io.BytesIO()
     figure.savefig(content, dpi=dpi, format="png")
     return write_bytes(path, content.getvalue())
 
 
 def dark_of(path: Path) -> Path:
-    """Where the dark twin of a chart lies."""
+    """Path of a chart in the dark theme."""
     return path.with_name(f"{path.stem}-dark{path.suffix}")
 
 
 @contextmanager
 def drawn_in(theme: Theme) -> Iterator[None]:
-    """Everything drawn inside has the colours of a theme."""
+    """Context in which everything is drawn in the colours of a theme."""
     token = _theme.set(theme)
     try:
         with rc_context(_style(theme)):
@@ -81,28 +83,28 @@ def drawn_in(theme: Theme) -> Iterator[None]:
 
 
 def ink() -> str:
-    """Colour of text in the theme that is drawn."""
+    """Colour of text in the current theme."""
     return _theme.get().ink
 
 
 def muted() -> str:
-    """Colour of what stands back: limits, references, the true course."""
+    """Colour of secondary elements in the current theme: limits, references, the true course."""
     return _theme.get().muted
 
 
 def faint() -> str:
-    """Colour of areas and rules behind everything."""
+    """Colour of areas and rules in the background."""
     return _theme.get().line
 
 
 def sequential() -> ListedColormap:
-    """Viridis without the end that the theme's background would swallow."""
+    """Viridis without the end that has too little contrast to the theme's background."""
     low, high = (0.0, 0.88) if _theme.get() == LIGHT else (0.2, 1.0)
     return ListedColormap(colormaps["viridis"](np.linspace(low, high, SHADES)))
 
 
 def plain_log(axis: Axis) -> None:
-    """Label a logarithmic axis with plain numbers, and 2, 3 and 5 between the powers of ten where these are few."""
+    """Label a logarithmic axis with plain numbers. If there are few powers of ten, 2, 3 and 5 are also labelled."""
 
     def between(value: float, _: int | None) -> str:
         low, high = sorted(axis.get_view_interval())

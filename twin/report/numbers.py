@@ -1,37 +1,44 @@
-"""Numbers as text for people: whole numbers whole, no exponents where digits do, one number of decimals down a column."""
+"""Readable numbers: integers without decimals, exponents only for very large or small numbers, equal decimals in a column."""
 
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import TypeGuard
 
-NOTHING = "–"  # a missing value
-MINUS = "−"  # as wide as a plus sign in tabular figures
-GROUP = "\u202f"  # narrow no-break space between groups of three digits
-GROUPED_FROM = 10_000  # smaller numbers are read well without groups
-PLAIN_LOW, PLAIN_HIGH = 1e-4, 1e9  # sizes between which a number is written without a power of ten
-FEWEST = 2  # significant digits that a column leaves its smallest value
-LONGEST = 6  # digits of a column's largest value; where it would need more, each value has its own decimals
+# Text for a missing value.
+NOTHING = "–"
+# Minus sign, which has the width of a plus sign in tabular figures.
+MINUS = "−"
+# Narrow no-break space between groups of three digits.
+GROUP = "\u202f"
+# Least number that is written with groups of digits.
+GROUPED_FROM = 10_000
+# Absolute values between which a number is written without a power of ten.
+PLAIN_LOW, PLAIN_HIGH = 1e-4, 1e9
+# Least number of significant digits of a column's smallest value.
+FEWEST = 2
+# Most digits of a column's largest value. If it would need more, each value has its own number of decimals.
+LONGEST = 6
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: object, digits: int = 3, *, decimals: int | None = None, signed: bool = False) -> str:
-    """One number for running text or a cell.
+    """A number as text for a sentence or a cell.
 
     Parameters
     ----------
     value : int, float, bool, str or None
-        A bool becomes yes or no, None and NaN become a dash, a text stays as it is.
-    digits : int
-        Significant digits of a fraction; digits before the point are never rounded away.
-    decimals : int, optional
-        Digits after the point instead; whole numbers get them, too.
+        A bool becomes yes or no, None and NaN become a dash, a text is not changed.
+        digits : int
+            Significant digits of a number that is not whole; digits before the point are always written.
+        decimals : int, optional
+            Number of digits after the point instead, also for whole numbers.
     signed : bool
         Write a plus sign before positive numbers.
     """
     if value is None or isinstance(value, str):
         return NOTHING if value is None else value
-    if isinstance(value, bool) or type(value).__name__ == "bool":  # numpy's too, which is not Python's
+    if isinstance(value, bool) or type(value).__name__ == "bool":  # numpy's bool is another type
         return "yes" if value else "no"
     if not isinstance(value, Real):
         return str(value)
@@ -51,15 +58,15 @@ def number(value: object, digits: int = 3, *, decimals: int | None = None, signe
             decimals = max(0, digits - 1 - _power(size, digits)) if size else 0
     text = f"{abs(size):.{decimals}f}"
     if not float(text):
-        sign = ""  # a rounded zero has no sign
+        sign = ""  # a number that is rounded to zero has no sign
     return sign + _grouped(text)
 
 
 def column(values: Sequence[object], digits: int = 3, *, decimals: int | None = None, signed: bool = False) -> list[str]:
-    """The values of a table's column, all with as many decimals, so that their points stand under each other.
+    """The values of a table's column with equally many decimals, so that their decimal points are aligned.
 
-    The column's median gets ``digits`` significant digits and its smallest value at least two. Where that would take more than six
-    digits for the largest one, each value gets its own decimals.
+    The column's median has ``digits`` significant digits, its smallest value at least two. If the largest value would need more than six
+    digits for that, each value has its own number of decimals.
     """
     sizes = sorted(abs(float(v)) for v in values if is_number(v) and math.isfinite(float(v)) and float(v))
     if decimals is None and sizes:
@@ -73,7 +80,7 @@ def column(values: Sequence[object], digits: int = 3, *, decimals: int | None = 
 
 
 def is_number(value: object) -> TypeGuard[Real]:
-    """Whether a value is a number, numpy's included; a bool is none."""
+    """Whether a value is a number of Python or numpy. A bool is not a number."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 

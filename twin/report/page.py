@@ -1,7 +1,7 @@
-"""Pages of results: a builder that every command uses, and the templates that give all of them one look.
+"""Pages of results: a builder that all commands use, and templates that give all pages the same look.
 
-A page is one HTML file that needs no network. Its pictures lie beside it, or inside it (``embed``). All text is escaped; emphasis
-comes from `strong`, `code`, `good` and `bad`, which escape what they are given.
+A page is one HTML file that needs no network. Its pictures are files beside it, or are embedded in it (``embed``). All text is escaped;
+emphasis is made by `strong`, `code`, `good` and `bad`, which escape their argument.
 """
 
 import base64
@@ -24,7 +24,8 @@ from twin.report.themes import stylesheet
 from twin.store import write_text
 
 Kind = Literal["chart", "frame", "photo"]
-FEWEST_IN_CONTENTS = 4  # sections: a shorter page needs no list of them
+# Least number of sections of a page that has a table of contents.
+FEWEST_IN_CONTENTS = 4
 MIME = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".svg": "image/svg+xml"}
 
 
@@ -35,12 +36,12 @@ class Picture:
     Attributes
     ----------
     path : Path
-        Relative to the page's folder, or absolute and then within it.
-    alt : str
-        What it shows, for those who do not see it.
-    caption : str or Markup
-    kind : {"chart", "frame", "photo"}
-        A chart has a dark twin beside it (`twin.report.charts.write_chart`); a frame's pixels are shown as they are.
+        Relative to the page's folder, or absolute and inside this folder.
+        alt : str
+            Description of the picture for readers who can't see it.
+        caption : str or Markup
+        kind : {"chart", "frame", "photo"}
+            A chart has a second file for the dark theme (`twin.report.charts.write_chart`). The pixels of a frame are not smoothed.
     width_px : int, optional
         Largest width on the page.
     """
@@ -77,7 +78,7 @@ class _File:
 
 @dataclass(frozen=True)
 class _Source:
-    """A picture as the template shows it."""
+    """A picture in the form that the template needs."""
 
     src: str
     dark: str
@@ -96,13 +97,13 @@ class _Link:
 
 @dataclass
 class Page:
-    """A page in the making: parts are added in their order, then it is written.
+    """A page that is being made: its parts are added in their order, then it is written.
 
     Attributes
     ----------
     title : str
     made_by : str
-        The command that makes such a page, as ``twin realism``.
+        The command that makes the page, for example ``twin realism``.
     topic : str
         A few words above the title.
     lead : str
@@ -122,7 +123,7 @@ class Page:
         self.text(*paragraphs)
 
     def heading(self, title: str, *, anchor: str = "") -> None:
-        """Begin a part of a section; ``anchor`` is what links of the page name (default: made of the title)."""
+        """Begin a part of a section; ``anchor`` is the name for links to it (by default it is made from the title)."""
         self._blocks.append(_Block("heading", title=title, anchor=anchor or slug(title)))
 
     def text(self, *paragraphs: str) -> None:
@@ -135,7 +136,7 @@ class Page:
             self._blocks.append(_Block("items", lines=items))
 
     def notice(self, title: str, items: Sequence[str], *, tone: Literal["", "good", "bad"] = "") -> None:
-        """Add notes that must not be overlooked; nothing where there are none."""
+        """Add important notes. Without items nothing is added."""
         if items:
             self._blocks.append(_Block("notice", title=title, lines=items, tone=tone))
 
@@ -144,22 +145,22 @@ class Page:
         self._blocks.append(_Block("table", table=make_table(rows, columns, caption=caption)))
 
     def figures(self, *pictures: Picture, layout: Literal["", "row", "beside"] = "") -> None:
-        """Add pictures: below each other, in a ``row`` that wraps, or a narrow one ``beside`` a wide one."""
+        """Add pictures: one below the other, in a ``row`` that wraps, or a narrow one ``beside`` a wide one."""
         self._blocks.append(_Block("figures", pictures=pictures, layout=layout))
 
     def download(self, path: Path, what: str = "") -> None:
-        """Name a file beside the page, and what it holds."""
+        """Add a link to a file beside the page, and a description of its content."""
         self._files.append(_File(path, what))
 
     def write(self, path: Path, *, embed: bool = False) -> Path:
-        """Write the page; the path.
+        """Write the page, and return the path.
 
         Parameters
         ----------
         path : Path
-            Of the HTML file.
-        embed : bool
-            Put the pictures into the file, so that it can be given away alone.
+            The HTML file.
+            embed : bool
+                Embed the pictures in the file, so that it can be sent alone.
         """
         return write_text(path, self.html(path.parent, embed=embed))
 
@@ -181,29 +182,29 @@ class Page:
 
 
 def render_page(package: str, **content: object) -> str:
-    """A package's own ``page.html.j2`` as HTML, for pages that are more than results; it extends ``base.html.j2``.
+    """Render a package's own ``page.html.j2``, which extends ``base.html.j2``, as HTML. It is for pages with more than results.
 
-    Every name that the template uses must be given, ``stylesheet`` excepted.
+    Every name that the template uses must be given, except ``stylesheet``.
     """
     return _render("page.html.j2", ChoiceLoader([PackageLoader(package, "."), PackageLoader("twin.report", ".")]), **content)
 
 
 def provenance(made_by: str) -> Markup:
-    """What made a page: the command, the version of this package, the time."""
+    """The line that states the command, the version of this package and the time at which a page was made."""
     try:
         release = version("tactip-twin")
-    except PackageNotFoundError:  # run from a source folder that is not installed
+    except PackageNotFoundError:  # the program runs from a source folder that was not installed
         release = "(not installed)"
     return Markup("Made by <code>{}</code>, tactip-twin {}, {:%Y-%m-%d %H:%M} UTC.").format(made_by, release, datetime.now(UTC))
 
 
 def strong(text: object) -> Markup:
-    """Text that stands out."""
+    """Emphasised text."""
     return Markup("<strong>{}</strong>").format(text)
 
 
 def code(text: object) -> Markup:
-    """A name as it is typed."""
+    """A name in the font for code."""
     return Markup("<code>{}</code>").format(text)
 
 
@@ -218,17 +219,17 @@ def bad(text: object) -> Markup:
 
 
 def sentence(*parts: str) -> Markup:
-    """Parts of a paragraph joined by spaces; plain texts among them are escaped, empty ones left out."""
+    """Parts of a paragraph joined by spaces. Plain texts among them are escaped, empty ones left out."""
     return Markup(" ").join(part for part in parts if part)
 
 
 def slug(title: str) -> str:
-    """A title as the name of a place in a page."""
+    """A title as the name of an anchor in a page."""
     return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "part"
 
 
 def link_to(anchor: str) -> str:
-    """Address of a place in the same page."""
+    """Address of an anchor in the same page."""
     return f"#{quote(anchor, safe='')}"
 
 
@@ -249,5 +250,5 @@ def _embedded(path: Path) -> str:
 
 
 def _within(path: Path, folder: Path) -> Path:
-    """A file's path from the page's folder; a path that is neither absolute nor begins with the folder is one already."""
+    """A file's path relative to the page's folder. A path that is not absolute and does not begin with the folder is already relative."""
     return Path(os.path.relpath(path, folder)) if path.is_absolute() or path.is_relative_to(folder) else path

@@ -1,4 +1,4 @@
-"""Pins, graphs and Voronoi areas drawn on an axes of the caller, and one picture of one contact: skin, frame, pins, areas, displacement."""
+"""Drawings of pins, graphs and Voronoi areas on given axes, and a figure of one contact: skin, frame, pins, areas, displacement."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,19 +25,19 @@ EXTRA = "#ffb000"
 EDGE = "#5ec8ff"
 """Colour of a graph's edges."""
 BORDER = "#00000040"
-"""Colour of a coloured cell's border; it shows on any ground."""
+"""Colour of a coloured cell's border, which is visible on any ground."""
 FRAME_REACH = 0.6
-"""A frame around pins shows this share of their extent to each side of their middle: the pins and the ring around them."""
+"""Distance from the middle of the pins to each side of the shown part of a frame, as a share of the pins' extent."""
 ENLARGEMENTS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-"""Factors by which arrows may be enlarged."""
+"""Possible factors by which arrows are enlarged."""
 LONG_PERCENTILE = 95
-"""Percentile of the arrows' lengths that counts as the longest. Longer ones may reach beyond the next pin."""
+"""Percentile of the arrows' lengths that is used as the longest. Longer arrows may reach beyond the next pin."""
 SURFACE_GRID = 80
-"""Samples across an interpolated surface."""
+"""Number of samples across an interpolated surface."""
 
 
 def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.ndarray | None = None) -> None:
-    """The frame itself, in pixels with y down; with points (N, 2) only the part around them."""
+    """Draw a frame in pixels with y down. If points (N, 2) are given, only the part around them is drawn."""
     ax.imshow(image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     if around_px is not None:
         height, width = image.shape[:2]
@@ -48,7 +48,7 @@ def draw_frame(ax: Axes, image: np.ndarray, title: str = "", *, around_px: np.nd
 
 
 def draw_graph(ax: Axes, graph: PinGraph) -> None:
-    """The edges of a graph, and its cells where it has a tessellation."""
+    """Draw the edges of a graph, and its cells if it has a tessellation."""
     once = graph.edges[graph.edges[:, 0] < graph.edges[:, 1]] if graph.kind != "knn" else graph.edges
     ax.add_collection(LineCollection(list(graph.nodes_px[once]), colors=EDGE, linewidths=0.7, alpha=0.85))
     if graph.cells:
@@ -56,12 +56,12 @@ def draw_graph(ax: Axes, graph: PinGraph) -> None:
 
 
 def draw_nodes(ax: Axes, graph: PinGraph) -> None:
-    """The nodes of a graph."""
+    """Draw the nodes of a graph."""
     ax.plot(*graph.nodes_px.T, ".", color=FOUND, markersize=4)
 
 
 def draw_pins(ax: Axes, observation: Observation) -> None:
-    """Found pins, the model's guess for the lost ones, and the rejected blobs."""
+    """Draw found pins, the predicted places of lost ones, and the rejected blobs."""
     ax.plot(*observation.pins_px.T, ".", color=FOUND, markersize=4)
     ax.plot(*observation.predicted_px.T, "x", color=LOST, markersize=6)
     if len(observation.extra_px):
@@ -69,7 +69,7 @@ def draw_pins(ax: Axes, observation: Observation) -> None:
 
 
 def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title: str, *, limit: float | None = None) -> None:
-    """Voronoi cells coloured by their relative change of area against no contact (percent), up to ``limit`` (default: their own)."""
+    """Draw Voronoi cells coloured by the relative change of their area from rest in percent, up to ``limit`` (default: the largest)."""
     change = 100 * (graph.area_px2 / rest_area_px2 - 1)
     limit = limit or max(5.0, float(np.nanpercentile(np.abs(change), 99)))
     cells = PolyCollection(graph.cells, array=change, cmap="RdBu_r", clim=(-limit, limit), edgecolors=BORDER, linewidths=0.4)
@@ -79,7 +79,7 @@ def draw_area_change(ax: Axes, graph: PinGraph, rest_area_px2: np.ndarray, title
 
 
 def draw_displacement(ax: Axes, rest_px: np.ndarray, pins_px: np.ndarray, title: str, *, enlarged: float = 1.0) -> None:
-    """Arrows from each pin's rest position (N, 2) to where it is now, to scale or ``enlarged``; colours are the true lengths."""
+    """Draw arrows from each pin's place at rest (N, 2) to its present place, ``enlarged`` by a factor. Colours show the true lengths."""
     moved = pins_px - rest_px
     length = np.hypot(*moved.T)
     ax.plot(*rest_px.T, ".", color=faint(), markersize=3)
@@ -89,14 +89,14 @@ def draw_displacement(ax: Axes, rest_px: np.ndarray, pins_px: np.ndarray, title:
 
 
 def enlargement(rest_px: np.ndarray, pins_px: np.ndarray) -> float:
-    """Factor by which to enlarge arrows between points (N, 2): the largest one with which a long arrow still fits between two pins."""
+    """Factor to enlarge arrows between points (N, 2): the largest one with which a long arrow does not exceed the distance of two pins."""
     apart = np.median(cKDTree(rest_px).query(rest_px, k=2)[0][:, 1])
     longest = np.percentile(np.hypot(*(pins_px - rest_px).T), LONG_PERCENTILE)
     return max((factor for factor in ENLARGEMENTS if factor * longest <= apart), default=ENLARGEMENTS[0])
 
 
 def draw_area_surface(ax: Axes3D, nodes_px: np.ndarray, value: np.ndarray, title: str) -> None:
-    """A per-pin value as a smooth surface over the image plane (cubic interpolation; 3D axes)."""
+    """Draw a value of each pin as a smooth surface over the image plane (cubic interpolation; 3D axes)."""
     low, high = nodes_px.min(axis=0), nodes_px.max(axis=0)
     grid_x, grid_y = np.meshgrid(*[np.linspace(a, b, SURFACE_GRID) for a, b in zip(low, high, strict=True)])
     surface = CloughTocher2DInterpolator(nodes_px, value)(grid_x, grid_y)
@@ -117,9 +117,9 @@ def area_surface_figure(rest: PinGraph, contact: PinGraph) -> Figure:
 
 @dataclass(frozen=True)
 class Look:
-    """A frame through the pipeline, beside the same sensor without contact.
+    """A frame with its observation, and the observation of the same sensor without contact.
 
-    ``rest`` is the observation of a no-contact frame of the same form.
+    ``rest`` is the observation of a frame without contact of the same form.
     """
 
     frame: Frame
@@ -127,7 +127,7 @@ class Look:
     rest: Observation
 
     def graphs(self) -> tuple[PinGraph, PinGraph]:
-        """The graph of the frame and that of no contact.
+        """The graphs of the frame and of the frame without contact.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class Look:
 
 
 def contact_panel(skin_picture: Path, look: Look, title: str) -> Figure:
-    """Six panels of one contact; where the pipeline found no graph the reason stands in its place."""
+    """A figure with six panels of one contact. If the pipeline found no graph, the reason is shown instead."""
     figure, axes = new_figure(3, 2, panel_inch=4.4)
     figure.suptitle(title)
     axes[0].imshow(imread(skin_picture))
@@ -170,13 +170,13 @@ def area_change_at(look: Look, center_px: np.ndarray, *, count: int) -> float:
 
 
 def _without_frame(ax: Axes, title: str) -> None:
-    """Take ticks and frame off an axes, and give it a title."""
+    """Remove ticks and frame of an axes, and set its title."""
     ax.set(title=title, xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
 
 
 def _pixel_axes(ax: Axes, points_px: np.ndarray, title: str) -> None:
-    """An axes in pixels around points (N, 2), y down."""
+    """Set the limits of an axes to pixels around points (N, 2), with y down."""
     low, high = np.nanmin(points_px, axis=0), np.nanmax(points_px, axis=0)
     margin = 0.08 * (high - low)
     ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(high[1] + margin[1], low[1] - margin[1]), aspect="equal")

@@ -1,7 +1,7 @@
-"""The deformed skin in 3D, drawn by PyVista in a process of its own.
+"""Pictures of the deformed skin in 3D, drawn by PyVista in a separate process.
 
-VTK ends the whole process where it finds neither a display nor EGL. So it draws in a child process; if that dies, the
-picture is drawn plainly with matplotlib instead and the caller is told why.
+VTK kills the whole process if it finds neither a display nor EGL. Therefore it is used in a child process. If that ends with an error, a
+simpler picture is drawn by matplotlib, and the caller gets the reason.
 """
 
 import subprocess
@@ -21,10 +21,15 @@ from twin.geometry.mesh import SensorMesh, skin_surface
 from twin.objects import ObjectField
 from twin.types import ContactState
 
+# Box of the sensor frame that the picture shows: x0, x1, y0, y1, z0, z1, mm.
 SCENE_BOUNDS_MM = (-24.0, 24.0, -24.0, 24.0, -2.0, 32.0)
+# Width and height of the picture, px.
 WINDOW_PX = (1100, 900)
+# Time after which the child process is ended, s.
 CHILD_TIMEOUT_S = 120
-CUT_NORMAL, CUT_ORIGIN = (0.0, -1.0, 0.0), (0.0, -0.01, 0.0)  # of the plane whose front is cut away, so that one sees the pins
+# Normal and a point (mm) of the plane whose front is cut away, so that the pins are visible.
+CUT_NORMAL, CUT_ORIGIN = (0.0, -1.0, 0.0), (0.0, -0.01, 0.0)
+# Advice in the message that VTK can't draw.
 REMEDY = "install libegl1 and libgl1 (apt-get install libegl1 libgl1) for shaded 3D pictures"
 
 
@@ -40,7 +45,7 @@ def pins_surface(pins: PinsSpec, state: ContactState) -> pv.PolyData:
     parts = []
     stem_end = state.caps_mm - state.axis * pins.cap_height_mm / 2
     for start, end, diameter_mm in (
-        (state.base_mm + 0.1 * (stem_end - state.base_mm), stem_end, pins.diameter_mm),  # just off the flat facets of the skin
+        (state.base_mm + 0.1 * (stem_end - state.base_mm), stem_end, pins.diameter_mm),  # begins slightly above the skin's flat facets
         (stem_end, state.caps_mm + state.axis * pins.cap_height_mm / 2, pins.cap_diameter_mm),
     ):
         count = len(start)
@@ -56,12 +61,12 @@ def draw_contact_skin(mesh: SensorMesh, pins: PinsSpec, state: ContactState, fie
 
 
 def draw_skin(skin: pv.PolyData, pins: pv.PolyData, touched: pv.PolyData, path: Path) -> str:
-    """Write a picture of the skin (coloured by ``displacement_mm``), cut open, with pins and object.
+    """Write a picture of the skin, coloured by ``displacement_mm`` and cut open, with pins and object.
 
     Returns
     -------
     str
-        "" if PyVista drew it, else the reason why it was drawn plainly.
+        "" if PyVista drew it, else the reason why matplotlib drew a simpler picture.
     """
     with tempfile.TemporaryDirectory() as folder:
         for name, surface in (("skin", skin), ("pins", pins), ("object", touched)):
@@ -73,7 +78,7 @@ def draw_skin(skin: pv.PolyData, pins: pv.PolyData, touched: pv.PolyData, path: 
 
 
 def probe_offscreen() -> str:
-    """Whether VTK can draw without a window on this machine: "" if so, else why not."""
+    """Empty if VTK can draw without a window on this machine, else the reason why not."""
     with tempfile.TemporaryDirectory() as folder:
         for name in ("skin", "pins", "object"):
             pv.Sphere().save(Path(folder) / f"{name}.vtp")
@@ -83,12 +88,12 @@ def probe_offscreen() -> str:
 def object_surface(
     distance: Callable[[np.ndarray], np.ndarray], T_sensor_object: np.ndarray, *, bounds_mm: Sequence[float], samples: int = 100
 ) -> pv.PolyData:
-    """The zero level of an object's signed distance inside a box of the sensor frame.
+    """The surface of an object inside a box of the sensor frame: the zero level of its signed distance.
 
     Parameters
     ----------
     distance : callable
-        (k, 3) points in the object frame, mm, to (k,) signed distances, mm.
+        Function from points (k, 3) in the object frame, mm, to signed distances (k,), mm.
     T_sensor_object : (4, 4) float
     bounds_mm : (6,) float
         x0, x1, y0, y1, z0, z1 of the box.
@@ -145,7 +150,7 @@ def _cut(surface: pv.PolyData) -> pv.PolyData:
 
 
 def _glow() -> ListedColormap:
-    """Inferno without its black end, which would vanish in the background."""
+    """Inferno without its black end, which can't be seen on the background."""
     return ListedColormap(colormaps["inferno"](np.linspace(0.22, 0.97, 256)))
 
 

@@ -1,4 +1,4 @@
-"""Tables: as CSV files for machines, and as the tables of a page."""
+"""Tables: CSV files, and the tables of a page."""
 
 import csv
 import io
@@ -20,25 +20,26 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Column:
-    """How the values of one key are shown.
+    """How the values of one key of the rows are shown.
 
     Attributes
     ----------
     key : str
-        Of the rows; a row without it has an empty value there.
-    title, unit : str
-        Of the heading.
+        Key of the rows; a row without it has an empty value.
+        title, unit : str
+            Text of the heading.
     digits : int
         Significant digits of the column's median.
     decimals : int, optional
-        Digits after the point instead.
-    signed : bool
-    best : {"", "least", "most"}
-        Which value is marked as the best.
-    scale : float
-        By which numbers are multiplied: 100 for a share that is shown in percent.
-    align : {"", "right"}
-        ``right`` for texts that are numbers, each with its own decimals.
+        Number of digits after the point instead.
+        signed : bool
+            Write a plus sign before positive numbers.
+        best : {"", "least", "most"}
+            Which value is marked as the best.
+        scale : float
+            Factor on the numbers: 100 for a share that is shown in percent.
+        align : {"", "right"}
+            ``right`` for texts that are numbers, each with its own number of decimals.
     """
 
     key: str
@@ -53,7 +54,7 @@ class Column:
 
     @classmethod
     def of(cls, key: str, *, unit: str = "", best: Literal["", "least", "most"] = "", digits: int = 3) -> "Column":
-        """A column titled by its key; the unit is taken from the key's end (``depth_mm``) unless it is given."""
+        """A column whose title is made from its key. The unit is the end of the key (``depth_mm``) unless it is given."""
         words = key.split("_")
         if not unit and len(words) > 1 and words[-1] in UNITS:
             unit = UNITS[words.pop()]
@@ -62,7 +63,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """A value of a row that carries more than itself.
+    """A value of a row with additional information.
 
     Attributes
     ----------
@@ -72,9 +73,9 @@ class Cell:
     note : str
         Small text below.
     bar : float, optional
-        Share in [0, 1], drawn as a bar below.
-    href : str
-        Address within the page.
+        Share in [0, 1] that is drawn as a bar below.
+        href : str
+            Address of a link within the page.
     """
 
     value: object
@@ -86,7 +87,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Head:
-    """A heading as it is shown."""
+    """A heading in the form that the template needs."""
 
     title: str
     unit: str
@@ -95,7 +96,7 @@ class Head:
 
 @dataclass(frozen=True)
 class Shown:
-    """A cell as it is shown; ``style`` holds its CSS classes."""
+    """A cell in the form that the template needs; ``style`` holds its CSS classes."""
 
     text: object
     number: bool
@@ -107,7 +108,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Table:
-    """A table as a page shows it: ``body`` has a row of cells for each row, one for each of ``heads``."""
+    """A table in the form that the template needs: ``body`` has a list of cells for each row, one for each of ``heads``."""
 
     heads: list[Head]
     body: list[list[Shown]]
@@ -122,7 +123,7 @@ def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption:
     rows : sequence of mappings
         Values by key: numbers, texts, None, or `Cell`.
     columns : sequence of Column or str
-        A key alone stands for ``Column.of(key)``.
+        A key is short for ``Column.of(key)``.
     caption : str
     """
     chosen = [entry if isinstance(entry, Column) else Column.of(entry) for entry in columns]
@@ -139,12 +140,12 @@ def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption:
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> Path:
-    """Rows of the same keys as CSV, numbers in full; the path."""
+    """Write rows with the same keys as CSV with full precision, and return the path."""
     return _write_csv(path, list(rows[0]), rows)
 
 
 def write_table(path: Path, rows: Sequence[Row]) -> Path:
-    """Rows as CSV for reading, numbers to six digits; a column of any row is a column of the table."""
+    """Write rows as readable CSV with six significant digits. The table has the columns of all rows. Returns the path."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     return _write_csv(path, columns, [{key: _plain(value) for key, value in row.items()} for row in rows])
 
@@ -176,5 +177,5 @@ def _best(values: list[object], best: str) -> set[int]:
 def _shown(cell: Cell, value: object, text: str, numeric: bool, best: bool) -> Shown:
     styles = [name for name, given in (("number", numeric), ("best", best), (cell.tone, bool(cell.tone))) if given]
     bar = None if cell.bar is None else round(100 * min(max(cell.bar, 0.0), 1.0))
-    shown = value if isinstance(value, str) else text  # marked-up text stays what it is
+    shown = value if isinstance(value, str) else text  # texts with markup are not changed
     return Shown(shown, numeric, " ".join(styles), cell.note, bar, cell.href)

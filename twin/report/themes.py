@@ -1,6 +1,6 @@
-"""The colours of pages and charts, for a light and a dark theme, and the stylesheet that is made of them.
+"""The colours of pages and charts for a light and a dark theme, and the stylesheet with these colours.
 
-Text colours have a contrast of at least 4.5:1 to every background of their theme, lines of charts at least 3:1 in both themes
+Text colours have a contrast of at least 4.5:1 to every background of their theme. Lines of charts have at least 3:1 in both themes
 (WCAG 2.1, success criteria 1.4.3 and 1.4.11).
 """
 
@@ -15,11 +15,11 @@ class Theme:
     Attributes
     ----------
     page, surface, tint : str
-        Backgrounds: of the page, of figures and tables, and of what is marked.
-    ink, muted, accent, good, bad : str
-        Text: usual, secondary, links, and values that meet their target or miss it.
-    line : str
-        Rules between rows, borders, the grid of a chart.
+        Backgrounds: of the page, of figures and tables, and of marked parts.
+        ink, muted, accent, good, bad : str
+            Text: normal, secondary, links, values that meet their target, values that miss it.
+        line : str
+            Rules between rows, borders, the grid of a chart.
     """
 
     page: str
@@ -36,14 +36,14 @@ class Theme:
 LIGHT = Theme("#f6f7f9", "#ffffff", "#e4eefa", "#1a222d", "#526070", "#0a58a8", "#0f6b3a", "#ad2118", "#d8dee6")
 DARK = Theme("#0f1419", "#161c23", "#1c2f45", "#e4e9ef", "#a1b0c0", "#82bbf7", "#62d296", "#ff9488", "#2c3744")
 
-# Series of a chart, in this order, the same in both themes. Any two differ by at least 20 (CIELAB) for readers with usual sight, for
-# protanopes and for deuteranopes: found by a random search among the colours with the contrast above.
+# Colours of the series of a chart in their order, the same in both themes. They were found by a random search among the colours with the
+# contrast above. Any two differ by at least 20 (CIELAB) for readers with normal colour vision, for protanopes and for deuteranopes.
 BLUE, RED, GREEN, PURPLE, OLIVE = "#0a7ff8", "#b73f2c", "#35956e", "#b355ac", "#a19200"
 SERIES = (BLUE, RED, GREEN, PURPLE, OLIVE)
 
 
 def stylesheet() -> str:
-    """CSS of every page: the themes' colours as variables, chosen by ``prefers-color-scheme``, and ``style.css``."""
+    """CSS of all pages: the colours of the themes as variables, which ``prefers-color-scheme`` chooses, and ``style.css``."""
     rules = resources.files(__package__).joinpath("style.css").read_text(encoding="utf-8")
     light, dark = (f":root {{ {_variables(theme)} }}" for theme in (LIGHT, DARK))
     return f":root {{ color-scheme: light dark; }}\n{light}\n@media (prefers-color-scheme: dark) {{ {dark} }}\n{rules}"

@@ -1,4 +1,4 @@
-"""Keeping results: files written whole or not at all, a cache, work that can be gone on with, and what code made it all."""
+"""Storage of results: files that are written whole or not at all, a cache, resumable work, and records of the code that made them."""
 
 from twin.store.atomic import (
     locked,

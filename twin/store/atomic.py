@@ -1,9 +1,9 @@
-"""The one place that writes results: a file is there whole, or as it was before.
+"""Writing of results. After any interruption a file is either complete, or as it was before.
 
-The content goes to a temporary file in the same folder, is flushed to the disk, and takes the file's name in one step. A
-process that is killed meanwhile leaves the old file as it was, and beside it a temporary file that ``remove_parts`` removes.
+The content is written to a temporary file in the same folder, flushed to the disk, and renamed in one step. If the process is killed
+before that, the old file is unchanged, and the temporary file stays until ``remove_parts`` removes it.
 
-`locked` holds a folder for one run at a time.
+`locked` reserves a folder for one run at a time.
 """
 
 import errno
@@ -23,9 +23,9 @@ from filelock import FileLock, Timeout
 from twin.errors import StoreError
 
 PART = ".part"
-"""End of a temporary file's name, which begins with a dot."""
+"""End of the name of a temporary file. The name begins with a dot."""
 LOCK = ".lock"
-"""Name of the file that the operating system's lock is on; it may stay behind."""
+"""Name of the file that is locked by the operating system. It may remain after the run."""
 
 _REMEDIES = {
     errno.ENOSPC: "free some space and give the same command again",
@@ -41,12 +41,12 @@ _ANY_REMEDY = "give another folder or free some space"
 
 
 def write_with(path: Path, fill: Callable[[BinaryIO], object]) -> Path:
-    """Write what ``fill`` puts into an open binary file; the path.
+    """Write the content that ``fill`` writes to an open binary file, and return the path.
 
     Raises
     ------
     StoreError
-        The file cannot be written: the disk is full, the folder is read-only or missing. What was there before is still there.
+        The file cannot be written: the disk is full, the folder is read-only or missing. An existing file is unchanged.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}{secrets.token_hex(4)}{PART}")
     try:
@@ -65,36 +65,39 @@ def write_with(path: Path, fill: Callable[[BinaryIO], object]) -> Path:
 
 
 def write_bytes(path: Path, data: bytes) -> Path:
-    """Write bytes; errors as of ``write_with``."""
+    """Write bytes; raises as ``write_with``."""
     return write_with(path, lambda file: file.write(data))
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write text as UTF-8, its line ends as they are; errors as of ``write_with``."""
-    return write_bytes(path, text.encode())
+    """Write text as UTF-8, its line ends as they are; errors as of ``write_with``.
+
+    Names of files that the locale can't decode are written with the bytes that they have on the disk.
+    """
+    return write_bytes(path, text.encode(errors="surrogateescape"))
 
 
 @contextmanager
 def text_file(path: Path) -> Iterator[io.StringIO]:
-    """A text to be filled within ``with``, and written when that ends without an error; errors as of ``write_with``."""
+    """Context that gives a text to write to. If the context ends without an error, the text is written; raises as ``write_with``."""
     text = io.StringIO(newline="")
     yield text
     write_text(path, text.getvalue())
 
 
 def write_json(path: Path, content: object, *, default: Callable[[object], object] | None = None) -> Path:
-    """Write JSON with indented lines; ``default`` as of ``json.dumps``, errors as of ``write_with``."""
+    """Write JSON with indented lines; ``default`` as in ``json.dumps``; raises as ``write_with``."""
     return write_text(path, json.dumps(content, indent=1, default=default) + "\n")
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = False) -> Path:
-    """Write arrays by name as ``np.load`` reads them; errors as of ``write_with``."""
+    """Write arrays by name in the format that ``np.load`` reads; raises as ``write_with``."""
     save: Callable[..., None] = np.savez_compressed if compressed else np.savez
     return write_with(path, lambda file: save(file, **arrays))
 
 
 def replace_folder(part: Path, path: Path) -> Path:
-    """Give a finished folder its name, in place of the folder that has it; the path.
+    """Rename a finished folder, which replaces an existing folder of that name. Returns the path.
 
     Raises
     ------
@@ -110,7 +113,7 @@ def replace_folder(part: Path, path: Path) -> Path:
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove the temporary files and folders that killed processes left in a folder which nobody else writes to now.
+    """Remove the temporary files and folders of killed processes. No other process may be writing to the folder.
 
     Raises
     ------
@@ -125,19 +128,19 @@ def remove_parts(folder: Path) -> None:
 
 
 def unwritten(path: Path, error: OSError) -> StoreError:
-    """The error to raise where a path can't be written: names the path, the reason and the remedy."""
+    """The error for a path that can't be written. It names the path, the reason and the remedy."""
     remedy = _REMEDIES.get(error.errno or 0, _ANY_REMEDY)
     return StoreError(f"{path}: can't be written ({error.strerror or error}); {remedy}")
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder (made if missing) for this run alone; a run that is killed lets go of it.
+    """Context that reserves a folder, made if missing, for this run. The lock of a killed run is released.
 
     Raises
     ------
     StoreError
-        Another run holds the folder, or it cannot be written to.
+        Another run has reserved the folder, or it cannot be written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

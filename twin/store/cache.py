@@ -1,49 +1,47 @@
-"""Arrays that are slow to compute, kept on disk between processes.
+"""A cache on disk of arrays that are slow to compute.
 
-Each entry is one file whose name is the hash of its key and of the code that computes it. A cache may fail, the work may not:
-whatever is wrong with the folder or a file, the arrays are computed, and one warning names the path. ``TACTIP_CACHE`` names
-another folder, or ``off`` for none.
+Each entry is one file, whose name is the hash of its key and of the code that computes it. A failure of the cache does not stop the work:
+if the folder or a file can't be used, the arrays are computed, and one warning names the path. The environment variable ``TACTIP_CACHE``
+names another folder, or is ``off`` for no cache.
 """
 
 import os
 import re
-import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import platformdirs
 
-from twin.errors import StoreError
+from twin.errors import StoreError, warn_once
 from twin.store.atomic import write_npz
 from twin.store.fingerprint import Maker, UnknownCodeError, fingerprint
 from twin.store.made import inputs_digest
 
 _VARIABLE = "TACTIP_CACHE"
-_FORMAT = 2  # raised whenever older files must not be read
-_LIMIT_BYTES = 1_000_000_000  # of all entries together; the longest unused go first
+_FORMAT = 2  # version of the files' format; it is increased if older files must not be read
+_LIMIT_BYTES = 1_000_000_000  # largest size of all entries together; entries that were unused longest are removed first
 _ENTRY = r"[\w-]+-[0-9a-f]{64}\.npz"
-_OURS = re.compile(rf"{_ENTRY}|\.{_ENTRY}\.\w+\.part")  # the folder may hold other things, which are left alone
+_OURS = re.compile(rf"{_ENTRY}|\.{_ENTRY}\.\w+\.part")  # other files in the folder are not touched
 
 
 def cached_arrays(
     kind: str, key: dict, compute: Callable[[], dict[str, np.ndarray]], *, code: tuple[Maker, ...] | None = None
 ) -> dict[str, np.ndarray]:
-    """The arrays of ``compute()``, from disk where they are kept.
+    """The arrays of ``compute()``. They are read from disk if they are stored there, else computed and stored.
 
     Parameters
     ----------
     kind : str
-        What the arrays are, in letters, digits and hyphens: a part of the file's name and of the key.
+        Name of the kind of arrays, of letters, digits and hyphens. It is part of the file's name and of the key.
     key : dict
         Every input that the arrays depend on, as ``inputs_digest`` takes it.
     compute : callable
-        Gives arrays by name; no array of objects. Its errors are the caller's, and nothing is kept then.
+        Returns arrays by name; arrays of objects are not allowed. Its errors are passed on, and nothing is stored then.
     code : tuple of functions, classes or names of modules, optional
-        The code that the arrays depend on: ``compute`` itself by default. Give it where ``compute`` lies in a module that imports
-        much more than it computes with.
+        The code that the arrays depend on; by default ``compute``. It should be given if the module of ``compute`` imports much that
+        does not affect the arrays.
 
     Returns
     -------
@@ -51,7 +49,7 @@ def cached_arrays(
 
     Notes
     -----
-    Arrays that other code computed are not taken. Where the code of ``compute`` can't be read, nothing is kept.
+    Arrays that other code computed are not used. If the code of ``compute`` can't be read, nothing is stored.
     """
     digest = inputs_digest(_FORMAT, kind, key)
     folder = cache_folder()
@@ -60,7 +58,7 @@ def cached_arrays(
     try:
         path = folder / f"{kind}-{inputs_digest(digest, fingerprint(*(code or (compute,))))}.npz"
     except UnknownCodeError as error:
-        _warn(str(error))
+        warn_once(str(error))
         return _arrays(compute)
     found = _read(path)
     if found is None:
@@ -70,7 +68,7 @@ def cached_arrays(
 
 
 def cache_folder() -> Path | None:
-    """Where entries are kept; None where the cache is off."""
+    """Folder of the entries; None if the cache is off."""
     chosen = os.environ.get(_VARIABLE, "")
     if chosen.lower() == "off":
         return None
@@ -91,15 +89,15 @@ def _read(path: Path) -> dict[str, np.ndarray] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except Exception as error:  # damaged bytes raise whatever zipfile and numpy run into; the file is written anew
-        _warn(f"{path}: not a readable cache entry ({error}); computed again")
+        warn_once(f"{path}: not a readable cache entry ({error}); computed again")
         return None
     with suppress(OSError):
-        os.utime(path)  # used now
+        os.utime(path)  # records the time of use
     return found
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Keep arrays; other processes see the whole file or none."""
+    """Store arrays. Other processes see the complete file or none."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_npz(path, arrays)
@@ -107,15 +105,15 @@ def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
     except (OSError, StoreError) as error:
         reason = error.__cause__ if isinstance(error, StoreError) else error
         why = getattr(reason, "strerror", None) or reason
-        _warn(f"{path.parent}: results can't be kept ({why}); set {_VARIABLE} to a writable folder, or to off")
+        warn_once(f"{path.parent}: results can't be kept ({why}); set {_VARIABLE} to a writable folder, or to off")
 
 
 def _make_room(folder: Path) -> None:
-    """Remove the longest unused entries above the limit; parts that a killed process left count as entries."""
+    """Remove the entries that were unused longest until the limit is met. Temporary files of killed processes count as entries."""
     entries = []
     for path in folder.iterdir():
         if _OURS.fullmatch(path.name):
-            with suppress(FileNotFoundError):  # another process was faster
+            with suppress(FileNotFoundError):  # another process has removed it
                 status = path.stat()
                 entries.append((status.st_mtime_ns, status.st_size, path))
     total = sum(size for _, size, _ in entries)
@@ -124,9 +122,3 @@ def _make_room(folder: Path) -> None:
             return
         path.unlink(missing_ok=True)
         total -= size
-
-
-@cache
-def _warn(message: str) -> None:
-    """Each message once in a process."""
-    warnings.warn(message, RuntimeWarning, stacklevel=4)

@@ -1,9 +1,9 @@
-"""What code made a result: the modules that a function imports, directly and through others, and the versions of its libraries.
+"""The code that made a result: all modules that a function imports directly or indirectly, and the versions of its libraries.
 
-The modules are followed from file to file by their import statements, also those within functions. A name that a package
-only passes on is followed to the module that defines it, so the package's other modules don't count. Of each module the
-syntax tree counts without docstrings; comments and formatting are not in it. So a changed formula is other code, and a
-changed explanation is not. The texts of the command line lie in ``twin.cli``, which nothing that computes imports.
+Modules are found by the import statements in their files, including those in functions. A name that a package re-exports is followed to
+the module that defines it, so the package's other modules don't count. The fingerprint of a module is that of its syntax tree without
+docstrings; comments and formatting are not in the tree. Therefore a changed formula changes the fingerprint, and a changed explanation
+does not. The texts of the command line are in ``twin.cli``, which no computing module imports.
 """
 
 import ast
@@ -22,8 +22,8 @@ from twin.errors import StoreError
 
 PACKAGES = ("scenes", "twin", "training", "hardware")
 ROOT = Path(__file__).parents[2]  # the folder that the packages lie in
-KEEPER = "twin.store"  # keeps results and has no part in making them
-LIBRARIES = {  # import name -> distribution, of those whose version may change a number
+KEEPER = "twin.store"  # package that does not count, because it stores results and does not compute them
+LIBRARIES = {  # import name -> distribution, for libraries whose version may change a result
     "cv2": "opencv-python-headless",
     "drjit": "drjit",
     "mitsuba": "mitsuba",
@@ -40,7 +40,7 @@ Maker = Callable[..., Any] | str  # a function, a class, or the name of a module
 
 
 class UnknownCodeError(StoreError):
-    """The source of a function can't be read: it was typed in, not written to a file."""
+    """The source of a function can't be read, because it was typed in and not read from a file."""
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,16 @@ class Code:
 
     @cached_property
     def fingerprint(self) -> str:
-        """One digest of all, 64 hexadecimal digits."""
+        """One digest of all modules and libraries, 64 hexadecimal digits."""
         lines = [f"{name} {of}\n" for part in (self.modules, self.libraries) for name, of in sorted(part.items())]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
     def record(self) -> dict[str, dict[str, str]]:
-        """As JSON holds it."""
+        """The code as a dict for JSON."""
         return {"modules": dict(sorted(self.modules.items())), "libraries": dict(sorted(self.libraries.items()))}
 
     def changes(self, record: Mapping[str, Mapping[str, str]]) -> list[str]:
-        """What differs from the code of a record, each in a few words; nothing where they are the same."""
+        """Differences from the code of a record, each in a few words; empty if there are none."""
         before, now = record.get("modules", {}), self.modules
         found = [f"{name} changed" for name in sorted(now) if name in before and before[name] != now[name]]
         found += [f"{name} is new" for name in sorted(now) if name not in before]
@@ -88,25 +88,26 @@ def fingerprint(*makers: Maker) -> str:
 
 
 def code_of(*makers: Maker, root: Path = ROOT) -> Code:
-    """The code behind functions, read once in a process.
+    """The code of functions. It is read once in a process.
 
     Parameters
     ----------
     makers : functions, classes or names of modules
-        Each stands for its module. ``functools.partial``, methods and callable instances stand for what they call.
+        For each the code is that of its module and of all that this imports. For ``functools.partial``, methods and callable instances it
+        is that of the called function.
     root : Path
-        Folder that the packages lie in.
+        Folder of the packages.
 
     Raises
     ------
     UnknownCodeError
-        The source of one can't be read.
+        The source of one of them can't be read.
     """
     return _code(root, tuple(sorted({_module_of(maker) for maker in makers})))
 
 
 def name_of(maker: Maker) -> str:
-    """Name of a function or class with its module; of a module its own."""
+    """Name of a function or class with its module, or name of a module."""
     maker = _called(maker)
     return maker if isinstance(maker, str) else f"{maker.__module__}.{maker.__qualname__}"
 
@@ -117,7 +118,7 @@ def _module_of(maker: Maker) -> str:
 
 
 def _called(maker: Maker) -> Maker:
-    """The function or class itself: what a partial or a decorated function calls, the class of a callable instance."""
+    """The function or class itself: the one that a partial or a decorated function calls, or the class of a callable instance."""
     while isinstance(maker, partial):
         maker = maker.func
     if isinstance(maker, str):
@@ -147,7 +148,7 @@ def _code(root: Path, starts: tuple[str, ...]) -> Code:
 
 
 def _file_of(root: Path, name: str) -> Path | None:
-    """Source of a module where the search starts, which may lie outside of the packages."""
+    """Source of a module at which the search starts. It may be outside of the packages."""
     if name.partition(".")[0] in PACKAGES:
         return _source(root, name)
     file = getattr(sys.modules.get(name), "__file__", None)
@@ -155,13 +156,13 @@ def _file_of(root: Path, name: str) -> Path | None:
 
 
 def _source(root: Path, name: str) -> Path | None:
-    """File of a module, or of a package's own code; None where there is none."""
+    """File of a module, or of a package's ``__init__``; None if there is none."""
     place = root.joinpath(*name.split("."))
     return next((file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()), None)
 
 
 def _resolved(root: Path, name: str, asked: str | None) -> list[str]:
-    """Modules that ``from name import asked`` (or ``import name``) takes code from."""
+    """Modules whose code ``from name import asked`` (or ``import name``) uses."""
     if name == KEEPER or name.startswith(f"{KEEPER}."):
         return []
     if asked is None or asked == "*":
@@ -177,7 +178,7 @@ def _resolved(root: Path, name: str, asked: str | None) -> list[str]:
 
 @dataclass(frozen=True)
 class _Module:
-    """One file: digest, what it imports as (module, name or None), and the names that it has from other modules."""
+    """One file: digest, imports as (module, name or None), and the names that it imports from other modules."""
 
     digest: str
     imports: tuple[_From, ...]
@@ -192,7 +193,7 @@ def source_text(file: Path) -> str:
 @cache
 def _read(root: Path, file: Path, name: str) -> _Module:
     collecting = gc.isenabled()
-    gc.disable()  # a syntax tree is many small objects: collecting among them doubles the time
+    gc.disable()  # a syntax tree has many small objects, and garbage collection would double the time
     try:
         tree = ast.parse(source_text(file))
         lines: list[str] = []
@@ -207,7 +208,7 @@ def _read(root: Path, file: Path, name: str) -> _Module:
 
 
 def _imports(tree: ast.Module, module: str, is_package: bool) -> tuple[tuple[_From, ...], dict[str, _From]]:
-    """Every import of a module, but those for a type checker alone; and its names that come from other modules."""
+    """All imports of a module, except those for a type checker alone, and the names that it imports from other modules."""
     found: dict[_From, None] = {}
     names: dict[str, _From] = {}
     waiting: list[ast.AST] = [tree]
@@ -231,7 +232,7 @@ def _imports(tree: ast.Module, module: str, is_package: bool) -> tuple[tuple[_Fr
 
 
 def _flatten(node: ast.AST, lines: list[str]) -> None:
-    """Append a syntax tree as text, without docstrings, places, and fields that are empty."""
+    """Append a syntax tree as text, without docstrings, line numbers and empty fields."""
     lines.append(f"({type(node).__name__}")
     body = getattr(node, "body", None)
     docstring = body[0] if isinstance(node, _DOCUMENTED) and body and _is_text(body[0]) else None
@@ -239,7 +240,7 @@ def _flatten(node: ast.AST, lines: list[str]) -> None:
         value = getattr(node, name, None)
         if isinstance(value, list):
             parts = [part for part in value if part is not docstring]
-            lines += [f" {name}["] if parts else []  # an empty list may be a field that only later versions of Python know
+            lines += [f" {name}["] if parts else []  # empty lists are left out, because later versions of Python have additional fields
             for part in parts:
                 if isinstance(part, ast.AST):
                     _flatten(part, lines)

@@ -1,4 +1,4 @@
-"""What made a result, as a small record that every output carries; and what went into it, as one digest."""
+"""The record that every output has of the code that made it, and the digest of its inputs."""
 
 import hashlib
 import json
@@ -17,23 +17,23 @@ PROGRAM = "tactip-twin"
 
 
 def inputs_digest(*inputs: object) -> str:
-    """Digest of inputs, 64 hexadecimal digits; the order of a dict's keys does not matter.
+    """Digest of inputs, 64 hexadecimal digits. It does not depend on the order of a dict's keys.
 
     Parameters
     ----------
     inputs : objects
-        What JSON can hold, bytes, arrays of numbers, specifications, dataclasses and paths, nested to any depth.
+        Values that JSON can hold, bytes, arrays of numbers, specifications, dataclasses and paths, nested to any depth.
 
     Raises
     ------
     TypeError
-        An input is of another kind.
+        An input has another type.
     """
     return hashlib.sha256(json.dumps(inputs, sort_keys=True, default=_plain).encode()).hexdigest()
 
 
 def _plain(value: object) -> object:
-    """A value that JSON cannot hold as something that it can."""
+    """A value that JSON can hold instead of one that it can't."""
     if isinstance(value, bytes):
         return {"sha256": hashlib.sha256(value).hexdigest()}
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
@@ -55,17 +55,16 @@ def made_by(*by: Maker, inputs: object = None, dated: bool = True) -> dict[str, 
     Parameters
     ----------
     by : functions, classes or names of modules
-        What made it; the first one gives the record its name.
-    inputs : object, optional
-        What it was made of, as ``inputs_digest`` takes it.
-    dated : bool
-        Whether the record has a date. False where the same work must leave the same bytes.
+        The code that made the result; the record has the name of the first one.
+        inputs : object, optional
+            The inputs of the result, as ``inputs_digest`` takes them.
+        dated : bool
+            Whether the record has a date. It must be False if the same work must give the same bytes.
 
     Returns
     -------
     dict of str to str
-        ``by`` (name), ``version`` (of the program), ``code`` (fingerprint), ``inputs`` (digest, where there are any) and ``date``
-        (UTC).
+        ``by`` (name), ``version`` (of the program), ``code`` (fingerprint), ``inputs`` (digest, if there are any) and ``date`` (UTC).
     """
     record = {"by": name_of(by[0]), "version": program_version(), "code": fingerprint(*by)}
     if inputs is not None:

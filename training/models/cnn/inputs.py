@@ -1,4 +1,4 @@
-"""What the convolutional networks see of frames: small grey images."""
+"""Inputs of the convolutional networks: small grey images of the frames."""
 
 from collections.abc import Callable
 
@@ -8,6 +8,7 @@ import torch
 
 from training.dataset import Dataset
 from training.models.cnn.network import INPUT_PX
+from training.pins import recording_key
 from twin.frames import open_recording
 from twin.frames.forms import gray_levels
 from twin.store import cached_arrays
@@ -33,15 +34,16 @@ class ImageInputs:
 
 
 def small_image(image: np.ndarray) -> np.ndarray:
-    """A frame as the convolutional networks see it: (128, 128) uint8."""
+    """The small grey image of a frame, (128, 128) uint8."""
     return cv2.resize(gray_levels(image), (INPUT_PX, INPUT_PX), interpolation=cv2.INTER_AREA)
 
 
 def image_inputs(dataset: Dataset, progress: Callable | None = None) -> ImageInputs:
-    """The frames of a data set, small, in its order."""
+    """Small images of a data set's frames, in the order of its rows."""
+
+    recording = open_recording(dataset.folder, dataset.pins.sensor, dataset.pins.form)
 
     def compute() -> dict[str, np.ndarray]:
-        recording = open_recording(dataset.folder, dataset.pins.sensor, dataset.pins.form)
         images = {}
         for frame in recording:
             images[frame.name] = small_image(frame.image)
@@ -49,5 +51,5 @@ def image_inputs(dataset: Dataset, progress: Callable | None = None) -> ImageInp
                 progress(frame.sequence + 1, len(recording))
         return {"images": np.stack([images[name] for name in dataset.pins.image_name])}
 
-    key = {"path": str(dataset.folder.resolve()), "names": dataset.pins.image_name.tolist(), "pins": dataset.pins.nodes_px.tobytes()}
-    return ImageInputs(cached_arrays("small-images", key | {"px": INPUT_PX}, compute)["images"])
+    key = recording_key(recording, dataset.pins.sensor) | {"rows": dataset.pins.image_name.tolist(), "px": INPUT_PX}
+    return ImageInputs(cached_arrays("small-images", key, compute)["images"])

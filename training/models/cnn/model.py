@@ -1,4 +1,4 @@
-"""The convolutional baselines as models: ``cnn-v1`` and ``cnn-v2``, which see the frame itself and no pins."""
+"""The convolutional baselines as models: ``cnn-v1`` and ``cnn-v2``. Their input is the frame itself, not the pins."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ class CnnModel(Model):
     Attributes
     ----------
     filters : int
-        Of each convolution.
+        Number of filters of each convolution.
     dense : tuple of int
         Units of the dense layers before the last one.
     """
@@ -35,6 +35,10 @@ class CnnModel(Model):
     def prepare(self, data: Dataset, train: np.ndarray) -> Prepared:
         """See ``Model``."""
         return Prepared(image_inputs(data))
+
+    def seen(self, data: Dataset) -> object:
+        """See ``Model``: the small images."""
+        return image_inputs(data).images.numpy()
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Cnn:
         """See ``Model``; there are no sizes."""
@@ -55,7 +59,7 @@ class CnnModel(Model):
         return trained.ensemble(image_inputs(data), torch.from_numpy(rows))
 
 
-# PoseNet's (Lepora 2020).
+# Settings of PoseNet (Lepora 2020).
 POSENET_RECIPE = Recipe(
     epochs=100, batch=16, rate=1e-4, schedule="constant", patience=10, decay=0.0, average=0.0, loss="l2", scaling="unit", members=1
 )

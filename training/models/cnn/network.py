@@ -1,19 +1,23 @@
 """The convolutional baselines: PoseNet (Lepora 2020) and the paper's smaller version of it.
 
-Five convolutions 3x3 with ELU and max-pooling, then dense layers with ELU and a little dropout, on frames
-resized to 128 x 128. ``cnn-v1``: 256 filters, dense 64 and the outputs. ``cnn-v2``: 48 filters and one more dense layer.
+Frames are resized to 128 x 128. Five 3x3 convolutions with ELU and max-pooling are followed by dense layers with ELU and a small dropout.
+``cnn-v1`` has 256 filters and one hidden dense layer of 64 units; ``cnn-v2`` has 48 filters and two such layers.
 
-The pooling stands before the ELU: as ELU is increasing, the maximum is the same, and a quarter of the values is left for it.
-With the channels last in memory ``cnn-v2`` then trains twice as fast on a processor as in the usual order.
+The pooling is done before the ELU. Because ELU is increasing, the maximum is the same, and ELU is computed for a quarter of the values
+only. The channels are last in memory: ``cnn-v2`` then trains twice as fast on a CPU as in the usual order.
 """
 
 import torch
 from torch import nn
 
+# Side of the network's input image, px.
 INPUT_PX = 128
+# Share of the dense layers' inputs that are set to 0 in training.
 DROPOUT = 0.06
+# Number of convolutions.
 LAYERS = 5
-L1, L2 = 6e-4, 1e-3  # of the dense weights, as PoseNet
+# Weights of the L1 and L2 penalties of the hidden dense layers' weights (PoseNet, Lepora 2020).
+L1, L2 = 6e-4, 1e-3
 
 
 class Cnn(nn.Module):
@@ -22,11 +26,11 @@ class Cnn(nn.Module):
     Parameters
     ----------
     filters : int
-        Of each convolution.
+        Number of filters of each convolution.
     dense : tuple of int
         Units of the dense layers before the last one.
     outputs : int
-        Labels K.
+        Number K of labels.
     """
 
     def __init__(self, filters: int, dense: tuple[int, ...], outputs: int) -> None:

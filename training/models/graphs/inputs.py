@@ -1,4 +1,4 @@
-"""What the paper's graph networks see of frames: a graph of its own for each, with places and areas as node features."""
+"""Inputs of the paper's graph networks: each frame has its own graph, with places and areas as node features."""
 
 import numpy as np
 import torch
@@ -7,7 +7,8 @@ from training.models.graphs.network import GraphRows, graph_rows
 from twin.pins.graph import knn_edges
 from twin.pins.voronoi import directed_edges, triangulate
 
-RELEASE_PX = 300.0  # side of the release's resized image, in whose px and px^2 its features are
+# Side in px of the resized image of the published code. The features are in px and px^2 of this image.
+RELEASE_PX = 300.0
 
 
 class GraphInputs:
@@ -19,7 +20,7 @@ class GraphInputs:
     edges : list of (E_k, 2) int arrays
         Directed edges of each of M graphs.
     symmetric : bool
-        Whether every edge is there in both directions.
+        Whether every edge is given in both directions.
     """
 
     def __init__(self, features: np.ndarray, edges: list[np.ndarray], *, symmetric: bool) -> None:
@@ -39,13 +40,13 @@ class GraphInputs:
 
 
 def frame_edges(kind: str, nodes_px: np.ndarray) -> np.ndarray:
-    """Directed edges (E, 2) of one frame: ``knn``, or ``delaunay`` (nearest neighbours where there are no triangles)."""
+    """Directed edges (E, 2) of one frame: ``knn``, or ``delaunay`` (nearest neighbours if the pins form no triangles)."""
     triangles = None if kind == "knn" else triangulate(nodes_px)
     return knn_edges(nodes_px) if triangles is None else directed_edges(triangles, len(nodes_px))
 
 
 def pixel_features(nodes_px: np.ndarray, area_px2: np.ndarray | None, width_px: int) -> np.ndarray:
-    """Features (M, N, 2 or 3) as published: x, y about their medians in px of the release's image, and the area (px^2)."""
+    """Features (M, N, 2 or 3) as published: x and y from their medians in px of the published code's image, and the area (px^2)."""
     scale = RELEASE_PX / width_px
     centred = scale * (nodes_px - np.median(nodes_px, axis=1, keepdims=True))
     return centred if area_px2 is None else np.concatenate([centred, scale**2 * area_px2[..., None]], axis=-1)

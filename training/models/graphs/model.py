@@ -15,14 +15,14 @@ from twin.pins.reference import Reference
 
 @dataclass(frozen=True, kw_only=True)
 class GraphModel(PinModel):
-    """A graph network on a graph of its own for every frame.
+    """A graph network in which each frame has its own graph.
 
     Attributes
     ----------
     edges : {"knn", "delaunay"}
-        Nearest neighbours, with x and y at the nodes; or Delaunay's, with x, y and the Voronoi area.
-    dense : {"paper", "release"}
-        The dense layers, as the paper states them or as the published code has them.
+        Edges between nearest neighbours, with the node features x and y; or Delaunay's, with x, y and the Voronoi area.
+        dense : {"paper", "release"}
+            Dense layers as the paper states them, or as in the published code.
     """
 
     edges: Literal["knn", "delaunay"]
@@ -34,7 +34,7 @@ class GraphModel(PinModel):
         return Gcn(3 if self._sees_areas else 2, outputs, self.dense)
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> GraphInputs:
-        """See ``PinModel``; nothing is learnt beforehand, and where the camera sits is not asked."""
+        """See ``PinModel``. Nothing is learnt before training, and the camera's place is not corrected."""
         width_px = frame_size(pins.sensor, pins.form)[0]
         features = pixel_features(pins.nodes_px, pins.area_px2 if self._sees_areas else None, width_px)
         edges = [frame_edges(self.edges, nodes_px) for nodes_px in pins.nodes_px]
@@ -45,7 +45,8 @@ class GraphModel(PinModel):
         return self.edges == "delaunay"
 
 
-# Where the paper says nothing: the release's settings with smaller batches, so more steps, that end at a rate of 0.
+# Settings that the paper does not state are those of the published code, with two changes: the batches are smaller, so that there are
+# more steps, and the learning rate falls to 0.
 PAPER_RECIPE = Recipe(epochs=150, batch=128, rate=2e-3, schedule="cosine", decay=0.0, average=0.0, scaling="none", members=1)
 RELEASE_RECIPE = replace(PAPER_RECIPE, epochs=200, batch=512, rate=1.5e-3, schedule="plateau", patience=30)
 

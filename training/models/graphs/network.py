@@ -1,8 +1,9 @@
-"""The paper's graph networks: five graph convolutions over a graph of its own for every frame, pooling, three dense layers.
+"""The paper's graph networks: five graph convolutions over each frame's own graph, pooling, three dense layers.
 
-A graph convolution (Kipf and Welling 2017) is ``D^-1/2 (A + I) D^-1/2 X W``. Averaging comes first and ``W`` second, which
-gives the same and costs less, as channels only grow here. Where paper and release differ, both are variants: the paper's
-dense units 96, 64, 2; the release's 128, 96, 2, the first two with batch norm.
+A graph convolution (Kipf and Welling 2017) is ``D^-1/2 (A + I) D^-1/2 X W``. Here averaging is done before the product with ``W``. The
+result is the same, and it costs less because each layer has at least as many output channels as input channels. Where the paper and
+the published code ("release") differ, both are variants: the paper's dense layers have 96, 64 and 2 units; the release's have 128, 96
+and 2, the first two with batch norm.
 """
 
 import warnings
@@ -15,19 +16,20 @@ from torch import nn
 
 CHANNELS = (16, 32, 48, 64, 96)
 DENSE = {"paper": (96, 64), "release": (128, 96)}
-SLOPE = 0.01  # of the leaky ReLU below 0
+# Slope of the leaky ReLU for negative inputs.
+SLOPE = 0.01
 
 
 @dataclass(frozen=True)
 class GraphRows:
-    """Normalised adjacency of M graphs of N nodes, row by row, and its transpose.
+    """Normalised adjacency, or its transpose, of M graphs of N nodes as sparse rows.
 
     Attributes
     ----------
     start : (M, N + 1) int32
-        Where each node's entries begin, counted from the graph's first one.
-    first : (M + 1,) int64
-        Where each graph's entries begin in ``column`` and ``weight``.
+        Index of each node's first entry, counted from the graph's first entry.
+        first : (M + 1,) int64
+            Index of each graph's first entry in ``column`` and ``weight``.
     column : (nnz,) int16
     weight : (nnz,) float32
     """
@@ -54,9 +56,10 @@ class GraphRows:
 
 
 def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False) -> GraphRows:
-    """Normalise the directed edges (E_k, 2), source and target, of graphs of ``nodes`` nodes each; every node gets a loop.
+    """Normalise the directed edges (E_k, 2), source and target, of graphs of ``nodes`` nodes each. A loop is added to every node.
 
-    A row holds the in-edges of a node, with ``1 / sqrt(d_i d_j)``, d the in-degrees with loop; transposed, its out-edges.
+    A row holds the in-edges of a node (``transposed``: its out-edges) with the weights ``1 / sqrt(d_i d_j)``, d being the in-degree
+    including the loop.
     """
     starts, columns, weights = [], [], []
     loop = np.arange(nodes)
@@ -77,15 +80,15 @@ def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False)
 class GraphConvolution(torch.autograd.Function):
     """``leaky_relu(batch_norm(A h W^T))`` in training, with the statistics of the batch (Ioffe and Szegedy 2015).
 
-    The norm is linear once its statistics are known, and they follow from the mean and the covariance S of ``a = A h``:
-    output channel c has the mean ``W_c m`` and the variance ``W_c S W_c^T``. So norm and weights are one product with
-    ``K W``, ``K = diag(gain / deviation)``, and no pass over the wider output is needed. A bias before the norm would
-    cancel and is left out. The way back is the derivative of the same formulas, with the transpose of A at hand.
+    The statistics of the norm follow from the mean m and the covariance S of ``a = A h``: output channel c has the mean ``W_c m`` and
+    the variance ``W_c S W_c^T``. With these the norm is linear. Therefore norm and weights are one product with ``K W``,
+    ``K = diag(gain / deviation)``, and no pass over the wider output is needed. A bias before the norm would cancel, so there is none.
+    ``backward`` is the derivative of the same formulas and uses the transpose of A.
     """
 
     @staticmethod
     def forward(
-        ctx: Any,  # PyTorch declares no type that holds what is kept here
+        ctx: Any,  # PyTorch declares no type for an object with these attributes
         matrix: torch.Tensor,
         transpose: torch.Tensor,
         h: torch.Tensor,
@@ -94,7 +97,7 @@ class GraphConvolution(torch.autograd.Function):
         offset: torch.Tensor,
         eps: float,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Activations (V, D) of the nodes of all graphs, and mean and variance (D,) of what the norm saw.
+        """Activations (V, D) of the nodes of all graphs, and mean and variance (D,) of the norm's inputs.
 
         Parameters
         ----------
@@ -103,9 +106,9 @@ class GraphConvolution(torch.autograd.Function):
         h : (V, C) float
         weight : (D, C) float
         gain, offset : (D,) float
-            Of the norm.
-        eps : float
-            Added to the variance.
+            Parameters of the norm.
+            eps : float
+                Added to the variance, so that a constant channel does not lead to a division by 0.
         """
         around = _product(matrix, h)
         mean = around.mean(dim=0)
@@ -126,7 +129,7 @@ class GraphConvolution(torch.autograd.Function):
         """Derivatives with respect to the arguments of ``forward``, from those with respect to its activations (V, D)."""
         around, out, weight, gain, spread, inverse = ctx.saved_tensors
         size = gain * inverse
-        of_norm = torch.ops.aten.leaky_relu_backward(gradient, out, SLOPE, True)  # of the norm's output
+        of_norm = torch.ops.aten.leaky_relu_backward(gradient, out, SLOPE, True)  # derivatives by the norm's output
         of_offset = (of_norm.new_ones(1, len(of_norm)) @ of_norm)[0]
         pull = of_norm.T @ around
         of_gain = (pull * weight).sum(dim=1) * inverse
@@ -141,7 +144,7 @@ class GraphConvolution(torch.autograd.Function):
 
 
 def _product(matrix: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """Sparse times dense, written straight to where it belongs (``@`` would fill that with zeros and copy it first)."""
+    """Product of a sparse and a dense matrix, written directly to the result (``@`` would first fill the result with zeros and copy it)."""
     out = x.new_empty(matrix.shape[0], x.shape[1])
     return torch.addmm(out, matrix, x, beta=0, out=out)
 

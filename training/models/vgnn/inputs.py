@@ -1,4 +1,4 @@
-"""What ``vgnn`` sees of frames: every pin's displacement and area, the camera's own displacement taken out."""
+"""Inputs of ``vgnn``: every pin's displacement and area, with the camera's own displacement subtracted."""
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ class PinInputs:
     features : (M, N, 3) float
     lost : (M, N) bool
     displaced : (M,) float, optional
-        Part of a frame's difference from the expected camera that was taken out, 0 to 1; none if left out.
+        Share, 0 to 1, of each frame's difference from the expected camera that was taken out; 0 for all frames if not given.
     """
 
     def __init__(self, features: np.ndarray, lost: np.ndarray, displaced: np.ndarray | None = None) -> None:
@@ -32,7 +32,7 @@ class PinInputs:
 
 
 def pin_features(nodes_px: np.ndarray, area_px2: np.ndarray, reference: Reference) -> np.ndarray:
-    """Features (M, N, 3) of matched pins: displacement from rest in mean rest spacings, logarithm of area over rest area."""
+    """Features (M, N, 3) of matched pins: displacement from rest in mean rest spacings, logarithm of the ratio of area to rest area."""
     moved = (nodes_px - reference.pins_px) / reference.spacing_px.mean()
     return np.concatenate([moved, np.log(area_px2 / reference.area_px2)[..., None]], axis=-1)
 
@@ -40,7 +40,7 @@ def pin_features(nodes_px: np.ndarray, area_px2: np.ndarray, reference: Referenc
 def filled(
     registration: Registration, nodes_px: np.ndarray, area_px2: np.ndarray, lost: np.ndarray, reference: Reference
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pins (M, N, 2) and areas (M, N) with lost pins (M, N) where the others' modes put them."""
+    """Pins (M, N, 2) and areas (M, N). A lost pin (M, N) is placed by the modes of the other pins' displacements."""
     nodes_px, area_px2 = nodes_px.copy(), area_px2.copy()
     for k in np.flatnonzero(lost.any(axis=1)):
         nodes_px[k] = registration.fill(nodes_px[k], lost[k])
@@ -57,6 +57,6 @@ def seated_inputs(
     *,
     together: bool = False,
 ) -> PinInputs:
-    """Inputs of frames (see ``filled``) whose camera displacement is taken out; ``together`` as in ``Registration``."""
+    """Inputs of frames (see ``filled``) with the camera's displacement taken out; ``together`` as in ``Registration``."""
     nodes, area, _, share = registration(nodes_px, area_px2, together=together)
     return PinInputs(pin_features(nodes, area, reference), lost, share)

@@ -1,4 +1,4 @@
-"""``vgnn``, our model: pins matched to the layout at rest, a graph network and pin modes, a Gaussian process beside them."""
+"""``vgnn``, our model: pins matched to the layout at rest, a graph network with pin modes, and a Gaussian process of the modes."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -17,9 +17,10 @@ from training.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 from twin.pins.voronoi import directed_edges, triangulate
 
-PROCESS_MODES = 30  # of the displacement, which the Gaussian process sees beside all modes of the areas: the finer ones are noise to it
-# Buffers that are made anew from the pins. The waves are not: those of equal frequency are any basis, and another linear algebra
-# library chooses another one.
+# Number of modes of the displacement that are inputs of the Gaussian process, with all modes of the areas. Finer modes are noise to it.
+PROCESS_MODES = 30
+# Buffers that a small copy leaves out, because they follow from the pins. The waves are kept: waves of equal frequency can be any
+# basis of their space, and another linear algebra library would choose another one.
 DERIVED = ("adjacency", "smoothing")
 
 
@@ -39,9 +40,9 @@ class VgnnModel(PinModel):
         return Vgnn(np.asarray(edges), len(reference.pins_px), outputs, VgnnSize(**size))
 
     def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:
-        """See ``Model``: the camera's displacement is learnt from the training rows.
+        """See ``Model``. How a contact changes a frame's similarity to the layout at rest is learnt from the training rows.
 
-        In view 1 all of a frame's difference from the expected camera is taken out, as if the camera sat elsewhere.
+        In view 1 the whole difference of each frame from the expected camera is taken out, as for a camera that sits elsewhere.
         """
         registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
         nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
@@ -54,7 +55,7 @@ class VgnnModel(PinModel):
         return Prepared(inputs, {"registration": registration.arrays()}, views=2)
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> PinInputs:
-        """See ``PinModel``; where a no-contact frame told where the camera sits, nothing of it has to be guessed."""
+        """See ``PinModel``. If a frame without contact shows where the camera sits, no displacement of the camera is estimated."""
         registration = Registration(**learnt["registration"])
         pins = pins.seen_from(reference) if pins.measured else pins
         nodes_px, area_px2 = filled(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
@@ -63,11 +64,11 @@ class VgnnModel(PinModel):
         return seated_inputs(registration, nodes_px, area_px2, pins.lost, reference, together=together)
 
     def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> None:
-        """See ``Model``: feature scales and pin modes."""
+        """See ``Model``. Sets the scales of the features and the pin modes."""
         cast(Vgnn, network).prepare(cast(PinInputs, inputs).x[rows])
 
     def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
-        """See ``Model``: the first modes of the displacement and those of the areas."""
+        """See ``Model``. The inputs are the first modes of the displacement and all modes of the areas."""
         vgnn, pins = cast(Vgnn, network), cast(PinInputs, inputs)
         with torch.no_grad():
             amplitudes = vgnn.amplitudes(vgnn.known(*pins.batch(rows))).double().numpy()
@@ -76,7 +77,7 @@ class VgnnModel(PinModel):
         return Modes(seen, pins.displaced[rows].numpy())
 
     def pack(self, weights: Weights) -> Weights:
-        """See ``Model``: without what the pins' graph tells, and without attention between pins that are no neighbours."""
+        """See ``Model``. Leaves out what follows from the pins' graph, and attention between pins that are not neighbours."""
         kept = {key: value for key, value in weights.items() if key not in DERIVED}
         if "attention" in kept:
             kept["attention"] = kept["attention"][weights["adjacency"] > 0]

@@ -1,15 +1,15 @@
-"""Our network: a Voronoi graph network on what every pin does, read out pin by pin.
+"""Our network: a graph network on the displacement and the Voronoi area of every pin.
 
-Pins have a stable order, so a frame is a dense array over the one Delaunay graph of the layout at rest, and averaging over
-neighbours is one product with a fixed (N, N) matrix. Each node's features are its displacement (in rest spacings) and the
-logarithm of its Voronoi cell's area over the area at rest. Two branches meet:
+Pins have a fixed order. Therefore all frames are dense arrays over one graph, the Delaunay graph of the layout at rest, and averaging
+over neighbours is one product with a fixed (N, N) matrix. Each node's features are its displacement (in rest spacings) and the
+logarithm of the ratio of its Voronoi cell's area to the area at rest. There are two branches:
 
-- graph: layers ``h + silu(h U + (A h) W + e)`` with A the attention-weighted mean over neighbours, e an embedding of the pin;
-  pooled with the graph's smoothest Laplacian eigenvectors instead of a mean over the pins, which would forget where things happen;
+- graph: layers ``h + silu(h U + (A h) W + e)``, where A is the attention-weighted mean over neighbours and e an embedding of the pin.
+  They are pooled with the graph's smoothest Laplacian eigenvectors, because a mean over the pins would lose where something happens;
 - modes: the amplitudes of the principal components of all displacements, and of the areas averaged over neighbours.
 
-A multi-layer perceptron with skip connections turns both into the labels, the logarithm of each one's error scale, and the
-logit that the shear move was executed.
+From both branches a multi-layer perceptron with skip connections computes the labels, the logarithm of each label's error scale, and the
+logit of the probability that the shear move was executed.
 """
 
 from dataclasses import dataclass
@@ -21,13 +21,15 @@ from torch import nn
 
 from training.models.vgnn.registration import spanned
 
-FEATURES = 3  # dx, dy, log area ratio
+# Features of a node: dx, dy and the logarithm of the area ratio.
+FEATURES = 3
+# Penalty of the least-squares fit of modes by which lost pins are filled in.
 FILL_RIDGE = 1e-3
 
 
 @dataclass(frozen=True)
 class VgnnSize:
-    """Sizes of the network; ``layers`` 0 leaves the graph branch out, ``modes`` 0 the other."""
+    """Sizes of the network. There is no graph branch if ``layers`` is 0, and no modes branch if ``modes`` and ``area_modes`` are 0."""
 
     channels: int = 6
     layers: int = 1
@@ -44,14 +46,14 @@ class Vgnn(nn.Module):
     Parameters
     ----------
     edges : (E, 2) int
-        Directed edges of the rest layout, both directions.
+        Directed edges of the layout at rest, in both directions.
     pins : int
-        N.
-    outputs : int
-        Labels K.
+        Number N of pins.
+        outputs : int
+            Number K of labels.
     """
 
-    adjacency: torch.Tensor  # (N, N) 1 where the column's pin is a neighbour of the row's
+    adjacency: torch.Tensor  # (N, N) 1 if the column's pin is a neighbour of the row's pin, else 0
     scale: torch.Tensor  # (FEATURES,) deviation of each feature
     smoothing: torch.Tensor  # (N, N) mean over a pin and its neighbours
     components: torch.Tensor  # (2 N, modes)
@@ -90,7 +92,7 @@ class Vgnn(nn.Module):
         self.head = nn.Linear(size.width, 2 * outputs + 1)
 
     def prepare(self, x: torch.Tensor) -> None:
-        """Take feature scales and principal components from training features (M, N, F) of frames without lost pins."""
+        """Set the scales of the features and the principal components from training features (M, N, F) of frames without lost pins."""
         self.scale.copy_(x.flatten(0, 1).std(dim=0).clamp(min=1e-6))
         for flat, mean, components in zip(
             self._modal(x), (self.mode_mean, self.area_mean), (self.components, self.area_components), strict=True
@@ -106,7 +108,7 @@ class Vgnn(nn.Module):
         ----------
         x : (B, N, F) float
         lost : (B, N) bool, optional
-            Pins whose features are not to be used; each takes the mean of its neighbours.
+            Pins whose features are unknown. They are filled in: see ``known``.
 
         Returns
         -------
@@ -130,7 +132,7 @@ class Vgnn(nn.Module):
         return {"mean": out[:, :k] + self.linear(z), "log_scale": out[:, k : 2 * k], "executed": out[:, 2 * k], "embedding": h}
 
     def known(self, x: torch.Tensor, lost: torch.Tensor | None) -> torch.Tensor:
-        """Features with those of lost pins filled in: displacement from the modes that the other pins show, area from neighbours."""
+        """Features with those of lost pins filled in: the displacement by the modes of the other pins, the area by the neighbours."""
         if lost is None or not bool(lost.any()):
             return x
         x = fill_lost(x, lost, self.adjacency)
@@ -139,7 +141,7 @@ class Vgnn(nn.Module):
         return x
 
     def _fill_by_modes(self, moved: torch.Tensor, lost: torch.Tensor) -> torch.Tensor:
-        """Displacements (N, 2) whose lost rows continue the known ones' least-squares modes."""
+        """Displacements (N, 2) whose lost rows follow from the modes that fit the known rows best (least squares)."""
         length = self.components.norm(dim=0)
         directions = self.components[:, length > 0] / length[length > 0]
         away = moved.flatten() / self.scale[0] - self.mode_mean
@@ -158,7 +160,7 @@ class Vgnn(nn.Module):
         return x[..., :2].flatten(1) / self.scale[0], x[..., 2] @ self.smoothing.T / self.scale[2]
 
     def graph(self, x: torch.Tensor) -> torch.Tensor:
-        """Node states (N, B, C) after all graph layers; nodes come first, so that averaging is one matrix product."""
+        """Node states (N, B, C) after all graph layers. Nodes are the first axis, so that averaging is one matrix product."""
         weights = self.neighbour_weights()
         h = x.transpose(0, 1).contiguous()
         for k, (layer, embedding) in enumerate(zip(self.layers, self.embedding, strict=True)):
@@ -168,7 +170,7 @@ class Vgnn(nn.Module):
         return h
 
     def neighbour_weights(self) -> torch.Tensor:
-        """Attention (N, N) of each pin on its neighbours, rows summing to 1; computed once while nothing is learnt."""
+        """Attention (N, N) of each pin to its neighbours; each row sums to 1. In evaluation mode it is computed once."""
         if self.training or self._weights is None:
             weights = torch.softmax(self.attention.masked_fill(self.adjacency == 0, -torch.inf), dim=1)
             if self.training:
@@ -183,7 +185,7 @@ class Vgnn(nn.Module):
 
 
 def fill_lost(x: torch.Tensor, lost: torch.Tensor, adjacency: torch.Tensor) -> torch.Tensor:
-    """Features (B, N, F) with those of lost pins replaced by the mean over their known neighbours, from the edge of a gap inwards."""
+    """Features (B, N, F) with those of lost pins replaced by the mean over known neighbours. A gap is filled from its edge inwards."""
     known = (~lost).to(x.dtype)[..., None]
     x = torch.where(lost[..., None], 0.0, x)
     while bool((known == 0).any()):
@@ -197,9 +199,10 @@ def fill_lost(x: torch.Tensor, lost: torch.Tensor, adjacency: torch.Tensor) -> t
 
 
 def mode_components(centred: torch.Tensor, count: int) -> torch.Tensor:
-    """Principal directions (D, count) of rows (M, D), so scaled that mode k has the deviation 3 sqrt(s_k / s_0).
+    """Principal directions (D, count) of rows (M, D), scaled so that mode k has the standard deviation 3 sqrt(s_k / s_0).
 
-    The square root keeps small modes, which carry the finer facts, within a network's reach. Missing modes are 0.
+    s_k are the singular values. The square root makes small modes, which carry finer detail, large enough for a network. Missing modes
+    are 0.
     """
     _, sizes, directions = torch.linalg.svd(centred.double(), full_matrices=False)
     keep = spanned(sizes.numpy(), count)
@@ -210,7 +213,7 @@ def mode_components(centred: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def laplacian_waves(adjacency: torch.Tensor, count: int) -> torch.Tensor:
-    """The graph's ``count`` smoothest waves (N, count), of mean square 1/N: eigenvectors of its normalised Laplacian."""
+    """The graph's ``count`` smoothest waves (N, count): eigenvectors of its normalised Laplacian, with a mean square of 1/N."""
     root = adjacency.sum(dim=1).clamp(min=1).rsqrt().double()
     laplacian = torch.eye(len(adjacency), dtype=torch.float64) - root[:, None] * adjacency.double() * root
     waves = torch.linalg.eigh(laplacian)[1][:, :count]

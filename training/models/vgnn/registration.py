@@ -1,33 +1,44 @@
-"""Whether the camera sits where it sat in training: a frame that is displaced, turned or scaled as a whole, told from contact.
+"""Registration: is a frame shifted, turned or scaled as a whole because the camera sits elsewhere than in training, or by contact?
 
-Contact moves the pins too, but not freely. The best similarity (shift, turn, scale) is taken out of the pins; what is left of their
-displacement tells how large that similarity has to be. Where the observed similarity differs from the expected one by far more than it
-ever does in training, the difference comes from the camera, and it is taken out of the frame. All frames of one recording share a camera:
-there the median over many frames tells its displacement far better than one frame can.
+A contact also changes the similarity (shift, turn, scale) between the pins and their layout at rest, but not independently of the other
+displacements. The best similarity is taken out of the pins, and the expected similarity is predicted from the displacements that are
+left. If the observed similarity differs from the expected one by far more than in training, the difference comes from the camera and is
+taken out of the frame. All frames of one recording are of one camera, so the median over many frames gives its displacement much more
+precisely than one frame.
 
-Taking the difference out also removes a little of the contact. A model that also learns from training frames with the whole difference
-taken out knows such frames, and loses little on them.
+Taking the difference out also removes a small part of the contact. Therefore a model is also trained on frames with the whole difference
+taken out, and loses little accuracy on such frames.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-MODES = 40  # modes of what the similarity leaves, that the expected similarity depends on
-SQUARED = 20  # the first modes, whose products it depends on too
-RIDGE = 0.1  # penalty of the least-squares fit, in modes of unit deviation
-LEAST_SIZE = 1e-5  # of a kept mode, relative to the largest; features are in single precision, rounded to 1e-7 of their size
-FILL_RIDGE = 1e-3  # penalty of the modes that lost pins are filled in by
-FILL_ROUNDS = 3  # rounds of filling in: the similarity changes with the pins that were filled in
-MANY = 30  # frames, from which on their median difference tells where their common camera sits
-COMMON = 1.5  # median difference, in usual differences, above which it is taken for the camera's
-FREE = 6.0  # difference of a frame, in usual differences, up to which nothing is taken out
-FULL = 9.0  # difference of a frame, in usual differences, from which on all of it is taken out
+# Number of modes of the displacements without their similarity, from which the expected similarity is predicted.
+MODES = 40
+# Number of the first modes whose products are also used for the prediction.
+SQUARED = 20
+# Penalty of the least-squares fit of the prediction, for modes scaled to a standard deviation of 1.
+RIDGE = 0.1
+# Least size of a mode relative to the largest. Features are in single precision, with a relative rounding error of 1e-7.
+LEAST_SIZE = 1e-5
+# Penalty of the least-squares fit of modes by which lost pins are filled in.
+FILL_RIDGE = 1e-3
+# Rounds of filling in. There are several, because the similarity changes with the pins that were filled in.
+FILL_ROUNDS = 3
+# Number of frames from which on the median of their differences is used as the difference of their common camera.
+MANY = 30
+# Median difference, relative to the usual one, above which the camera is taken to be displaced.
+COMMON = 1.5
+# Difference of a single frame, relative to the usual one, up to which nothing is taken out.
+FREE = 6.0
+# Difference of a single frame, relative to the usual one, from which on the whole difference is taken out.
+FULL = 9.0
 
 
 @dataclass(frozen=True)
 class Registration:
-    """The expected similarity of a frame as a quadratic function of what the similarity leaves.
+    """The expected similarity of a frame, as a quadratic function of the displacements without their similarity.
 
     Attributes
     ----------
@@ -35,9 +46,9 @@ class Registration:
     mean : (2 N,) float
     components : (2 N, m) float
     weight : (q, 4) float
-        To log scale, turn (rad), shift x and y (px).
-    usual : (4,) float
-        Root mean square difference between observed and expected similarity, each training frame left out of the fit in turn.
+        Coefficients for the logarithm of scale, turn (rad), shift in x and y (px).
+        usual : (4,) float
+            Root mean square difference between observed and expected similarity; the fit that predicts a training frame leaves it out.
     """
 
     rest_px: np.ndarray
@@ -47,7 +58,7 @@ class Registration:
     usual: np.ndarray
 
     def __call__(self, nodes_px: np.ndarray, area_px2: np.ndarray, *, together: bool = False) -> tuple:
-        """Frames with the camera's part taken out.
+        """Take the camera's displacement out of frames.
 
         Parameters
         ----------
@@ -59,11 +70,11 @@ class Registration:
         Returns
         -------
         nodes_px, area_px2
-            As given where the camera sits as in training.
-        taken : (M, 4) float
-            Log scale, turn (rad), shift (px) taken out.
-        share : (M,) float
-            Part of the frame's own difference that was taken out, 0 to 1.
+            Unchanged if the camera sits as in training.
+            taken : (M, 4) float
+                What was taken out: logarithm of scale, turn (rad), shift (px).
+            share : (M,) float
+                Share of the frame's own difference that was taken out, 0 to 1.
         """
         difference = self.difference(nodes_px)
         common = np.zeros(4)
@@ -83,12 +94,12 @@ class Registration:
         return np.stack([z.real, z.imag], axis=-1) + middle, area_px2 * np.exp(-2 * taken[:, :1])
 
     def fill(self, nodes_px: np.ndarray, lost: np.ndarray) -> np.ndarray:
-        """One frame's pins (N, 2); each lost pin (N,) is put where the modes of the others' displacements place it."""
+        """One frame's pins (N, 2), in which each lost pin (N,) is placed by the modes of the other pins' displacements."""
         directions = self.components / np.maximum(np.linalg.norm(self.components, axis=0), 1e-12)
         known = np.repeat(~lost, 2)
         normal = directions[known].T @ directions[known] + FILL_RIDGE * np.eye(directions.shape[1])
         middle = self.rest_px.mean(axis=0)
-        for _ in range(FILL_ROUNDS):  # the similarity sees the pins that were filled in before
+        for _ in range(FILL_ROUNDS):  # the similarity depends on the pins that the round before filled in
             aligned, similarity = align(nodes_px[None], self.rest_px)
             away = aligned.ravel() - self.mean
             found = self.mean + directions @ np.linalg.solve(normal, directions[known].T @ away[known])
@@ -98,7 +109,7 @@ class Registration:
         return nodes_px
 
     def difference(self, nodes_px: np.ndarray) -> np.ndarray:
-        """Differences (M, 4) between the frames' similarities and those that are expected from their contact."""
+        """Differences (M, 4) between the frames' similarities and those expected from their contacts."""
         aligned, observed = align(nodes_px, self.rest_px)
         return observed - _terms(self._modes(aligned)) @ self.weight
 
@@ -106,18 +117,18 @@ class Registration:
         return (aligned.reshape(len(aligned), -1) - self.mean) @ self.components
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays that make the same registration again."""
+        """The arrays from which the same registration can be made again."""
         return {key: getattr(self, key) for key in ("rest_px", "mean", "components", "weight", "usual")}
 
 
 def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registration, np.ndarray]:
-    """Learn which similarity comes with a contact, from frames (M, N, 2) of one camera position.
+    """Learn which similarity a contact causes, from frames (M, N, 2) of one camera position.
 
     Returns
     -------
     Registration
     left : (M, 4) float
-        Each frame's difference when it is left out of the fit.
+        Difference of each frame from a fit without this frame.
     """
     aligned, observed = align(nodes_px, rest_px)
     flat = aligned.reshape(len(aligned), -1)
@@ -135,7 +146,7 @@ def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registr
 
 
 def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frames brought to rest by their least-squares similarity, and that similarity.
+    """Take the least-squares similarity to the layout at rest out of frames.
 
     Parameters
     ----------
@@ -145,9 +156,9 @@ def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.nda
     Returns
     -------
     aligned : (M, N, 2) float
-        What is left of the displacement from rest, px.
-    similarity : (M, 4) float
-        Log scale, turn (rad), shift of the middle x and y (px), from rest to the frame.
+        Displacement from rest without the similarity, px.
+        similarity : (M, 4) float
+            Logarithm of scale, turn (rad), shift of the centre in x and y (px), from rest to the frame.
     """
     middle = rest_px.mean(axis=0)
     shift = nodes_px.mean(axis=1) - middle
@@ -159,10 +170,10 @@ def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def spanned(sizes: np.ndarray, most: int) -> int:
-    """How many modes of centred rows to keep, at most ``most``; ``sizes`` are the rows' singular values, the largest first.
+    """Number of modes of centred rows to keep, at most ``most``; ``sizes`` are the rows' singular values, the largest first.
 
-    M centred rows span M - 1 directions at most. The modes after these are made of rounding errors. Scaled to unit deviation, they would
-    turn the rounding errors of other rows into amplitudes of thousands.
+    M centred rows span at most M - 1 directions. All further modes are rounding errors. If they were scaled to a standard deviation of 1,
+    the rounding errors of other rows would become amplitudes of thousands.
     """
     return int((sizes[:most] > LEAST_SIZE * sizes[0]).sum())
 

@@ -1,4 +1,4 @@
-"""What training on several objects is worth on an object that was never touched."""
+"""Study: do models that are trained on several objects estimate contacts with an object that they never touched?"""
 
 from training.studies.objects.plan import Plan
 from training.studies.objects.study import Result, rows_in_range, run, table, verdicts

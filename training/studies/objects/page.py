@@ -1,4 +1,4 @@
-"""The page of the study of objects never seen: errors on every object, of a model of several objects and of one object alone."""
+"""The page of the study of unseen objects: errors on every object, of a model of several objects and of a model of one object."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,7 +25,7 @@ def write_page(
     rows: Sequence[Mapping],
     verdicts: Sequence[str],
 ) -> Path:
-    """Write ``index.html`` and its chart; the page.
+    """Write ``index.html`` and its chart, and return the page's path.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def write_page(
     names : sequence of str
         Labels.
     ranges : mapping of str to (low, high)
-        Of the labels that are judged.
+        Ranges of the labels that are judged.
     rows, verdicts : sequences
         As ``table`` and ``verdicts`` give them.
     """
@@ -80,7 +80,7 @@ def write_page(
 
 
 def errors_figure(rows: Sequence[Mapping], names: Sequence[str], alone: str) -> Figure:
-    """A panel for each label: objects down, multiples of the error on the first object across."""
+    """A chart with a panel for each label: each object's error as a multiple of the error on the first object."""
     objects = list(dict.fromkeys(row["object"] for row in rows))
     figure, axes = sized_figure((4.4 * len(names) + 1.0, 0.34 * len(objects) + 1.3), len(names))
     for panel, (ax, name) in enumerate(zip(axes, names, strict=True)):

@@ -11,9 +11,12 @@ from training.recipes import TrainingError
 from training.studies.sim_to_real.twins import contact_of
 from twin.types import FINE
 
-TESTS_APART = 1000  # of the draws, so that no contact is learnt and judged
+# Added to the seed of the contacts that are judged, so that none of them is also trained on.
+TESTS_APART = 1000
+# Name of the model that is trained on all objects of ``Plan.train``.
 MIXED = "mixed"
-TIMES = 1.5  # the error on an unseen object over that on the first one: what is aimed at
+# Largest ratio of the error on an unseen object to the error on the first object at which the aim is met.
+TIMES = 1.5
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Plan:
     ----------
     sensor : SensorSpec
     experiment : ExperimentSpec
-        Whose ranges of labels are judged. What is trained on is the experiment that it names as wider, else itself.
+        Contacts whose labels lie within its ranges are judged. Training uses the experiment that it names as wider, else itself.
     randomisation : RandomisationSpec
     train, unseen : tuple of ObjectSpec
         The first of ``train`` is the one that is also trained on alone.
@@ -32,7 +35,7 @@ class Plan:
         Contacts to train on, and to judge on, for each object.
     seed, across : int
     epochs : int or None
-        Of both trainings; None: the study's own number.
+        Epochs of both trainings; None: the model's own number.
     workers : int
         Processes that simulate.
     """
@@ -90,7 +93,7 @@ class Plan:
         )
 
     def trained_on(self, sets: dict[str, Dataset]) -> dict[str, Dataset]:
-        """Data set of each model, from those of all folders: as many contacts for both."""
+        """The data set that each model is trained on, by the model's name. Both have the same number of contacts."""
         parts = [sets[f"sim/{thing.name}"] for thing in self.train]
         first = parts[0].rows(np.flatnonzero(contact_of(parts[0]) < self.count))
         return {MIXED: joined([first, *parts[1:]]), self.alone.name: parts[0]}

@@ -1,7 +1,7 @@
-"""What training on several objects is worth on an object that was never touched, beside training on the first of them alone.
+"""The study of unseen objects: a model trained on several objects is compared with a model trained on the first of them alone.
 
-All contacts are simulated, pins alone. Labels mean the same on every object (``twin.rig.touch``). Both models learn from as many
-contacts; every object's errors are those on contacts of its own that no model has seen.
+All contacts are simulated, without pictures. Labels mean the same on every object (``twin.rig.touch``). Both models are trained on
+the same number of contacts. The errors on an object are measured on other contacts with it, which neither model was trained on.
 """
 
 from dataclasses import dataclass
@@ -25,16 +25,16 @@ from twin.report.table import write_table
 
 @dataclass(frozen=True)
 class Result:
-    """What came of it.
+    """The result of the study.
 
     Attributes
     ----------
     rows : list of dict
         See ``table``.
     verdicts : list of str
-        See the function of that name.
+        See ``verdicts``.
     names : tuple of str
-        Of the labels.
+        Names of the labels.
     written : list of Path
     """
 
@@ -44,7 +44,7 @@ class Result:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """A line for each model and object, and the verdicts; for people."""
+        """The result as lines of text: one for each model and object, then the verdicts."""
         lines = []
         for row in self.rows:
             errors = ", ".join(f"{name} {row[f'{name}_error']:.3g} ({row[f'{name}_times']:.2f} times)" for name in self.names)
@@ -55,8 +55,7 @@ class Result:
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     """Simulate contacts of all objects, train both models, and judge them on contacts of every object.
 
-    Writes data sets, runs, ``objects.csv`` and ``index.html`` to ``out``. What lies there from an earlier call with the same plan is not
-    made again.
+    Writes data sets, runs, ``objects.csv`` and ``index.html`` to ``out``. Results of an earlier call with the same plan are used again.
 
     Raises
     ------
@@ -86,13 +85,16 @@ def _simulated(plan: Plan, folder: Path, title: str, config: GenerationConfig, c
 
 
 def rows_in_range(data: Dataset, experiment: ExperimentSpec) -> np.ndarray:
-    """Rows whose corrected labels lie within the experiment's ranges: the way there, and contacts beside an edge, may not."""
+    """Indices of the rows whose corrected labels lie within the experiment's ranges.
+
+    States on the way to a contact, and contacts beside an edge, may lie outside of them.
+    """
     low, high = np.array([experiment.ranges()[name] for name in data.targets.names]).T
     return np.flatnonzero(((data.targets.corrected >= low) & (data.targets.corrected <= high)).all(axis=1))
 
 
 def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[dict[str, Any]]:
-    """A row for each model and object: mean absolute errors, biases, and how many times the model's error on the first object."""
+    """A row for each model and object: mean absolute errors, biases, and the ratios of the errors to those on the first object."""
     rows = []
     for model, run in runs.items():
         estimator = PoseEstimator.load(run)
@@ -117,7 +119,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
 
 
 def verdicts(plan: Plan, rows: list[dict[str, Any]], names: tuple[str, ...]) -> list[str]:
-    """For each unseen object whether the mixed model's errors stay within ``TIMES`` those on the first one."""
+    """A sentence for each unseen object: are the mixed model's errors at most ``TIMES`` its errors on the first object?"""
     lines = []
     for row in rows:
         if row["model"] != MIXED or row["object"] not in {thing.name for thing in plan.unseen}:

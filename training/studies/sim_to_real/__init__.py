@@ -1,4 +1,4 @@
-"""What the twin is worth on real frames: trained in it, with a few labelled frames beside it, and without it."""
+"""Study of the twin's value for real frames: models trained in the twin, with a few labelled frames in addition, and without the twin."""
 
 from training.studies.sim_to_real.study import Plan, Result, run
 

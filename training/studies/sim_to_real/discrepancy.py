@@ -1,13 +1,14 @@
-"""What a calibrated twin's pins still miss on a real sensor, learnt from a few labelled frames (Kennedy & O'Hagan 2001).
+"""The discrepancy between a calibrated twin's pins and real ones, learnt from a few labelled frames (Kennedy & O'Hagan 2001).
 
-A frame's residual, real less simulated displacement, is divided by the rms of the simulated displacement (where nothing
-moves, nothing is missed) and written in the residuals' own modes; each mode's amplitude is a Gaussian process of the label,
+A frame's residual is the real displacement minus the simulated one. It is divided by the rms of the simulated displacement, because
+without displacement there is no residual. The scaled residuals are decomposed into their principal modes. Each mode's amplitude a is a
+Gaussian process of the label l,
 
     a(l) ~ GP(0, c^2 + s^2 exp(-sum_i (l_i - l'_i)^2 / 2 w_i^2) + n^2 [same frame])
 
-(Higdon et al. 2008). c, s, w and n maximise the marginal likelihood; l is the pose of the tap and the move as far as it was
-executed. Drawn for simulated contacts, one function of the posterior for each, it teaches a model what the twin is known to
-miss, and how little it is to be trusted where the frames don't tell.
+(Higdon et al. 2008). c, s, w and n maximise the marginal likelihood; l is the pose of the tap and the executed move. For each
+simulated contact one function is drawn from the posterior and added to the pins. So a model is trained with the twin's known
+discrepancy, and with a wide spread of discrepancies where no labelled frame is near.
 """
 
 from collections.abc import Callable
@@ -26,23 +27,35 @@ from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel
 
 FRICTION = next(parameter for parameter in PARAMETERS if parameter.name == "rig.friction")
-FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)  # tried on every labelled frame; with the last one the object sticks
-PLAIN_PX = 0.5  # change of the pins with the logarithm of friction, from which on a frame shows its friction
-USUAL = (0.05, 0.95)  # quantiles of the frames' frictions between which friction is drawn
-WIDER = 1.25  # factor by which the range of drawn frictions is wider at both ends
-FEWEST = 8  # frames that the twin must be able to simulate and explain
-LEAST_PX = 0.5  # least rms displacement that a frame's residuals are divided by
-VARIES = 1e-6  # mm or deg; an axis of the label with a smaller standard deviation is left out
-MODES_SHARE = 0.97  # part of the residuals' variance that the modes hold
-LENGTHS = (1.0, 30.0)  # bounds of w, in standard deviations of the label
-SIZES = (1e-3, 10.0)  # bounds of c and s, in rms of the amplitude
-NOISES = (0.05, 1.0)  # bounds of n^2; with less noise so many lengths would explain some tens of frames exactly
-TRUSTED = 0.5  # least ``Weights.trust`` of a frame whose residuals are used
+# Coefficients of friction that every labelled frame is simulated with. With the last one the object sticks.
+FRICTIONS = (0.05, 0.15, 0.25, 0.35, 0.5, 0.8, 3.0)
+# Least rms change of the pins' places in px, by a change of 1 in the logarithm of friction, at which a frame's friction can be estimated.
+PLAIN_PX = 0.5
+# Quantiles of the frames' frictions between which friction is drawn.
+USUAL = (0.05, 0.95)
+# Factor by which the range of drawn frictions is extended at both ends.
+WIDER = 1.25
+# Least number of labelled frames that the twin must be able to simulate and explain.
+FEWEST = 8
+# Least rms displacement in px by which a frame's residuals are divided.
+LEAST_PX = 0.5
+# Least standard deviation in mm or deg of an axis of the label; an axis that varies less is left out.
+VARIES = 1e-6
+# Share of the residuals' variance that the modes contain.
+MODES_SHARE = 0.97
+# Bounds of w, in standard deviations of the label.
+LENGTHS = (1.0, 30.0)
+# Bounds of c and s, relative to the rms of the amplitude.
+SIZES = (1e-3, 10.0)
+# Bounds of n^2, relative to the variance of the amplitude. With less noise the many lengths would overfit some tens of frames.
+NOISES = (0.05, 1.0)
+# Least ``Weights.trust`` of a frame whose residuals are used.
+TRUSTED = 0.5
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """What a twin misses on K frames with N pins.
+    """Residuals of a twin on K frames with N pins.
 
     Attributes
     ----------
@@ -51,11 +64,11 @@ class Residuals:
     moved_px : (K, N, 2) float
         Simulated displacements.
     missing_px : (K, N, 2) float
-        Real less simulated; 0 for lost pins.
+        Real minus simulated displacements; 0 for lost pins.
     friction : (K,) float
-        The likeliest friction of each frame; NaN where no move was executed, because only a move shows it.
-    friction_px : (K,) float
-        How plainly each frame shows its friction: rms change of the pins' places with its logarithm.
+        Estimated friction of each frame; NaN if no move was executed, because only a move shows the friction.
+        friction_px : (K,) float
+            Rms change of the pins' places by a change of 1 in the logarithm of friction. If it is small, the friction is uncertain.
     """
 
     axes: np.ndarray
@@ -70,9 +83,10 @@ class Residuals:
         return float(np.linalg.norm(self.missing_px, axis=-1).mean())
 
     def friction_spread(self) -> FrictionSpread | None:
-        """What friction to draw for simulated contacts; None where too few moves were executed to tell.
+        """Range in which friction is drawn for simulated contacts; None if too few executed moves show it.
 
-        A frame that slides or sticks with every friction shows nothing and is left out. All frames that show their friction count alike.
+        A frame in which the object slides, or sticks, with every friction does not show its friction and is left out. All other frames
+        have the same weight.
         """
         shown = self.friction[np.isfinite(self.friction) & (self.friction_px >= PLAIN_PX)]
         if len(shown) < FEWEST:
@@ -82,22 +96,23 @@ class Residuals:
 
 
 def label_axes(labels: list[ArmLabel]) -> np.ndarray:
-    """(K, 12) the pose that was tapped at, and the move as far as it was executed: mm and deg."""
+    """(K, 12) the pose of the tap, and the move (0 if it was not executed), in mm and deg."""
     return np.stack([np.concatenate([label.pose - label.move, label.move * label.executed]) for label in labels])
 
 
 def measure_residuals(
     setup: Setup, measured: MeasuredFrames, progress: Callable | None = None, *, frictions: tuple = FRICTIONS
 ) -> Residuals:
-    """Simulate labelled frames after the tap and after the move, with several frictions, and compare the likeliest story of each frame.
+    """Simulate labelled frames with several frictions, and compare each frame with the simulated state that is most like it.
 
-    Between two frictions pins are assumed to move evenly with the logarithm of friction. Friction differs from frame to frame, and
-    simulated data sets draw it. So the best friction of each frame is taken: else the residuals would hold the friction a second time.
+    The states after the tap and after the move are compared. Between two frictions the pins' places are interpolated linearly in the
+    logarithm of friction. Friction differs from frame to frame, and simulated data sets draw it. Therefore each frame is compared at its
+    best friction: otherwise the residuals would include the effect of friction, and it would be simulated twice.
 
     Raises
     ------
     TrainingError
-        The twin can simulate and explain too few frames.
+        The twin can simulate and explain fewer than ``FEWEST`` frames.
     """
     labels, real_px = measured.labels, measured.pins_px - measured.no_contact_px
     setup = replace(setup, parameters=(FRICTION,))
@@ -117,10 +132,10 @@ def measure_residuals(
 
 
 def _likeliest(moved: np.ndarray, real_px: np.ndarray, frictions: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The displacements (M, 2, N, 2) nearest to the real ones (M, N, 2), from those with F frictions (F, M, 2, N, 2).
+    """The simulated displacements (M, 2, N, 2) nearest to the real ones (M, N, 2), from those with F frictions (F, M, 2, N, 2).
 
-    Also returned are their frictions (M, 2), and the rms change of the pins with the logarithm of friction (M, 2), px. All are NaN where
-    the contact failed with every friction.
+    Also returned are their frictions (M, 2), and the rms change of the pins in px by a change of 1 in the logarithm of friction (M, 2).
+    All are NaN if the contact can't be simulated with any friction.
     """
     seen, target = np.isfinite(real_px)[:, None], np.nan_to_num(real_px)[:, None]
     best, least = np.full(moved.shape[1:], np.nan), np.full(moved.shape[1:3], np.inf)
@@ -129,12 +144,12 @@ def _likeliest(moved: np.ndarray, real_px: np.ndarray, frictions: tuple) -> tupl
     for k in range(len(frictions)):
         after = min(k + 1, len(frictions) - 1)
         start, way, step = moved[k], moved[after] - moved[k], log[after] - log[k]
-        way = np.where(np.isfinite(way), way, 0.0)  # the next one failed: this one alone
+        way = np.where(np.isfinite(way), way, 0.0)  # if the simulation with the next friction failed, this friction is used alone
         along, length = ((part * way * seen).sum(axis=(-2, -1)) for part in (target - start, way))
         share = np.clip(along / np.maximum(length, 1e-12), 0, 1)
         there = start + share[..., None, None] * way
         squared = (((target - there) * seen) ** 2).sum(axis=(-2, -1))
-        nearer = squared < least  # never where it failed
+        nearer = squared < least  # false for simulations that failed, because their distance is NaN
         best[nearer], least[nearer] = there[nearer], squared[nearer]
         friction[nearer] = np.exp(log[k] + share * step)[nearer]
         told_px[nearer] = np.sqrt(length / way.shape[-2])[nearer] / max(step, 1e-12)
@@ -142,7 +157,7 @@ def _likeliest(moved: np.ndarray, real_px: np.ndarray, frictions: tuple) -> tupl
 
 
 class Discrepancy:
-    """Gaussian processes of the residuals' modes.
+    """Gaussian processes of the amplitudes of the residuals' modes.
 
     Parameters
     ----------
@@ -157,19 +172,19 @@ class Discrepancy:
         left, sizes, self.modes = np.linalg.svd(relative, full_matrices=False)
         kept = np.searchsorted(np.cumsum(sizes**2) / (sizes**2).sum(), MODES_SHARE) + 1
         amplitudes = left * sizes
-        self.rest = amplitudes[:, kept:] @ self.modes[kept:] / np.sqrt(len(axes))  # random combinations of what the modes leave
+        self.rest = amplitudes[:, kept:] @ self.modes[kept:] / np.sqrt(len(axes))  # ``draw_px`` adds random combinations of these rows
         self.modes = self.modes[:kept]
         self.sizes = np.sqrt((amplitudes[:, :kept] ** 2).mean(axis=0))
         self.processes = [_process(self._scaled(axes), column) for column in (amplitudes[:, :kept] / self.sizes).T]
 
     def mean_px(self, labels: list[ArmLabel], moved_px: np.ndarray) -> np.ndarray:
-        """(S, N, 2) what S simulated displacements (S, N, 2) are expected to miss."""
+        """(S, N, 2) expected discrepancy of S simulated displacements (S, N, 2), px."""
         scaled = self._scaled(label_axes(labels))
         amplitudes = np.stack([process.mean(Points.of(scaled)) for process in self.processes], axis=1)
         return self._fields(amplitudes, moved_px)
 
     def draw_px(self, labels: list[ArmLabel], moved_px: np.ndarray, contact: np.ndarray, seed: int) -> np.ndarray:
-        """(S, N, 2) what S simulated displacements may miss: for the states of each contact (S,) one function of the posterior."""
+        """(S, N, 2) random discrepancy of S simulated displacements, px. One function is drawn for all states of a contact (S,)."""
         scaled = self._scaled(label_axes(labels))
         amplitudes = np.empty((len(scaled), len(self.modes)))
         shares = np.empty((len(scaled), len(self.rest)))
@@ -177,13 +192,13 @@ class Discrepancy:
             rows = np.flatnonzero(contact == number)
             rng = np.random.default_rng([seed, int(number)])
             for k, process in enumerate(self.processes):
-                own = process.kernel.noises[0] * rng.normal()  # of the frame, the same for all states of a contact
+                own = process.kernel.noises[0] * rng.normal()  # noise of a frame; all states of a contact have the same
                 amplitudes[rows, k] = process.draw(Points.of(scaled[rows]), rng) + own
             shares[rows] = rng.normal(size=len(self.rest))
         return self._fields(amplitudes, moved_px, shares @ self.rest)
 
     def summary(self) -> list[dict]:
-        """Of each mode: its share of the residuals, and of its variance the part that the label tells."""
+        """For each mode: its share of the residuals' variance, and the part of the mode's variance that the label explains."""
         share = self.sizes**2 / ((self.sizes**2).sum() + (self.rest**2).sum())
         noise = [process.kernel.noises[0] ** 2 for process in self.processes]
         return [{"share": float(a), "told": float(max(0.0, 1 - n))} for a, n in zip(share, noise, strict=True)]
@@ -197,7 +212,7 @@ class Discrepancy:
 
 
 def _process(axes: np.ndarray, amplitude: np.ndarray) -> Posterior:
-    """The likeliest process of an amplitude (K,) of labels (K, A), both of about unit size, within the bounds above."""
+    """The process with the largest likelihood of an amplitude (K,) by labels (K, A), both scaled to about 1, within the bounds above."""
 
     def kernel(length: float, size: float, variance: float) -> Kernel:
         return Kernel(CONSTANT_AND_SMOOTH, np.full(axes.shape[1], length), np.full(2, size), np.sqrt([variance]))
@@ -209,5 +224,5 @@ def _process(axes: np.ndarray, amplitude: np.ndarray) -> Posterior:
 
 
 def _rms_px(moved_px: np.ndarray) -> np.ndarray:
-    """(S,) of displacements (S, N, 2), with a floor."""
+    """(S,) rms of displacements (S, N, 2), at least ``LEAST_PX``."""
     return np.maximum(np.sqrt((moved_px**2).sum(axis=-1).mean(axis=-1)), LEAST_PX)

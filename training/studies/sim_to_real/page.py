@@ -1,4 +1,4 @@
-"""The page of the study of what the twin is worth on real frames: errors by the number of labelled real frames."""
+"""The page of the sim-to-real study: errors by the number of labelled real frames."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,9 +15,12 @@ from twin.report.page import Page, Picture
 from twin.report.table import Column
 from twin.report.themes import BLUE, OLIVE, PURPLE, RED
 
-SIMULATED = "simulated"  # the row trained in the twin alone; rows without one ingredient begin with this word and a comma
-BARE = "simulated, bare"  # the row trained on simulated pins as they are
-STYLES = ((RED, "o-"), (OLIVE, "s--"))  # of the models that were trained on real frames, in the order of the rows
+# Name of the row of the model trained in the twin alone. Names of rows without one ingredient begin with this word and a comma.
+SIMULATED = "simulated"
+# Name of the row of the model trained on simulated pins without a drawn discrepancy.
+BARE = "simulated, bare"
+# Colours and lines of the models trained on real frames, in the order of the rows.
+STYLES = ((RED, "o-"), (OLIVE, "s--"))
 
 
 def write_page(
@@ -40,35 +43,35 @@ def write_page(
     rows: Sequence[Mapping],
     problems: Sequence[str],
 ) -> Path:
-    """Write ``index.html`` and its charts; the page.
+    """Write ``index.html`` and its charts, and return the page's path.
 
     Parameters
     ----------
     folder : Path
     sensor : str
     tested, frames, labelled : int
-        Number of frames that are judged, in the whole recording, and labelled for the twin.
-    seed : int
-        By which the frames were drawn.
+        Number of frames that are judged, of all frames of the recording, and of frames that are labelled for the twin.
+        seed : int
+            Seed with which the frames were drawn.
     calibrated : bool
         Whether the specification was fitted to the labelled frames.
     error_px : float
-        Mean distance of the twin's pins from those of the labelled frames.
-    modes : sequence
-        The first modes of what the pins miss: the ``share`` of each, and the part of it that the label tells (``told``).
-    friction : FrictionSpread or None
-        Range in which friction was drawn for simulated contacts; None where all of them had the rig's friction.
+        Mean distance between the twin's pins and those of the labelled frames.
+        modes : sequence
+            First modes of the discrepancy: the ``share`` of each, and the part of it that the label explains (``told``).
+        friction : FrictionSpread or None
+            Range in which friction was drawn for simulated contacts; None if all of them had the rig's friction.
     simulated, contacts : int
         Number of simulated states, and of the contacts that they belong to.
     names : sequence of str
         Labels.
     left_out : (K,) float
-        Errors of the process alone on labelled frames that were left out of it.
+        Errors of the Gaussian process alone on each labelled frame, predicted from the others.
     columns : sequence of str
         Keys of the table, in their order.
     rows : sequence of mappings
     problems : sequence of str
-        What the reader of the recording found odd.
+        Irregularities of the recording.
     """
     page = Page(f"From the twin to real frames: {sensor}", "twin study sim-to-real", topic="TacTip twin: study")
     page.lead = (
@@ -99,7 +102,7 @@ def write_page(
 
 
 def _charts(folder: Path, rows: Sequence[Mapping], names: Sequence[str], labelled: int) -> list[Picture]:
-    """Errors by the number of labelled frames, and without one ingredient at a time where such rows are there."""
+    """Errors by the number of labelled frames, and errors without one ingredient at a time if there are such rows."""
     charts = [
         Picture(
             write_chart(folder / "errors.png", lambda: errors_figure(rows, names)),
@@ -154,7 +157,7 @@ def _beside_said(names: Sequence[str], left_out: np.ndarray) -> str:
 
 
 def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
-    """Errors against corrected labels over the number of labelled real frames, a panel for each label, both axes logarithmic."""
+    """A chart of errors against corrected labels by the number of labelled real frames; a panel for each label, both axes logarithmic."""
     figure, axes = sized_figure((5.2 * len(names), 4.2), len(names))
     for ax, name in zip(axes, names, strict=True):
         key = f"{name}_corrected"
@@ -178,7 +181,7 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
 
 
 def ingredients_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
-    """Errors of the twin's own rows as dots, the first row's as a line, a panel for each label."""
+    """A chart of the errors of the rows trained in the twin: the first row as a line, the others as dots; a panel for each label."""
     figure, axes = sized_figure((4.4 * len(names) + 2.0, 0.34 * len(rows) + 1.1), len(names))
     places = np.arange(len(rows))[::-1]
     for panel, (ax, name) in enumerate(zip(axes, names, strict=True)):

@@ -1,4 +1,4 @@
-"""The steps of the study of what the twin is worth on real frames; each can be called alone."""
+"""The steps of the sim-to-real study. Each can be called alone."""
 
 import json
 from dataclasses import dataclass, replace
@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from scenes.object import ObjectSpec
 from training.assemble import intervals
@@ -14,11 +13,13 @@ from training.dataset import Dataset, joined, split_rows
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_check
 from training.gaussian_process import fit_two_fidelities
+from training.identity import identity_of
 from training.loop import epoch_step
-from training.models import recipe_of
+from training.models import model_named, recipe_of
 from training.pins import voronoi_areas
 from training.recipes import TrainingError
-from training.run import RunConfig, is_finished, train_run, write_tensors
+from training.run import RunConfig, is_finished, train_run
+from training.run_files import CONFIG, TENSORS, read_tensors, write_tensors
 from training.simulated import config_of, is_pins_only, open_simulated
 from training.studies.sim_to_real.discrepancy import Discrepancy
 from training.studies.sim_to_real.twins import contact_of
@@ -28,25 +29,30 @@ from twin.progress import Step
 from twin.rig.labels import ArmLabel, read_arm_labels
 from twin.store import write_text
 
-TWIN_EPOCHS = 60  # of a training on thousands of simulated states; more epochs change nothing
-MANY = 500  # labelled frames that a morning's work with the rig gives
-RANGE_MARGIN = 0.1  # simulated states may lie beyond the labelled frames' range of a label by this part of it
-MODES = 20  # of the displacements, that the quadratic regression is given
-RIDGES = 10.0 ** np.arange(-4, 3.1, 0.5)  # penalties that it chooses from, by the error of each frame left out
+# Epochs of a training on thousands of simulated states. More epochs do not change the errors.
+TWIN_EPOCHS = 60
+# Number of labelled frames that can be recorded with the rig in a morning.
+MANY = 500
+# Share of the labelled frames' range of a label by which simulated states may lie outside of it.
+RANGE_MARGIN = 0.1
+# Number of modes of the displacements that are inputs of the quadratic regression.
+MODES = 20
+# Penalties of the quadratic regression that are tried; the one with the smallest leave-one-out error is used.
+RIDGES = 10.0 ** np.arange(-4, 3.1, 0.5)
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Which frames of a recording serve what.
+    """Which frames of a recording are used for what.
 
     Attributes
     ----------
     test : (t,) int
-        The random fifth that every model is judged on and none has seen.
-    few : (n,) int
-        The labelled frames, drawn at random from the others.
-    trained : dict of str to (m,) int
-        Frames to train on without the twin: ``few`` itself, more, and all others; each holds the ones before it.
+        A random fifth, on which all models are judged and none is trained.
+        few : (n,) int
+            The labelled frames, drawn at random from the others.
+        trained : dict of str to (m,) int
+            Frames to train on without the twin: ``few``, more of them, and all that are not judged on. Each set contains those before it.
     """
 
     test: np.ndarray
@@ -55,12 +61,12 @@ class Frames:
 
 
 def choose_frames(count: int, labels: int, seed: int) -> Frames:
-    """Draw the frames of a recording of ``count``.
+    """Draw the frames of a recording of ``count``, which is in the order of its names.
 
     Raises
     ------
     TrainingError
-        There are not so many.
+        The recording has fewer frames than are asked for.
     """
     rest, test = split_rows(count, seed)
     if labels > len(rest):
@@ -81,7 +87,7 @@ def arm_labels(data: Dataset) -> list[ArmLabel]:
 def with_missing(
     simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, *, progress: Step | None = None
 ) -> Dataset:
-    """A simulated data set whose pins have moved by what the twin may miss, drawn for each contact; ``labels`` are its ``arm_labels``."""
+    """A simulated data set with a discrepancy, drawn for each contact, added to its pins; ``labels`` are its ``arm_labels``."""
     pins = simulated.pins
     missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
     nodes_px = pins.nodes_px + missing_px
@@ -89,7 +95,7 @@ def with_missing(
 
 
 def measured_of(part: Dataset) -> MeasuredFrames:
-    """Frames of a recording with the arm's labels, as contacts are fitted to them."""
+    """Frames of a recording with the arm's labels, in the form that fits of contacts take."""
     pins_px = np.where(part.pins.lost[..., None], np.nan, part.pins.nodes_px)
     return MeasuredFrames(part.pins.form, part.pins.image_name.tolist(), arm_labels(part), pins_px, part.pins.reference.pins_px, [])
 
@@ -101,10 +107,10 @@ def train_in_twin(
     seed: int,
     split: int | None,
     epochs: int | None,
-    labelled: tuple[str, ...] = (),
+    labelled: Dataset | None = None,
     progress: Step | None = None,
 ) -> None:
-    """A run on simulated contacts, or what is left of it to do.
+    """Train a run on simulated contacts, or continue it.
 
     Parameters
     ----------
@@ -112,15 +118,18 @@ def train_in_twin(
         As in ``RunConfig``.
     epochs : int or None
         None: ``TWIN_EPOCHS``.
-    labelled : tuple of str
-        Names of the real frames that told what the simulated contacts miss.
+    labelled : Dataset, optional
+        The real frames that told what the simulated contacts miss.
     """
     recipe = recipe_of("vgnn", members=1, epochs=epochs or TWIN_EPOCHS, kernel=False)
-    _train(RunConfig("vgnn", recipe, seed=seed, split=split, labelled=labelled), sim, out, progress)
+    taught: dict[str, object] = {}
+    if labelled is not None:
+        taught = identity_of(labelled, model_named("vgnn")) | {"image_names": labelled.pins.image_name.tolist()}
+    _train(RunConfig("vgnn", recipe, seed=seed, split=split, labelled=taught), sim, out, progress)
 
 
 def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Step | None = None) -> None:
-    """A run on real frames alone, all of those given, or what is left of it to do."""
+    """Train a run on all of the given real frames alone, or continue it."""
     _train(RunConfig("vgnn", recipe_of("vgnn", epochs=epochs), seed=seed, split=None), real, out, progress)
 
 
@@ -130,12 +139,12 @@ def _train(config: RunConfig, data: Dataset, out: Path, progress: Step | None) -
 
 
 def states_like(simulated: Dataset, labelled: Dataset) -> np.ndarray:
-    """Rows of simulated states whose labels are about those of labelled frames.
+    """Rows of simulated states whose labels lie within the range of the labelled frames' labels, extended by ``RANGE_MARGIN``.
 
     Raises
     ------
     TrainingError
-        They are fewer than the labelled frames.
+        There are fewer such states than labelled frames.
     """
     told, truth = simulated.targets.corrected, labelled.targets.corrected
     margin = RANGE_MARGIN * np.ptp(truth, axis=0)
@@ -149,21 +158,21 @@ def states_like(simulated: Dataset, labelled: Dataset) -> np.ndarray:
 
 
 def states_touching(parts: list[Dataset], touched: ObjectSpec) -> Dataset:
-    """Of simulated data sets those of one object, joined; all of them if none is."""
+    """The simulated data sets of one object, joined; all data sets if none is of this object."""
     return joined([part for part in parts if config_of(part.folder).object.name == touched.name] or parts)
 
 
 @dataclass(frozen=True)
 class Beside:
-    """What became of a run that labelled frames were put beside.
+    """Result of ``put_beside``.
 
     Attributes
     ----------
     left_out : (K,) float
-        Mean absolute error (mm, deg) of the Gaussian process alone, on labelled frames that are left out of it one after another.
-    intervals : dict of str to array
-        The intervals of the run itself, widened to what the labelled frames say of it, under their names in ``weights.pt``; see
-        ``widen_intervals``.
+        Mean absolute error (mm, deg) of the Gaussian process alone on each labelled frame, predicted from the others.
+        intervals : dict of str to array
+            Intervals of the original run, widened to its errors on the labelled frames, by their names in ``weights.pt``; see
+            ``widen_intervals``.
     """
 
     left_out: np.ndarray
@@ -171,13 +180,14 @@ class Beside:
 
 
 def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, seed: int) -> Beside:
-    """Write the average of a run of ``vgnn`` and a Gaussian process that knows labelled frames, as a run, to ``out``.
+    """Average a run of ``vgnn`` with a Gaussian process of labelled frames, and write the result as a run to ``out``.
 
-    The run ``run`` stays as it is. The two models err differently. Labelled frames can't tell how much each is to count, because both
-    have learnt from them, so the average is plain. The intervals of ``out`` are those of the average.
+    The run ``run`` is not changed. The average has smaller errors than either model, because their errors differ. Both have the same
+    weight: labelled frames can't decide a better one, because both models were trained on them. The intervals of ``out`` are those of
+    the average.
 
-    Simulated contacts make the intervals of ``run`` too narrow. What is returned has them widened to the run's errors on the labelled
-    frames, and to those of the process on frames that are left out of it one after another.
+    The intervals of ``run`` are too narrow for real frames, because they come from simulated contacts. The returned ones are widened
+    to the run's errors on the labelled frames, and to the process's leave-one-out errors on them.
 
     Parameters
     ----------
@@ -186,11 +196,11 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     out : Path
         Folder of the new run; made if missing.
     simulated : Dataset
-        Contacts as the bare specification has them, with labels like the labelled frames' (``states_like``).
-    labelled : Dataset
-        n frames.
-    seed : int
-        Of the simulated states drawn.
+        Contacts simulated without a drawn discrepancy, with labels like those of the labelled frames (``states_like``).
+        labelled : Dataset
+            The n labelled frames.
+        seed : int
+            Seed with which simulated states are drawn.
 
     Raises
     ------
@@ -210,28 +220,28 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
         for values in (getattr(labelled.targets, labels), labelled.targets.raw, getattr(simulated.targets, labels))
     )
     process, alone = fit_two_fidelities(known, told, seen, truth, seed=seed)
-    content = torch.load(run / "weights.pt", weights_only=True)
+    content = read_tensors(run / TENSORS)
     missed = [intervals(made, truth, raw, scale, executed) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
     content |= intervals((mean + alone) / 2, truth, raw, scale, executed) | {"beside": process.arrays()}
     out.mkdir(parents=True, exist_ok=True)
-    write_tensors(out / "weights.pt", content)
+    write_tensors(out / TENSORS, content)
     about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}
-    write_text(out / "config.json", json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
+    write_text(out / CONFIG, json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
     return Beside(np.abs(alone - truth).mean(axis=0) * ensemble.scale, wider)
 
 
 def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
-    """Change a finished run: its intervals become those given (``Beside.intervals``). Its estimates stay as they are.
+    """Replace the intervals of a finished run by the given ones (``Beside.intervals``). Its estimates do not change.
 
-    Doing it once more with the same intervals changes nothing.
+    A second call with the same intervals has no effect.
     """
-    content = torch.load(run / "weights.pt", weights_only=True)
-    write_tensors(run / "weights.pt", content | wider)
+    content = read_tensors(run / TENSORS)
+    write_tensors(run / TENSORS, content | wider)
 
 
 def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict[str, Any]:
-    """A row of the study's table: mean errors of a run on the frames that are judged on."""
+    """A row of the study's table: mean errors of a run on the judged frames."""
     estimator = PoseEstimator.load(run)
     found = judge(estimator.predict_rows(real, test), real, test)
     row = {"trained_on": name, "labelled_frames": labelled, "model": estimator.model}
@@ -242,7 +252,7 @@ def judged(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray)
 
 
 def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) -> dict[str, Any]:
-    """The same of the plainest model: ridge regression on the displacements' first modes and their products."""
+    """A row of the study's table for the simplest model: ridge regression on the displacements' first modes and their products."""
     moved = (real.pins.nodes_px - real.pins.reference.pins_px).reshape(len(real), -1)
     middle = moved[rows].mean(axis=0)
     _, sizes, directions = np.linalg.svd(moved[rows] - middle, full_matrices=False)
@@ -258,7 +268,7 @@ def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) 
         for ridge in RIDGES:
             shrunk = sizes**2 / (sizes**2 + ridge)
             fitted = left @ (shrunk * (left.T @ y))
-            error = np.abs((y - fitted) / (1 - (left**2) @ shrunk)).mean()  # each frame left out
+            error = np.abs((y - fitted) / (1 - (left**2) @ shrunk)).mean()  # leave-one-out error
             if error < best:
                 best = error
                 made[:, k] = x[test] @ (right.T @ (shrunk / sizes * (left.T @ y))) + shift[k]

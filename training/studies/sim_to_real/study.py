@@ -1,4 +1,4 @@
-"""The study of what the twin is worth on real frames, from its plan to its tables and runs."""
+"""The sim-to-real study, from its plan to its tables and runs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +9,8 @@ import numpy as np
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_experiment, load_object, load_randomisation
 from training.dataset import Dataset, joined, load_dataset
 from training.generation import generate, require_count
+from training.recipes import TrainingError
+from training.simulated import is_simulated
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
 from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.steps import (
@@ -44,7 +46,7 @@ SHOWN_MODES = 4  # of what the twin misses, that the page names
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked.
+    """Settings of a study.
 
     Attributes
     ----------
@@ -52,29 +54,34 @@ class Plan:
     frames : Path
         A labelled real recording.
     experiment : ExperimentSpec
-        How it was recorded, and what is learnt.
-    contacts : ExperimentSpec or None
-        What is simulated; None: the experiment that ``experiment`` names as wider, else itself.
-    labels : int
-        Labelled frames beside the simulated contacts.
-    seed : int
-        Of the frames drawn, the contacts and the weights.
-    draws : int
-        Of what the twin misses, for each contact.
-    count : int
-        Contacts to simulate.
-    simulated : tuple of Path
-        Finished data sets to learn from instead; several are joined. None is simulated then for the twin with all ingredients.
-    calibrate : bool
-        Fit the specification to the labelled frames first.
-    ablate : bool
-        Also train without one ingredient at a time.
-    epochs : int or None
-        Of every training; None: the model's own number.
+        The experiment that the recording was made with. It also names the labels that are learnt.
+        contacts : ExperimentSpec or None
+            The experiment that is simulated; None: the one that ``experiment`` names as wider, else ``experiment``.
+        labels : int
+            Number of labelled frames that are used with the simulated contacts.
+        seed : int
+            Seed of the choice of frames, the contacts and the weights.
+        draws : int
+            Number of discrepancies that are drawn for each contact.
+        count : int
+            Number of contacts to simulate.
+        simulated : tuple of Path
+            Finished data sets to use instead of simulating contacts for the twin with all ingredients; several are joined.
+        calibrate : bool
+            Fit the specification to the labelled frames first.
+        ablate : bool
+            Also train without one ingredient at a time.
+        epochs : int or None
+            Epochs of every training; None: the default of that training.
     workers : int
         Processes that simulate.
     across : int
         Elements along each side of the skin's grid.
+
+    Raises
+    ------
+    TrainingError
+        A folder of ``simulated`` holds no simulated data set.
     """
 
     sensor: SensorSpec
@@ -96,6 +103,9 @@ class Plan:
         require_count(self.count)
         if not 1 <= self.draws <= MOST_DRAWS:
             raise DatasetError(f"--draws {self.draws}: expected 1 to {MOST_DRAWS} for each contact")
+        for folder in self.simulated:
+            if not is_simulated(folder):
+                raise TrainingError(f"--sim {folder}: no simulated data set; give the folder of one that 'twin dataset' has finished")
 
     @property
     def touched(self) -> ObjectSpec:
@@ -112,16 +122,16 @@ class Plan:
 
 @dataclass(frozen=True)
 class Result:
-    """What came of it.
+    """The result of the study.
 
     Attributes
     ----------
     rows : list of dict
-        One for each model: what it was trained on, its errors (mm, deg) against corrected and raw labels, and more.
+        A row for each model: what it was trained on, and its errors (mm, deg) against corrected and raw labels.
     left_out : (K,) float
         See ``Beside``.
     residual_px : float
-        Mean distance of the labelled frames' pins from the twin's.
+        Mean distance between the labelled frames' pins and the twin's.
     written : list of Path
     """
 
@@ -131,7 +141,7 @@ class Result:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """A line for each model, for people."""
+        """The result as lines of text, one for each model."""
         shown = [key for key in self.rows[0] if key.endswith(("_corrected", "_raw"))]
         return [
             f"{row['trained_on']}, {row['labelled_frames']} labelled, {row['model']}: "
@@ -142,21 +152,21 @@ class Result:
 
 @dataclass(frozen=True)
 class _Ground:
-    """What all models of a study start from.
+    """What all models of a study have in common.
 
     Attributes
     ----------
     sensor : SensorSpec
-        As shipped, or fitted to the labelled frames.
-    real, few : Dataset
-        The recording, and its labelled frames.
+        The sensor as shipped, or fitted to the labelled frames.
+        real, few : Dataset
+            The recording, and its labelled frames.
     chosen : Frames
     measured : MeasuredFrames
         Pins and arm's labels of the labelled frames.
     residuals : Residuals
-        What the twin with all ingredients misses on them.
-    full : Twin
-        That twin, and ``twins``: it and those that lack one ingredient.
+        Residuals of the twin with all ingredients on the labelled frames.
+        full : Twin
+            The twin with all ingredients. ``twins``: this twin and those without one ingredient.
     """
 
     plan: Plan
@@ -173,14 +183,14 @@ class _Ground:
 
 
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
-    """Train in the twin, with labelled frames beside it, and without the twin; judge all on the same real frames.
+    """Train in the twin, in the twin with labelled frames, and without the twin; judge all models on the same real frames.
 
-    Writes runs, ``study.csv`` and ``index.html`` to ``out``. What lies there from an earlier call with the same plan is not made again.
+    Writes runs, ``study.csv`` and ``index.html`` to ``out``. Results of an earlier call with the same plan are used again.
 
     Raises
     ------
     TrainingError
-        There are too few frames, or the simulated contacts have other labels than they.
+        There are too few frames, or the labels of the simulated contacts differ from theirs.
     """
     ground = _prepare(plan, out, progress)
     known = {_tried(ground.full): Discrepancy(ground.residuals)}
@@ -204,9 +214,9 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
 
 
 def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
-    """Read and choose frames, fit the specification if asked to, and see what the twin misses on the labelled ones."""
+    """Read and choose frames, fit the specification if the plan says so, and measure the residuals on the labelled frames."""
     with stage(progress, "frames") as step:
-        real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step)
+        real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
     chosen = choose_frames(len(real), plan.labels, plan.seed)
     out.mkdir(parents=True, exist_ok=True)
     few = real.rows(chosen.few)
@@ -225,17 +235,17 @@ def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
 
 
 def _labelled(plan: Plan, sensor: SensorSpec, measured: MeasuredFrames, out: Path, across: int) -> Setup:
-    """How the labelled frames are simulated."""
+    """The setup with which the labelled frames are simulated."""
     return Setup(sensor, plan.experiment, plan.touched, measured.form, across, out / "labelled", plan.workers, ())
 
 
 def _tried(twin: Twin) -> tuple[int, tuple[float, ...]]:
-    """What the residuals of a twin depend on, within one study."""
+    """Everything that the residuals of a twin depend on within one study."""
     return twin.across, twin.frictions
 
 
 def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
-    """What the twin misses on the labelled frames, where it is told; ``known`` keeps it for the next twin."""
+    """The discrepancy of a twin that uses one, else None. ``known`` stores it for other twins with the same residuals."""
     if not twin.learns:
         return None
     if _tried(twin) not in known:
@@ -246,7 +256,7 @@ def _missing(ground: _Ground, twin: Twin, known: dict[tuple[int, tuple[float, ..
 
 
 def _simulated(ground: _Ground, twin: Twin) -> list[Dataset]:
-    """The twin's contacts: simulated here, or finished data sets."""
+    """The twin's contacts: simulated, or read from finished data sets."""
     plan, folders = ground.plan, list(ground.plan.simulated) if twin is ground.full else []
     if not folders:
         folders = [ground.out / twin.contacts]
@@ -260,7 +270,7 @@ def _simulated(ground: _Ground, twin: Twin) -> list[Dataset]:
 
 
 def _learnt(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
-    """What a model learns from: the states once for each draw of what the twin misses, or once as they are."""
+    """The data sets to train on: the states once for each draw of the discrepancy, or once unchanged if there is none."""
     if missing is None:
         return [twin.part(joined(sets))]
     labels, drawn = [arm_labels(each) for each in sets], []
@@ -273,7 +283,7 @@ def _learnt(ground: _Ground, twin: Twin, sets: list[Dataset], missing: Discrepan
 
 
 def _trained(ground: _Ground, twin: Twin, learnt: list[Dataset], told: bool) -> Path:
-    """The folder of the twin's run; ``told``: whether labelled frames taught what it misses."""
+    """Train the twin's run, and return its folder; ``told``: whether a discrepancy was learnt from labelled frames."""
     folder, plan = ground.out / twin.name, ground.plan
     with stage(ground.progress, twin.name) as step:
         train_in_twin(
@@ -282,14 +292,14 @@ def _trained(ground: _Ground, twin: Twin, learnt: list[Dataset], told: bool) -> 
             seed=plan.seed,
             split=plan.seed,
             epochs=plan.epochs,
-            labelled=tuple(ground.measured.names) if told else (),
+            labelled=ground.few if told else None,
             progress=step,
         )
     return folder
 
 
 def _beside(ground: _Ground, folder: Path, sets: list[Dataset]) -> Beside:
-    """Put the labelled frames beside the twin's run, and widen its intervals to what these frames say of it."""
+    """Average the twin's run with a Gaussian process of the labelled frames, and widen its intervals to its errors on these frames."""
     bare = states_touching(sets, ground.plan.touched)
     made = put_beside(folder, ground.out / BESIDE, bare.rows(states_like(bare, ground.few)), ground.few, seed=ground.plan.seed)
     widen_intervals(folder, made.intervals)
@@ -297,7 +307,7 @@ def _beside(ground: _Ground, folder: Path, sets: list[Dataset]) -> Beside:
 
 
 def _without_the_twin(ground: _Ground) -> list[dict[str, Any]]:
-    """Rows of models that are trained on real frames alone."""
+    """Rows of the table for the models that are trained on real frames alone."""
     rows = []
     for name, index in ground.chosen.trained.items():
         folder = ground.out / f"real_{name}"

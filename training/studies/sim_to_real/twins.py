@@ -1,4 +1,4 @@
-"""The twins of a study: the one that a model is to learn in, and the same without one of its ingredients at a time."""
+"""The twins of a study: the one with all ingredients, and twins without one ingredient each."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,30 +16,33 @@ from training.recipes import TrainingError
 from training.studies.sim_to_real.discrepancy import FRICTIONS
 from twin.rig.kinematics import rig_of
 
-COARSE = 12  # elements across
-FEW = 0.2  # of the contacts
+# Elements across the skin of the twin with a coarse mesh.
+COARSE = 12
+# Share of the contacts that the twin with few contacts is trained on.
+FEW = 0.2
+# Angle in deg to whose multiples the axes of an uncalibrated sensor are rounded.
 QUARTER_DEG = 90.0
 
 
 @dataclass(frozen=True)
 class Twin:
-    """How contacts are simulated, and what of them is learnt.
+    """How contacts are simulated, and which of them are used for training.
 
     Attributes
     ----------
     name : str
-        Of the run's folder.
-    says : str
-        What the study's table calls it.
-    contacts : str
-        Name of the set of contacts, which several twins may share.
+        Name of the run's folder.
+        says : str
+            Name in the study's table.
+        contacts : str
+            Name of the set of contacts; several twins may have the same set.
     randomisation : RandomisationSpec
     across : int
         Elements along each side of the skin's grid.
     learns : bool
-        Whether it is told what its pins miss on the labelled frames.
-    share : float
-        Of the set's contacts, the first ones, that are learnt from.
+        Whether a discrepancy is learnt from the labelled frames and added to the pins.
+        share : float
+            Share of the set's contacts, the first ones, that are used for training.
     """
 
     name: str
@@ -54,11 +57,11 @@ class Twin:
 
     @property
     def frictions(self) -> tuple[float, ...]:
-        """Of a labelled frame, tried one after another to see what is missed whatever its friction was."""
+        """The frictions with which labelled frames are simulated, so that the residuals do not include the effect of friction."""
         return FRICTIONS if self.randomisation.friction else (rig_of(self.sensor).friction,)
 
     def config(self, touched: ObjectSpec, seed: int) -> GenerationConfig:
-        """Of its contacts, without pictures."""
+        """Configuration of the twin's contacts, without pictures."""
         return GenerationConfig(
             sensor=self.sensor,
             object=touched,
@@ -72,7 +75,7 @@ class Twin:
         )
 
     def part(self, contacts: Dataset) -> Dataset:
-        """The states of the contacts that are learnt from."""
+        """The states of the contacts that are used for training."""
         if self.share == 1:
             return contacts
         group = contact_of(contacts)
@@ -86,7 +89,7 @@ def contact_of(simulated: Dataset) -> np.ndarray:
     Raises
     ------
     TrainingError
-        The data set is none of simulated contacts.
+        The data set is not one of simulated contacts.
     """
     if simulated.group is None:
         raise TrainingError(f"{', '.join(map(str, simulated.folders))}: no simulated contacts; give a data set of 'twin dataset'")
@@ -96,16 +99,16 @@ def contact_of(simulated: Dataset) -> np.ndarray:
 def without_one_ingredient(
     full: Twin, uncalibrated: SensorSpec, any_friction: RandomisationSpec, every_tolerance: RandomisationSpec
 ) -> list[Twin]:
-    """Twins that lack one thing each, or have one more.
+    """Twins that differ from ``full`` in one ingredient each.
 
     Parameters
     ----------
     uncalibrated : SensorSpec
-        As it was before any labelled frame was looked at; see ``as_mounted``.
-    any_friction : RandomisationSpec
-        Draws friction without having seen a frame.
-    every_tolerance : RandomisationSpec
-        Draws skin and gel, too.
+        The sensor without any measurement of labelled frames; see ``as_mounted``.
+        any_friction : RandomisationSpec
+            Draws friction from a range that does not depend on labelled frames.
+        every_tolerance : RandomisationSpec
+            Also draws properties of skin and gel.
     """
 
     def but(name: str, says: str, *, shared: bool = False, **changes: Any) -> Twin:
@@ -126,7 +129,7 @@ def without_one_ingredient(
 
 
 def as_mounted(sensor: SensorSpec) -> SensorSpec:
-    """The sensor as somebody knows it who has put it on the arm and measured nothing: axes to a quarter turn, the rest as drawn."""
+    """The sensor as known before any measurement: its turn about its axis to a quarter turn, and the tool point at the tip."""
     rig = rig_of(sensor)
     quarter = QUARTER_DEG * round(rig.image_turn_deg / QUARTER_DEG)
     plain = RigSpec(tcp_to_dome_mm=-sensor.skin.outer_radius_mm, turn_sign=rig.turn_sign, image_turn_deg=quarter)

@@ -1,4 +1,4 @@
-"""The Tac-VGNN paper's comparison on a recording: graphs, models, training efficiency, and what the areas show."""
+"""The Tac-VGNN paper's comparison on a recording: graphs, models, training efficiency, and the Voronoi areas of contacts."""
 
 from training.studies.tac_vgnn.study import Plan, Result, run
 

@@ -1,8 +1,8 @@
-"""What the graphs are: the paper's table of graph sizes and times, and its figure of Voronoi areas in contact.
+"""The paper's table of graph sizes and times, and its figure of Voronoi areas in contact.
 
-The figure shows by eye where and how deep the sensor is touched. Four contacts are rendered in the twin, each 2 and 4 mm beyond first
-touch: a flat surface and an edge under the middle of the sensor, and a surface that reaches only its top or only its bottom. Recorded
-frames of about these depths stand beside them.
+The figure shows where and how deep the sensor is touched. Four contacts are rendered in the twin, each 2 and 4 mm beyond first touch: a
+flat surface and an edge at the middle of the sensor, and a surface that reaches only its top or only its bottom. Recorded frames of
+about these depths are shown for comparison.
 """
 
 from dataclasses import dataclass
@@ -28,24 +28,29 @@ from twin.simulator import Simulator
 from twin.types import Form, PinGraph
 
 KINDS: tuple[GraphKind, ...] = ("knn", "delaunay", "voronoi")
-TIMED = 200  # graphs of each kind, evenly spread over the frames, whose making is timed
+# Number of graphs of each kind, spread evenly over the frames, whose computation is timed.
+TIMED = 200
 # Table I of the paper: directed edges and seconds, by number of pins and kind of graph.
 PAPER = {
     (127, "knn"): (762, 0.004), (127, "delaunay"): (744, 0.007), (127, "voronoi"): (744, 0.019),
     (331, "knn"): (1986, 0.010), (331, "delaunay"): (1860, 0.008), (331, "voronoi"): (1860, 0.045),
 }  # fmt: skip
-DEPTHS_MM = (2.0, 4.0)  # beyond first touch
-TAP_MM = 5.0  # depth of the tap in the published recordings (tap_move in their meta.json)
-ASIDE_MM = 6.0  # from the middle of the sensor to the border of a surface that touches one side only
-# The contacts: object, turn of the whole contact about the sensor's axis (deg, from x towards y), and offset before the turn (mm).
-# The y axis of the image points down.
+# Depths of the contacts beyond first touch, mm.
+DEPTHS_MM = (2.0, 4.0)
+# Depth of the tap in the published recordings, mm (tap_move in their meta.json).
+TAP_MM = 5.0
+# Distance in mm from the middle of the sensor to the border of a surface that touches one side only.
+ASIDE_MM = 6.0
+# Each contact's object, its turn about the sensor's axis (deg, from x towards y), and its offset before the turn (mm). The y axis of
+# the image points down.
 CONTACTS = {
     "centre, surface": ("plane", 0.0, 0.0),
     "centre, edge": ("edge", 0.0, 0.0),
     "top, surface": ("edge", -90.0, ASIDE_MM),
     "bottom, surface": ("edge", 90.0, ASIDE_MM),
 }
-# Differences from the wanted contact that weigh the same when a recorded frame is chosen.
+# Units of the differences from the wanted contact when the most similar recorded frame is chosen: a difference of one unit in depth counts
+# as much as one unit in angle or shear.
 USUAL = {"depth_mm": 0.25, "angle_deg": 1.5, "shear_mm": 0.5, "shear_deg": 0.7}
 
 
@@ -55,7 +60,7 @@ def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
     chosen = np.linspace(0, len(pins) - 1, min(TIMED, len(pins))).astype(int)
     rows = []
     for kind in KINDS:
-        make_graph(kind, rest, outmost=outmost)  # loads the compiled code
+        make_graph(kind, rest, outmost=outmost)  # not timed: the first call loads the compiled code
         taken, edges = [], []
         for k in chosen:
             started = perf_counter()
@@ -81,18 +86,19 @@ def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class AreaChange:
-    """The areas of one contact.
+    """The change of the Voronoi areas by one contact.
 
     Attributes
     ----------
     name : str
     depth_mm : float
-        Beyond first touch.
-    graph : PinGraph
-        Voronoi.
-    rest_area_px2 : (N,) float
-    source : str
-        ``twin``, or the recorded frame's name.
+        Depth beyond first touch.
+        graph : PinGraph
+            Voronoi graph of the contact.
+        rest_area_px2 : (N,) float
+            Areas without contact.
+        source : str
+            ``twin``, or the name of the recorded frame.
     """
 
     name: str
@@ -102,7 +108,7 @@ class AreaChange:
     source: str = "twin"
 
     def figures(self) -> dict[str, Any]:
-        """Row of the table: by how many percent areas changed, and the mean place of growth (px from the middle, weighted by growth)."""
+        """Row of the table: changes of the areas in percent, and the mean place of growth in px from the middle, weighted by growth."""
         change = 100 * (self.graph.area_px2 / self.rest_area_px2 - 1)
         grown = np.maximum(change, 0)
         place = self.graph.nodes_px - self.graph.nodes_px.mean(axis=0)
@@ -126,12 +132,12 @@ def twin_contacts(
     names: tuple[str, ...] = tuple(CONTACTS),
     progress: Step | None = None,
 ) -> list[AreaChange]:
-    """Every contact at every depth: pressed, rendered, its pins found and their Voronoi cells made.
+    """Simulate and render every contact at every depth, find its pins, and compute their Voronoi cells.
 
     Raises
     ------
     TwinError
-        The pins of a rendered frame are not found.
+        The pins of a rendered frame can't be found.
     """
     simulator, pipeline = Simulator(spec), Pipeline(spec, form)
     rest = pipeline(simulator.shoot_rest(form).frame)
@@ -154,7 +160,7 @@ def twin_contacts(
 
 
 def recorded_contacts(data: Dataset) -> list[AreaChange]:
-    """The recorded frame nearest to a straight press of each depth; none where the labels lack depth, angle or moves.
+    """The recorded frame nearest to a straight press of each depth. The list is empty if a label of depth, angle or move is missing.
 
     The depth beyond first touch is ``pose_2`` + tap + the rig's contact offset, which is 0 for a rig that was never calibrated.
     """
@@ -184,7 +190,7 @@ def _turned(turn_deg: float) -> np.ndarray:
 
 
 def contacts_figure(contacts: list[AreaChange]) -> Figure:
-    """One column for each contact, the shallow one above the deep one, all on the same colour scale."""
+    """A figure with a column for each contact: the shallow one above, the deep one below. All have the same colour scale."""
     limit = max(contact.figures()["largest_growth_percent"] for contact in contacts)
     names = list(dict.fromkeys(contact.name for contact in contacts))
     figure, axes = new_figure(len(names), len(DEPTHS_MM), panel_inch=3.8)

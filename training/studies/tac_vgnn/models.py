@@ -1,9 +1,8 @@
-"""The models of the paper's comparison: trained on the same rows, judged on the same others, and timed at several batch sizes."""
+"""The models of the paper's comparison. All are trained and judged on the same rows, and timed at several batch sizes."""
 
 import csv
 import ctypes
 import gc
-import json
 import threading
 import time
 from dataclasses import dataclass
@@ -23,12 +22,16 @@ from training.models.part import Inputs
 from training.networks import parameter_count
 from training.pins import PinTable
 from training.run import RunConfig, is_finished, train_run
+from training.run_files import CHECKPOINT, TENSORS, read_config
 from twin.progress import Progress, silent, stage
 
-INITIAL_ROWS = 500  # rows from which a timed network takes its scales and modes; its speed does not depend on their number
-MIB = 2.0**20  # bytes
-WATCH_S = 0.01  # s between two looks at the process's memory
-# Columns of the page's table of models that hold no errors, in their order.
+# Number of rows from which a timed network takes its scales and modes. Its speed does not depend on this number.
+INITIAL_ROWS = 500
+# Bytes of a MiB.
+MIB = 2.0**20
+# Time between two measurements of the process's memory, s.
+WATCH_S = 0.01
+# Columns of the page's table of models that hold no errors, in the order of the table.
 SHOWN = (
     *("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters"),
     *("frames", "without_prediction", "leak_slope", "paper_mm", "paper_deg"),
@@ -42,7 +45,7 @@ class PlannedRun:
     Attributes
     ----------
     name : str
-        A model, or one with an ingredient left out, as ``vgnn-without-graph``.
+        Name of a model, or of one without an ingredient, such as ``vgnn-without-graph``.
     config : RunConfig
     """
 
@@ -56,7 +59,7 @@ class PlannedRun:
 
 
 def plan_run(name: str, *, labels: str, seed: int, split: int, epochs: int | None = None) -> PlannedRun:
-    """The run that a model's name stands for.
+    """The run of a model with this name.
 
     Raises
     ------
@@ -71,12 +74,12 @@ def plan_run(name: str, *, labels: str, seed: int, split: int, epochs: int | Non
 def train_all(
     plans: list[PlannedRun], data: Dataset, out: Path, *, max_minutes: float | None, device: str = "cpu", progress: Progress = silent
 ) -> dict[str, float]:
-    """Train every run, or continue it; the time left is shared evenly among the runs still to come.
+    """Train or continue every run. The remaining time is divided evenly among the remaining runs.
 
     Returns
     -------
     dict
-        Minutes that this call spent on each run, by its folder; runs for which no time was left are missing.
+        Minutes that this call spent on each run, by the run's folder. Runs for which no time was left are missing.
     """
     started, spent = monotonic(), {}
     for k, plan in enumerate(plans):
@@ -97,7 +100,7 @@ def train_all(
 
 
 def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None) -> dict[str, Any]:
-    """One run's row of the table: its errors on the rows kept out of training, or only that it was not begun."""
+    """One run's row of the table, with its errors on the rows kept out of training. If it was not begun, the row says only that."""
     folder = out / plan.folder
     row: dict[str, Any] = {
         "model": plan.name,
@@ -106,15 +109,15 @@ def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None)
         "minutes_now": minutes,
         "state": "not begun",
     }
-    if not (folder / "weights.pt").is_file():
+    if not (folder / TENSORS).is_file():
         return row
     estimator = PoseEstimator.load(folder)
     rows = rows_to_judge(estimator, data, "validation")
     metrics = judge(estimator.predict_rows(data, rows), data, rows)
     curves = read_curves(folder)
     row |= {
-        "state": "ended early" if (folder / "checkpoint.pt").exists() else "finished",
-        "parameters": json.loads((folder / "config.json").read_text())["parameters"],
+        "state": "ended early" if (folder / CHECKPOINT).exists() else "finished",
+        "parameters": read_config(folder)["parameters"],
         "epochs": len(curves),
         "epochs_allowed": plan.config.recipe.epochs * plan.config.recipe.members,
         "training_minutes": sum(point["seconds"] for point in curves) / 60,
@@ -139,12 +142,12 @@ def error_columns(data: Dataset) -> list[str]:
 
 def read_curves(folder: Path) -> list[dict[str, float]]:
     """The learning curve of a run: a dict of numbers for each epoch, one network after the other."""
-    with (folder / "curves.csv").open(newline="") as file:
+    with (folder / "curves.csv").open(newline="", encoding="utf-8") as file:
         return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
 
 def ordering(rows: list[dict[str, Any]], key: str) -> list[tuple[str, float, float]]:
-    """Models in the order of a column's mean over seeds, the least first: name, mean, and largest less least of the seeds."""
+    """Models sorted by a column's mean over seeds, the smallest first: name, mean, and difference between largest and smallest seed."""
     values: dict[str, list[float]] = {}
     for row in rows:
         if row.get(key) is not None:
@@ -153,14 +156,14 @@ def ordering(rows: list[dict[str, Any]], key: str) -> list[tuple[str, float, flo
 
 
 class PeakMemory:
-    """The largest memory while it is watched, in MiB above the start: of the GPU, or of the process's resident set on a CPU."""
+    """Context that measures the peak memory, in MiB above that at its start: of the GPU, or of the process's resident set on a CPU."""
 
     def __init__(self, device: str = "cpu") -> None:
         self.device, self.peak = device, 0.0
 
     def __enter__(self) -> "PeakMemory":
         gc.collect()
-        # Memory that was freed before and not given back to the system would hide what is taken now.
+        # Freed memory that was not given back to the system would be reused, and the resident set would not grow.
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim:
             trim(0)
@@ -185,24 +188,24 @@ class PeakMemory:
     def _now(self) -> float:
         if self.device == "cuda":
             return torch.cuda.memory_allocated() / MIB
-        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / MIB
+        return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * 4096 / MIB
 
 
 def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, device: str = "cpu") -> dict[str, Any]:
-    """Time and memory of training a model for an epoch, or for some batches where an epoch takes many minutes.
+    """Time and memory of training a model for an epoch, or for some batches if an epoch takes many minutes.
 
     Parameters
     ----------
     pins : PinTable
         M frames.
     inputs : Inputs
-        Rows of an epoch: each frame once or several times.
+        Inputs of an epoch. It may hold each frame several times.
 
     Returns
     -------
     dict
         ``model``, ``parameters``, ``batch``, ``rows_timed``, ``ms_per_frame`` (in an epoch, all its rows together),
-        ``s_per_epoch`` (None where only some batches were timed) and ``memory_mib``. A first pass, not timed, warms up.
+        ``s_per_epoch`` (None if only some batches were timed) and ``memory_mib``. A first pass is not timed.
     """
     torch.manual_seed(0)
     part, count = model_named(model), len(inputs)

@@ -16,12 +16,17 @@ from twin.report.page import Page, Picture
 from twin.report.table import Column
 from twin.report.themes import SERIES
 
-RUN = ("model", "seed", "state")  # columns of the table of models that name a run
-TRAINING = ("epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters")  # those that get a table of their own
-FEW = 5  # points of a curve that are marked, as a line of one or two would not be seen
-LINES = ("-", "--", ":", "-.")  # of models, one after the other once the colours are used up; the seeds of a model look alike
+# Columns of the table of models that name a run.
+RUN = ("model", "seed", "state")
+# Columns about training, which are shown in a separate table.
+TRAINING = ("epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters")
+# Number of points up to which the points of a curve are marked, because a line of one or two points can't be seen.
+FEW = 5
+# Line styles. The next one is used when all colours are used. All seeds of a model have the same colour and style.
+LINES = ("-", "--", ":", "-.")
+# Units of scaled labels by the recipe's scaling.
 SCALINGS = {"none": "mm and deg", "standard": "standard deviations", "unit": "half ranges"}
-HEADINGS = {  # of the tables' columns, with their units; others are titled by their keys
+HEADINGS = {  # titles and units of the tables' columns; the title of any other column is its key
     "epochs_allowed": ("epochs allowed", ""),
     "training_minutes": ("training", "min"),
     "s_per_epoch": ("per epoch", "s"),
@@ -43,25 +48,25 @@ HEADINGS = {  # of the tables' columns, with their units; others are titled by t
 
 
 def draw_efficiency(path: Path, rows: list[dict]) -> Path:
-    """Time of training against batch size; the marker's area is the memory."""
+    """Draw the time of training against batch size. The area of a marker is proportional to the memory."""
     return write_chart(path, lambda: _efficiency_figure(rows))
 
 
 def draw_curves(path: Path, plans: list[PlannedRun], folder: Path) -> Path:
-    """Error on the watched tenth of the training rows against epochs and against time, of every run that has begun."""
+    """Draw the error on the held-out tenth of the training rows against epochs and against time, for every run that was begun."""
     begun = [plan for plan in plans if (folder / plan.folder / "curves.csv").is_file()]
     return write_chart(path, lambda: _curves_figure(begun, folder))
 
 
 def draw_contacts(path: Path, contacts: list[AreaChange]) -> Path:
-    """The interpretability figure."""
+    """Draw the change of the Voronoi areas of each contact (the paper's interpretability figure)."""
     return write_chart(path, lambda: contacts_figure(contacts))
 
 
 def write_page(
     out: Path, *, data: Dataset, models: list[dict], graphs: list[dict], efficiency: list[dict], contacts: list[dict], notes: dict
 ) -> Path:
-    """``index.html`` over all that was written beside it.
+    """Write ``index.html``, which shows all tables and charts in the same folder.
 
     Parameters
     ----------
@@ -70,7 +75,7 @@ def write_page(
     models, graphs, efficiency, contacts : list of dict
         Rows of the tables of the same names.
     notes : dict
-        ``columns`` of the table of models, ``labels`` that were learnt, ``max_minutes``, ``device`` and ``threads``.
+        ``columns`` of the table of models, kind of ``labels`` that were learnt, ``max_minutes``, ``device`` and ``threads``.
     """
     ranges = ", ".join(
         f"{name} [{number(float(data.targets.raw[:, k].min()))}, {number(float(data.targets.raw[:, k].max()))}] {unit}"

@@ -11,21 +11,22 @@ from scenes import SensorSpec
 from training.dataset import Dataset, load_dataset
 from training.models import model_named
 from training.networks import choose_device
-from training.recipes import TrainingError
 from training.studies.tac_vgnn.contacts import AreaChange, compare_graphs, recorded_contacts, twin_contacts
 from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
 from training.studies.tac_vgnn.page import draw_contacts, draw_curves, draw_efficiency, write_page
+from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.types import Form
 
 MODELS = ("gnn", "tac-vgnn", "vgnn", "cnn-v2", "cnn-v1")
-BATCHES = (64, 256, 512)  # of the efficiency figure
+# Batch sizes of the efficiency figure.
+BATCHES = (64, 256, 512)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is compared, on what.
+    """Settings of the comparison.
 
     Attributes
     ----------
@@ -33,28 +34,28 @@ class Plan:
         A labelled recording.
     sensor : SensorSpec
     models : tuple of str
-        As ``plan_run`` takes them.
-    seeds : tuple of int
-        Of weights and order; every model is trained with each.
-    labels : {"raw", "corrected"}
-        That are learnt.
-    target : str or tuple of str
-        A preset, or the label columns.
-    split : int
-        Seed of the fifth that is kept out of training.
-    epochs : int or None
-        None: each model's own number.
-    max_minutes : float or None
-        For all trainings together.
-    batches : tuple of int
-        Of the efficiency figure; none: no figure.
-    contacts : bool
-        Press and render the contacts of the area figure.
-    device : {"auto", "cpu", "cuda"}
-    threads : int or None
-        Of the CPU.
-    form : Form or None
-        Of the frames; told by size and content where None.
+        Names of models, as ``plan_run`` takes them.
+        seeds : tuple of int
+            Seeds of the weights and of the order of rows; every model is trained with each seed.
+        labels : {"raw", "corrected"}
+            Kind of labels that are learnt.
+        target : str or tuple of str
+            A preset, or the label columns.
+        split : int
+            Seed of the random fifth of the rows that is kept out of training.
+        epochs : int or None
+            Number of epochs; None: each model's own number.
+        max_minutes : float or None
+            Time for all trainings together.
+        batches : tuple of int
+            Batch sizes of the efficiency figure; if empty, there is no figure.
+        contacts : bool
+            Simulate and render the contacts of the area figure.
+        device : {"auto", "cpu", "cuda"}
+        threads : int or None
+            Number of CPU threads.
+        form : Form or None
+            Form of the frames; None: recognised by size and content.
     """
 
     data: Path
@@ -74,9 +75,11 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.labels not in ("corrected", "raw"):
-            raise TrainingError(f"--labels must be corrected or raw, got {self.labels!r}")
+            raise OptionError(f"--labels must be corrected or raw, got {self.labels!r}")
         if not self.models or not self.seeds:
-            raise TrainingError("nothing to compare: give at least one of --models and of --seeds")
+            raise OptionError("nothing to compare: give at least one of --models and of --seeds")
+        if any(batch < 1 for batch in self.batches):
+            raise OptionError(f"--batches {','.join(map(str, self.batches))}: a batch has at least 1 frame")
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""
@@ -89,16 +92,16 @@ class Plan:
 
 @dataclass(frozen=True)
 class Result:
-    """What came of it.
+    """The result of the comparison.
 
     Attributes
     ----------
     rows : list of dict
-        One for each run, see ``table_row``.
-    graphs, efficiency, contacts : list of dict
-        Rows of the tables beside it; the last two are empty where they were not asked for.
-    names : tuple of str
-        Of the labels.
+        A row for each run, see ``table_row``.
+        graphs, efficiency, contacts : list of dict
+            Rows of the other tables; the last two are empty if they were not asked for.
+        names : tuple of str
+            Names of the labels.
     written : list of Path
     """
 
@@ -110,7 +113,7 @@ class Result:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """A line for each run, for people."""
+        """The result as lines of text, one for each run."""
         return [f"{row['model']}, seed {row['seed']}: {row['state']}{self._errors(row)}" for row in self.rows]
 
     def _errors(self, row: dict[str, Any]) -> str:
@@ -120,15 +123,15 @@ class Result:
 
 
 def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
-    """Compare graphs, models, training efficiency, and what the areas show.
+    """Compare graphs, models and training efficiency, and show the Voronoi areas of contacts.
 
     Writes ``runs/``, ``models.csv``, ``graphs.csv``, ``efficiency.csv``, ``contacts.csv``, their figures and ``index.html`` to ``out``.
-    A run that was ended is gone on with.
+    An interrupted run is continued.
 
     Raises
     ------
     TrainingError
-        A model is not known, the device is missing, or a folder holds another run.
+        A model or the device does not exist, or a folder holds another run.
     """
     device, runs = choose_device(plan.device), plan.runs()
     if plan.threads:
@@ -173,7 +176,7 @@ def _efficiency(plan: Plan, runs: list[PlannedRun], data: Dataset, device: str, 
 
 
 def _contacts(plan: Plan, data: Dataset, progress: Progress) -> list[AreaChange]:
-    """Contacts of the twin, where they are asked for, and recorded ones."""
+    """Contacts of the twin if they are asked for, and recorded contacts."""
     recorded = recorded_contacts(data)
     if not plan.contacts:
         return recorded

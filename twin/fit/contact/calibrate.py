@@ -11,7 +11,7 @@ from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError
+from twin.errors import OptionError
 from twin.fit.contact.fit import fit_contact, held_out_px, simulate
 from twin.fit.contact.parameters import PARAMETERS, Parameter
 from twin.fit.contact.report import summary_of, write_calibration
@@ -84,7 +84,7 @@ class ContactCalibration:
     sensor : SensorSpec
         The specification with the fitted parameters.
     summary : dict
-        All figures, as ``calibration.json`` holds them.
+        Content of ``calibration.json``.
     written : list of Path
         The specification, then the page.
     """
@@ -94,7 +94,7 @@ class ContactCalibration:
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """The parameters with their uncertainty, and the errors before and after; for people."""
+        """The result as lines of text: the parameters with their uncertainty, and the errors before and after."""
         lines = [f"note: {problem}" for problem in self.summary["problems"]]
         for p in self.summary["parameters"]:
             doubt = "" if p["known"] else "  (these frames do not tell it)"
@@ -102,6 +102,7 @@ class ContactCalibration:
         for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
             if part := self.summary[key]:
                 lines.append(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
+        lines += self.summary["warnings"]
         if self.summary["distrusted"]:
             lines.append(f"not trusted: {', '.join(self.summary['distrusted'])}")
         return lines
@@ -124,7 +125,8 @@ def calibrate_to_file(
 ) -> ContactCalibration:
     """Fit the contact of a specification to labelled frames, and write it.
 
-    Beside the specification a folder ``NAME-contact`` holds the page and the simulated contacts: an interrupted run goes on there.
+    The folder ``NAME-contact`` beside the specification holds the page and the simulated contacts, so that an interrupted run can be
+    continued.
 
     Parameters
     ----------
@@ -133,22 +135,22 @@ def calibrate_to_file(
     out : Path
         The ``.toml`` file to write.
     touched : ObjectSpec, optional
-        What the sensor touched; the experiment's own object by default.
-    labels : int
-        How many frames to fit to; they are chosen at random.
+        The object; the experiment's own by default.
+        labels : int
+            Number of frames to fit to; they are chosen at random.
     seed : int
         Seed of this choice.
     hold : collection of str
-        Names of parameters that stay as they are.
+        Names of parameters that are not fitted.
 
     Raises
     ------
     FrameError
-        No labels, no pins, too few frames, an unknown parameter, or ``out`` is no name of a ``.toml`` file.
+        There are no labels, no pins or too few frames, a parameter is unknown, or ``out`` is not the name of a ``.toml`` file.
     """
     names = [parameter.name for parameter in PARAMETERS]
     if unknown := set(hold) - set(names):
-        raise FrameError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
+        raise OptionError(f"--hold {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = folder_beside(out, "contact")
     parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
     with stage(progress, "contacts") as step:
@@ -168,5 +170,5 @@ def calibrate_to_file(
             progress=step,
         )
     said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
-    write_sensor(out, fitted, said)
+    write_sensor(out, fitted, "\n".join([said, *summary["warnings"]]))
     return ContactCalibration(fitted, summary, [out, page])

@@ -1,14 +1,14 @@
-"""Fitting contacts to labelled frames when it is not known whether each frame's move had been executed.
+"""Fit of contacts to labelled frames if it is not known whether each frame's move was executed.
 
-With d_k1, d_k0 the mean squared pin errors of frame k after the move and after the tap alone, s^2 the median squared
-error, w the share of executed moves and theta the parameters with their prior,
+d_k1 and d_k0 are the mean squared pin errors of frame k after the move and after the tap alone, s^2 the median squared error, w the share
+of executed moves, and theta the parameters with their prior:
 
     E-step:  p_k = w exp(-n d_k1 / 2 s^2) / (w exp(-n d_k1 / 2 s^2) + (1 - w) exp(-n d_k0 / 2 s^2))
     M-step:  theta minimises sum_k c_k n (p_k d_k1 + (1 - p_k) d_k0) / s^2 + sum ((theta - theta_0) / prior)^2
 
-n is how many independent numbers a frame's pins stand for: errors of the model are shared by all of them. c_k falls for
-frames that neither story fits. The M-step is one Gauss-Newton step by differences; the uncertainty is the inverse of its
-matrix at the end.
+n is the number of independent observations in a frame. It is smaller than the number of pins, because the model's errors are common to all
+pins. c_k is smaller for frames that neither story (move executed, or not) fits. The M-step is one Gauss-Newton step with difference
+quotients. The uncertainty is the inverse of its matrix at the end.
 """
 
 from dataclasses import dataclass
@@ -25,45 +25,45 @@ from twin.progress import Step
 from twin.rig.kinematics import rig_of
 
 INDEPENDENT = 6.0
-"""n above: number of modes of the displacement that carry nearly all of it."""
+"""n above: the number of modes that contain nearly all of the displacement."""
 ROUNDS = 3
 """Most rounds of E-step and M-step."""
 SHORTEST = 1 / 8
-"""A Gauss-Newton step is halved down to this share of its length before it is given up."""
+"""Least share of a Gauss-Newton step. A step that does not lower the cost is halved until this share, then the search ends."""
 DISTRUST = 9.0
-"""A frame whose squared error exceeds the median by this factor (3 sd) counts less."""
+"""Ratio of a frame's squared error to the median (3 standard deviations) above which the frame has a smaller weight."""
 EXPECT_ROUNDS = 20
-"""Rounds of the E-step between the shares of executed moves and the variance. It settles in fewer."""
+"""Rounds of the E-step, in which the share of executed moves and the variance are found alternately. Fewer rounds are enough."""
 START_FRAMES = 3
-"""This many frames with the largest turns, and as many with the largest moves, decide the signs to start from."""
+"""Number of frames with the largest turns, and of frames with the largest moves, by which the signs at the start are chosen."""
 TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
-"""Turns of the image, deg, that are tried to start from."""
+"""Turns of the image, deg, that are tried at the start."""
 FEWEST = 4
 """Fewest frames to which a contact is fitted."""
 LEAST_PX2 = 0.01
-"""Least variance of a pin's place, px^2: pins are not measured better."""
+"""Least variance of a pin's place, px^2: the precision of the measurement."""
 SMALLEST_SHARE, LARGEST_SHARE = 0.05, 0.95
 """Bounds of the share of executed moves, so that its logarithm stays finite."""
 
 
 @dataclass(frozen=True)
 class ContactFit:
-    """What a calibration found.
+    """The result of a calibration.
 
     Attributes
     ----------
     sensor : SensorSpec
     start, value, sd : (P,) float
-        Fitted quantities of the setup's parameters (see ``Parameter.scale``): shipped and fitted ones, and their uncertainty.
-    told : (P,) float
-        Share of the prior's variance that the frames removed: 1 where the frames tell the parameter, 0 where it stayed at its start.
+        Fitted quantities of the setup's parameters (see ``Parameter.scale``) at the start and at the end, and their standard deviations.
+        told : (P,) float
+            Share of the prior's variance that the frames removed: 1 if the frames determine the parameter, 0 if it stayed at its start.
     correlation : (P, P) float
     executed : (M,) float
         Probability that each frame's move was executed.
     trust : (M,) float
-        1 for a frame that one story fits, towards 0 for one that none does.
-    before_px, after_px : (M,) float
-        Mean pin error of each frame under its likelier story.
+        1 for a frame that one story fits; near 0 for a frame that none fits.
+        before_px, after_px : (M,) float
+            Mean pin error of each frame for the story that fits it better.
     share : float
         Share of the moves that were executed.
     """
@@ -91,7 +91,7 @@ class Weights:
     variance_px2: float
 
     def cost(self, squared_px2: np.ndarray) -> float:
-        """Cost of squared errors (M, 2), after tap and move; a failed contact (NaN) costs nothing."""
+        """Cost of squared errors (M, 2), after tap and after move. A failed contact (NaN) has no cost."""
         squared = np.nan_to_num(squared_px2)
         each = (1 - self.executed) * squared[:, 0] + self.executed * squared[:, 1]
         return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
@@ -135,7 +135,7 @@ def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Step | None
 def _searched(
     setup: Setup, measured: MeasuredFrames, target: np.ndarray, start: np.ndarray, sign: int, progress: Step | None
 ) -> tuple[np.ndarray, np.ndarray, Weights]:
-    """The values (P,) of least cost, the displacements (M, 2, N, 2) px under them, and the E-step's weights there."""
+    """The values (P,) with the least cost, their displacements (M, 2, N, 2) px, and the weights of the E-step for them."""
     prior = np.array([p.prior for p in setup.parameters])
     value = start.copy()
     moved = simulate(setup, measured, [value], sign, progress)[0]
@@ -163,7 +163,7 @@ def _searched(
 
 
 def held_out_px(setup: Setup, fit: ContactFit, measured: MeasuredFrames, *, progress: Step | None = None) -> tuple[float, float]:
-    """Mean pin error, before and after, on frames that were not fitted; each under its likelier story."""
+    """Mean pin error, before and after, on frames that were not fitted. Each frame's error is that of the story that fits it better."""
     target = measured.pins_px - measured.no_contact_px
     errors = []
     for values, sign in ((fit.start, rig_of(setup.sensor).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign)):
@@ -172,14 +172,14 @@ def held_out_px(setup: Setup, fit: ContactFit, measured: MeasuredFrames, *, prog
 
 
 def likelier_px(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(M,) mean pin error under the story that leaves less, of displacements (M, 2, N, 2) against (M, N, 2)."""
+    """(M,) mean pin error of displacements (M, 2, N, 2) from (M, N, 2), for the story with the smaller one."""
     seen = np.isfinite(target[:, None, :, 0])
     each = np.where(seen, np.linalg.norm(moved - target[:, None], axis=-1), 0.0)
     return np.fmin(*(each.sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)).T)
 
 
 def expect(squared_px2: np.ndarray) -> Weights:
-    """The E-step from squared errors (M, 2), after tap and move: shares and variance are found in turn until they stay."""
+    """The E-step from squared errors (M, 2) after tap and after move. Share and variance are found alternately until they converge."""
     failed = ~np.isfinite(squared_px2).all(axis=1)
     squared = np.where(failed[:, None], 0.0, squared_px2)
     best, share = squared.min(axis=1), 0.5
@@ -191,13 +191,13 @@ def expect(squared_px2: np.ndarray) -> Weights:
         each = (1 - executed) * squared[:, 0] + executed * squared[:, 1]
         if trust.sum() == 0:
             break
-        variance = max(float(np.median(each[~failed])), LEAST_PX2)  # the median, so that one frame that nothing fits does not widen it
+        variance = max(float(np.median(each[~failed])), LEAST_PX2)  # the median, because frames that nothing fits do not change it
         share = float(np.clip(trust @ executed / trust.sum(), SMALLEST_SHARE, LARGEST_SHARE))
     return Weights(executed, trust, share, variance)
 
 
 def _start(setup: Setup, measured: MeasuredFrames, target: np.ndarray, progress: Step | None) -> tuple[np.ndarray, int]:
-    """Values (P,) and the sign of the turns to start from: those that fit best among both signs and all quarter turns of the image."""
+    """Values (P,) and sign of the turns at the start: the best fit among both signs and all quarter turns of the image."""
     value = values_of(setup.sensor, setup.experiment, setup.parameters)
     by_turn = np.argsort([-np.abs(label.pose[3:] - label.move[3:]).max() for label in measured.labels])[:START_FRAMES]
     by_move = np.argsort([-np.abs(label.move[:3]).max() for label in measured.labels])[:START_FRAMES]
@@ -222,21 +222,21 @@ def simulate(setup: Setup, measured: MeasuredFrames, values: list, sign: int, pr
 
 
 def _slopes(setup: Setup, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress: Step | None) -> np.ndarray:
-    """(P, M, 2, N, 2) px for a unit of each parameter; 0 where a contact failed."""
+    """Derivatives (P, M, 2, N, 2) of the displacements by each fitted quantity, px; 0 for a failed contact."""
     steps = np.diag([p.step for p in setup.parameters])
     there = simulate(setup, measured, [value + step for step in steps], sign, progress)
     return np.nan_to_num((there - moved) / np.diag(steps)[:, None, None, None, None])
 
 
 def mean_squared(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(M, 2) mean squared pin error, px^2, of displacements (M, 2, N, 2); lost pins are left out, a failed contact is NaN."""
+    """(M, 2) mean squared pin error, px^2, of displacements (M, 2, N, 2). Lost pins are left out; a failed contact gives NaN."""
     seen = np.isfinite(target[:, None, :, 0])
     each = np.sum((moved - target[:, None]) ** 2, axis=-1)
     return np.where(seen, each, 0.0).sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
 
 
 def _normal(slopes: np.ndarray, missing: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Newton's matrix (P, P) and right-hand side (P,); lost pins count for nothing."""
+    """Matrix (P, P) and right-hand side (P,) of the Gauss-Newton step. Lost pins are left out."""
     seen = np.isfinite(missing)
     share = np.stack([1 - weights.executed, weights.executed], axis=1) * weights.trust[:, None]
     pins = np.maximum(seen[..., 0].sum(axis=-1), 1)

@@ -1,4 +1,4 @@
-"""The numbers that contacts are calibrated by."""
+"""The parameters of the contact calibration."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,26 +10,26 @@ from scenes.sensor import SensorSpec
 from twin.rig.kinematics import TURNING, rig_of
 
 LEAST = 1e-3
-"""Least number whose logarithm is taken (of 1 - 2 nu for a Poisson's ratio nu)."""
+"""Least number of which a logarithm is computed; for a Poisson's ratio nu the least 1 - 2 nu."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a sensor's specification.
+    """One number of a sensor's specification that is fitted.
 
     Attributes
     ----------
     name : str
-        Dotted key; ``rig.turn_offset_deg`` is the turn in the plane of approach and across.
-    prior : float
-        Sd of the fitted quantity around its start before any frame is seen.
-    step : float
-        Step of the fitted quantity for difference quotients.
+        Dotted key. Of ``rig.turn_offset_deg`` only the turn in the plane of approach and across is fitted.
+        prior : float
+            Prior standard deviation of the fitted quantity around its start.
+        step : float
+            Step of the fitted quantity for difference quotients.
     scale : {"plain", "log", "volume"}
-        The fitted quantity: the number itself, its logarithm, or, for a Poisson's ratio nu, log(1 - 2 nu), which tells how much the
-        volume yields.
+        The fitted quantity: the number itself, its logarithm, or, for a Poisson's ratio nu, log(1 - 2 nu), which measures how
+        compressible the volume is.
     least : float
-        Smallest number that makes sense. The fitted quantity may go below it; the number then stays here.
+        Smallest meaningful number. If the fitted quantity is below it, the number is ``least``.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Parameter:
         return float(np.exp(fitted) if self.scale == "log" else (1 - np.exp(fitted)) / 2)
 
     def slope(self, fitted: float) -> float:
-        """Absolute change of the number for a unit of the fitted quantity."""
+        """Absolute change of the number for a change of the fitted quantity by 1."""
         return 1.0 if self.scale == "plain" else float(np.exp(fitted)) / (1 if self.scale == "log" else 2)
 
 
@@ -73,7 +73,7 @@ PARAMETERS = (
 
 
 def values_of(sensor: SensorSpec, experiment: ExperimentSpec, parameters: tuple[Parameter, ...] = PARAMETERS) -> np.ndarray:
-    """Fitted quantities (P,) of the parameters, as the specification has them."""
+    """Fitted quantities (P,) of the specification's parameters."""
     plain = sensor.model_dump(include={"gel", "skin", "pins"}) | {"rig": rig_of(sensor).model_dump()}
     turning = TURNING[experiment.approach] - 3
     out = []
@@ -92,7 +92,7 @@ def changed(
     Raises
     ------
     ValidationError
-        The values make no valid sensor.
+        The values do not make a valid sensor.
     """
     plain = sensor.model_dump(mode="json") | {"rig": rig_of(sensor).model_dump(mode="json")}
     plain["rig"]["turn_sign"] = int(turn_sign)

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from twin.fit.contact.fit import INDEPENDENT, ContactFit
 from twin.fit.contact.simulate import Setup
+from twin.frames import distinct_stems
 from twin.judge.labelled.model import MeasuredFrames
 from twin.report.charts import new_figure, write_chart
 from twin.report.numbers import number
@@ -18,11 +19,11 @@ from twin.rig.kinematics import rig_of
 from twin.store import made_by, write_json
 
 TOLD = 0.5
-"""Frames tell a parameter if they remove at least this share of its prior variance."""
+"""Least share of a parameter's prior variance that the frames must remove for it to count as determined."""
 TRUSTED = 0.5
-"""A frame with less trust than this is listed as not trusted, and not drawn."""
+"""Trust below which a frame is listed as not trusted, and not drawn."""
 ALIKE = 0.9
-"""From this correlation on, two parameters can hardly be told apart."""
+"""Absolute correlation from which on two parameters are listed as hardly distinguishable."""
 
 
 def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out: tuple | None, held_frames: int) -> dict:
@@ -52,6 +53,7 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
         "executed_share": fit.share,
         "fitted_px": {"before": float(np.nanmean(fit.before_px)), "after": float(np.nanmean(fit.after_px)), "frames": len(measured)},
         "held_out_px": {"before": held_out[0], "after": held_out[1], "frames": held_frames} if held_out else {},
+        "warnings": warnings_of(fit, held_out, held_frames),
         "distrusted": [frame["image_name"] for frame in frames if frame["trust"] < TRUSTED],
         "frames": frames,
         "independent_numbers_a_frame": INDEPENDENT,
@@ -59,19 +61,38 @@ def summary_of(setup: Setup, measured: MeasuredFrames, fit: ContactFit, held_out
     }
 
 
+def warnings_of(fit: ContactFit, held_out: tuple | None, held_frames: int) -> list[str]:
+    """What is worse than before the fit, or not known; empty if nothing is."""
+    found = []
+    if not held_out:
+        found.append(
+            "no frame was left to keep out of the fit: how well it does on other frames is not known; give more frames, or less --labels"
+        )
+    pairs = {"the fitted frames": (float(np.nanmean(fit.before_px)), float(np.nanmean(fit.after_px)))}
+    if held_out:
+        pairs[f"the {held_frames} frames kept out"] = held_out
+    for frames, (before, after) in pairs.items():
+        if not after <= before:
+            found.append(
+                f"the fit ended worse than it began on {frames}: {before:.2f} -> {after:.2f} px; look at the page before you use it"
+            )
+    return found
+
+
 def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray, fit: ContactFit, summary: dict) -> Path:
-    """Write ``calibration.json``, charts and ``index.html``; the page.
+    """Write ``calibration.json``, charts and ``index.html``, and return the page.
 
     Parameters
     ----------
     moved : (2, 2, M, N, 2) float
-        Simulated displacements, px, before and after the calibration: each after the tap and after the move.
+        Simulated displacements, px. Axes: before and after the calibration; after the tap and after the move; frame; pin; x and y.
     """
     figures = write_json(folder / "calibration.json", summary | {"made_by": made_by("twin.fit.contact.fit")})
     solved = np.flatnonzero(np.isfinite(fit.after_px) & np.isfinite(fit.before_px) & (fit.trust >= TRUSTED))
     chosen = solved[np.argsort(fit.before_px[solved])[[len(solved) // 2, -1]]] if len(solved) else solved
     page = Page(f"Contact of {summary['sensor']}", "twin calibrate contact", topic="TacTip twin: contact calibration", lead=_lead(summary))
     page.notice("Not trusted, as neither story fits them", [", ".join(summary["distrusted"])] if summary["distrusted"] else [], tone="bad")
+    page.notice("Warnings", summary["warnings"], tone="bad")
     page.notice("Noted", summary["problems"])
     _parameters_section(page, summary)
     page.section("Frames")
@@ -87,8 +108,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
         caption="Mean pin error of each frame; a dash: its contact failed.",
     )
     page.section("Real pins to simulated ones")
-    for k in chosen:
-        name = Path(measured.names[k]).stem
+    for k, name in zip(chosen, distinct_stems([measured.names[k] for k in chosen]), strict=True):
         chart = write_chart(folder / f"{name}.png", partial(_frame_figure, measured, moved, fit, int(k)))
         page.figures(Picture(chart, f"Pin errors of {name} before and after the calibration", measured.names[k]))
     page.download(figures, "all figures of this page")

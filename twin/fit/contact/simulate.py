@@ -1,4 +1,4 @@
-"""Simulated displacements of many contacts under many parameter values, each kept on disk as soon as it is there."""
+"""Simulated displacements of many contacts with many parameter values. Each is stored on disk as soon as it is computed."""
 
 import json
 from dataclasses import dataclass
@@ -23,25 +23,25 @@ from twin.workers import outcomes
 
 @dataclass(frozen=True)
 class Setup:
-    """What all contacts of a calibration share.
+    """Settings that all contacts of a calibration have in common.
 
     Attributes
     ----------
     sensor : SensorSpec
-        The sensor where the fit starts.
-    experiment : ExperimentSpec
-        How the arm approached the object.
+        The sensor at the start of the fit.
+        experiment : ExperimentSpec
+            The experiment that the frames were recorded with.
     touched : ObjectSpec
     form : Form
-        Form of the frames: the displacements are in px of it.
+        Form of the frames, in whose px the displacements are.
     across : int
         Elements along each side of the skin's grid.
     folder : Path
-        Where the simulated contacts are kept.
-    workers : int
-        Processes.
-    parameters : tuple of Parameter
-        What is fitted.
+        Folder for the simulated contacts.
+        workers : int
+            Number of processes.
+        parameters : tuple of Parameter
+            The fitted parameters.
     """
 
     sensor: SensorSpec
@@ -54,7 +54,7 @@ class Setup:
     parameters: tuple[Parameter, ...] = PARAMETERS
 
     def displacements(self, jobs: list[tuple], labels: list[ArmLabel], progress: Step | None = None) -> np.ndarray:
-        """(J, 2, N, 2) px after tap and after move for jobs of (values (P,), turn_sign, row of ``labels``); NaN where one failed."""
+        """(J, 2, N, 2) px after tap and after move, for jobs of (values (P,), turn_sign, row of ``labels``); NaN if the contact failed."""
         plans = [
             {"values": np.asarray(values).tolist(), "sign": int(sign), "pose": list(labels[row].pose), "move": list(labels[row].move)}
             for values, sign, row in jobs

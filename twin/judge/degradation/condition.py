@@ -1,7 +1,7 @@
-"""A condition: one way in which a sensor degrades, as frozen data, and where in the chain it acts.
+"""A condition: one way in which a sensor degrades, as frozen data, and the stage of the chain on which it acts.
 
-The chain is specification, contact, light on the film, camera response, frame, and the pipeline's own settings. Every hook
-returns its input unchanged, bit for bit, where the value is the nominal one.
+The stages are specification, contact, light on the film, camera response, frame, and the pipeline's settings. If the value is the nominal
+one, every hook returns its input unchanged, bit for bit.
 """
 
 import zlib
@@ -21,19 +21,19 @@ from twin.pins import DetectorSpec
 
 @dataclass(frozen=True)
 class View:
-    """What a condition may know of the picture it degrades.
+    """The information about a picture that conditions may use.
 
     Attributes
     ----------
     spec : SensorSpec
-        As it is rendered, degradations of the specification included.
-    center_px : (2,) float
-    radius_px : float
-        Of the disc through which the gel is seen.
-    px_per_mm : float
-        At the caps at rest.
-    caps_px : (N, 2) float
-        Where the caps are in this frame.
+        The rendered specification, including its degradations.
+        center_px : (2,) float
+        radius_px : float
+            Centre and radius of the disc through which the gel is seen.
+        px_per_mm : float
+            Scale at the caps at rest.
+        caps_px : (N, 2) float
+            Places of the caps in this frame.
     """
 
     spec: SensorSpec
@@ -45,7 +45,7 @@ class View:
     @classmethod
     def of(cls, spec: SensorSpec, caps_px: np.ndarray) -> "View":
         """The view of a sensor whose caps are at ``caps_px`` (N, 2), raw-frame px."""
-        disc = lens_disc(spec)
+        disc = lens_disc(spec.view, spec.housing)
         caps_mm = rest_pins(spec.geometry).caps_mm
         apart = [cKDTree(points).query(points, k=2)[0][:, 1] for points in (project(spec.view, caps_mm), caps_mm)]
         return cls(spec, disc.center_px, disc.radius_px, float(np.median(apart[0] / apart[1])), caps_px)
@@ -57,11 +57,11 @@ class View:
 
     @property
     def saturation(self) -> float:
-        """Linear light that the camera shows as white."""
+        """Linear light at which the camera is saturated."""
         return 1.0 / self.spec.response.exposure
 
     def grid(self, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """x and y (H, W) of a frame's pixels from the disc's centre, in its radius."""
+        """x and y (H, W) of a frame's pixels from the disc's centre, in units of its radius."""
         y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
         return (x - np.float32(self.center_px[0])) / self.radius_px, (y - np.float32(self.center_px[1])) / self.radius_px
 
@@ -84,7 +84,7 @@ class SectionChange(Protocol[S]):
 
 @dataclass(frozen=True)
 class OnSection(Generic[S]):
-    """A change of one section, as a change of the specification. (A class, not a closure: conditions travel between processes.)"""
+    """A change of one section, as a change of the specification. It is a class, because closures can't be sent between processes."""
 
     section: str
     change: SectionChange[S]
@@ -97,30 +97,30 @@ class OnSection(Generic[S]):
 class Condition:
     """One way in which a sensor degrades.
 
-    The parameter is ``nominal`` at severity 0 and ``severe`` at severity 1, and linear between them.
+    The parameter is ``nominal`` at severity 0 and ``severe`` at severity 1, and linear in the severity.
 
     Attributes
     ----------
     name, title, family : str
     parameter, unit : str
-        What ``nominal`` and ``severe`` are values of.
+        Name and unit of the parameter whose values are ``nominal`` and ``severe``.
     nominal, severe : float
     spec : callable, optional
-        ``spec(spec, value, rng)``: the degraded specification, before anything is rendered; ``OnSection`` where one section changes.
-    solves : bool
-        The specification's mechanics change: contacts are solved anew.
+        ``spec(spec, value, rng)`` returns the degraded specification, before anything is rendered; ``OnSection`` if one section changes.
+        solves : bool
+            Whether the mechanics of the specification change, so that contacts must be solved anew.
     light : callable, optional
-        ``light(light, value, view, rng)``: linear light on the film, before the camera's response.
-    frame : callable, optional
-        ``frame(image, value, view, rng)``: gray levels or RGB (uint8).
-    moves : callable, optional
-        ``moves(px, value, view)``: where ``light`` or ``frame`` moves points (n, 2) of the picture.
-    hides : callable, optional
-        ``hides(value, view, rng)``: (N,) bool, caps that are gone.
-    setting : callable, optional
-        ``setting(detector, value)``: a `DetectorSpec` that is set wrongly.
-    image_level : bool
-        Acts on a frame alone, so that a real frame can be degraded, too.
+        ``light(light, value, view, rng)`` returns the degraded linear light on the film, before the camera's response.
+        frame : callable, optional
+            ``frame(image, value, view, rng)`` returns the degraded gray levels or RGB (uint8).
+        moves : callable, optional
+            ``moves(px, value, view)`` returns the places to which ``light`` or ``frame`` moves points (n, 2) of the picture.
+        hides : callable, optional
+            ``hides(value, view, rng)`` returns the caps that are gone, (N,) bool.
+        setting : callable, optional
+            ``setting(detector, value)`` returns a `DetectorSpec` with a wrong setting.
+        image_level : bool
+            Whether the condition acts on a frame alone, so that real frames can also be degraded.
     """
 
     name: str
@@ -144,7 +144,7 @@ class Condition:
         return self.nominal + severity * (self.severe - self.nominal)
 
     def rng(self, draw: int = 0) -> np.random.Generator:
-        """The condition's own random numbers, the same at every severity, so that a degradation grows and does not move."""
+        """The condition's own random numbers. They are the same at every severity, so that a degradation grows at the same place."""
         return np.random.default_rng([zlib.crc32(self.name.encode()), draw])
 
 
@@ -166,12 +166,12 @@ class Case:
 
     @property
     def solves(self) -> bool:
-        """Contacts are solved anew."""
+        """Whether contacts must be solved anew."""
         return any(c.solves for c in self.conditions)
 
     @property
     def image_level(self) -> bool:
-        """Acts on frames alone."""
+        """Whether all conditions act on frames alone."""
         return all(c.image_level for c in self.conditions)
 
     def label(self, severity: float) -> str:
@@ -200,14 +200,14 @@ class Case:
         return image
 
     def on_points(self, px: np.ndarray, severity: float, view: View) -> np.ndarray:
-        """Where points (n, 2) go."""
+        """The places to which points (n, 2) are moved."""
         for c in self.conditions:
             if c.moves is not None:
                 px = c.moves(px, c.value(severity), view)
         return px
 
     def gone(self, severity: float, view: View) -> np.ndarray:
-        """(N,) bool: caps that are no longer there."""
+        """(N,) bool: caps that are gone."""
         gone = np.zeros(len(view.caps_px), bool)
         for c in self.conditions:
             if c.hides is not None:
@@ -223,12 +223,12 @@ class Case:
 
 
 def altered(spec: SensorSpec, **sections: Mapping[str, Any]) -> SensorSpec:
-    """A copy of a specification with values changed, section by section. Values are not validated: they are computed in range."""
+    """A copy of a specification with values changed section by section. It is not validated, because all values are computed in range."""
     return spec.model_copy(update={name: getattr(spec, name).model_copy(update=values) for name, values in sections.items()})
 
 
 def chosen(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
-    """(count,) bool: a random share of the places. A larger share, drawn with the same numbers, holds the smaller one."""
+    """(count,) bool: a random share of the places. A larger share with the same random numbers contains the smaller one."""
     mask = np.zeros(count, bool)
     mask[rng.permutation(count)[: round(share * count)]] = True
     return mask

@@ -1,4 +1,4 @@
-"""How severe a condition may grow before a measure crosses its limit: curves and envelopes of a sweep that has been run."""
+"""Curves and envelopes of a finished sweep: the severity of a condition at which a measure crosses its limit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from twin.judge.degradation.sweep import Plan, run_sweep
 from twin.pins.reference import nominal_reference
 
 DRAWS = 400
-"""Number of draws of the bootstrap over the frames."""
+"""Number of bootstrap samples of the frames."""
 BAND = (5, 95)
-"""Percentiles of these draws that bound the band: a 90 % interval."""
+"""Percentiles of these samples at the ends of the band: a 90 % interval."""
 SHORT = 0.75
-"""A real sensor with less than this share of the rendered margin has lost some of it. Chosen."""
+"""Share of the margin of rendered frames below which a real sensor counts as having lost margin. Chosen."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Curve:
     measure : Measure
     limit : float
     severity, mean, low, high : (S,) float
-        NaN where the measure has no meaning in any frame; the band is a 90 % bootstrap interval over the frames.
+        Severity, mean and ends of the band, a 90 % bootstrap interval over the frames. NaN if the measure is undefined in all frames.
     crossing : float
-        Severity at which the mean crosses the limit, linear between the steps; inf if it never does.
+        Severity at which the mean crosses the limit, by linear interpolation between the steps; inf if it does not.
     """
 
     case: str
@@ -47,20 +47,20 @@ class Curve:
 
 @dataclass(frozen=True)
 class Envelope:
-    """How far one pipeline goes under one case.
+    """The severity that one pipeline endures under one case.
 
     Attributes
     ----------
     case : Case
     pipeline : str
     severity : float
-        Severity at which the first measure crosses its limit; inf if none does up to the severest step.
-    measure : str
-        Name of that measure; "" if none.
-    looked : float
-        Severity of the severest step.
-    interval : (2,) float
-        Severities at which the ends of that measure's 90 % band cross; inf where one does not.
+        Severity at which the first measure crosses its limit; inf if none does up to the last step.
+        measure : str
+            Name of that measure; "" if none.
+        looked : float
+            Severity of the last step.
+        interval : (2,) float
+            Severities at which the ends of that measure's 90 % band cross the limit; inf if one does not.
     """
 
     case: Case
@@ -72,17 +72,17 @@ class Envelope:
 
     @property
     def reached(self) -> bool:
-        """Whether the pipeline fails within the range looked at."""
+        """Whether the pipeline fails within the swept range."""
         return np.isfinite(self.severity)
 
     @property
     def width(self) -> float:
-        """Severity, at most that of the severest step: a lower bound where the pipeline does not fail."""
+        """Severity, at most that of the last step. If the pipeline does not fail, it is a lower bound."""
         return min(self.severity, self.looked)
 
     @property
     def label(self) -> str:
-        """The severity in the parameter's unit, for people."""
+        """The severity as text, in the parameter's unit."""
         if not self.reached:
             return f"> {self.case.label(self.looked)}"
         return self.case.label(self.severity) if self.severity > 0 else "fails undegraded"
@@ -90,27 +90,27 @@ class Envelope:
 
 @dataclass(frozen=True)
 class Share:
-    """The margin of a sensor's real frames beside that of rendered ones."""
+    """The margin of a sensor's real frames compared with that of rendered frames."""
 
     real: Envelope
     rendered: Envelope
 
     @property
     def value(self) -> float:
-        """Ratio of the severities; a bound where either does not fail within the range."""
+        """Ratio of the severities. If one of them does not fail within the range, it is a bound."""
         if self.rendered.width > 0:
             return self.real.width / self.rendered.width
         return np.inf if self.real.width > 0 else 1.0
 
     @property
     def short(self) -> bool:
-        """Whether the real sensor has clearly less margin than the rendered one."""
+        """Whether the real sensor has significantly less margin than the rendered one."""
         return self.value < SHORT
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A sweep that has been run and judged.
+    """A finished sweep with its curves and envelopes.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Judgement:
 
 
 def judge_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> Judgement:
-    """Run a sweep, or what is left of it, and judge it."""
+    """Run or continue a sweep, and compute its curves and envelopes."""
     rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
     pitch_px = float(np.mean(nominal_reference(plan.source.spec, plan.source.form).spacing_px))
     curves = curves_of(rows, plan.cases, pitch_px)
@@ -136,7 +136,7 @@ def judge_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int,
 
 
 def crossing(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndarray) -> float:
-    """Severity at which a mean crosses its limit for the first time, linear between steps; inf if it never does."""
+    """Severity at which a mean first crosses its limit, by linear interpolation between steps; inf if it does not."""
     known = np.isfinite(mean)
     severity, mean = severity[known], mean[known]
     for k, value in enumerate(mean):
@@ -148,7 +148,7 @@ def crossing(measure: Measure, limit: float, severity: np.ndarray, mean: np.ndar
 
 
 def curves_of(rows: list[dict], cases: tuple[Case, ...], pitch_px: float) -> list[Curve]:
-    """Curves of all measures, pipelines and models; rows as `run_sweep` gives them."""
+    """Curves of all measures, pipelines and models from the rows of `run_sweep`."""
     table = _poses_against_nominal(rows)
     curves = []
     for case in cases:
@@ -175,7 +175,7 @@ def envelopes_of(curves: list[Curve], cases: tuple[Case, ...]) -> list[Envelope]
 
 
 def shares_of(real: list[Envelope], rendered: list[Envelope], pipeline: str) -> list[Share]:
-    """Real envelopes of one pipeline beside the rendered ones of the same cases, least share first."""
+    """Real envelopes of one pipeline with the rendered ones of the same cases. The smallest share comes first."""
     beside = {e.case.name: e for e in rendered if e.pipeline == pipeline}
     return sorted((Share(e, beside[e.case.name]) for e in real if e.pipeline == pipeline), key=lambda share: share.value)
 
@@ -195,9 +195,9 @@ def _curve(case: str, pipeline: str, measure: Measure, limit: float, rows: list[
 
 
 def _poses_against_nominal(rows: list[dict]) -> list[dict]:
-    """Rows of models with the mean absolute change of their lengths and angles against the same frame undegraded.
+    """Rows of models with the mean absolute change of their lengths and angles from those of the undegraded frame.
 
-    A frame without contact has no pose that could be wrong: NaN.
+    Frames without contact have no pose, so their change is NaN.
     """
     nominal = {(r["case"], r["pipeline"], r["frame"]): r["pose"] for r in rows if "pose" in r and r["severity"] == 0}
     table = []

@@ -1,4 +1,4 @@
-"""What is judged in a degraded frame, and the limit at which it counts as failed."""
+"""The measures of a degraded frame, and the limits at which they count as failed."""
 
 from dataclasses import dataclass
 
@@ -10,26 +10,26 @@ from twin.judge.degradation.shots import DegradedShot
 from twin.pins.detector import Detector, Found, named
 from twin.types import PinGraph
 
-# A claim that is farther from every pin than this share of the distance to that pin's nearest neighbour is wrong. Chosen: less than half,
-# so that no claim is near to two pins.
+# Largest distance of a claimed place from a pin that it counts for, as a share of the distance to that pin's nearest neighbour. It was
+# chosen below one half, so that a claim counts for one pin at most.
 GATE = 0.35
-# Cost of a pairing beyond the gate: far above any distance in a picture, px.
+# Cost of a pair outside the gate, px. It is far above any distance in a picture.
 OUT_OF_REACH = 1e6
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One figure of a frame.
+    """One measured quantity of a frame.
 
     Attributes
     ----------
     name, title, unit : str
     limit : float
         Limit of the mean over the contacts.
-    least : bool
-        The limit is a least value, not a largest one.
-    in_pitches : bool
-        The limit is in mean distances of neighbouring pins, not in ``unit``.
+        least : bool
+            Whether the limit is a least value instead of a largest value.
+        in_pitches : bool
+            Whether the limit is in mean distances of neighbouring pins instead of ``unit``.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Measure:
     in_pitches: bool = False
 
     def failed(self, value: float, limit: float) -> bool:
-        """Whether a value lies beyond a limit."""
+        """Whether a value exceeds a limit."""
         return value < limit if self.least else value > limit
 
 
@@ -61,7 +61,7 @@ POSE_MEASURES = (
 
 
 def judge_shot(detector: Detector, found: Found, shot: DegradedShot) -> dict[str, float]:
-    """The measures of one frame; NaN where one has no meaning (no names, no graph, nothing paired)."""
+    """The measures of one frame. A measure is NaN if it is undefined (no labels, no graph, or no pairs)."""
     truth_px = shot.caps_px
     known = np.isfinite(truth_px[:, 0])
     spacing = np.full(len(truth_px), np.nan)
@@ -69,7 +69,7 @@ def judge_shot(detector: Detector, found: Found, shot: DegradedShot) -> dict[str
     pin, claim = _pairs(found.claims_px, truth_px, GATE * spacing)
     right = shot.visible[pin]
     apart = np.linalg.norm(found.claims_px[claim[right]] - truth_px[pin[right]], axis=1)
-    doubtful = known & ~shot.visible  # a hidden cap may be seen in part: a claim there is neither right nor wrong
+    doubtful = known & ~shot.visible  # a hidden cap may be partly visible, so a claim there is neither right nor wrong
     claims = len(found.claims_px) - int(doubtful[pin].sum()) - _beside_unknown(found.claims_px, known)
     area, edges = _graph_errors(detector, found, shot)
     return {
@@ -84,12 +84,12 @@ def judge_shot(detector: Detector, found: Found, shot: DegradedShot) -> dict[str
 
 
 def _beside_unknown(claims_px: np.ndarray, known: np.ndarray) -> int:
-    """Number of claims that may be pins whose place is not known: a consensus of detectors may lack some pins."""
+    """Number of claims that may be pins whose place is unknown. The consensus of detectors may lack some pins."""
     return max(0, min(len(claims_px) - int(known.sum()), int((~known).sum())))
 
 
 def _pairs(claims_px: np.ndarray, truth_px: np.ndarray, gate_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pins and claims paired one to one, nearest first, within each pin's gate."""
+    """Pairs of pins and claims, one to one within each pin's gate. The nearest are paired first."""
     if not len(claims_px):
         return np.zeros(0, int), np.zeros(0, int)
     known = np.flatnonzero(np.isfinite(gate_px))
@@ -103,7 +103,7 @@ def _pairs(claims_px: np.ndarray, truth_px: np.ndarray, gate_px: np.ndarray) -> 
 
 
 def _swaps(found: Found, truth_px: np.ndarray, gate_px: np.ndarray) -> float:
-    """Share of the pins whose name stands at another pin's place."""
+    """Share of the pins whose label is at another pin's place."""
     if found.pins_px is None:
         return np.nan
     seen = np.flatnonzero(np.isfinite(found.pins_px[:, 0]))
@@ -116,7 +116,7 @@ def _swaps(found: Found, truth_px: np.ndarray, gate_px: np.ndarray) -> float:
 
 
 def _graph_errors(detector: Detector, found: Found, shot: DegradedShot) -> tuple[float, float]:
-    """Median relative error of the cells and share of edges in common, against the method's own graph of the true pins."""
+    """Median relative error of the cells' areas, and share of common edges, compared with the method's own graph of the true pins."""
     if found.graph is None or not np.isfinite(shot.caps_px).all():
         return np.nan, np.nan
     true = detector.graph_of(shot.caps_px)

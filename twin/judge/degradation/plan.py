@@ -1,4 +1,4 @@
-"""A sweep as a file: which conditions, how far, in which steps, which pairs."""
+"""The file of a sweep: its conditions, their ranges, the steps, and pairs of conditions."""
 
 from collections import Counter
 from dataclasses import replace
@@ -16,7 +16,7 @@ from twin.judge.degradation.sweep import SEVERITIES
 
 
 class ConditionPlan(Section):
-    """``severe``: the parameter's value at severity 1, in the condition's unit; its own one, which is the most, where not given."""
+    """``severe``: value at severity 1, in the unit of the parameter. The default is the condition's own value, which is the largest."""
 
     name: str
     severe: float | None = None
@@ -27,7 +27,7 @@ class ConditionPlan(Section):
         Raises
         ------
         TwinError
-            It is unknown, or the range is none of its own.
+            The condition is unknown, or the range is not within its own range.
         """
         known = condition(self.name)
         if self.severe is None:
@@ -43,8 +43,8 @@ class ConditionPlan(Section):
 class SweepPlan(Section):
     """A user's sweep.
 
-    ``steps``: severities between 0 and 1, rising (0 is always looked at). ``condition``: those to sweep (none: all).
-    ``pairs``: two names each, both growing together.
+    ``steps``: increasing severities between 0 and 1 (0 is always included). ``condition``: the conditions to sweep (none: all).
+    ``pairs``: two names each; both conditions have the same severity.
     """
 
     steps: Annotated[tuple[Annotated[float, Field(gt=0, le=1)], ...], Field(min_length=1)] = SEVERITIES[1:]
@@ -52,7 +52,7 @@ class SweepPlan(Section):
     pairs: tuple[tuple[str, str], ...] = ()
 
     def severities(self) -> tuple[float, ...]:
-        """All of them, from 0 up."""
+        """All severities, from 0 upwards."""
         return (0.0, *sorted(set(self.steps)))
 
     def cases(self) -> tuple[Case, ...]:
@@ -81,7 +81,7 @@ def load_plan(path: Path) -> SweepPlan:
     Raises
     ------
     TwinError
-        It can't be read, or a key or name is unknown.
+        The file can't be read, or a key or name is unknown.
     """
     try:
         return read_section(path, SweepPlan)

@@ -1,4 +1,4 @@
-"""A sweep's page, charts and tables."""
+"""The page, charts and tables of a sweep."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,30 +20,30 @@ from twin.report.themes import BLUE, RED, SERIES
 from twin.store import made_by, write_json
 
 ACROSS = 3
-"""Plots in a row. Beside the picture of a frame more would be too small to read."""
+"""Number of plots in a row. More would be too small to read beside the picture of a frame."""
 SHOWN = ("valid", "recall", "precision", "centroid_px", "area_error", "edges", *(m.name for m in POSE_MEASURES))
-"""Measures of a condition's chart, in their order."""
+"""Measures in the chart of a condition, in their order."""
 TITLES = {m.name: m.title + (f", {m.unit}" if m.unit else "") for m in (*MEASURES, *POSE_MEASURES)}
 """Title of each measure with its unit."""
 TWICE = 2.0
-"""Ratio of widths from which on an envelope counts as twice as wide."""
+"""Least ratio of widths at which an envelope counts as twice as wide."""
 CASE_DPI = 90
-"""Resolution of a condition's chart, dots per inch: there are dozens of them on a page."""
+"""Resolution of a condition's chart, dots per inch. It is low, because a page has dozens of them."""
 
 
 def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str], rendered: Judgement | None = None) -> list[Path]:
-    """Write index.html, its plots, and the tables; their paths, the page first.
+    """Write index.html, its plots, and the tables. Returns their paths, the page first.
 
     Parameters
     ----------
     out : Path
     judged : Judgement
     source : str
-        Name of the frames' folder, or how they were made.
+        Name of the frames' folder, or a description of how they were made.
     notes : list of str
         Remarks for the page.
     rendered : Judgement, optional
-        The same cases on rendered frames, to be shown beside real ones.
+        The same cases on rendered frames, which are shown with those on real frames.
     """
     (out / "plots").mkdir(exist_ok=True)
     plan, envelopes = judged.plan, judged.envelopes
@@ -88,7 +88,7 @@ def write_report(out: Path, judged: Judgement, *, source: str, notes: list[str],
 
 
 def case_figure(case: Case, curves: Sequence[Curve], rendered: Sequence[Curve]) -> Figure:
-    """Every measure against the parameter with its band. Curves of rendered frames beside real ones are dashed and have no band."""
+    """A chart of all measures against the parameter, with their bands. Curves of rendered frames are dashed and have no band."""
     curves, rendered = ([c for c in group if c.case == case.name] for group in (curves, rendered))
     names = [name for name in SHOWN if any(c.measure.name == name for c in curves)]
     pipelines = list(dict.fromkeys(c.pipeline for c in curves))
@@ -114,7 +114,7 @@ def case_figure(case: Case, curves: Sequence[Curve], rendered: Sequence[Curve]) 
 
 
 def shares_figure(shares: Sequence[Share]) -> Figure:
-    """Severities at which real frames fail, as dots with intervals; bars reach up to where rendered frames fail. One line a condition."""
+    """A chart with a line for each condition: a dot with interval where real frames fail, and a bar up to where rendered frames fail."""
     figure, (ax,) = sized_figure((9.0, 0.32 * len(shares) + 1.2))
     for y, share in enumerate(reversed(shares)):
         real, rendered = share.real, share.rendered
@@ -133,7 +133,7 @@ def shares_figure(shares: Sequence[Share]) -> Figure:
 
 @dataclass(frozen=True)
 class _Entry:
-    """What the page says of one case: envelopes by pipeline, its chart, and the worst frame with what it shows."""
+    """The content of the page about one case: envelopes by pipeline, chart, and the worst frame with its label."""
 
     case: Case
     envelopes: dict[str, Envelope]
@@ -273,9 +273,9 @@ def _parameters(case: Case) -> str:
 
 
 def compare(envelopes: list[Envelope], ours: str, theirs: str) -> dict:
-    """In how many cases one pipeline's envelope is as wide as another's, and twice as wide; widths are severities, at most 1.
+    """Number of cases in which one pipeline's envelope is as wide as another's, and twice as wide. Widths are severities, at most 1.
 
-    Where neither fails within the range the two count as equally wide; ``narrower`` names the cases where ours is narrower.
+    If neither fails within the range, they count as equally wide; ``narrower`` names the cases in which ours is narrower.
     """
     pairs = [(e, next(o for o in envelopes if o.case == e.case and o.pipeline == theirs)) for e in envelopes if e.pipeline == ours]
     wider = [a.case.name for a, b in pairs if a.width >= b.width]
@@ -285,7 +285,7 @@ def compare(envelopes: list[Envelope], ours: str, theirs: str) -> dict:
 
 
 def _worst(out: Path, cells: list[Cell], case: Case, envelope: Envelope) -> tuple[Path, str] | None:
-    """Picture and label of the worst frame at the first severity beyond the envelope, or at the severest one."""
+    """Picture and label of the worst frame at the first severity above the envelope, or at the last one."""
     own = [cell for cell in cells if cell.case == case]
     cell = next((c for c in own if c.severity >= envelope.severity and c.severity > 0), own[-1])
     path = out / "pictures" / f"{cell.file}.jpg"

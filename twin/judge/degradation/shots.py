@@ -1,6 +1,6 @@
-"""Degraded frames with known pins: rendered frames, or real ones whose pins several detectors agree on.
+"""Degraded frames with known pins: rendered frames, or real frames in which several detectors agree on the pins.
 
-The contacts of rendered frames are solved once and kept. All conditions that leave the mechanics alone share them.
+The contacts of rendered frames are solved once and stored. All conditions that do not change the mechanics use the same contacts.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from twin.types import Form, Frame
 
 @dataclass(frozen=True)
 class Contact:
-    """An object of `scenes` and how the sensor is pressed against it."""
+    """An object of `scenes`, and the pose in which the sensor is pressed against it."""
 
     name: str
     object_name: str
@@ -50,7 +50,7 @@ CONTACTS = (
     Contact("edge", "edge", ContactPose(3.5, twist_deg=15.0)),
     Contact("cylinder", "cylinder", ContactPose(3.0, offset_mm=(3.0, 2.0))),
 )
-"""Contacts over which a sweep judges."""
+"""Contacts of a sweep."""
 NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...]]] = {
     "response": {
         "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "blur_sigma_px": 0.0, "brightness_drift": 0.0, "read_noise": 0.0,
@@ -59,12 +59,12 @@ NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...]]] = {
     "camera": {"vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0)},
     "gel": {"haze": 0.0},
 }  # fmt: skip
-"""Sections of a specification whose camera neither blurs, colours nor disturbs: a real frame has gone through a camera already."""
+"""Values of a specification whose camera adds no blur, colour or noise. They are used for real frames, which a camera has already taken."""
 
 
 @dataclass(frozen=True)
 class DegradedShot:
-    """A degraded frame and where its pins truly are.
+    """A degraded frame and the true places of its pins.
 
     Attributes
     ----------
@@ -72,11 +72,11 @@ class DegradedShot:
         Name of the contact, or of the real frame.
     frame : Frame
     caps_px : (N, 2) float
-        Where the pins truly are.
-    visible : (N,) bool
-        The cap is there, within the frame, and nothing stands before it.
-    touched : bool
-        Something is in contact. Real frames are assumed to show a contact.
+        True places of the pins.
+        visible : (N,) bool
+            Whether the cap exists, is within the frame, and is not hidden.
+        touched : bool
+            Whether there is a contact. Real frames are assumed to show one.
     """
 
     name: str
@@ -88,7 +88,7 @@ class DegradedShot:
 
 @dataclass(frozen=True)
 class RenderedSource:
-    """Frames of a sensor drawn by `Preview` over contacts; every pin's place is known."""
+    """Frames of contacts of a sensor, drawn by `Preview`. The places of all pins are known."""
 
     spec: SensorSpec
     contacts: tuple[Contact, ...]
@@ -103,7 +103,7 @@ class RenderedSource:
         return [contact.name for contact in self.contacts]
 
     def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
-        """The frames under a case. Contacts that cannot be solved are left out."""
+        """The frames degraded by a case. Contacts that cannot be solved are left out."""
         spec = case.on_spec(self.spec, severity)
         view = View.of(spec, np.zeros((spec.pins.count, 2)))
         geometry = _with_light_of(self.spec, spec)
@@ -120,14 +120,14 @@ class RenderedSource:
 
 @dataclass(frozen=True)
 class RealSource:
-    """Real frames; truth is where several detectors agree that the pins are (`consensus`).
+    """Real frames. The places on which several detectors agree (`consensus`) count as the true places of the pins.
 
     Attributes
     ----------
     spec : SensorSpec
     frames : tuple of Frame
     caps_px : (M, N, 2) float
-        NaN where no agreement tells a pin's place.
+        True places; NaN for pins on which the detectors do not agree.
     """
 
     spec: SensorSpec
@@ -144,7 +144,7 @@ class RealSource:
         return [frame.name for frame in self.frames]
 
     def shoot(self, case: Case, severity: float) -> list[DegradedShot]:
-        """The frames under a case, which must be `image_level`."""
+        """The frames degraded by a case, which must be `image_level`."""
         neutral = altered(self.spec, **NEUTRAL)
         spec = case.on_spec(neutral, severity)
         in_light = severity > 0 and self.form == Form.RAW and any(c.spec is not None or c.light is not None for c in case.conditions)
@@ -161,7 +161,7 @@ class RealSource:
 
 
 def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
-    """The pins under a contact, from the cache where it has been solved before.
+    """The pins in a contact, from the cache if it was solved before.
 
     Raises
     ------
@@ -183,14 +183,14 @@ def pins_under(spec: SensorSpec, contact: Contact) -> PinState:
 
 
 def _degraded(name: str, image: np.ndarray, form: Form, case: Case, severity: float, view: View, visible: np.ndarray) -> DegradedShot:
-    """A shot whose pins lie and are visible as the case leaves them."""
+    """A shot with the places and the visibility of the pins after the case has moved and hidden them."""
     caps_px = case.on_points(view.caps_px, severity, view)
     inside = np.all((caps_px >= 0) & (caps_px <= np.array(image.shape[1::-1]) - 1), axis=1)
     return DegradedShot(name, Frame(image, form, name), caps_px, visible & inside & ~case.gone(severity, view))
 
 
 def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
-    """``spec`` with those values of ``base`` that move no pin in the picture. Under most conditions the result equals ``base``."""
+    """``spec`` with the values of ``base`` that do not affect the pins' places. Under most conditions the result equals ``base``."""
     gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
     alike = altered(spec, gel=gel, camera={"vignetting": base.camera.vignetting})
     return alike.model_copy(update={name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
@@ -208,9 +208,9 @@ class _Film:
 
 @lru_cache(maxsize=2)
 def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contacts: tuple[Contact, ...]) -> tuple[_Film, ...]:
-    """Films of contacts of the sensor ``mechanics``, seen by the camera of ``geometry`` and lit as ``spec``.
+    """Films of contacts of the sensor ``mechanics``, projected by the camera of ``geometry``, with the lights of ``spec``.
 
-    All conditions that act behind the film share these films. Contacts that cannot be solved are left out.
+    All conditions that act after the film use these films. Contacts that cannot be solved are left out.
     """
     preview, films = Preview(spec, static=_static(spec)), []
     for draw, contact in enumerate(contacts):
@@ -219,20 +219,20 @@ def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contac
         except ContactError:
             continue
         light = preview.render(state)
-        light.flags.writeable = False  # it is shared
+        light.flags.writeable = False  # the array is shared by all conditions
         films.append(_Film(draw, contact, light, truth))
     return tuple(films)
 
 
 @lru_cache(maxsize=32)
 def _pressed(spec: SensorSpec, mechanics: SensorSpec, contact: Contact) -> tuple[PinState, CapTruth]:
-    """Pins under a contact of the sensor ``mechanics``, and where the camera of ``spec`` sees them."""
+    """Pins in a contact of the sensor ``mechanics``, and their places in the picture of ``spec``'s camera."""
     state = pins_under(mechanics, contact)
     return state, cap_truth(spec, rest_pins(spec.geometry), state, Form.RAW)
 
 
 def _static(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Light and cover of what contact does not change. Most conditions leave it alone, so it is kept."""
+    """Light and cover of the static layer. Most conditions do not change it, so it is stored."""
     plain = spec.model_copy(update={"gel": spec.gel.model_copy(update={"haze": 0.0, "absorption_per_mm": (0.0, 0.0, 0.0)})})
     bare = {"cap_albedo": (1.0, 1.0, 1.0), "cap_levels": (), "cap_shapes": (), "skin_albedo": (0.0, 0.0, 0.0)}
     plain = altered(plain, appearance=bare, camera={"vignetting": 0.0}, response=NEUTRAL["response"])

@@ -1,6 +1,6 @@
-"""A whole robustness study into one folder, on rendered or on real frames.
+"""A complete robustness study on rendered or on real frames, with its results in one folder.
 
-In real frames nobody knows where the pins are. There, the places on which several detectors agree are taken as the truth.
+The true places of the pins in real frames are unknown. The places on which several detectors agree are used instead.
 """
 
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError, TwinError
+from twin.errors import FrameError, OptionError, TwinError
 from twin.frames import evenly_read, open_recording
 from twin.judge.degradation.condition import Case
 from twin.judge.degradation.envelope import Envelope, judge_sweep
@@ -24,9 +24,9 @@ from twin.store import Item, inputs_digest
 from twin.types import Form, Frame
 
 AGREE = 0.15
-"""Two detectors agree on a pin if their places differ by less than this share of the pins' median spacing. Chosen."""
+"""Distance of two detectors' places, as a share of the pins' median spacing, below which they agree on a pin. Chosen."""
 LEAST_KNOWN = 0.97
-"""A frame is refused if a smaller share of its pins than this is agreed on."""
+"""Least share of a frame's pins on which detectors must agree. Frames with a smaller share are refused."""
 LEAST_AGREEING = 2
 """Number of detectors that must agree on a pin."""
 
@@ -43,7 +43,7 @@ def rendered_study(
     model_digests: dict[str, str] | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Envelope], list[Path]]:
-    """A study on rendered frames; models as `Plan` takes them, other options and results as `study`."""
+    """A study on rendered frames. Models are as in `Plan`, other options and results as in `study`."""
     source, bar = RenderedSource(spec, CONTACTS), partial(stage, progress)
     with bar("contacts, undegraded"):
         frames = [shot.frame for shot in source.shoot(cases[0], 0.0)]
@@ -68,10 +68,10 @@ def real_study(
     model_digests: dict[str, str] | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Envelope], list[Path]]:
-    """A study on a folder of real frames: image-level conditions only.
+    """A study on a folder of real frames, with image-level conditions only.
 
-    Models as `Plan` takes them, other options and results as `study`. With ``beside``, rendered frames are swept, too, and the envelope
-    of raw frames is shown on theirs.
+    Models are as in `Plan`, other options and results as in `study`. With ``beside`` and raw frames, rendered frames are also swept, and
+    the envelopes of both are compared.
     """
     recording = open_recording(path, spec)
     frames, bar = evenly_read(recording, limit), partial(stage, progress)
@@ -99,7 +99,7 @@ def study(
     notes: list[str] | None = None,
     rendered: RenderedSource | None = None,
 ) -> tuple[list[Envelope], list[Path]]:
-    """Sweep, judge and write; the envelopes and the files written, the page first.
+    """Sweep, judge and write. Returns the envelopes and the written files, the page first.
 
     Parameters
     ----------
@@ -109,11 +109,11 @@ def study(
     out : Path
     progress : Progress
     jobs : int
-        Processes.
+        Number of processes.
     notes : list of str, optional
         Remarks for the page.
     rendered : RenderedSource, optional
-        Rendered frames of the same sensor. They are swept likewise (in ``out/rendered``), and the plan's frames are shown beside them.
+        Rendered frames of the same sensor. They are also swept (in ``out/rendered``), and the plan's frames are compared with them.
     """
     with stage(progress, "conditions x steps") as step:
         judged = judge_sweep(plan, out, jobs=jobs, progress=step)
@@ -125,14 +125,14 @@ def study(
 
 
 def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
-    """Refuse names before anything is solved or drawn.
+    """Check names before any work is done.
 
     Parameters
     ----------
     names : list of str
         Methods, or files of detectors.
     models : tuple of str
-        Names of the models whose rows stand beside those of the pipelines.
+        Names of the models, whose rows are in the same tables as those of the pipelines.
 
     Raises
     ------
@@ -141,21 +141,21 @@ def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
     """
     for name in names:
         if name not in METHODS and Path(name).suffix != ".toml":
-            raise TwinError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
+            raise OptionError(f"--pipeline {name}: give one of {', '.join(METHODS)}, or a .toml file written by 'twin tune'")
     called = [name if name in METHODS else load_detector(Path(name)).name for name in names]
     if len(set(called)) < len(called):
-        raise TwinError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
+        raise OptionError(f"--pipeline: each needs a name of its own, got {', '.join(called)}; rename the files")
     if len({*called, *models}) < len(called) + len(models):
-        raise TwinError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
+        raise OptionError(f"--model: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
 
 
 def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress: Step) -> tuple[DetectorSpec, ...]:
-    """Detectors by file or by method: ours as the specification has it, others tuned on undegraded frames and kept in ``folder``.
+    """Detectors by file or by method. Ours is that of the specification; others are tuned on undegraded frames and stored in ``folder``.
 
     Raises
     ------
     TwinError
-        A file cannot be read. `check_pipelines` tells this before any work is done.
+        A file cannot be read. `check_pipelines` finds this before any work is done.
     """
     folder.mkdir(parents=True, exist_ok=True)
     chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
@@ -178,7 +178,7 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
 
 
 def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpec]) -> tuple[RealSource, list[str]]:
-    """Frames whose pins at least two detectors see at the same places, and why others were refused.
+    """Frames in which at least two detectors find the pins at the same places, and the reasons why other frames were refused.
 
     Raises
     ------
@@ -204,12 +204,12 @@ def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpe
 
 
 def _agreed(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place (N, 2) of each pin, the first detector's among those that agree with it, and how many (N,) agree, by D detectors (D, N, 2)."""
+    """Places (N, 2) of the pins by the first of D detectors (D, N, 2), and number (N,) of detectors that agree, including the first."""
     pitch = np.nanmedian(np.sort(np.linalg.norm(seen[0][:, None] - seen[0][None], axis=2), axis=1)[:, 1])
     near = np.linalg.norm(seen - seen[0], axis=2) < AGREE * pitch
     return np.where(np.isfinite(seen[0]), seen[0], np.nan), near.sum(axis=0)
 
 
 def _on_frames(case: Case) -> bool:
-    """Whether a case acts on gray levels or settings alone. Nothing else can be applied to a thresholded frame."""
+    """Whether a case acts on gray levels or settings alone. Only such cases can be applied to thresholded frames."""
     return all(c.light is None and c.spec is None for c in case.conditions)

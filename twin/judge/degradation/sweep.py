@@ -1,49 +1,47 @@
-"""Every case at every severity: cells that are computed in parallel, kept one by one, and never computed twice."""
+"""Sweep: every case at every severity is a cell. Cells are computed in parallel and stored, and finished cells are not computed again."""
 
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from scenes import load_object
-from twin.errors import TwinError
 from twin.judge.degradation.condition import Case, Condition
 from twin.judge.degradation.measures import judge_shot
 from twin.judge.degradation.shots import DegradedShot, RealSource, RenderedSource
 from twin.pins import DetectorSpec, Found, make_detector
 from twin.store import Item, find_json, inputs_digest, keep_json, write_bytes
 from twin.types import Frame
+from twin.workers import in_processes
 
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 CELLS = "cells"
 """Name of the folder with the finished cells."""
 Estimate = Callable[[Frame], tuple[np.ndarray, tuple[str, ...], bool]]
-"""A model's answer for a frame: the pose's values, their units ("mm" or "deg"), and whether the answer is valid."""
+"""A model's estimate for a frame: the pose's values, their units ("mm" or "deg"), and whether the estimate is valid."""
 Models = Callable[[], dict[str, Estimate]]
-"""Gives estimates by the models' names; each process calls it once."""
+"""Function that returns models by their names; each process calls it once."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep runs through.
+    """Settings of a sweep.
 
     Attributes
     ----------
     source : RenderedSource or RealSource
     detectors : tuple of DetectorSpec
-        Pictures are kept of the first one.
-    cases : tuple of Case
-    severities : tuple of float
-        Ascending, the first is 0.
-    models : callable, optional
-        Gives models by name; each process calls it once.
-    model_digests : dict of str to str
-        By the models' names: a digest of all that a model's answers depend on.
+        Pictures are written of the first one.
+        cases : tuple of Case
+        severities : tuple of float
+            Increasing; the first is 0.
+        models : callable, optional
+            Returns models by name; each process calls it once.
+        model_digests : dict of str to str
+            Digest of everything that a model's estimates depend on, by the model's name.
     """
 
     source: RenderedSource | RealSource
@@ -69,7 +67,7 @@ class Cell:
 
 
 def cells_of(plan: Plan) -> list[Cell]:
-    """All cells; severity 0 is one cell that all cases share, its case the first one."""
+    """All cells. For severity 0 there is one cell for all cases; its case is the first one."""
     base = inputs_digest(_inputs(plan))
     cells = []
     for case in plan.cases:
@@ -85,52 +83,30 @@ def cells_of(plan: Plan) -> list[Cell]:
 def run_sweep(plan: Plan, folder: Path, *, jobs: int, progress: Callable[[int, int], None]) -> list[dict]:
     """All rows of a sweep: one for each case, severity, frame and detector (or model).
 
-    Finished cells lie in ``folder/cells``; what lies there, computed from the same sensor, pipelines, models and code, is not
-    computed again.
+    Finished cells are stored in ``folder/cells``. Those that were computed with the same sensor, pipelines, models and code are used
+    again.
     """
     cells = cells_of(plan)
     (folder / "pictures").mkdir(parents=True, exist_ok=True)
     open_cells = {cell.file: cell for cell in cells if find_json(folder / CELLS, cell.item) is None}
     total = len({cell.file for cell in cells})
     progress(total - len(open_cells), total)
-    if open_cells:
-        _compute(plan, folder, list(open_cells.values()), jobs, lambda done: progress(total - len(open_cells) + done, total))
+    for done, _ in enumerate(in_processes(_begin, (plan, folder), list(open_cells.values()), processes=jobs)):
+        progress(total - len(open_cells) + done + 1, total)
     return [
         row | {"case": cell.case.name, "severity": cell.severity} for cell in cells for row in find_json(folder / CELLS, cell.item) or []
     ]
 
 
-def _compute(plan: Plan, folder: Path, cells: list[Cell], jobs: int, progress: Callable[[int], None]) -> None:
-    if jobs == 1:
-        _begin(plan, folder)
-        for done, cell in enumerate(cells):
-            _run(cell)
-            progress(done + 1)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin, initargs=(plan, folder)) as pool:
-        running = [pool.submit(_run, cell) for cell in cells]
-        try:
-            for done, future in enumerate(as_completed(running)):
-                future.result()
-                progress(done + 1)
-        except BrokenProcessPool as error:
-            raise TwinError("a process of the sweep ended before its time, perhaps because memory ran out; go on with --jobs 1") from error
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-_WORK: dict = {}  # what `_begin` was given; each process builds it once
-
-
-def _begin(plan: Plan, folder: Path) -> None:
+def _begin(plan: Plan, folder: Path) -> Callable[[Cell], None]:
+    """What computes and keeps a cell."""
     cv2.setNumThreads(1)
-    _WORK.update(plan=plan, folder=folder, models=plan.models() if plan.models else {})
+    return partial(_run, plan, folder, plan.models() if plan.models else {})
 
 
-def _run(cell: Cell) -> None:
-    plan, folder = _WORK["plan"], _WORK["folder"]
-    rows, worst = [], None
+def _run(plan: Plan, folder: Path, models: dict[str, Estimate], cell: Cell) -> None:
+    rows: list[dict] = []
+    worst: tuple[float, DegradedShot, Found] | None = None
     detectors = [make_detector(plan.source.spec, cell.case.on_setting(spec, cell.severity)) for spec in plan.detectors]
     for shot in plan.source.shoot(cell.case, cell.severity):
         for place, detector in enumerate(detectors):
@@ -138,7 +114,7 @@ def _run(cell: Cell) -> None:
             rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | judge_shot(detector, found, shot))
             if place == 0 and (worst is None or rows[-1]["recall"] < worst[0]):
                 worst = rows[-1]["recall"], shot, found
-        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in _WORK["models"].items()]
+        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in models.items()]
     if worst is not None:
         picture = cv2.imencode(".jpg", overlay(worst[1], worst[2]))[1].tobytes()
         write_bytes(folder / "pictures" / f"{cell.file}.jpg", picture)
@@ -146,7 +122,7 @@ def _run(cell: Cell) -> None:
 
 
 def _plain_number(value: object) -> float:
-    """A number of NumPy as JSON holds it."""
+    """A number of NumPy as a number that JSON can hold."""
     if isinstance(value, np.number | np.bool_):
         return float(value)
     raise TypeError(f"expected a number, got {type(value).__name__}")
@@ -158,7 +134,7 @@ def _pose(estimate: Estimate, shot: DegradedShot) -> dict:
 
 
 def overlay(shot: DegradedShot, found: Found) -> np.ndarray:
-    """The frame (H, W, 3) uint8 BGR: true pins that are seen in green, missed ones in red, claims as dots."""
+    """Picture (H, W, 3) uint8 BGR of a frame: true pins that were found in green, missed ones in red, claims as dots."""
     image = shot.frame.image
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
     claims = found.claims_px
@@ -172,12 +148,12 @@ def overlay(shot: DegradedShot, found: Found) -> np.ndarray:
 
 
 def _hooks(conditions: tuple[Condition, ...]) -> list[Callable]:
-    """The functions by which conditions degrade: a cell depends on the code of its own conditions, not on that of all."""
+    """The functions of the given conditions. A cell depends on the code of its own conditions, not on that of all conditions."""
     return [hook for c in conditions for hook in (c.spec, c.light, c.frame, c.moves, c.hides, c.setting) if hook is not None]
 
 
 def _inputs(plan: Plan) -> list[object]:
-    """Everything that all cells are made of."""
+    """All inputs that the cells have in common."""
     source = plan.source
     shared = [source.spec, plan.detectors, plan.model_digests]
     if isinstance(source, RenderedSource):

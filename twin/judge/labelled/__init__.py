@@ -1,4 +1,4 @@
-"""How far the twin's pins are from those of labelled real frames."""
+"""Comparison of the twin's pins with those of labelled real frames."""
 
 from twin.judge.labelled.compare import Comparison, compare, table_of
 from twin.judge.labelled.model import ContactModel, MeasuredFrames, measure_frames

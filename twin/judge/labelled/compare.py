@@ -1,4 +1,4 @@
-"""Pin errors of the twin on labelled frames: with nothing free, and with one friction of its own for a frame."""
+"""Pin errors of the twin on labelled frames: without any fit, and with an individual friction for each frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from twin.judge.labelled.model import ContactModel, MeasuredFrames
 from twin.progress import Step
 
 FRICTIONS = (0.0, 0.15, 0.25, 0.32, 0.4, 0.5, 0.65, 1.0, 2.0)
-"""Coefficients of friction that are tried for a frame of its own."""
+"""Coefficients of friction that are tried to find a frame's individual friction."""
 BINS = 4
-"""Bins of a measure in the table of mean errors."""
+"""Number of bins of a measure in the table of mean errors."""
 MEASURES = {"depth_mm": "depth, mm", "angle_deg": "turn, deg", "shear_mm": "shear, mm"}
-"""What the errors are tabled by, with its title."""
+"""Measures by which the errors are tabled, and their titles."""
 
 
 @dataclass(frozen=True)
@@ -25,17 +25,17 @@ class Comparison:
     ----------
     measured : MeasuredFrames
     simulated_px : (M, N, 2) float
-        NaN where the contact failed.
-    error_px : (M,) float
-        Mean over the pins; NaN where the contact failed.
+        NaN if the contact failed.
+        error_px : (M,) float
+            Mean error over the pins; NaN if the contact failed.
     executed : (M,) bool
         Whether the arm executed the frame's move.
     by : dict of str to (M,) float
         ``depth_mm`` (the label along the approach), ``angle_deg`` (size of all turns), ``shear_mm`` (size of the executed move).
     friction, friction_error_px : (M,) float
-        The frame's own friction and its error; NaN where it was not sought.
-    failures : dict of str to str
-        Why a contact failed, by image name.
+        Individual friction of a frame, and the error with it; NaN for frames for which it was not fitted.
+        failures : dict of str to str
+            Reasons of failed contacts, by image name.
     """
 
     measured: MeasuredFrames
@@ -49,9 +49,9 @@ class Comparison:
 
 
 def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: int = 0, progress: Step | None = None) -> Comparison:
-    """Simulate every frame's contact, and seek the own friction of some frames.
+    """Simulate every frame's contact, and fit an individual friction to some frames.
 
-    ``friction_frames``: number of frames whose friction is sought. They are spread evenly over the frames with an executed move.
+    ``friction_frames`` is the number of frames whose friction is fitted. They are spread evenly over the frames with an executed move.
     """
     executed = np.array([label.executed for label in measured.labels])
     sought = _evenly(np.flatnonzero(executed), friction_frames)
@@ -81,7 +81,7 @@ def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: i
                 error = float(pin_errors(simulate(row, friction), measured.pins_px[row]))
             except ContactError:
                 continue
-            if not error >= best_error[row]:  # also where the rig's friction failed (NaN)
+            if not error >= best_error[row]:  # also true if the contact failed with the rig's friction (NaN)
                 best[row], best_error[row] = friction, error
     return Comparison(measured, simulated, errors, executed, _measures(model, measured), best, best_error, failures)
 
@@ -103,25 +103,25 @@ def table_of(found: Comparison) -> list[dict]:
 
 
 def pin_errors(simulated_px: np.ndarray, measured_px: np.ndarray) -> np.ndarray:
-    """Mean over the pins of their distance, for each frame: (..., M) of (..., M, N, 2); lost pins (NaN) are left out."""
+    """Mean distance of the pins for each frame, (..., M), from places (..., M, N, 2). Lost pins (NaN) are left out."""
     return np.nanmean(np.linalg.norm(simulated_px - measured_px, axis=-1), axis=-1)
 
 
 def binned_means(values: np.ndarray, by: np.ndarray, edges: Sequence[float]) -> np.ndarray:
-    """Mean of the values whose ``by`` lies in each bin (the last bin is closed); NaN where a bin is empty."""
+    """Mean of the values whose ``by`` is in each bin (the last bin includes its upper edge); NaN for an empty bin."""
     where = np.clip(np.searchsorted(edges, by, side="right") - 1, 0, len(edges) - 2)
     return np.array([values[where == k].mean() if (where == k).any() else np.nan for k in range(len(edges) - 1)])
 
 
 def _evenly(rows: np.ndarray, count: int) -> np.ndarray:
-    """At most ``count`` of the rows, evenly spread, the first and the last among them."""
+    """At most ``count`` of the rows, spread evenly, including the first and the last."""
     if not count or not len(rows):
         return rows[:0]
     return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
 
 
 def _measures(model: ContactModel, measured: MeasuredFrames) -> dict[str, np.ndarray]:
-    """The measures (M,) of each frame that the errors are tabled by."""
+    """The measures (M,) of all frames by which the errors are tabled."""
     axis = model.experiment.axis
     poses = np.array([label.pose - (0 if label.executed else label.move) for label in measured.labels])
     moves = np.array([label.move * label.executed for label in measured.labels])

@@ -1,7 +1,7 @@
 """Labelled real frames, and the twin's pins for their labels.
 
-Pins are compared in px of the frames as they are. A simulated pin is the recorded no-contact pin plus the simulated
-displacement: where each pin of a printed sensor really sits is not the mechanics' matter.
+Pins are compared in px of the recorded frames. A simulated pin is the recorded no-contact pin plus the simulated displacement, so that
+the places of individual pins of a printed sensor do not count as errors of the mechanics.
 """
 
 from dataclasses import dataclass
@@ -39,10 +39,10 @@ class MeasuredFrames:
     names : list of str
     labels : list of ArmLabel
     pins_px : (M, N, 2) float
-        NaN for lost pins.
+        Places; NaN for lost pins.
     no_contact_px : (N, 2) float
     problems : list of str
-        What was odd or left out, one line each.
+        Irregularities and what was left out, one line each.
     """
 
     form: Form
@@ -59,12 +59,12 @@ class MeasuredFrames:
 def measure_frames(
     folder: Path, spec: SensorSpec, count: int | None, seed: int, *, form: Form | None = None, progress: Step | None = None
 ) -> MeasuredFrames:
-    """The pins of ``count`` frames of a labelled recording, chosen at random (None: of all), in the table's order.
+    """Find the pins of ``count`` random frames of a labelled recording (None: of all frames). The frames have the order of the table.
 
     Raises
     ------
     FrameError
-        No labels, or no frame with pins.
+        There are no labels, or the pins were found in no frame.
     """
     recording = open_recording(folder, spec, form)
     labels, problems = read_arm_labels(recording), list(recording.problems)
@@ -92,12 +92,12 @@ def measure_frames(
 
 
 class ContactModel:
-    """Displacements of a sensor's pins for labels of an experiment.
+    """Simulated displacements of a sensor's pins for labels of an experiment.
 
     Parameters
     ----------
     form : Form
-        Whose pixels the pins are in.
+        Form of the frames in whose pixels the displacements are given.
     across : int
         Elements along each side of the skin's grid.
     """
@@ -105,22 +105,22 @@ class ContactModel:
     def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
         self.spec, self.experiment, self.form = spec, experiment, form
         self.rig = rig_of(spec)
-        self.solver = SkinSolver(spec, resolution=Resolution(across), keep=False)
+        self.solver = SkinSolver(spec, resolution=Resolution(across))
         self.contact = RigContact(self.solver, experiment, touched)
         self.rest_px = self._pixels(self.solver.rest().caps_mm)
 
     def displacement_px(self, label: ArmLabel, friction: float | None = None) -> np.ndarray:
-        """(N, 2) px, from no contact; with the rig's friction unless another is given.
+        """Displacement (N, 2) from the state without contact, px, with the rig's friction unless another is given.
 
         Raises
         ------
         ContactError
-            The contact does not converge, or can't be.
+            The contact does not converge, or is impossible.
         """
         return self.displacements_px(label, friction)[1]
 
     def displacements_px(self, label: ArmLabel, friction: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The same after the tap, and at the end: after the move, if it was executed."""
+        """Displacements after the tap and at the end, as ``displacement_px``. The end is after the move if it was executed."""
         way = self.contact.way(label)
         if not way.touches and not label.executed:
             return np.zeros_like(self.rest_px), np.zeros_like(self.rest_px)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from scenes.sensor import SensorSpec
 from twin.judge.labelled.compare import MEASURES, Comparison, table_of
 from twin.report.charts import new_figure, write_chart
 from twin.report.numbers import number
@@ -18,8 +17,8 @@ from twin.report.table import Column
 from twin.store import made_by, write_json, write_text
 
 
-def summary_of(found: Comparison, spec: SensorSpec) -> dict:
-    """All figures, as ``validation.json`` holds them."""
+def summary_of(found: Comparison, sensor: str) -> dict:
+    """All figures of a comparison, as ``validation.json`` holds them; ``sensor`` is the sensor's name."""
     moved = np.linalg.norm(found.measured.pins_px - found.measured.no_contact_px, axis=-1)
     sought = np.isfinite(found.friction_error_px)
     friction = {}
@@ -31,7 +30,7 @@ def summary_of(found: Comparison, spec: SensorSpec) -> dict:
             "median": float(np.median(found.friction[sought])),
         }
     return {
-        "sensor": spec.name,
+        "sensor": sensor,
         "form": str(found.measured.form),
         "frames": len(found.measured),
         "mean_displacement_px": float(np.nanmean(moved)),
@@ -42,17 +41,33 @@ def summary_of(found: Comparison, spec: SensorSpec) -> dict:
     }
 
 
-def write_validation(out: Path, found: Comparison, spec: SensorSpec, summary: dict) -> list[Path]:
-    """Write ``index.html`` with its charts, ``frames.csv`` and ``validation.json``; the paths."""
+def write_validation(out: Path, found: Comparison, description: str, summary: dict) -> list[Path]:
+    """Write ``index.html`` with its charts, ``frames.csv`` and ``validation.json``.
+
+    Parameters
+    ----------
+    out : Path
+        Existing folder.
+    found : Comparison
+    description : str
+        Description of the sensor, with which the page begins.
+    summary : dict
+        As ``summary_of`` gives it.
+
+    Returns
+    -------
+    list of Path
+        The files, the page first.
+    """
     table = write_text(out / "frames.csv", _frames_csv(found))
     figures = write_json(out / "validation.json", summary | {"made_by": made_by("twin.judge.labelled.compare")})
     errors = write_chart(out / "errors.png", lambda: _draw_errors(found))
     frames = write_chart(out / "frames.png", lambda: _draw_worst(found))
     page = Page(
-        f"Pins of {spec.name} against real frames",
+        f"Pins of {summary['sensor']} against real frames",
         "twin validate",
         topic="TacTip twin: validation",
-        lead=f"{spec.description}. Each frame's contact is simulated along the arm's own way, from its label alone, and the simulated "
+        lead=f"{description}. Each frame's contact is simulated along the arm's own way, from its label alone, and the simulated "
         "displacement is added to the recorded no-contact pins. Error: mean over pins and frames, px of the "
         f"{summary['form']} frames. {summary['frames']} frames, in which pins move by "
         f"{number(summary['mean_displacement_px'], decimals=2)} px on average.",
@@ -118,7 +133,7 @@ def _draw_errors(found: Comparison) -> Figure:
 
 
 def _draw_worst(found: Comparison) -> Figure:
-    """Error of each pin in the median and in the worst frame."""
+    """Draw the error of each pin in the frame with the median error and in the worst frame."""
     order = np.argsort(np.where(np.isfinite(found.error_px), found.error_px, -1.0))[-np.isfinite(found.error_px).sum() :]
     figure, axes = new_figure(2, panel_inch=5.0)
     for ax, k, title in ((axes[0], order[len(order) // 2], "median frame"), (axes[1], order[-1], "worst frame")):

@@ -1,1 +1,1 @@
-"""How close rendered frames come to real ones: pictures pair by pair, and the statistics of both."""
+"""Comparison of rendered frames with real ones: pairs of pictures, and statistics of both sets."""

@@ -1,4 +1,4 @@
-"""Real frames with the skin fitted to their pins: what every stage of the calibration works on."""
+"""Real frames with the skin fitted to their pins, which all stages of the calibration use."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,21 +14,21 @@ from twin.judge.pictures.frames import read_real
 from twin.mechanics.skin_fit import FittedPins
 from twin.progress import Step
 
-# Gray level from which on a pixel tells nothing: the camera's curve ends there.
+# Gray level from which on a pixel counts as saturated.
 SATURATED = 250
 
 
 @dataclass(frozen=True)
 class Aligned:
-    """A real frame and the pins in space that it shows.
+    """A real frame and its pins in space.
 
     Attributes
     ----------
     name : str
     image : (H, W, 3) or (H, W) uint8
     pins_px : (N, 2) float
-        Raw-frame px, specification's order.
-    state : FittedPins
+        Raw-frame px, in the specification's order.
+        state : FittedPins
     """
 
     name: str
@@ -38,22 +38,22 @@ class Aligned:
 
 
 def read_frames(folder: Path, spec: SensorSpec, limit: int, progress: Step) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Usable frames of a folder, evenly spread: name, image (H, W[, 3]) uint8 and pins (N, 2) px of each.
+    """Read usable frames of a folder, spread evenly: name, image (H, W[, 3]) uint8 and pins (N, 2) px of each.
 
     Raises
     ------
     FrameError
-        No frame can be used, or one does not fit the camera: it has another size, or is in colour where the camera is mono
-        (or the other way round). Names the first and why.
+        No frame can be used, or a frame does not fit the camera: its size differs, or one of both is colour and the other mono. The
+        message names the first such frame and the reason.
     """
-    real = read_real(folder, spec, lens_disc(spec), limit=limit, progress=progress)
+    real = read_real(folder, spec, lens_disc(spec.view, spec.housing), limit=limit, progress=progress)
     for found in real.frames:
         require_cameras_own(found.frame.image, found.frame.name, spec.camera)
     return [(found.frame.name, found.frame.image, found.pins_px) for found in real.frames]
 
 
 def require_cameras_own(image: np.ndarray, name: str, camera: CameraSpec) -> None:
-    """Raise ``FrameError`` where an image does not have the camera's size and channels: what is rendered could not be compared with it."""
+    """Raise ``FrameError`` if an image does not have the camera's size and channels, because it could not be compared with renders."""
     height, width = image.shape[:2]
     if (height, width) != (camera.height_px, camera.width_px):
         raise FrameError(
@@ -74,7 +74,7 @@ def require_cameras_own(image: np.ndarray, name: str, camera: CameraSpec) -> Non
 
 
 def to_light(levels: np.ndarray, response: ResponseSpec) -> np.ndarray:
-    """Light in the renderer's unit from gray levels: the response curve, white balance and exposure undone."""
+    """Light in the renderer's unit from gray levels, by the inverse of response curve, white balance and exposure."""
     share = np.clip((np.asarray(levels, float) - response.black_level) / (255 - response.black_level), 0, 1)
     gain = _gain(levels, response)
     return share**response.gamma / gain
@@ -87,20 +87,20 @@ def to_levels(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
 
 
 def levels_slope(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
-    """Derivative of ``to_levels`` by the light, finite in the dark."""
+    """Derivative of ``to_levels`` by the light; it is finite in the dark."""
     gain = _gain(light, response)
     share = np.clip(gain * light, 1e-6, 1)
     return (255 - response.black_level) / response.gamma * share ** (1 / response.gamma - 1) * gain
 
 
 def _gain(values: np.ndarray, response: ResponseSpec) -> float | np.ndarray:
-    """Factor on the light before the curve: exposure, and white balance where the last axis is colour (3 long)."""
+    """Factor on the light before the response curve: exposure, and white balance if the last axis has the three colours."""
     colour = np.ndim(values) and np.shape(values)[-1] == 3
     return response.exposure * (np.array(response.white_balance) if colour else 1.0)
 
 
 def revised(spec: SensorSpec, **sections: Mapping[str, Any]) -> SensorSpec:
-    """A copy with values changed section by section (``camera={"k1": 0.1}``), validated again."""
+    """A validated copy with values changed section by section (``camera={"k1": 0.1}``)."""
     data = spec.model_dump()
     for name, values in sections.items():
         data[name] = data[name] | values

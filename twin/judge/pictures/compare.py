@@ -1,4 +1,4 @@
-"""The comparison's order of work: read, align, render, measure."""
+"""The steps of the comparison: read, align, render, measure."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -48,9 +48,9 @@ class Pair:
         The rendered frame.
     figures : ImageFigures
     remainder_px : float
-        Median distance by which the fitted skin misses the pins (pin-aligned), or mean error of the pins (pose-aligned).
-    exact : bool
-        The detector finds exactly all pins in the render.
+        Median distance between the fitted skin's pins and the real ones (pin-aligned), or mean error of the pins (pose-aligned).
+        exact : bool
+            Whether the detector finds exactly all pins in the render.
     """
 
     real: RealFrame
@@ -67,11 +67,11 @@ class PoseAligned:
     Attributes
     ----------
     rig : RigSpec
-        As fitted.
-    fitted : (M,) bool
-        The frames that it was fitted to.
-    contacts : (M, 3) float
-        Indentation in mm, n_x and n_y of each.
+        The fitted rig.
+        fitted : (M,) bool
+            The frames that the rig was fitted to.
+        contacts : (M, 3) float
+            Indentation in mm, n_x and n_y of each frame's contact.
     pairs : list of Pair
     """
 
@@ -82,7 +82,7 @@ class PoseAligned:
 
 
 def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, progress: Step) -> list[Pair]:
-    """Fit the skin to each frame's pins, render and capture it: this tests camera and light, not the mechanics."""
+    """Fit the skin to each frame's pins, render and capture it. This tests camera and light, but not the mechanics."""
     fit, shoot, pairs = SkinFit(spec), _Shooter(spec, disc, quality), []
     for number, real in enumerate(frames):
         pins = fit(real.pins_px)
@@ -92,7 +92,7 @@ def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, qualit
 
 
 def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, bar: Bar) -> PoseAligned:
-    """Render each frame from its label alone, mechanics included. The arm's rig is fitted to one half of the frames.
+    """Render each frame from its label alone, which includes the mechanics. The arm's rig is fitted to one half of the frames.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
 
 
 def statistics(pairs: list[Pair], disc: Disc, *, progress: Step) -> Statistics:
-    """Real against pin-aligned renders: caps, skin, noise, spectrum, spots."""
+    """Compare real frames with pin-aligned renders: caps, skin, noise, spectrum, spots."""
     sets: tuple[list[FrameStatistics], list[FrameStatistics]] = ([], [])
     for number, pair in enumerate(pairs):
         for measured, image in zip(sets, (pair.real.frame.image, pair.image), strict=True):
@@ -131,7 +131,7 @@ def statistics(pairs: list[Pair], disc: Disc, *, progress: Step) -> Statistics:
 
 
 class _Shooter:
-    """Renders states beside real frames and compares them."""
+    """Renders states and compares the renders with real frames."""
 
     def __init__(self, spec: SensorSpec, disc: Disc, quality: Quality, mesh: SensorMesh | None = None):
         self._spec, self._disc = spec, disc

@@ -15,9 +15,9 @@ from twin.pins.pipeline import Pipeline
 from twin.progress import Step
 from twin.types import Form, Frame, Observation
 
-# A lit frame is brighter than this gray level at this percentile of the disc.
+# A frame counts as dark if this percentile of the disc's gray levels is at most this level.
 DARK_LEVEL, BRIGHT_PERCENTILE = 40.0, 99.0
-# Gray level from which on a pixel is saturated, and largest share of the disc that may be.
+# Least gray level of a saturated pixel, and largest share of saturated pixels in the disc.
 SATURATED_LEVEL, MOST_SATURATED = 250, 0.1
 
 
@@ -29,9 +29,9 @@ class RealFrame:
     ----------
     frame : Frame
     pins_px : (N, 2) float
-        Raw-frame px, specification's order.
-    label : dict of str to float
-        The frame's row of the recording's table (its numbers).
+        Raw-frame px, in the specification's order.
+        label : dict of str to float
+            The numbers in the frame's row of the recording's table.
     """
 
     frame: Frame
@@ -53,12 +53,12 @@ class RealFrames:
 
 
 def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, progress: Step | None = None) -> RealFrames:
-    """Read raw frames, evenly spread over the recording if there are more than ``limit``.
+    """Read raw frames. If there are more than ``limit``, those that are read are spread evenly over the recording.
 
     Raises
     ------
     FrameError
-        No folder, not raw frames, or none that can be used: names the first and why.
+        The folder does not exist, or it has no raw frames, or none that can be used. The message names the first one and the reason.
     """
     recording = open_recording(path, spec)
     if recording.form is not Form.RAW:
@@ -86,12 +86,12 @@ def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = N
 
 
 def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc) -> Observation:
-    """The observation of a frame that is fit to be compared.
+    """Check that a frame can be compared, and return its observation.
 
     Raises
     ------
     FrameError
-        Too dark, saturated, or pins missing: names the frame and says which.
+        The frame is too dark or saturated, or pins are missing. The message names the frame and the reason.
     """
     if frame.image.shape[:2] == disc.inside.shape:
         levels = gray_levels(frame.image)[disc.inside]

@@ -1,8 +1,8 @@
-"""A real frame against its render, pixel by pixel, over the lens disc.
+"""Comparison of a real frame with its render, pixel by pixel, over the lens disc.
 
-The figures are PSNR, SSIM (Wang et al. 2004, as scikit-image computes it) and FLIP (Andersson et al. 2020): the difference, from 0 to 1,
-that an eye sees when the two alternate on a usual screen (67 px per degree). Outside the disc the real frame takes the render's place,
-so that nothing from there enters the windows of SSIM and FLIP.
+The figures are PSNR, SSIM (Wang et al. 2004, computed by scikit-image) and FLIP (Andersson et al. 2020). FLIP is the difference, from 0 to
+1, that is visible when both pictures alternate on a normal screen (67 px per degree). Outside the disc both pictures are made equal, so
+that these pixels do not affect SSIM and FLIP near the disc's edge.
 """
 
 from dataclasses import asdict, dataclass
@@ -22,7 +22,7 @@ CHANGE_GAIN = 2
 
 @dataclass(frozen=True)
 class ImageFigures:
-    """Likeness of one pair: PSNR in dB (inf: identical), SSIM (1: identical), FLIP (0: identical)."""
+    """Similarity of one pair: PSNR in dB (inf: identical), SSIM (1: identical), FLIP (0: identical)."""
 
     psnr_db: float
     psnr_gray_db: float
@@ -41,7 +41,7 @@ def compare_images(real: np.ndarray, rendered: np.ndarray, inside: np.ndarray) -
     Raises
     ------
     FrameError
-        They differ in shape or aren't 8-bit.
+        The frames differ in shape or are not 8-bit.
     """
     if real.shape != rendered.shape or real.dtype != np.uint8 or rendered.dtype != np.uint8:
         raise FrameError(
@@ -66,7 +66,7 @@ def flip_map(real: np.ndarray, rendered: np.ndarray) -> np.ndarray:
 
 
 def difference_picture(real: np.ndarray, rendered: np.ndarray) -> np.ndarray:
-    """Where the render is brighter (above middle gray) or darker, twice amplified; uint8."""
+    """Difference picture (uint8), amplified twice: above middle gray the render is brighter than the real frame, below it is darker."""
     return np.clip(127.5 + CHANGE_GAIN * (rendered.astype(float) - real), 0, 255).astype(np.uint8)
 
 

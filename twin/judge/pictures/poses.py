@@ -1,12 +1,12 @@
-"""Contacts from labels alone: the arm's rig fitted to a part of the frames, the twin's contact model for all of them.
+"""Contacts from labels alone: the arm's rig is fitted to one part of the frames, and the twin's contact model is applied to all.
 
-A label leads to a contact by the rig's kinematics (``twin.rig``). Seven numbers of the rig are fitted, as the rig of a recording may
-never have been calibrated: contact offset, tool point in three directions, the image's turn, and the offsets of the two turns that
-tilt the sensor. The robot's handedness (``turn_sign``) is tried both ways.
+The rig's kinematics give the contact of a label (``twin.rig``). Because the rig of a recording may not have been calibrated, seven of its
+parameters are fitted: contact offset, tool point in three directions, the image's turn, and the offsets of the two turns that tilt the
+sensor. Both values of the robot's handedness (``turn_sign``) are tried.
 
-The pins of a tap depend smoothly on the indentation and the plate's normal in the sensor frame. While the rig is fitted, a cubic
-polynomial through simulated taps stands for them. A second round takes into account what the polynomial misses at the first
-round's contacts.
+The pins of a tap are a smooth function of the indentation and the plate's normal in the sensor frame. While the rig is fitted, this
+function is approximated by a cubic polynomial fitted to simulated taps. In a second round the polynomial's errors at the contacts of the
+first round are corrected.
 """
 
 from collections.abc import Callable
@@ -26,24 +26,33 @@ from twin.rig.contact import RigContact
 from twin.rig.kinematics import object_pose
 from twin.rig.labels import ArmLabel
 
-EXPERIMENT = "surface-3d"  # what recordings with labels for all of depth and two tilts are of
-BANK_TAPS = 40  # twice the 20 terms of the polynomial
-BANK_BELOW_MM, BANK_ABOVE_MM = 1.5, 2.5  # of the labelled depths, that the fitted contact offset may make of them
-LEAST_INDENT_MM = 0.3  # of a simulated tap
-BANK_MARGIN_DEG = 3.0  # beyond the labelled tilts
-DEGREE = 3  # of the polynomial
-TURNS_DEG = (0.0, 90.0, 180.0, 270.0)  # of the image, added to the rig's, from which the fit starts
-FEWEST = 2  # frames to fit to
+# Experiment of recordings whose labels are depth and two tilts.
+EXPERIMENT = "surface-3d"
+# Number of simulated taps: twice the 20 terms of the polynomial.
+BANK_TAPS = 40
+# Margins of the simulated taps' depths below and above the labelled depths, mm, because the fitted contact offset is added to these.
+BANK_BELOW_MM, BANK_ABOVE_MM = 1.5, 2.5
+# Least indentation of a simulated tap, mm.
+LEAST_INDENT_MM = 0.3
+# Margin of the simulated taps' tilts beyond the labelled tilts, deg.
+BANK_MARGIN_DEG = 3.0
+# Degree of the polynomial.
+DEGREE = 3
+# Turns that are added to the rig's turn of the image at the starts of the fit, deg.
+TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+# Least number of frames to fit to.
+FEWEST = 2
+# Number of fitted parameters.
 PARAMETERS = 7
 
 
 def label_columns(experiment: ExperimentSpec) -> tuple[str, ...]:
-    """The columns that an experiment's labels must have: those of its pose that it varies."""
+    """The columns that an experiment's labels must have: the coordinates of the pose that the experiment varies."""
     return tuple(name for name, (low, high) in experiment.ranges().items() if name.startswith("pose") and low != high)
 
 
 def labels_of_rows(rows: list[dict[str, float]], experiment: ExperimentSpec) -> list[ArmLabel]:
-    """Frames' rows as the arm's labels; what the experiment does not vary counts as 0 where the table lacks it.
+    """The arm's labels from frames' rows. A coordinate that the experiment does not vary is 0 if the table does not have it.
 
     Raises
     ------
@@ -58,7 +67,7 @@ def labels_of_rows(rows: list[dict[str, float]], experiment: ExperimentSpec) -> 
 
 
 def contacts_of(rig: RigSpec, experiment: ExperimentSpec, labels: list[ArmLabel], radius_mm: float) -> np.ndarray:
-    """Indentation in mm of a flat plate as commanded, and n_x and n_y of its normal in the sensor frame, (m, 3)."""
+    """Commanded indentation of a flat plate in mm, and n_x and n_y of its normal in the sensor frame, (m, 3)."""
     poses = np.stack([object_pose(rig, experiment, label.pose, radius_mm) for label in labels])
     normal = poses[:, :3, 2]
     return np.column_stack([radius_mm - np.einsum("mi,mi->m", normal, poses[:, :3, 3]), normal[:, :2]])
@@ -77,11 +86,11 @@ class PlateTaps:
         self.solver, self.experiment, self._plate = solver, experiment, load_object("plane")
 
     def contact(self, rig: RigSpec) -> RigContact:
-        """Contacts by a rig, the frictions and compliances of which count as well."""
+        """The contact model with a rig, including the rig's friction and compliances."""
         return RigContact(self.solver, self.experiment, self._plate, rig=rig)
 
     def pins_px(self, rig: RigSpec, labels: list[ArmLabel], progress: Callable[[int, int], None] | None = None) -> np.ndarray:
-        """(m, N, 2) px of labels' contacts."""
+        """Pins (m, N, 2) px of the labels' contacts."""
         contact, pins = self.contact(rig), []
         for label in labels:
             pins.append(project(self.solver.spec.view, contact.end(label).caps_mm))
@@ -91,12 +100,12 @@ class PlateTaps:
 
 
 class TapBank:
-    """Pins of taps as a polynomial of indentation and normal, through simulated ones.
+    """Pins of taps as a polynomial of indentation and normal, fitted to simulated taps.
 
     Parameters
     ----------
     contacts : (k, 3) float
-        As of ``contacts_of``.
+        Contacts as ``contacts_of`` gives them.
     pins_px : (k, N, 2) float
         Their pins.
     """
@@ -106,7 +115,7 @@ class TapBank:
         self._coefficients = np.linalg.lstsq(self._terms(contacts), pins_px.reshape(len(pins_px), -1), rcond=None)[0]
 
     def pins_px(self, contacts: np.ndarray) -> np.ndarray:
-        """(m, N, 2) px of contacts (m, 3)."""
+        """Pins (m, N, 2) px of contacts (m, 3)."""
         pins_px: np.ndarray = (self._terms(contacts) @ self._coefficients).reshape(len(contacts), -1, 2)
         return pins_px
 
@@ -117,7 +126,7 @@ class TapBank:
 
 
 def bank_labels(rig: RigSpec, experiment: ExperimentSpec, labels: list[ArmLabel], radius_mm: float) -> list[ArmLabel]:
-    """Labels spread over all contacts that the given ones may turn out to be, whatever the fitted rig."""
+    """Labels that cover the range of contacts which the given labels may have with any fitted rig."""
     axis, turns = experiment.axis, tilts_of(experiment)
     depth = np.array([label.pose[axis] for label in labels]) + experiment.zero_mm
     steepest_deg = np.hypot(*np.array([label.pose[turns] for label in labels]).T).max() + BANK_MARGIN_DEG
@@ -128,7 +137,7 @@ def bank_labels(rig: RigSpec, experiment: ExperimentSpec, labels: list[ArmLabel]
         pose = np.zeros(6)
         pose[turns] = np.array([tilt.real, tilt.imag]) - np.array(rig.turn_offset_deg)[np.array(turns) - 3]
         wanted_mm = shallowest + (deepest - shallowest) * share
-        for _ in range(2):  # indentation is linear in the label but for the plate's tilt
+        for _ in range(2):  # without the plate's tilt the indentation is linear in the label, so that two rounds are enough
             pose[axis] += wanted_mm - contacts_of(rig, experiment, [ArmLabel(pose, np.zeros(6))], radius_mm)[0, 0]
         out.append(ArmLabel(pose, np.zeros(6)))
     return out
@@ -149,19 +158,19 @@ def fit_rig(
     *,
     simulate: Callable[[RigSpec], np.ndarray] | None = None,
 ) -> RigSpec:
-    """The rig under which the pins (m, N, 2) px of labelled frames are best explained, by least squares.
+    """Fit the rig to the pins (m, N, 2) px of labelled frames by least squares.
 
     Parameters
     ----------
     start : RigSpec
-        Its friction, compliances and plate tilt are kept.
-    simulate : callable, optional
-        Gives the true pins (m, N, 2) px of the labels under a rig: with it there is a second round.
+        The rig at the start. Its friction, compliances and plate tilt are not changed.
+        simulate : callable, optional
+            Returns the simulated pins (m, N, 2) px of the labels with a rig. If it is given, there is a second round.
 
     Raises
     ------
     FrameError
-        Too few frames.
+        There are too few frames.
     """
     if len(labels) < FEWEST:
         raise FrameError(
@@ -192,7 +201,7 @@ def fit_rig(
 
 
 def _moved(rig: RigSpec, experiment: ExperimentSpec, x: np.ndarray) -> RigSpec:
-    """The rig with its fitted numbers moved by (PARAMETERS,), each in a unit that makes it of order 1."""
+    """The rig with its fitted parameters changed by ``x`` (PARAMETERS,), each in a unit in which the change is of order 1."""
     offsets = np.array(rig.turn_offset_deg)
     offsets[np.array(tilts_of(experiment)) - 3] += 10 * x[5:]
     return rig.model_copy(
@@ -208,13 +217,13 @@ def _moved(rig: RigSpec, experiment: ExperimentSpec, x: np.ndarray) -> RigSpec:
 
 
 def halves(count: int, seed: int = 0) -> np.ndarray:
-    """(count,) bool: a random half to fit to; the others are for the test."""
+    """(count,) bool: a random half to fit to. The other half is for the test."""
     fitting = np.zeros(count, bool)
     fitting[np.random.default_rng(seed).permutation(count)[: count // 2]] = True
     return fitting
 
 
 def mean_pin_error_px(simulated_px: np.ndarray, seen_px: np.ndarray) -> np.ndarray:
-    """Mean distance over the pins (..., N, 2), lost ones left out."""
+    """Mean distance over the pins (..., N, 2). Lost pins are left out."""
     error: np.ndarray = np.nanmean(np.linalg.norm(simulated_px - seen_px, axis=-1), axis=-1)
     return error

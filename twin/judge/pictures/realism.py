@@ -1,4 +1,4 @@
-"""The whole comparison of a folder of real frames with their renders, into one folder."""
+"""The complete comparison of a folder of real frames with their renders, with its results in one folder."""
 
 from collections.abc import Callable
 from functools import partial
@@ -25,7 +25,7 @@ from twin.progress import Progress, Step, silent, stage
 
 
 class TwoSample(Protocol):
-    """Outcome of a two-sample test: share of the images told right, and its interval."""
+    """Result of a two-sample test: share of rightly assigned patches, and its interval."""
 
     @property
     def accuracy(self) -> float: ...
@@ -37,7 +37,7 @@ class TwoSample(Protocol):
     def high(self) -> float: ...
 
 
-# test(real images, rendered images, inside, progress)
+# A two-sample test: ``test(real images, rendered images, inside, progress)``.
 Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Step], TwoSample]
 
 
@@ -52,18 +52,18 @@ def run_realism(
     test: Test | None = None,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Compare and write everything.
+    """Compare real frames with their renders, and write all results.
 
     Parameters
     ----------
     folder : Path
-        Raw frames, with ``targets.csv`` where the labels are needed.
+        Raw frames, with ``targets.csv`` if the labels are needed.
     spec : SensorSpec
     out : Path
     with_poses : bool
         Also render from the labels alone.
     limit : int, optional
-        Most frames, evenly spread.
+        Most frames that are used; they are spread evenly over the folder.
     quality : {"preview", "standard", "high"}
     test : callable, optional
         The two-sample test.
@@ -74,16 +74,16 @@ def run_realism(
     metrics : dict
         Content of metrics.json.
     written : list of Path
-        The page first.
+        The files, the page first.
 
     Raises
     ------
     FrameError
         No frame can be used, or the labels are missing.
     RenderError
-        Nothing can be rendered here.
+        The renderer does not work on this machine.
     """
-    disc, bar = lens_disc(spec), partial(stage, progress)
+    disc, bar = lens_disc(spec.view, spec.housing), partial(stage, progress)
     with bar("read the real frames, find their pins") as step:
         real = read_real(folder, spec, disc, limit=limit, progress=step)
     with bar("fit the skin to the pins, render") as step:

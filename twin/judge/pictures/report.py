@@ -1,4 +1,4 @@
-"""What the comparison leaves behind: metrics.json, tables, pictures and the page."""
+"""The output of the comparison: metrics.json, tables, pictures and the page."""
 
 from pathlib import Path
 from typing import Literal
@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from scenes.sensor import SensorSpec
+from twin.frames import distinct_stems
 from twin.frames.images import write_image
 from twin.judge.pictures.compare import Pair, PoseAligned
 from twin.judge.pictures.images import difference_picture
@@ -31,11 +32,10 @@ NAMES = {
 
 
 def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
-    """Write real, rendered and difference of every pair; the page's rows."""
+    """Write the real, the rendered and the difference picture of every pair. Returns rows for the page."""
     folder.mkdir(exist_ok=True)
     rows = []
-    for pair in pairs:
-        stem = Path(pair.real.frame.name).stem
+    for pair, stem in zip(pairs, distinct_stems([pair.real.frame.name for pair in pairs]), strict=True):
         real = pair.real.frame.image if pair.image.ndim == pair.real.frame.image.ndim else pair.real.gray
         row = _frame_row(pair, kind)
         images = {"real": real, kind: pair.image, f"{kind}-difference": difference_picture(real, pair.image)}
@@ -48,7 +48,7 @@ def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
 
 
 def image_summary(pairs: list[Pair]) -> dict:
-    """Mean, median, least and largest of each figure over the pairs, and the detector's share of exact frames."""
+    """Mean, median, least and largest value of each figure over the pairs, and the share of renders in which exactly all pins are found."""
     out = {}
     for name in pairs[0].figures.as_dict():
         values = np.array([getattr(pair.figures, name) for pair in pairs])
@@ -61,7 +61,7 @@ def image_summary(pairs: list[Pair]) -> dict:
 
 
 def statistics_summary(found: Statistics) -> dict:
-    """Statistics as plain numbers."""
+    """Statistics as a dict of numbers."""
     worst = {measure: found.worst(measure) for measure in RADIAL_MEASURES}
     return {
         "worst_relative_difference": worst,
@@ -78,7 +78,7 @@ def statistics_summary(found: Statistics) -> dict:
 
 
 def pose_summary(found: PoseAligned) -> dict:
-    """The fitted rig, the pins' errors on both halves, and the image figures on the half not fitted to."""
+    """The fitted rig, the pins' errors on both halves, and the image figures on the half that was not used for the fit."""
     error = np.array([pair.remainder_px for pair in found.pairs])
     test = [pair for pair, fitted in zip(found.pairs, found.fitted, strict=True) if not fitted]
     return {
@@ -89,7 +89,7 @@ def pose_summary(found: PoseAligned) -> dict:
 
 
 def write_tables(out: Path, pairs: list[Pair], found: Statistics, poses: PoseAligned | None) -> list[Path]:
-    """CSV files: figures by frame, measures by radius, spectra, spots."""
+    """Write CSV files: figures by frame, measures by radius, spectra, spots."""
     frames = [_frame_row(pair, "pins") for pair in pairs] + [_frame_row(pair, "pose") for pair in (poses.pairs if poses else [])]
     radial = [vars(row) | {"relative_difference": row.difference} for row in found.radial]
     spectrum = [
@@ -111,7 +111,7 @@ def _frame_row(pair: Pair, alignment: str) -> dict:
 
 
 def write_plots(folder: Path, found: Statistics) -> dict[str, Path]:
-    """Radial profiles and spectra as charts; ``radial`` and ``spectrum``."""
+    """Draw radial profiles and spectra. Returns the charts' paths by the keys ``radial`` and ``spectrum``."""
     return {
         "radial": write_chart(folder / "radial.png", lambda: _radial_figure(found)),
         "spectrum": write_chart(folder / "spectrum.png", lambda: _spectrum_figure(found)),
@@ -140,7 +140,7 @@ def _spectrum_figure(found: Statistics) -> Figure:
 
 
 def _plain_number(value: object) -> object:
-    """A number of NumPy as JSON holds it."""
+    """A number of NumPy as a number that JSON can hold."""
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"expected a number, got {type(value).__name__}")
@@ -165,7 +165,7 @@ def image_columns(*, mark_best: bool = False) -> list[Column]:
 def write_page(
     path: Path, spec: SensorSpec, metrics: dict, plots: dict[str, Path], pairs: list[dict], poses: list[dict], found: Statistics
 ) -> Path:
-    """index.html; pictures lie beside it.
+    """Write index.html, whose pictures are files beside it.
 
     Parameters
     ----------
@@ -191,11 +191,10 @@ def write_page(
     page.notice("Frames refused", [f"{row['image_name']}: {row['reason']}" for row in metrics["refused"]], tone="bad")
     page.section(
         "Pin-aligned: camera and light on trial",
-        "The skin is fitted to the pins of each real frame. So the render shows the same caps in the same places, whatever the mechanics "
-        "would say.",
+        "The skin is fitted to the pins of each real frame, so the render shows the same caps in the same places, without the mechanics.",
     )
     _image_table(page, metrics["pin_aligned"])
-    page.text(_detector_text(spec, metrics))
+    page.text(_detector_text(spec.pins.count, metrics))
     _statistics_section(page, metrics["statistics"], plots, found)
     if metrics["pose_aligned"]:
         error = metrics["pose_aligned"]["pin_error_px"]
@@ -226,12 +225,12 @@ def _image_table(page: Page, summary: dict) -> None:
     page.table([{"of": said} | {c.key: summary[c.key][part] for c in columns[1:]} for part, said in parts.items()], columns)
 
 
-def _detector_text(spec: SensorSpec, metrics: dict) -> str:
+def _detector_text(count: int, metrics: dict) -> str:
     def percent(share: float) -> str:
         return number(100 * share, decimals=1)
 
     said = (
-        f"The detector, with the parameters of the real frames, finds exactly all {spec.pins.count} pins in "
+        f"The detector, with the parameters of the real frames, finds exactly all {count} pins in "
         f"{percent(metrics['pin_aligned']['exact_fraction'])} % of the renders."
     )
     test = metrics["two_sample"]

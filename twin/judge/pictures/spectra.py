@@ -1,4 +1,4 @@
-"""Measures by the distance from the disc's centre, the noise floor, and the radial power spectrum of frames."""
+"""Measures by distance from the disc's centre, noise, and radial power spectrum of frames."""
 
 from dataclasses import dataclass
 
@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 
 BINS = 8
-"""Bins of the distance from the disc's centre."""
+"""Number of bins of the distance from the disc's centre."""
 SPECTRUM_BINS = 24
-"""Rings of the spectrum."""
+"""Number of rings of the spectrum."""
 LOWEST_CYCLES = 4.0
-"""Lowest frequency, cycles for each diameter of the disc. Below it the Hann window's own spectrum is seen."""
+"""Lowest frequency, cycles per diameter of the disc. Below it the spectrum is that of the Hann window."""
 GAUSSIAN_MAD = 1.4826
-"""Sd of a Gaussian relative to its median absolute deviation."""
+"""Ratio of a Gaussian's standard deviation to its median absolute deviation."""
 CLIP_ROUNDS = 3
-"""Rounds in which residuals beyond three sd are left out."""
+"""Number of rounds in which residuals above three standard deviations are left out."""
 NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
-"""Kernel that leaves nothing of constant, linear and twisted surfaces and has unit gain for white noise (Immerkaer 1996)."""
+"""Kernel whose response to constant, linear and bilinear surfaces is zero, and whose gain for white noise is 1 (Immerkaer 1996)."""
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,17 @@ class RadialRow:
 
     @property
     def difference(self) -> float:
-        """Relative difference of rendered from real."""
+        """Difference of the rendered mean from the real one, relative to the real one."""
         return self.rendered / self.real - 1
 
 
 def equal_count_edges(distance_px: np.ndarray, bins: int = BINS) -> np.ndarray:
-    """(bins + 1,) edges between which there are equally many of the distances."""
+    """(bins + 1,) edges of bins with equally many distances."""
     return np.quantile(distance_px[np.isfinite(distance_px)], np.linspace(0, 1, bins + 1))
 
 
 def bin_of(distance_px: np.ndarray, edges_px: np.ndarray) -> np.ndarray:
-    """Index of each distance's bin. A distance beyond the edges belongs to the outer bins; NaN to none (-1)."""
+    """Index of each distance's bin. Distances beyond the edges belong to the outer bins; NaN has the index -1."""
     index = np.clip(np.searchsorted(edges_px, distance_px, side="right") - 1, 0, len(edges_px) - 2)
     return np.where(np.isfinite(distance_px), index, -1)
 
@@ -49,7 +49,7 @@ def bin_of(distance_px: np.ndarray, edges_px: np.ndarray) -> np.ndarray:
 def radial_rows(
     measure: str, real: tuple[np.ndarray, np.ndarray], rendered: tuple[np.ndarray, np.ndarray], edges_px: np.ndarray
 ) -> list[RadialRow]:
-    """A measure in every bin. ``real`` and ``rendered`` are distances, px, and values, (n,) each; NaN values are left out."""
+    """A measure in every bin. ``real`` and ``rendered`` are distances in px and values, (n,) each. NaN values are left out."""
     means = []
     for distance, values in (real, rendered):
         where = bin_of(distance, edges_px)
@@ -60,10 +60,10 @@ def radial_rows(
 
 
 def noise_sd(gray: np.ndarray, where: np.ndarray) -> float:
-    """Sd of the noise in gray levels, over the pixels ``where`` (H, W) bool.
+    """Standard deviation of the noise in gray levels, over the pixels ``where`` (H, W) bool.
 
-    Immerkaer's kernel (1996) takes constant, linear and twisted surfaces away. Edges are left out: residuals beyond three sd do not
-    count, and the first sd is that of the median absolute deviation.
+    Immerkaer's kernel (1996) removes constant, linear and bilinear surfaces. Edges are removed by leaving out residuals above three
+    standard deviations; the first standard deviation is estimated from the median absolute deviation.
     """
     residual = cv2.filter2D(gray.astype(np.float32), cv2.CV_32F, NOISE_KERNEL)[where]
     sd = GAUSSIAN_MAD * float(np.median(np.abs(residual)))
@@ -75,8 +75,8 @@ def noise_sd(gray: np.ndarray, where: np.ndarray) -> float:
 def radial_spectrum(gray: np.ndarray, center_px: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Power against spatial frequency inside a disc.
 
-    The disc's mean is subtracted, a round Hann window is applied, and the power of the discrete Fourier transform is averaged over
-    rings of even width in log frequency. White noise of sd s has power s^2 everywhere.
+    The disc's mean is subtracted, a round Hann window is applied, and the power of the discrete Fourier transform is averaged over rings
+    of equal width in the logarithm of frequency. White noise with the standard deviation s has the power s^2 at all frequencies.
 
     Returns
     -------
@@ -106,5 +106,5 @@ def radial_spectrum(gray: np.ndarray, center_px: np.ndarray, radius_px: float) -
 
 
 def log_distance_db(real: np.ndarray, rendered: np.ndarray) -> float:
-    """Rms over the rings of the ratio of two spectra, in dB."""
+    """Rms over the rings of the logarithmic ratio of two spectra, dB."""
     return float(np.sqrt(np.mean((10 * np.log10(rendered / real)) ** 2)))

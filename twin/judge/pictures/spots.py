@@ -1,4 +1,4 @@
-"""Bright spots that stay where they are while the pins move: reflections of the LEDs in the window, bubbles."""
+"""Bright spots that do not move with the pins: reflections of the LEDs in the window, bubbles."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from scipy.optimize import linear_sum_assignment
 
 from twin.camera.projection import Disc
 
-# Side of the median filter, px, above which a spot rises; and gray levels by which it does.
+# Side of the median filter that gives the ground, px; least difference of a spot from the ground, gray levels.
 GROUND_PX, RISE = 25, 20.0
 # Least area of a spot.
 MIN_AREA_PX2 = 4
-# Nothing is looked for this close to the disc's edge, px.
+# Distance from the disc's edge within which nothing is searched, px.
 RIM_PX = 4.0
-# Nothing is looked for within this share of the pins' spacing around a pin.
+# Distance from a pin, as a share of the pins' spacing, within which nothing is searched.
 PIN_SHARE = 0.75
-# Most by which the place of a steady spot differs between frames, px, and least share of the frames that show it: pins hide it in others.
+# Largest difference of a steady spot's place between frames, px; least share of the frames that show it, because pins hide it in others.
 STEADY_PX, STEADY_SHARE = 3.0, 0.5
 # Largest distance of a real spot from its rendered counterpart, px.
 MOST_APART_PX = 6.0
@@ -31,7 +31,7 @@ class Spots:
 
 
 def find_spots(gray: np.ndarray, disc: Disc, pins_px: np.ndarray, spacing_px: float) -> Spots:
-    """Spots of a gray frame (H, W) in the disc, clear of the pins (n, 2)."""
+    """Spots of a gray frame (H, W) in the disc and away from the pins (n, 2)."""
     looked = (disc.inside & clear_of_pins(gray.shape, pins_px, PIN_SHARE * spacing_px)).astype(np.uint8)
     looked &= cv2.circle(np.zeros_like(looked), np.rint(disc.center_px).astype(int).tolist(), int(disc.radius_px - RIM_PX), 1, -1)
     rise = gray.astype(np.float32) - cv2.medianBlur(np.ascontiguousarray(gray), GROUND_PX)
@@ -46,7 +46,7 @@ def find_spots(gray: np.ndarray, disc: Disc, pins_px: np.ndarray, spacing_px: fl
 
 
 def steady_spots(frames: list[Spots], share: float = STEADY_SHARE) -> Spots:
-    """Spots that at least a share of the frames show, each at its mean place and with its mean peak."""
+    """Spots that at least a share of the frames shows, with their mean places and mean peaks."""
     px, peak = np.concatenate([spots.px for spots in frames]), np.concatenate([spots.peak for spots in frames])
     of = np.repeat(np.arange(len(frames)), [len(spots.px) for spots in frames])
     places, peaks, left = [], [], np.ones(len(px), bool)
@@ -76,7 +76,7 @@ def pin_spacing_px(pins_px: np.ndarray) -> float:
 
 
 def pair_spots(real: Spots, rendered: Spots) -> np.ndarray:
-    """Distances (m,) px of the real spots and their rendered counterparts, as many as lie within ``MOST_APART_PX``."""
+    """Distances (m,) px of real spots and their rendered counterparts, for all pairs within ``MOST_APART_PX``."""
     apart = np.linalg.norm(real.px[:, None] - rendered.px[None], axis=2)
     rows, columns = linear_sum_assignment(np.minimum(apart, 2 * MOST_APART_PX))
     found = apart[rows, columns]

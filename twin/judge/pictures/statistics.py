@@ -1,4 +1,4 @@
-"""What a set of frames looks like, and how a second set differs from it."""
+"""Statistics of a set of frames, and comparison of two sets."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ from twin.judge.pictures.spectra import RadialRow, equal_count_edges, log_distan
 from twin.judge.pictures.spots import Spots, clear_of_pins, find_spots, pair_spots, pin_spacing_px, steady_spots
 from twin.pins.caps import Caps, measure_caps
 
-# Skin farther from every pin than this share of the pins' spacing is bare.
+# Least distance of bare skin from every pin, as a share of the pins' spacing.
 CLEAR_SHARE = 0.55
-# Measures of caps that are compared by radius.
+# Measures of caps that are compared by the distance from the disc's centre.
 RADIAL_MEASURES = ("level", "contrast", "skin", "diameter_px", "eccentricity", "edge_px")
-# Largest relative difference in any bin that is aimed at, and the measures that it holds for.
+# Target: largest relative difference in any bin, and the measures for which it is the target.
 TARGET = 0.05
 TARGET_MEASURES = ("level", "diameter_px", "edge_px")
 
@@ -26,13 +26,13 @@ class FrameStatistics:
     ----------
     caps : Caps
     distance_px : (N,) float
-        Of each cap from the disc's centre.
+        Distance of each cap from the disc's centre.
     skin_level : float
         Median gray level of bare skin among the pins.
     noise_sd : float
-        Gray levels, on bare skin.
+        Standard deviation of the noise on bare skin, gray levels.
     frequency, power : (b,) float
-        Radial spectrum over the disc, cycles per px and squared gray levels.
+        Radial spectrum over the disc: cycles per px, and squared gray levels.
     spots : Spots
     """
 
@@ -47,7 +47,7 @@ class FrameStatistics:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Real against rendered frames.
+    """Comparison of real with rendered frames.
 
     Attributes
     ----------
@@ -57,10 +57,10 @@ class Statistics:
     frequency, real_power, rendered_power : (b,) float
         Mean spectra.
     spectrum_db : float
-        Log distance of the mean spectra.
-    real_spots, rendered_spots : Spots
-    spots_apart_px : (m,) float
-        Of the spots that have a counterpart.
+        Difference of the mean spectra (see ``log_distance_db``).
+        real_spots, rendered_spots : Spots
+        spots_apart_px : (m,) float
+            Distances of spots that have a counterpart.
     """
 
     radial: list[RadialRow]
@@ -94,14 +94,14 @@ def measure_frame(gray: np.ndarray, pins_px: np.ndarray, disc: Disc) -> FrameSta
 
 
 def bare_skin(shape: tuple[int, ...], pins_px: np.ndarray, disc: Disc) -> np.ndarray:
-    """(H, W) bool: pixels among the pins at (N, 2) px that show none of them."""
+    """(H, W) bool: pixels between the pins at (N, 2) px that show no pin."""
     places = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=2)
     among = disc.distance_px(places) < np.nanmax(disc.distance_px(pins_px))
     return clear_of_pins(shape, pins_px, CLEAR_SHARE * pin_spacing_px(pins_px)) & disc.inside & among
 
 
 def compare_statistics(real: list[FrameStatistics], rendered: list[FrameStatistics]) -> Statistics:
-    """All measures of two sets of frames; the bins hold equally many of the real caps."""
+    """Compare all measures of two sets of frames. All bins have equally many real caps."""
     edges = equal_count_edges(np.concatenate([f.distance_px for f in real]))
     rows: list[RadialRow] = []
     for measure in RADIAL_MEASURES:
@@ -127,5 +127,5 @@ def _by_distance(frames: list[FrameStatistics], measure: str) -> tuple[np.ndarra
 
 
 def _mean(frames: list[FrameStatistics], name: str) -> float:
-    """Mean over the frames of a figure of each."""
+    """Mean of an attribute over the frames."""
     return float(np.nanmean([getattr(f, name) for f in frames]))

@@ -1,4 +1,4 @@
-"""Every known condition, by name."""
+"""All known conditions, by name."""
 
 import difflib
 
@@ -11,12 +11,12 @@ CONDITIONS: dict[str, Condition] = {c.name: c for family in FAMILIES for c in fa
 
 
 def condition(name: str) -> Condition:
-    """A condition by its name.
+    """The condition with this name.
 
     Raises
     ------
     TwinError
-        There is none of that name; names the nearest.
+        There is no such condition; the message names the nearest one.
     """
     if name in CONDITIONS:
         return CONDITIONS[name]
@@ -26,5 +26,5 @@ def condition(name: str) -> Condition:
 
 
 def condition_lines() -> list[str]:
-    """Every condition with its parameter, and the value of it that is severe; for people."""
+    """All conditions as lines of text, with their parameters and the most severe value."""
     return [f"{c.name:18} {c.family:12} {c.title}: {c.parameter}, up to {c.severe:g} {c.unit}".rstrip() for c in CONDITIONS.values()]

@@ -1,4 +1,4 @@
-"""What goes wrong in the camera's chip, the stream and the recorder."""
+"""Degradations of the camera's chip, the stream and the recorder."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def jpeg(image: np.ndarray, value: float, view: View, rng: np.random.Generator) 
 
 
 def coarser(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """Fewer pixels, enlarged again to the frame's size because the pipeline expects that size."""
+    """A lower resolution. The picture is enlarged to the frame's size again, because the pipeline expects that size."""
     if value == 1:
         return image
     height, width = image.shape[:2]
@@ -34,7 +34,7 @@ def coarser(image: np.ndarray, value: float, view: View, rng: np.random.Generato
 
 
 def rows_lost(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """A lost row shows the last row that arrived before it."""
+    """Lost rows: each shows the last row that arrived before it."""
     lost = chosen(len(image), value, rng)
     last = np.maximum.accumulate(np.where(lost, 0, np.arange(len(image))))
     return image[last] if value else image
@@ -49,7 +49,7 @@ def hot(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -
 
 
 def posterised(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """The lowest bits are lost. A fraction of a bit makes the steps between levels wider by that power of two."""
+    """Loss of the lowest bits. With a fraction of a bit the steps between levels are wider by that power of two."""
     step = 2.0**value
     return np.clip(np.floor(image / step) * step, 0, 255).astype(np.uint8) if value else image
 

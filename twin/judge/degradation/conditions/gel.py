@@ -1,4 +1,4 @@
-"""What goes wrong in the gel: bubbles, haze, yellowing, softening."""
+"""Degradations of the gel: bubbles, haze, yellowing, softening."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from twin.judge.degradation.condition import Condition, OnSection, altered
 
 # Smallest and largest radius of a bubble, mm. Chosen.
 BUBBLE_RADIUS_MM = (0.15, 0.6)
-# Bubbles lie within this share of the housing's opening.
+# Share of the radius of the housing's opening within which bubbles are.
 BUBBLE_REACH = 0.9
-# Share of a cap's light that a bubble mirrors into the camera. Chosen.
+# Share of a cap's light that a bubble reflects into the camera. Chosen.
 BUBBLE_LIGHT = 0.6
 # Share of the light behind it that a bubble hides. Chosen.
 BUBBLE_OPACITY = 0.5
-# Random numbers that are drawn at once, so that more bubbles keep the places of the first ones.
+# Number of bubbles whose random numbers are drawn at once, so that the first bubbles have the same places for any number.
 MOST_BUBBLES = 1000
 # Linear light of a cap at mid gray, as a share of saturation.
 CAP_LIGHT = 0.25
@@ -24,7 +24,7 @@ MOST_HAZE = 1.0
 
 
 def bubbles(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
-    """Bubbles at the window, added one after the other; a fraction of a bubble is a fainter one."""
+    """Bubbles at the window, which are added one after the other. A fraction of a bubble is a fainter bubble."""
     if not value:
         return spec
     count = int(np.ceil(value))

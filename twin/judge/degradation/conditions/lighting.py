@@ -1,13 +1,13 @@
-"""What goes wrong with the light: LEDs that fail, and light from outside."""
+"""Degradations of the light: LEDs that fail, and light from outside."""
 
 import numpy as np
 
 from scenes.sensor import LedRingSpec
 from twin.judge.degradation.condition import Condition, OnSection, View, over_channels
 
-# Light in the middle of a glare, in saturations. It is large, so that the camera shows white well beyond the glare's half width.
+# Light in the middle of a glare, in saturations. It is large, so that the camera is saturated far beyond the glare's half width.
 GLARE = 3.0
-# Place of the glare's middle, x and y from the disc's centre, in the disc's radius.
+# Place of the glare's middle: x and y from the disc's centre, in units of the disc's radius.
 GLARE_AT = (0.35, -0.25)
 
 
@@ -31,7 +31,7 @@ def reddened(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRi
 
 
 def room_light(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """A veil that rises from one side of the disc to the other, over everything the camera sees."""
+    """Additional light over the whole frame, which increases from one side of the disc to the other."""
     if not value:
         return light
     x, y = view.grid(light.shape)
@@ -40,7 +40,7 @@ def room_light(light: np.ndarray, value: float, view: View, rng: np.random.Gener
 
 
 def glare(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """The mirror image of a lamp: even in the middle, with a steep edge."""
+    """The reflection of a lamp: uniform in the middle, with a steep edge."""
     if not value:
         return light
     x, y = view.grid(light.shape)

@@ -1,46 +1,46 @@
-"""What goes wrong between window and camera chip: focus, motion, dirt, scratches."""
+"""Degradations between window and camera chip: focus, motion, dirt, scratches."""
 
 import cv2
 import numpy as np
 
 from twin.judge.degradation.condition import Condition, View, over_channels
 
-# Sub-pixels a pixel and axis, over which the kernel of a blur is averaged.
+# Number of sub-pixels of a pixel along each axis, over which the kernel of a blur is averaged.
 SUBPIXELS = 8
-# Direction of the motion in the picture, from x towards y.
+# Direction of the motion in the picture, deg from x towards y.
 MOTION_DEG = 30.0
-# Sd of the Gaussian that makes smudges out of noise, mm at the caps: their size. Chosen.
+# Standard deviation of the Gaussian by which smudges are made from noise, mm at the caps. It is the smudges' size. Chosen.
 DIRT_SPACING_MM = 1.5
-# Share of the light that a smudge holds back. Chosen.
+# Share of the light that a smudge absorbs. Chosen.
 DIRT_OPACITY = 0.9
-# Sd of a smudge's edge, mm at the caps. The edge is soft because the lens' own surface is out of focus.
+# Standard deviation of a smudge's edge, mm at the caps. The edge is soft, because the lens' surface is out of focus.
 DIRT_EDGE_MM = 0.5
 # Width of a scratch, mm at the caps, and the light that it scatters, in saturations. Chosen.
 SCRATCH_WIDTH_MM, SCRATCH_LIGHT = 0.12, 0.25
-# Scratches whose places are drawn at once, so that more scratches keep the places of the first ones.
+# Number of scratches whose places are drawn at once, so that the first scratches have the same places for any number.
 MOST_SCRATCHES = 1000
-# Blurs between which a focus that varies over the picture is interpolated.
+# Number of blurs between which a focus that varies over the picture is interpolated.
 FOCUS_STEPS = 6
 
 
 def blurred_by(light: np.ndarray, kernel: np.ndarray) -> np.ndarray:
-    """Light (H, W[, 3]) blurred by a kernel of sum 1; the picture goes on mirrored."""
+    """Light (H, W[, 3]) blurred by a kernel of sum 1. The picture is mirrored at its border."""
     return cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REFLECT)
 
 
 def disc_kernel(diameter_px: float) -> np.ndarray:
-    """A disc's cover of pixels, sum 1: the circle of confusion."""
+    """Coverage of pixels by a disc, with the sum 1: the circle of confusion."""
     half = int(np.ceil(diameter_px / 2 + 0.5))
     fine = (np.arange((2 * half + 1) * SUBPIXELS) + 0.5) / SUBPIXELS - half - 0.5
     inside = fine[:, None] ** 2 + fine**2 <= (diameter_px / 2) ** 2
     kernel = inside.reshape(2 * half + 1, SUBPIXELS, 2 * half + 1, SUBPIXELS).mean(axis=(1, 3))
-    if kernel.sum() == 0:  # a disc smaller than a sub-pixel
+    if kernel.sum() == 0:  # the disc is smaller than a sub-pixel
         kernel[half, half] = 1
     return (kernel / kernel.sum()).astype(np.float32)
 
 
 def line_kernel(length_px: float, degrees: float) -> np.ndarray:
-    """A straight path's cover of pixels, sum 1."""
+    """Coverage of pixels by a straight line, with the sum 1."""
     half = int(np.ceil(length_px / 2 + 1))
     along = np.linspace(-0.5, 0.5, 20 * half + 1) * length_px
     x, y = along * np.cos(np.radians(degrees)) + half, along * np.sin(np.radians(degrees)) + half
@@ -61,7 +61,7 @@ def motion(light: np.ndarray, value: float, view: View, rng: np.random.Generator
 
 
 def rolled_focus(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """The circle of confusion grows evenly from one rim of the disc to the other: a lens that sits askew."""
+    """A tilted lens: the diameter of the circle of confusion is linear from one rim of the disc to the other."""
     if not value:
         return light
     x, y = view.grid(light.shape)
@@ -74,7 +74,7 @@ def rolled_focus(light: np.ndarray, value: float, view: View, rng: np.random.Gen
 
 
 def dirt(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """Smudges that cover a share of the disc and hold most of the light back."""
+    """Smudges that cover a share of the disc and absorb most of the light."""
     if not value:
         return light
     noise = rng.standard_normal(light.shape[:2], dtype=np.float32)
@@ -95,7 +95,7 @@ def scratched(light: np.ndarray, value: float, view: View, rng: np.random.Genera
     half = max(0.5 * SCRATCH_WIDTH_MM * view.px_per_mm, 0.5) / view.radius_px
     added = np.zeros(light.shape[:2], np.float32)
     for k in range(int(np.ceil(value))):
-        part = min(value - k, 1.0)  # the last one only begins
+        part = min(value - k, 1.0)  # the last scratch may be only a part of one
         distance = np.abs(np.cos(turn[k]) * x + np.sin(turn[k]) * y - away[k])
         added += np.float32(part * bright[k] * SCRATCH_LIGHT * view.saturation) * np.exp(-0.5 * (distance / half) ** 2)
     added *= x * x + y * y < 1

@@ -1,17 +1,18 @@
-"""What goes wrong with the camera's place and lens."""
+"""Degradations by the camera's place and lens."""
 
 import cv2
 import numpy as np
 
 from scenes.sensor import CameraSpec, SensorSpec
+from twin.camera.projection import lens_disc
 from twin.judge.degradation.condition import Condition, OnSection, View, altered
 
-# Direction of a shift in the picture (unit vector, 30 deg from x towards y).
+# Direction of a shift in the picture: unit vector at 30 deg from x towards y.
 AWAY = (np.cos(np.radians(30.0)), np.sin(np.radians(30.0)))
 
 
 def shifted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
-    """The chip sits beside the lens' axis."""
+    """The chip is displaced from the lens' axis."""
     if not value:
         return spec
     by = value * View.of(spec, np.zeros((0, 2))).px_per_mm
@@ -27,10 +28,10 @@ def zoomed(camera: CameraSpec, value: float, rng: np.random.Generator) -> Camera
 
 
 def distorted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
-    """Another lens: barrel distortion that draws the disc's rim in by a share of its radius."""
+    """Another lens, with a barrel distortion that moves the disc's rim inwards by a share of its radius."""
     if not value:
         return spec
-    rim = View.of(spec, np.zeros((0, 2))).radius_px / spec.camera.fx_px
+    rim = lens_disc(spec.view, spec.housing).radius_px / spec.camera.fx_px
     return altered(spec, camera={"k1": spec.camera.k1 - value / rim**2})
 
 
@@ -39,19 +40,19 @@ def vignetted(camera: CameraSpec, value: float, rng: np.random.Generator) -> Cam
 
 
 def roll(degrees: float, view: View) -> np.ndarray:
-    """(2, 3) map of pixels of a camera turned about its axis."""
+    """Map (2, 3) of pixels for a camera that is turned about its axis."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     turn, about = np.array([[c, -s], [s, c]]), np.array([view.spec.camera.cx_px, view.spec.camera.cy_px])
     return np.column_stack([turn, about - turn @ about])
 
 
 def skew(rise: float, view: View) -> np.ndarray:
-    """(2, 3) map of pixels of a rolling shutter: rows are shifted in proportion to their distance from the disc's centre."""
+    """Map (2, 3) of pixels for a rolling shutter: the shift of a row is proportional to its distance from the disc's centre."""
     return np.array([[1.0, rise, -rise * view.center_px[1]], [0.0, 1.0, 0.0]])
 
 
 def warped(light: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Light (H, W[, 3]) with its pixels moved by a map (2, 3); beyond the border its last row or column goes on."""
+    """Light (H, W[, 3]) with its pixels moved by a map (2, 3). Beyond the border the last row or column is repeated."""
     return cv2.warpAffine(light, matrix, light.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 

@@ -1,4 +1,4 @@
-"""What goes wrong in the settings: the camera's window, the pipeline's threshold."""
+"""Wrong settings: the camera's window, the pipeline's threshold."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from twin.pins import DetectorSpec
 
 
 def offset_px(value: float, view: View) -> tuple[int, int]:
-    """Displacement (x, y), whole px, by a share of the disc's radius."""
+    """Displacement (x, y) in whole px by a share of the disc's radius."""
     by = value * view.radius_px
     return round(0.8 * by), round(-0.6 * by)
 
 
 def wrong_crop(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """The camera's window is read at another place: the picture is displaced, and black where nothing was read."""
+    """The camera's window is at another place: the picture is displaced, and black outside of the original window."""
     dx, dy = offset_px(value, view)
     if not (dx or dy):
         return image

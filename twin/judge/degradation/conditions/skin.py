@@ -1,4 +1,4 @@
-"""What goes wrong with skin and caps."""
+"""Degradations of skin and caps."""
 
 import cv2
 import numpy as np
@@ -8,36 +8,34 @@ from twin.geometry.pins import rest_pins
 from twin.judge.degradation.condition import Condition, OnSection, View, altered, chosen, over_channels
 from twin.optics.surfaces import cap_albedo
 
-# Reflectance of a cap that has come off, relative to a whole one. It is not 0, because levels must be positive.
+# Reflectance of a cap that has come off, relative to an intact one. It is not 0, because levels must be positive.
 GONE = 1e-6
-# Outline of a broken cap, as ``appearance.cap_shapes`` has it: about a third of the area is left, and it lies askew. Chosen.
+# Outline of a broken cap, in the form of ``appearance.cap_shapes``: about a third of the area is left, on one side. Chosen.
 BROKEN = (-0.45, 0.2, 0.1, 0.15, 0.1)
-# Bits of a pixel's fraction with which OpenCV draws, and the steps a pixel that they make.
+# Number of fractional bits of the places at which OpenCV draws, and the resulting number of steps of a pixel.
 FINE_BITS = 4
 FINE = 2**FINE_BITS
-# Middle of a tear, x and y from the disc's centre, in the disc's radius.
+# Middle of a tear: x and y from the disc's centre, in units of the disc's radius.
 TEAR_AT = (-0.3, 0.35)
 # Room light through a tear, in saturations. Chosen.
 TEAR_LIGHT = 0.7
-# Least cosine of a cap's lean that is drawn: a cap that leans further would vanish.
+# Least cosine of a cap's tilt that is used for drawing, because a cap with a larger tilt would vanish.
 LEAST_FACING = 0.3
 
 
-def cap_levels(spec: SensorSpec) -> np.ndarray:
-    """Level (N,) of each cap relative to ``cap_albedo``: measured, or as the print's random pattern has it."""
-    albedo = np.array(spec.appearance.cap_albedo)
+def cap_levels(appearance: AppearanceSpec, count: int) -> np.ndarray:
+    """Reflectance (count,) of each cap relative to ``cap_albedo``: the measured one, else that of the print's random pattern."""
+    if appearance.cap_levels:
+        return np.array(appearance.cap_levels)
+    albedo = np.array(appearance.cap_albedo)
     k = int(albedo.argmax())
-    return (
-        np.array(spec.appearance.cap_levels)
-        if spec.appearance.cap_levels
-        else np.maximum(cap_albedo(spec.appearance, spec.pins.count)[:, k] / albedo[k], GONE)
-    )
+    return np.maximum(cap_albedo(appearance, count)[:, k] / albedo[k], GONE)
 
 
 def missing(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     if not value:
         return spec
-    levels = np.where(chosen(spec.pins.count, value, rng), GONE, cap_levels(spec))
+    levels = np.where(chosen(spec.pins.count, value, rng), GONE, cap_levels(spec.appearance, spec.pins.count))
     return altered(spec, appearance={"cap_levels": tuple(levels.tolist())})
 
 
@@ -66,7 +64,7 @@ def faded(appearance: AppearanceSpec, value: float, rng: np.random.Generator) ->
 def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
     if not value:
         return spec
-    levels = cap_levels(spec) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count)))
+    levels = cap_levels(spec.appearance, spec.pins.count) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count)))
     return altered(spec, appearance={"cap_levels": tuple(levels.tolist())})
 
 
@@ -76,7 +74,7 @@ def pale(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> 
 
 
 def translucent(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """Room light through the skin, stronger on one side; caps stand in front of the skin and hold it back."""
+    """Room light through the skin, stronger on one side. Caps are in front of the skin and block the light."""
     if not value:
         return light
     x, y = view.grid(light.shape)
@@ -85,7 +83,7 @@ def translucent(light: np.ndarray, value: float, view: View, rng: np.random.Gene
 
 
 def torn(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
-    """A round hole: room light instead of skin and caps."""
+    """A round hole, which shows room light instead of skin and caps."""
     if not value:
         return light
     x, y = view.grid(light.shape)
@@ -106,7 +104,7 @@ def swollen(skin: SkinSpec, value: float, rng: np.random.Generator) -> SkinSpec:
 
 
 def cap_cover(shape: tuple[int, ...], view: View) -> np.ndarray:
-    """(H, W) share of each pixel that a cap covers. Caps are drawn as discs at their places; a leaning cap is drawn smaller."""
+    """Share (H, W) of each pixel that is covered by a cap. Caps are drawn as discs at their places, tilted caps as smaller discs."""
     facing = np.clip(np.abs(rest_pins(view.spec.geometry).axis[:, 2]), LEAST_FACING, 1)
     cover = np.zeros(shape[:2], np.uint8)
     for (x, y), radius in zip(view.caps_px, view.cap_radius_px * np.sqrt(facing), strict=True):

@@ -1,0 +1,60 @@
+"""Compiled functions work where nothing can be kept, and say so once."""
+
+import errno
+import importlib.util
+import warnings
+
+import numba
+import pytest
+
+from twin.compiled import compiled
+from twin.errors import warn_once
+
+SOURCE = "def doubled(x):\n    return 2 * x\n\n\ndef tripled(x):\n    return 3 * x\n"
+
+
+@pytest.fixture
+def functions(tmp_path, monkeypatch):
+    """Functions of a module of their own, as numba keeps code by files."""
+    (tmp_path / "functions.py").write_text(SOURCE)
+    spec = importlib.util.spec_from_file_location("functions", tmp_path / "functions.py")
+    found = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(found)
+    warn_once.cache_clear()
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kept"))
+    yield found.doubled, found.tripled
+    warn_once.cache_clear()
+
+
+def test_machine_code_is_kept(functions, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert compiled()(functions[0])(2) == 4
+    assert list((tmp_path / "kept").rglob("*.nbc"))
+
+
+def test_where_no_folder_can_be_written_it_is_compiled_all_the_same(functions, tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_LOCATOR_CLASSES", "ZipCacheLocator")  # of numba's places one that is none here
+    with pytest.warns(RuntimeWarning, match="can't be kept .*no folder.*NUMBA_CACHE_DIR") as told:
+        twice, thrice = (compiled(fastmath=True)(function) for function in functions)
+    assert len(told) == 1 and (twice(2), thrice(2)) == (4, 6)
+
+
+def test_a_full_disk_costs_the_kept_code_alone(functions, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+    with pytest.warns(RuntimeWarning, match="kept.*No space left on device") as told:
+        twice, thrice = (compiled()(function) for function in functions)
+        assert (twice(2), thrice(2)) == (4, 6)
+    assert len(told) == 1
+
+
+def test_other_errors_of_the_compiler_are_not_taken_for_it(functions, monkeypatch):
+    def broken(**_):
+        raise RuntimeError("no such option")
+
+    monkeypatch.setattr(numba, "njit", broken)
+    with pytest.raises(RuntimeError, match="no such option"):
+        compiled()(functions[0])

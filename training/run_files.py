@@ -1,0 +1,138 @@
+"""The files of a run, written whole and read with care: what is damaged, or was never a run's, is an error that names the file."""
+
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from scenes.load import explained
+from scenes.sensor import SensorSpec
+from training.models import model_named
+from training.recipes import TrainingError
+from twin.store import write_with
+from twin.types import Form
+
+CONFIG = "config.json"  # what a run was told, resolved
+TENSORS = "weights.pt"  # its trained networks
+CHECKPOINT = "checkpoint.pt"  # the state of training, while it goes on
+AGAIN = "train again, or copy the run's folder anew"
+
+
+class _Pipeline(BaseModel):
+    form: Form
+    graph: str
+
+
+class _Config(BaseModel):
+    """What a model needs of ``config.json``; the rest says how it was trained."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    model: str
+    labels: str
+    columns: Annotated[list[str], Field(min_length=1)]
+    units: list[str]
+    split: int | None
+    size: dict[str, Annotated[int, Field(ge=0, le=100_000)]]
+    rows: dict[str, object]
+    sensor: SensorSpec
+    pipeline: _Pipeline
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """The configuration of a run.
+
+    Raises
+    ------
+    TrainingError
+        It can't be read, or a model can't be made from it.
+    """
+    path = run / CONFIG
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise damaged(path, getattr(error, "strerror", None) or "no readable JSON") from error
+    try:
+        _Config.model_validate(config)
+    except ValidationError as error:
+        raise damaged(path, explained(error, _Config)) from error
+    try:
+        model_named(config["model"])
+    except TrainingError as error:
+        raise damaged(path, str(error)) from error
+    return config
+
+
+def require_together(run: Path, config: Mapping[str, Any], content: Mapping[str, Any]) -> None:
+    """Refuse weights that are not those of the configuration beside them.
+
+    Raises
+    ------
+    TrainingError
+        They are of other pins or of another number of labels.
+    """
+    sensor = SensorSpec.model_validate(config["sensor"])
+    pins, labels = len(content["reference_px"]), len(content["shift"])
+    if pins != sensor.pins.count:
+        raise damaged(run / CONFIG, f"a sensor of {sensor.pins.count} pins, the weights are of {pins}")
+    if not labels == len(config["columns"]) == len(config["units"]):
+        raise damaged(run / CONFIG, f"{len(config['columns'])} columns and {len(config['units'])} units, the weights are of {labels}")
+
+
+def read_tensors(path: Path, remedy: str = AGAIN) -> dict[str, Any]:
+    """What ``write_tensors`` wrote.
+
+    PyTorch itself does not compare the checksums in the file, so a single changed byte would change weights in silence.
+
+    Parameters
+    ----------
+    remedy : str
+        What the user is told to do where the file can't be used.
+
+    Raises
+    ------
+    TrainingError
+        The file can't be read, is damaged, or was not written by ``write_tensors``.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            changed = file.testzip()
+        if changed:
+            raise zipfile.BadZipFile("a checksum is wrong")
+        content = torch.load(path, weights_only=True, map_location="cpu")
+    except OSError as error:
+        raise TrainingError(f"{path}: can't be read ({error.strerror or error}); {remedy}") from error
+    except zipfile.BadZipFile as error:
+        raise damaged(path, "cut, changed, or no file of weights", remedy) from error
+    except UnpicklingError as error:
+        raise damaged(path, "holds more than numbers, and is not loaded for that reason", remedy) from error
+    except (RuntimeError, ValueError, KeyError, EOFError, TypeError, AttributeError, IndexError) as error:
+        raise damaged(path, "no file of weights", remedy) from error
+    if not isinstance(content, dict):
+        raise damaged(path, "no file of weights", remedy)
+    return content
+
+
+def damaged(path: Path, how: str, remedy: str = AGAIN) -> TrainingError:
+    """The error to raise where a file of a run can't be used: names the file, how it is damaged, and the remedy."""
+    return TrainingError(f"{path}: not of a run of this version, or damaged ({how}); {remedy}")
+
+
+def write_tensors(path: Path, content: dict) -> None:
+    """Write a dict of numbers, text, lists, arrays and tensors so that ``read_tensors`` reads it."""
+    write_with(path, lambda file: torch.save(_as_tensors(content), file))
+
+
+def _as_tensors(value: object) -> object:
+    """The same content with arrays as tensors: PyTorch reads tensors back without running code that a file may hold."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value)
+    if isinstance(value, dict):
+        return {key: _as_tensors(part) for key, part in value.items()}
+    return [_as_tensors(part) for part in value] if isinstance(value, list) else value

@@ -41,9 +41,10 @@ init_0.png or --no-contact, in a frame that shows no contact, or made from many 
 camera fitted. Where the layout is unsure, the two likeliest are named with what would decide; then give --layout.
 
 \b
-Writes: MY.toml, a short specification with comments, to be used as --sensor MY.toml; beside
-it MY-new/ with index.html (what is known, what is assumed, what to do to know more) and
-pictures of frames with their pins.
+Writes:
+  MY.toml             a short specification with comments, for --sensor MY.toml
+  MY-new/index.html   what is known, what is assumed, what to do to know more;
+                      pictures of frames with their pins beside it
 
 \b
 --layout rings:10         331 pins in 10 rings

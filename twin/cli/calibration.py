@@ -42,7 +42,7 @@ camera fitted. Where the layout is unsure, the two likeliest are named with what
 
 \b
 Writes:
-  MY.toml             a short specification with comments, for --sensor MY.toml
+  MY.toml             a short, commented specification: --sensor MY.toml
   MY-new/index.html   what is known, what is assumed, what to do to know more;
                       pictures of frames with their pins beside it
 

@@ -12,7 +12,11 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from scenes.base import Fraction, Index, Name, NearOne, NonNegative, NotTruth, Positive, Rgb, Section
+from scenes.pins import PinsSpec
 from scenes.rig import RigSpec
+
+ELSEWHERE = "leave it out if it was measured on another layout"
+"""What to do with caps that were measured and do not fit."""
 
 
 class RelaxationTerm(Section):
@@ -29,6 +33,9 @@ def _compressible(poisson_ratio: float) -> float:
     if poisson_ratio > MOST_POISSON:
         raise ValueError(f"a contact does not converge above {MOST_POISSON}; rubber that hardly changes its volume has 0.49 to 0.4999")
     return poisson_ratio
+
+
+Poisson = Annotated[float, Field(ge=0), AfterValidator(_compressible)]
 
 
 class MaterialSpec(Section):
@@ -49,7 +56,7 @@ class MaterialSpec(Section):
     """
 
     young_modulus_mpa: Positive
-    poisson_ratio: Annotated[float, Field(ge=0), AfterValidator(_compressible)]
+    poisson_ratio: Poisson
     law: Literal["neo-hookean", "mooney-rivlin", "yeoh"] = "neo-hookean"
     second_invariant_share: Fraction = 0.0
     c20_c10: NonNegative = 0.0
@@ -68,10 +75,16 @@ class MaterialSpec(Section):
 
 
 class SkinSpec(MaterialSpec):
-    """Hemispherical skin, clamped in the rim plane ``z = rim_z_mm``."""
+    """Hemispherical skin, clamped in the rim plane ``z = rim_z_mm``.
 
-    outer_radius_mm: Positive
-    thickness_mm: Positive
+    The defaults are those of the printed TacTip: the radius of its makers' simulation CAD, about 1 mm of Agilus30 of Shore A 26 to 30
+    (0.4 to 1 MPa).
+    """
+
+    young_modulus_mpa: Positive = 0.7
+    poisson_ratio: Poisson = 0.47
+    outer_radius_mm: Positive = 20.0
+    thickness_mm: Positive = 1.0
     rim_z_mm: float = 0.0
 
 
@@ -89,8 +102,14 @@ class GelSpec(MaterialSpec):
         Share of the light towards the camera that the gel scatters forward.
     haze_sigma_px : float
         Sd of the Gaussian over which it is scattered.
+
+    Notes
+    -----
+    The default modulus is that of the gel RTV27905 (0.01 to 0.03 MPa).
     """
 
+    young_modulus_mpa: Positive = 0.02
+    poisson_ratio: Poisson = 0.47
     sealed: bool = False
     refractive_index: Index = 1.41
     absorption_per_mm: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
@@ -99,10 +118,13 @@ class GelSpec(MaterialSpec):
 
 
 class LensSpec(Section):
-    """Rigid flat window (acrylic) that closes the gel; ``z_mm`` is its gel-side face. Behind it is air."""
+    """Rigid flat window (acrylic) that closes the gel; ``z_mm`` is its gel-side face. Behind it is air.
 
-    z_mm: float
-    radius_mm: Positive
+    The default radius is measured from public CAD of the TacTip.
+    """
+
+    z_mm: float = -2.0
+    radius_mm: Positive = 19.25
     thickness_mm: Positive = 2.0
     refractive_index: Index = 1.49
 
@@ -110,41 +132,6 @@ class LensSpec(Section):
     def back_mm(self) -> float:
         """z of the face towards the camera."""
         return self.z_mm - self.thickness_mm
-
-
-class PinsSpec(Section):
-    """Pins on the skin's inside, normal to it. N = 1 + 3 r (r + 1) pins for r rings.
-
-    Attributes
-    ----------
-    layout : {"rings", "hexagon"}
-        Ring i is a circle or a hexagon of 6 i pins.
-    spacing : {"polar", "plan"}
-        What is proportional to a ring's number: the polar angle, or its sine (the pins are then even in plan).
-    rings : int
-    max_polar_deg : float
-        Polar angle of the outermost pins (of the corner pins of a hexagon).
-    phase_deg : float
-        Azimuth of the first pin of each ring, from x towards y.
-    length_mm, diameter_mm : float
-        Of the stem.
-    cap_diameter_mm, cap_height_mm : float
-    """
-
-    layout: Literal["rings", "hexagon"]
-    spacing: Literal["polar", "plan"] = "polar"
-    rings: Annotated[int, Field(ge=1, le=40)]
-    max_polar_deg: Annotated[float, Field(gt=0, lt=90)]
-    phase_deg: float = 0.0
-    length_mm: Positive
-    diameter_mm: Positive
-    cap_diameter_mm: Positive
-    cap_height_mm: Positive
-
-    @property
-    def count(self) -> int:
-        """Number of pins N."""
-        return 1 + 3 * self.rings * (self.rings + 1)
 
 
 class CameraSpec(Section):
@@ -178,7 +165,7 @@ class CameraSpec(Section):
 
     width_px: Annotated[int, Field(ge=16, le=8192)]
     height_px: Annotated[int, Field(ge=16, le=8192)]
-    channels: Literal["color", "mono"]
+    channels: Literal["color", "mono"] = "mono"
     projection: Literal["perspective", "fisheye"] = "perspective"
     fx_px: Positive
     fy_px: Positive
@@ -209,6 +196,8 @@ class CameraSpec(Section):
 class LedRingSpec(Section):
     """LEDs in the air behind the window, shining along +z. Each is a square that is turned to face the axis.
 
+    The defaults are a ring of six like that of the UR5's TacTip; 'twin calibrate optics' finds a sensor's own.
+
     Attributes
     ----------
     azimuth_deg : tuple of float
@@ -233,10 +222,10 @@ class LedRingSpec(Section):
         Sd of the Gaussian that stands for the middle.
     """
 
-    azimuth_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=64)]
-    radius_mm: Positive
-    z_mm: float
-    size_mm: Positive
+    azimuth_deg: Annotated[tuple[float, ...], Field(min_length=1, max_length=64)] = (0.0, 60.0, 120.0, 180.0, 240.0, 300.0)
+    radius_mm: Positive = 16.7
+    z_mm: float = -6.1
+    size_mm: Positive = 1.1
     power: Positive = 1.0
     balance: tuple[NonNegative, ...] = ()
     color: Rgb = (1.0, 1.0, 1.0)
@@ -280,6 +269,8 @@ class RimSpec(Section):
 class HousingSpec(Section):
     """The bright ring and wall around the disc that the camera sees: a flat annulus in the air.
 
+    The defaults are those of the UR5's TacTip, without what was measured of its rim.
+
     Its light is relative to the LEDs' power (formula: ``twin.optics.static_layer.housing_light``).
 
     Attributes
@@ -303,15 +294,15 @@ class HousingSpec(Section):
         Light measured on top of all that.
     """
 
-    aperture_radius_mm: Positive
-    outer_radius_mm: Positive
-    z_mm: float
+    aperture_radius_mm: Positive = 16.6
+    outer_radius_mm: Positive = 60.0
+    z_mm: float = -4.0
     center_mm: tuple[float, float] = (0.0, 0.0)
-    albedo: Rgb
+    albedo: Rgb = (0.9, 0.91, 0.77)
     ambient: NonNegative = 1.5
     ambient_falloff_mm: Positive = 20.0
     glow: NonNegative = 6.0
-    glow_radius_mm: Positive
+    glow_radius_mm: Positive = 16.3
     glow_height_mm: Positive = 1.5
     glow_exponent: Positive = 1.5
     lip_width_mm: NonNegative = 1.0
@@ -340,6 +331,8 @@ class SpeckSpec(Section):
 class AppearanceSpec(Section):
     """Reflectances (linear RGB, 0 to 1) of what the camera sees in the gel.
 
+    The defaults of skin, pins and caps are those fitted to the UR5's TacTip.
+
     Attributes
     ----------
     skin_albedo, pin_albedo, cap_albedo : three numbers
@@ -360,11 +353,11 @@ class AppearanceSpec(Section):
     specks : tuple of SpeckSpec
     """
 
-    skin_albedo: Rgb
+    skin_albedo: Rgb = (0.0006, 0.00048, 0.0055)
     skin_gloss: Fraction = 0.0
     skin_roughness: Annotated[float, Field(ge=0.05, le=1)] = 0.25
-    pin_albedo: Rgb
-    cap_albedo: Rgb
+    pin_albedo: Rgb = (0.00075, 0.00065, 0.0072)
+    cap_albedo: Rgb = (0.211, 0.411, 0.8)
     cap_gloss: Fraction = 0.0
     cap_roughness: Annotated[float, Field(ge=0.05, le=1)] = 0.25
     cap_bump: Fraction = 0.0
@@ -405,11 +398,11 @@ class ResponseSpec(Section):
         Of the stream; 0: not compressed.
     """
 
-    exposure: Positive
-    gamma: Positive
-    black_level: Annotated[float, Field(ge=0, lt=128)]
+    exposure: Positive = 1.0
+    gamma: Positive = 2.2
+    black_level: Annotated[float, Field(ge=0, lt=128)] = 4.0
     white_balance: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
-    blur_sigma_px: NonNegative
+    blur_sigma_px: NonNegative = 0.6
     brightness_drift: Fraction = 0.0
     read_noise: NonNegative = 2e-4
     shot_noise: NonNegative = 6e-5
@@ -465,6 +458,11 @@ class BlobSpec(Section):
         Disc within which pins are looked for.
     min_area_px2 : float
         Smaller blobs are left out.
+    spot_sigma_px : float
+        If above 0, pins are not found by a threshold but as bright spots of this size (sd of a Gaussian; a cap is about three wide), each
+        compared with its surroundings. It takes caps with a pattern, of uneven light, and near reflections.
+    rest_px : (N, 2) float
+        Where the pins were measured without contact, in this form's frames; empty: where the camera sees them by the specification.
     """
 
     threshold: float
@@ -473,6 +471,8 @@ class BlobSpec(Section):
     mask_center_px: tuple[float, float]
     mask_radius_px: Annotated[float, Field(gt=0, le=100_000)]
     min_area_px2: NonNegative = 1.0
+    spot_sigma_px: Annotated[float, Field(ge=0, le=200)] = 0.0
+    rest_px: tuple[tuple[float, float], ...] = ()
 
 
 class PipelineSpec(Section):
@@ -507,20 +507,23 @@ class CaptureSpec(Section):
 
 
 class SensorSpec(Section):
-    """A TacTip, complete. ``name`` is the file's stem; ``rig`` is there where contacts of this sensor on a robot were calibrated."""
+    """A TacTip, complete. ``name`` is the file's stem; ``rig`` is there where contacts of this sensor on a robot were calibrated.
+
+    A file needs only [pins], [camera] and [pipeline.raw]; all other sections have defaults, those of a printed TacTip.
+    """
 
     name: Name
-    description: str
-    source: str
-    skin: SkinSpec
-    gel: GelSpec
-    lens: LensSpec
+    description: str = ""
+    source: str = ""
+    skin: SkinSpec = SkinSpec()
+    gel: GelSpec = GelSpec()
+    lens: LensSpec = LensSpec()
     pins: PinsSpec
     camera: CameraSpec
-    leds: LedRingSpec
-    housing: HousingSpec
-    appearance: AppearanceSpec
-    response: ResponseSpec
+    leds: LedRingSpec = LedRingSpec()
+    housing: HousingSpec = HousingSpec()
+    appearance: AppearanceSpec = AppearanceSpec()
+    response: ResponseSpec = ResponseSpec()
     recording: RecordingSpec | None = None
     pipeline: PipelineSpec
     rig: RigSpec | None = None
@@ -558,11 +561,15 @@ class SensorSpec(Section):
             raise ValueError("leds.z_mm must not lie in front of the window's back (lens.z_mm - lens.thickness_mm)")
         shapes = self.appearance.cap_shapes
         if shapes and ({len(c) % 2 for c in shapes} != {1} or len({len(c) for c in shapes}) > 1 or len(shapes) != pins.count):
-            raise ValueError(f"appearance.cap_shapes needs a_0 and the same number of pairs for each of the {pins.count} pins")
+            each = f"a_0 and the same number of pairs for each of the {pins.count} pins"
+            raise ValueError(f"appearance.cap_shapes needs {each}; {ELSEWHERE}")
         if self.appearance.cap_levels and len(self.appearance.cap_levels) != pins.count:
-            raise ValueError(f"appearance.cap_levels needs one number for each of the {pins.count} pins")
+            raise ValueError(f"appearance.cap_levels needs one number for each of the {pins.count} pins; {ELSEWHERE}")
         if self.appearance.cap_offsets and len(self.appearance.cap_offsets) != pins.count:
-            raise ValueError(f"appearance.cap_offsets needs one pair for each of the {pins.count} pins")
+            raise ValueError(f"appearance.cap_offsets needs one pair for each of the {pins.count} pins; {ELSEWHERE}")
+        for form, blob in (("raw", self.pipeline.raw), ("recording", self.pipeline.recording)):
+            if blob is not None and blob.rest_px and len(blob.rest_px) != pins.count:
+                raise ValueError(f"pipeline.{form}.rest_px needs one place for each of the {pins.count} pins, or none at all")
         if (self.recording is None) != (self.pipeline.recording is None):
             raise ValueError("recording and pipeline.recording go together: give both or neither")
         return self

@@ -1,5 +1,7 @@
 """The text of a sensor's specification: a TOML file that a person can read and edit, and tables of its long arrays."""
 
+from collections.abc import Mapping
+
 import tomlkit
 
 from scenes.sensor import SensorSpec
@@ -9,8 +11,8 @@ ROW = 12
 """Most numbers in a line of a list."""
 
 
-def sensor_files(spec: SensorSpec, stem: str, comment: str = "") -> dict[str, str]:
-    """The files of a specification. Default values are left out, and so is the sensor's name, because the file is named after it.
+def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The files of a specification. Values that are the defaults are left out; the sensor's name is the file's.
 
     Parameters
     ----------
@@ -18,7 +20,9 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "") -> dict[str, st
     stem : str
         Name of the TOML file without its suffix. Tables are named after it.
     comment : str
-        Lines of comment at the beginning.
+        Lines that stand above everything.
+    notes : mapping of str to str
+        A comment behind a value, by its dotted key (``pins.max_polar_deg``); keys that are not written are passed over.
 
     Returns
     -------
@@ -29,9 +33,17 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "") -> dict[str, st
     for line in comment.splitlines():
         document.add(tomlkit.comment(line))
     given = {key: value for key, value in spec.model_dump(exclude_defaults=True).items() if key != "name" and value is not None}
+    given["pins"] = {"layout": spec.pins.layout} | given.get("pins", {})  # said even where it is the default
     plain, tables = take_out_tables(given, stem)
     for key in sorted(plain, key=lambda k: isinstance(plain[k], dict)):  # tables come last
         document.add(key, _item(plain[key]))
+    for dotted, note in (notes or {}).items():
+        *sections, name = dotted.split(".")
+        table: object = document
+        for section in sections:
+            table = table.get(section, {}) if isinstance(table, dict) else {}
+        if isinstance(table, dict) and name in table and hasattr(table[name], "comment"):
+            table[name].comment(note)
     return {**tables, f"{stem}.toml": tomlkit.dumps(document)}
 
 
@@ -47,7 +59,7 @@ def _item(value: object) -> object:
             table.add(key, _item(part))
         return table
     if isinstance(value, float):
-        return significant(value)
+        return tomlkit.item(significant(value))
     if isinstance(value, list | tuple):
         array = tomlkit.array()
         if value and isinstance(value[0], dict):
@@ -66,7 +78,7 @@ def _item(value: object) -> object:
             array.add_line(*(_item(v) for v in value[start : start + row]))
         array.add_line(indent="")
         return array
-    return value
+    return tomlkit.item(value)
 
 
 def _numbers(value: object) -> int:

@@ -145,7 +145,8 @@ def load_dataset(
     if not len(good):
         raise FrameError(f"{folder}: no frame has both pins and labels; {'; '.join(problems[:3])}")
     group = recording.labels[GROUP_COLUMN][rows][good] if GROUP_COLUMN in recording.labels else None
-    return Dataset(pins.rows(good), targets.rows(good), (Path(folder),), group, list(recording.problems) + problems)
+    kept = folder if isinstance(folder, Path) else Path(folder)  # a path of frames_at stays one
+    return Dataset(pins.rows(good), targets.rows(good), (kept,), group, list(recording.problems) + problems)
 
 
 def joined(parts: list[Dataset]) -> Dataset:

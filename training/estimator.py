@@ -21,7 +21,8 @@ from training.pins import PinTable
 from training.recipes import TrainingError
 from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
 from twin.errors import FrameError
-from twin.pins import Pipeline, make_reference, measure_reference
+from twin.frames.forms import blob_spec
+from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
 from twin.store import fingerprint
 from twin.types import Form, Frame
 
@@ -79,9 +80,11 @@ class PoseEstimator:
         self.sensor = SensorSpec.model_validate(config["sensor"])
         self.form = Form(config["pipeline"]["form"])
         self.names, self.units = tuple(config["columns"]), tuple(config["units"])
-        reference = make_reference(content["reference_px"].numpy(), self.sensor.pins.rings)
+        reference = make_reference(content["reference_px"].numpy(), self.sensor.pins)
         self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
         self.ensemble = Ensemble(self.part, reference, content, config["size"])
+        known = config.get("known_rest_px")  # of each pin without contact, measured on the unit that the weights are for
+        self._known_rest_px = None if known is None else np.array(known, float)
         learnt = {group: {key: value.numpy() for key, value in arrays.items()} for group, arrays in content["aside"].items()}
         self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
 
@@ -129,8 +132,25 @@ class PoseEstimator:
         """
         if not self.counts_from_rest:
             raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
+        return self._counted_from(measure_reference(self.sensor, self.form, frame))
+
+    @property
+    def recorded_sensor(self) -> SensorSpec:
+        """The sensor, its pins at rest where they were measured on the unit that the weights are for, if they were.
+
+        A recording without a no-contact frame is counted from there.
+        """
+        if self._known_rest_px is None:
+            return self.sensor
+        blob = blob_spec(self.sensor.pipeline, self.form).model_copy(update={"rest_px": tuple(map(tuple, self._known_rest_px.tolist()))})
+        return self.sensor.model_copy(update={"pipeline": self.sensor.pipeline.model_copy(update={str(self.form): blob})})
+
+    def at_known_rest(self) -> "PoseEstimator":
+        """The same model for frames of the unit that its weights are for, where there is no frame without contact."""
+        return self._counted_from(nominal_reference(self.recorded_sensor, self.form)) if self._known_rest_px is not None else self
+
+    def _counted_from(self, reference: Reference) -> "PoseEstimator":
         found = copy(self)
-        reference = measure_reference(self.sensor, self.form, frame)
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         found._trained = replace(self._trained, pipeline=found.pipeline)
         return found

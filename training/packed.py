@@ -90,7 +90,7 @@ def unpack(config: dict, path: Path) -> dict:
         for part in above:
             place = place.setdefault(part, {})
         place[last] = torch.from_numpy(array.astype(np.float32 if of_network else np.float64))
-    reference = make_reference(content["reference_px"].numpy(), SensorSpec.model_validate(config["sensor"]).pins.rings)
+    reference = make_reference(content["reference_px"].numpy(), SensorSpec.model_validate(config["sensor"]).pins)
     model = model_named(config["model"])
     blank = model.build(reference, len(content["shift"]), config["size"]).state_dict()
     return content | {NETWORKS: [model.unpack(weights, blank) for _, weights in sorted(content[NETWORKS].items())]}

@@ -113,7 +113,7 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
 
     found = cached_arrays("recorded-pins", recording_key(recording, spec), compute)
     problems += found.pop("notes").tolist()
-    reference = make_reference(found.pop("rest_px"), spec.pins.rings)
+    reference = make_reference(found.pop("rest_px"), spec.pins)
     return PinTable(spec, recording.form, reference, measured=bool(found.pop("measured")), **found)
 
 
@@ -125,6 +125,7 @@ def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
         "path": str(recording.path.resolve()),
         "names": recording.names,
         "files": json.dumps(states),
+        "reference": b"" if recording.reference is None else recording.reference.image.tobytes(),
         "form": str(recording.form),
         "sensor": spec.model_dump(mode="json"),
     }

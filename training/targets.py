@@ -6,6 +6,7 @@ depth is ``pose_2 + c move_1``, and the depth of a tap at ``pose_1`` is ``pose_2
 ``label_depth_per_move``; for simulated contacts it is the slope of the plate.
 """
 
+import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -104,8 +105,10 @@ def choose_targets(
         )
     missing = [name for name in names if name not in recording.labels]
     if missing:
+        near = [n for name in missing for n in difflib.get_close_matches(name, recording.labels, n=2)]
+        nearest = f"nearest: {', '.join(dict.fromkeys(near))}; " if near else ""
         raise FrameError(
-            f"{recording.path}: column {', '.join(missing)} is missing; {recording.labels_found()}; "
+            f"{recording.path}: column {', '.join(missing)} is missing; {recording.labels_found()}; {nearest}"
             f"choose columns of these, or one of {', '.join(PRESETS)}"
         )
     raw = np.column_stack([_numbers(recording.labels[name], name, problems) for name in names])[rows]

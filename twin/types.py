@@ -188,6 +188,8 @@ class Observation:
     predicted_px : (N, 2) float
         The motion model's guess for the lost pins, NaN for the found ones.
     found : int
+    expected : int
+        Pins that should be in view: all but those that the frame's border cuts off.
     valid : bool
     reason : str
         Why it is not valid ("" if it is).
@@ -202,6 +204,7 @@ class Observation:
     pins_px: FloatArray
     predicted_px: FloatArray
     found: int
+    expected: int
     valid: bool
     reason: str
     graph: PinGraph | None

@@ -58,7 +58,7 @@ def test_frames_that_belong_to_no_contact_form_groups_of_one(data):
 
 
 def test_pins_are_counted_from_one_layout(data):
-    moved = make_reference(data.pins.reference.pins_px + [3.0, -2.0], data.pins.sensor.pins.rings)
+    moved = make_reference(data.pins.reference.pins_px + [3.0, -2.0], data.pins.sensor.pins)
     other = named(data, "sim/b", 45, 45)
     both = joined([named(data, "sim/a", 0, 45), replace(other, pins=other.pins.seen_from(moved))])
     assert np.allclose(both.pins.nodes_px[45:], other.pins.nodes_px)

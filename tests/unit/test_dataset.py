@@ -146,7 +146,7 @@ def test_a_column_tells_its_unit(name, unit):
 def test_copies_of_a_row_stay_together(tmp_path):
     spec = write_recording(tmp_path / "r", ["f_0.png,-1,5,1,2", "f_1.png,-2,5,1,2"], ["f_0.png", "f_1.png"])
     data = load_dataset(tmp_path / "r", spec)
-    other = data.pins.seen_from(make_reference(data.pins.reference.pins_px + 1.0, spec.pins.rings))
+    other = data.pins.seen_from(make_reference(data.pins.reference.pins_px + 1.0, spec.pins))
     both = data.beside([other])
     assert both.group.tolist() == [0, 1, 0, 1] and np.array_equal(both.targets.raw, np.tile(data.targets.raw, (2, 1)))
     assert np.array_equal(both.pins.nodes_px, np.concatenate([data.pins.nodes_px, other.nodes_px]))

@@ -36,7 +36,7 @@ def verdicts(shown):
 def test_an_undamaged_sensor_has_no_bad_finding():
     found = verdicts(frames("noise", 0.0))
     assert {f.verdict for f in found.values()} == {Grade.GOOD}, found
-    assert set(found) == {"brightness", "saturation", "focus", "glare", "pins", "specks", "shift", "turn", "scale"}
+    assert set(found) == {"brightness", "saturation", "focus", "glare", "layout", "pins", "specks", "shift", "turn", "scale"}
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from scenes import load_sensor
+from scenes.pins import PinsSpec
 from twin.camera.projection import distort, pixel_rays, project, undistort
 from twin.geometry.pins import pin_lattice, rest_pins
 
@@ -76,9 +77,9 @@ def test_the_camera_looks_out_of_the_tip_with_x_right_and_y_down(sensor):
 
 @pytest.mark.parametrize(("layout", "rings", "count"), [("rings", 10, 331), ("hexagon", 6, 127)])
 def test_lattice_counts_symmetry_and_spacing(layout, rings, count):
-    lattice = pin_lattice(layout, rings)
-    assert lattice.shape == (count, 2) and lattice[:, 0].max() == pytest.approx(1)
-    z = lattice[:, 0] * np.exp(1j * lattice[:, 1])
+    lattice = pin_lattice(PinsSpec(layout=layout, rings=rings)).places
+    assert lattice.shape == (count, 2) and np.linalg.norm(lattice, axis=1).max() == pytest.approx(1)
+    z = lattice @ [1, 1j]
     turned = z * np.exp(1j * np.pi / 3)
     gaps = np.abs(turned[:, None] - z[None]).min(axis=1)
     assert gaps.max() < 1e-12  # a sixth of a turn maps the pattern onto itself

@@ -32,7 +32,7 @@ def run(data, tmp_path_factory):
 def other_camera(pins):
     """The same frames by a camera that sits otherwise, with its own no-contact layout."""
     moved = pins.reference.pins_px + [3.0, -2.0] + 0.3 * np.random.default_rng(5).normal(size=(127, 2))
-    return replace(pins, measured=True).seen_from(make_reference(moved, pins.sensor.pins.rings))
+    return replace(pins, measured=True).seen_from(make_reference(moved, pins.sensor.pins))
 
 
 def test_pins_are_counted_from_the_no_contact_frame_in_hand(data, run):

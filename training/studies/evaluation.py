@@ -12,6 +12,7 @@ from training.identity import changed_since
 from training.recipes import TrainingError
 from twin.errors import FrameError
 from twin.frames import Recording, open_recording
+from twin.pins.batch import MEASURED_BEFORE, recording_reference
 from twin.progress import Progress, silent, stage
 from twin.report.table import write_table
 from twin.store import writes
@@ -88,8 +89,12 @@ def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
     """
     estimator = PoseEstimator.load(run)
     recording = open_recording(frames, estimator.sensor, estimator.form)
-    if recording.reference is not None and estimator.counts_from_rest:
-        estimator = estimator.at_rest(recording.reference)
+    if estimator.counts_from_rest:
+        if recording.reference is not None:
+            estimator = estimator.at_rest(recording.reference)
+        else:
+            _, named = recording_reference(estimator.recorded_sensor, recording, recording.problems)
+            estimator = estimator.at_known_rest() if named == MEASURED_BEFORE else estimator
     return Predictions(estimator, recording)
 
 
@@ -186,7 +191,7 @@ def evaluate_run(
     estimator, parts = PoseEstimator.load(run), []
     for folder in recordings:
         with stage(progress, f"frames of {folder.name}") as step:
-            parts.append(load_dataset(folder, estimator.sensor, estimator.names, form=estimator.form, progress=step))
+            parts.append(load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form, progress=step))
     found = joined(parts)
     chosen = rows_to_judge(estimator, found, rows)
     if rows == "validation":

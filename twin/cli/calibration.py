@@ -1,5 +1,6 @@
 """Commands that compare the twin with a real sensor, and fit it to one.
 
+- ``twin new``: a specification of a sensor of which only frames are known.
 - ``twin calibrate``: a specification fitted to frames of a real sensor.
 - ``twin validate``: the twin's pins compared with those of labelled real frames.
 - ``twin realism``: how close the renders of a sensor come to its real frames.
@@ -13,8 +14,71 @@ from typing import Annotated
 import typer
 
 from twin.cli import app
-from twin.cli.options import CORES, Across, Force, FormOrAuto, Out, Quality, Sensor, Workers, if_given, say, tell
+from twin.cli.options import (
+    CORES,
+    Across,
+    Force,
+    FormOrAuto,
+    NoContact,
+    Out,
+    Quality,
+    Sensor,
+    Table,
+    Tuning,
+    Workers,
+    if_given,
+    say,
+    sensor_with,
+    tell,
+)
 from twin.types import FINE
+
+HELP_NEW = """Make a specification of your own sensor from its frames.
+
+Give a folder of frames, a video or a recording, of any size, colour, gray or thresholded. Some should show contacts of different
+kinds, and one no contact. Nothing else need be known: the layout of the pins is identified, their places without contact found (in
+init_0.png or --no-contact, in a frame that shows no contact, or made from many contacts, and it says which), and mask, threshold and
+camera fitted. Where the layout is unsure, the two likeliest are named with what would decide; then give --layout.
+
+\b
+Writes:
+  MY.toml             a short, commented specification: --sensor MY.toml
+  MY-new/index.html   what is known, what is assumed, what to do to know more;
+                      pictures of frames with their pins beside it
+
+\b
+--layout rings:10         331 pins in 10 rings
+         hexagon:6        127 pins in a hexagon
+         grid:9x7         9 columns, 7 rows
+         positions:F.csv  x,y of each pin, a line each, in any unit
+
+\b
+Example:
+  twin new recordings/mine --out mine.toml
+"""
+
+
+@app.command("new", help=HELP_NEW)
+def new(
+    frames: Annotated[Path, typer.Argument(help="folder of frames, video or recording")],
+    out: Annotated[Path, typer.Option("--out", metavar="MY.toml", help="the specification to write")],
+    layout: Annotated[str | None, typer.Option("--layout", metavar="L", help="the layout, if it is known")] = None,
+    no_contact: NoContact = None,
+    table: Table = None,
+    form: FormOrAuto = None,
+    limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 40,
+    force: Force = False,
+) -> None:
+    from scenes.pins import layout_from
+    from twin.cli.progress import shown
+    from twin.fit.new_sensor import new_sensor
+    from twin.store import overwriting
+
+    given = layout_from(layout) if layout else None
+    with overwriting(force), shown() as progress:
+        made = new_sensor(frames, out, layout=given, no_contact=no_contact, table=table, form=form, limit=limit, progress=progress)
+    tell(made)
+
 
 calibrate_app = typer.Typer(help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(calibrate_app, name="calibrate")
@@ -51,15 +115,15 @@ def optics(
         Path | None, typer.Option("--no-contact", metavar="FRAME", help="a raw frame without contact: fits the camera")
     ] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="fit at most N frames, evenly spread")] = 6,
+    pipeline: Tuning = None,
     force: Force = False,
 ) -> None:
-    from scenes import load_sensor
     from twin.cli.progress import shown
     from twin.fit.optics import calibrate_optics
     from twin.store import overwriting
 
     with overwriting(force), shown() as progress:
-        found = calibrate_optics(frames, load_sensor(sensor), out, limit=limit, no_contact=no_contact, progress=progress)
+        found = calibrate_optics(frames, sensor_with(sensor, pipeline), out, limit=limit, no_contact=no_contact, progress=progress)
     tell(found)
 
 
@@ -105,17 +169,21 @@ def contact(
     workers: Workers = CORES,
     across: Across = FINE,
     form: FormOrAuto = None,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
     force: Force = False,
 ) -> None:
-    from scenes import load_experiment, load_object, load_sensor
+    from scenes import load_experiment, load_object
     from twin.cli.progress import shown
     from twin.fit.contact.calibrate import calibrate_to_file
+    from twin.frames import frames_at
     from twin.store import overwriting
 
     with overwriting(force), shown() as progress:
         found = calibrate_to_file(
-            frames,
-            load_sensor(sensor),
+            frames_at(frames, table, no_contact),
+            sensor_with(sensor, pipeline),
             load_experiment(experiment),
             out,
             touched=if_given(load_object, object_),
@@ -164,17 +232,21 @@ def validate(
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the choice of frames")] = 0,
     across: Across = FINE,
     form: FormOrAuto = None,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
     force: Force = False,
 ) -> None:
-    from scenes import load_experiment, load_object, load_sensor
+    from scenes import load_experiment, load_object
     from training.studies.validation import validate_contacts
     from twin.cli.progress import shown
+    from twin.frames import frames_at
     from twin.store import overwriting
 
     with overwriting(force), shown() as progress:
         found = validate_contacts(
-            load_sensor(sensor),
-            frames,
+            sensor_with(sensor, pipeline),
+            frames_at(frames, table, no_contact),
             load_experiment(experiment),
             out,
             touched=if_given(load_object, object_),
@@ -233,17 +305,19 @@ def realism(
     limit: Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = None,
     quality: Annotated[Quality, typer.Option(help="samples per pixel")] = "standard",
     two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
+    table: Table = None,
+    pipeline: Tuning = None,
     force: Force = False,
 ) -> None:
-    from scenes import load_sensor
     from training.studies.realism import compare_with_renders
     from twin.cli.progress import shown
+    from twin.frames import frames_at
     from twin.store import overwriting
 
     with overwriting(force), shown() as progress:
         found = compare_with_renders(
-            path,
-            load_sensor(sensor),
+            frames_at(path, table),
+            sensor_with(sensor, pipeline),
             out,
             pose_aligned=pose_aligned,
             limit=limit,
@@ -368,14 +442,17 @@ def audit(
     sensor: Sensor,
     out: Out,
     form: FormOrAuto = None,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
     force: Force = False,
 ) -> None:
-    from scenes import load_sensor
     from training.studies.label_audit import audit_recording
     from twin.cli.progress import shown
+    from twin.frames import frames_at
     from twin.store import overwriting
 
-    spec = load_sensor(sensor)
+    spec = sensor_with(sensor, pipeline)
     with overwriting(force), shown() as progress:
-        found = audit_recording(data, spec, out, form=form, progress=progress)
+        found = audit_recording(frames_at(data, table, no_contact), spec, out, form=form, progress=progress)
     tell(found)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from twin.cli import app
-from twin.cli.options import Force, FormOrAuto, Out, Sensor, if_given, say, tell
+from twin.cli.options import Force, FormOrAuto, NoContact, Out, Sensor, Table, Tuning, if_given, say, sensor_with, tell
 
 HELP_PREPROCESS = """Find the pins in every frame.
 
@@ -44,17 +44,21 @@ def preprocess(
     out: Out,
     form: FormOrAuto = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="also write a picture of every frame with its pins and graph")] = False,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
     force: Force = False,
 ) -> None:
-    from scenes import load_sensor
     from twin.cli.progress import shown
+    from twin.frames import frames_at
     from twin.pins.batch import preprocess_recording
     from twin.progress import stage
     from twin.store import overwriting
 
-    spec = load_sensor(sensor)
+    spec = sensor_with(sensor, pipeline)
     with overwriting(force), shown() as progress, stage(progress, "frames") as step:
-        summary = preprocess_recording(path, spec, out, form=form, overlay=overlay, progress=step)
+        at = frames_at(path, table, no_contact)
+        summary = preprocess_recording(at, spec, out, form=form, overlay=overlay, progress=step)
     say(_lines(summary, spec.pins.count))
     say(f"wrote {out / name}" for name in ("pins.npz", "summary.json") + (("overlay",) if overlay else ()))
 
@@ -110,15 +114,19 @@ def graph(
     kind: Annotated[Kind, typer.Option("--kind", help="kind of graph")] = Kind.VORONOI,
     form: FormOrAuto = None,
     legacy: Annotated[bool, typer.Option("--legacy", help="the published release's own method and boundary, to compare with")] = False,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
     force: Force = False,
 ) -> None:
-    from scenes import load_sensor
     from twin.cli.progress import shown
+    from twin.frames import frames_at
     from twin.pins.graph_files import write_graphs_of
     from twin.store import overwriting
 
+    spec, at = sensor_with(sensor, pipeline), frames_at(path, table, no_contact)
     with overwriting(force), shown():
-        made = write_graphs_of(path, load_sensor(sensor), out, kind=kind.value, form=form, legacy=legacy)
+        made = write_graphs_of(at, spec, out, kind=kind.value, form=form, legacy=legacy)
     tell(made)
 
 

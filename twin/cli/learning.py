@@ -21,16 +21,21 @@ from twin.cli.options import (
     Device,
     Force,
     FormOrAuto,
+    NoContact,
     Out,
     Quality,
     Sensor,
     Split,
+    Table,
     Target,
     Threads,
+    Tuning,
     Workers,
     finite,
     if_given,
+    one_recording,
     say,
+    sensor_with,
     tell,
 )
 from twin.types import FINE
@@ -195,9 +200,11 @@ def train(
     threads: Threads = None,
     device: Device = "auto",
     form: FormOrAuto = None,
+    table: Table = None,
+    no_contact: NoContact = None,
+    pipeline: Tuning = None,
     force: Force = False,
 ) -> None:
-    from scenes import load_sensor
     from training.train import train_model
     from twin.cli.progress import shown
     from twin.store import overwriting
@@ -205,8 +212,8 @@ def train(
     with overwriting(force), shown() as progress:
         made = train_model(
             model,
-            load_sensor(sensor),
-            data,
+            sensor_with(sensor, pipeline),
+            one_recording(data, table, no_contact),
             out,
             target=target,
             labels=labels,
@@ -255,6 +262,8 @@ def evaluate(
     rows: Annotated[str, typer.Option("--rows", help="validation or all")] = "validation",
     labels: Annotated[str, typer.Option("--labels", help="truth in predictions.csv and errors.png: corrected or raw")] = "corrected",
     robustness: Annotated[bool, typer.Option("--robustness", help="also judge changed images (five times the frames)")] = False,
+    table: Table = None,
+    no_contact: NoContact = None,
     force: Force = False,
 ) -> None:
     from training.studies.evaluation import evaluate_run
@@ -262,7 +271,8 @@ def evaluate(
     from twin.store import overwriting
 
     with overwriting(force), shown() as progress:
-        found = evaluate_run(run, data, out, rows=rows, labels=labels, robustness=robustness, progress=progress)
+        recordings = one_recording(data, table, no_contact)
+        found = evaluate_run(run, recordings, out, rows=rows, labels=labels, robustness=robustness, progress=progress)
     tell(found)
 
 
@@ -277,10 +287,13 @@ The model contains its sensor and pipeline, and a frame of another sensor is ref
 def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
+    table: Table = None,
+    no_contact: NoContact = None,
 ) -> None:
     from training.studies.evaluation import predict_frames
+    from twin.frames import frames_at
 
-    say(predict_frames(run, frame).lines())
+    say(predict_frames(run, frames_at(frame, table, no_contact)).lines())
 
 
 HELP_PACK = """Write a small copy of a finished training run.

@@ -4,12 +4,15 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeVar
 
 import typer
 
 from twin.errors import OptionError
 from twin.types import Form
+
+if TYPE_CHECKING:
+    from scenes.sensor import SensorSpec
 
 Given = TypeVar("Given", str, Path)
 Spec = TypeVar("Spec")
@@ -58,6 +61,13 @@ Threads = Annotated[int | None, typer.Option("--threads", min=1, max=MOST_THREAD
 Workers = Annotated[int, typer.Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
 Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
+Table = Annotated[Path | None, typer.Option("--table", metavar="CSV", help="table of labels, if it is not targets.csv beside the frames")]
+NoContact = Annotated[
+    Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, if it is not init_0.png beside the frames")
+]
+Tuning = Annotated[
+    Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="pin detection that 'twin tune' wrote, instead of the sensor's own")
+]
 # Sensor whose trained weights are shipped with the package.
 SHIPPED_MODEL = Path("mg400-331")
 Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
@@ -105,6 +115,24 @@ def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
 def if_given(load: Callable[[Given], Spec], name: Given | None) -> Spec | None:
     """The specification of a name or file; None if none is given."""
     return load(name) if name else None
+
+
+def sensor_with(name: str, tuning: Path | None) -> "SensorSpec":
+    """The sensor, its pins found as a file of 'twin tune' says where one is given."""
+    from scenes import load_sensor
+    from twin.pins import load_detector, with_detector
+
+    spec = load_sensor(name)
+    return spec if tuning is None else with_detector(spec, load_detector(tuning))
+
+
+def one_recording(folders: list[Path], table: Path | None, no_contact: Path | None) -> list[Path]:
+    """The recordings; a table or a no-contact frame from elsewhere belongs to the only one."""
+    from twin.frames import frames_at
+
+    if len(folders) > 1 and (table or no_contact):
+        raise OptionError("--table and --no-contact belong to one recording; with several --data put each table beside its frames")
+    return [frames_at(folder, table, no_contact) for folder in folders]
 
 
 class Result(Protocol):

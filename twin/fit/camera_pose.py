@@ -25,7 +25,9 @@ MODEL_PX = 0.4
 UNSURE = 1 / 3
 # Absolute correlation of two parameters above which only one of them is determined.
 CORRELATED = 0.99
-# Residual, px, above which a pin has a smaller weight (soft L1).
+# A parameter is not held if the rms distance without it is this many times as large, or this many times MODEL_PX.
+WORSE = 2.0
+# Residual, px, beyond which a pin counts less (soft L1).
 ROBUST_PX = 1.0
 # Step of the numerical derivatives, as a share of the plausible range.
 STEP = 1e-4
@@ -102,17 +104,21 @@ class CameraReport:
     held: dict[str, str]
 
 
-def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] = FREE) -> tuple[SensorSpec, CameraReport]:
-    """Fit camera and pin pattern by least squares to the caps' projections through the window.
+def fit_camera(
+    spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] = FREE, named: bool = False
+) -> tuple[SensorSpec, CameraReport]:
+    """Least squares of camera and pin pattern on the caps' projections through the window.
 
     Parameters
     ----------
     spec : SensorSpec
         The start of the fit, and the values of all parameters that are not free. The ratio of ``fy_px`` to ``fx_px`` is kept.
     pins_px : (N, 2) float
-        Pins of a no-contact frame in raw-frame px, in any order; NaN if not found.
-        free : tuple of str
-            Names in ``PARAMETERS``.
+        Raw-frame px of a no-contact frame, in any order; NaN where not found.
+    free : tuple of str
+        Of ``PARAMETERS``.
+    named : bool
+        The pins are in the specification's order: they keep it.
 
     Returns
     -------
@@ -127,23 +133,31 @@ def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] =
     if unknown := set(free) - set(PARAMETERS):
         raise FrameError(f"{sorted(unknown)[0]} is not a parameter of the camera's fit; choose of {', '.join(PARAMETERS)}")
     pins_px = np.asarray(pins_px, float).reshape(-1, 2)
-    pins_px = pins_px[np.isfinite(pins_px).all(axis=1)]
+    seen = np.flatnonzero(np.isfinite(pins_px).all(axis=1))
+    pins_px = pins_px[seen]
     if not LEAST_PINS <= len(pins_px) <= spec.pins.count:
         raise FrameError(
             f"{len(pins_px)} pins found of {spec.pins.count}; between {LEAST_PINS} and all are needed: give another no-contact frame"
         )
     names, held = [name for name in PARAMETERS if name in free], {}
-    order = nearest_order(spec, pins_px)
-    for _ in range(len(free) + 1):
-        found, order, residual, slopes = _fit(spec, pins_px, order, names)
+    order = seen if named else nearest_order(spec, pins_px)
+    found, order, residual, slopes = _fit(spec, pins_px, order, names, rematch=not named)
+    needed: set[str] = set()
+    while True:
         sd, correlation = _certainty(residual, slopes)
-        alike = np.sqrt(len(pins_px) / spec.pins.rings)  # the pins of a ring have the same error, so they are one observation
+        rings = spec.pins.rings or np.sqrt(len(pins_px) / 3)  # as many as rings of so many pins
+        alike = np.sqrt(len(pins_px) / rings)  # the pins of a ring share one error
         doubtful = _undetermined(_values(spec, names), sd * alike * max(MODEL_PX / _rms(residual), 1), correlation)
-        if not doubtful:
+        name = next((name for name in names if name in doubtful and name not in needed), None)
+        if name is None:
             break
-        name = next(name for name in names if name in doubtful)
+        others = [other for other in names if other != name]
+        without = _fit(spec, pins_px, order, others, rematch=not named) if others else None
+        if without is None or _rms(without[2]) > WORSE * max(_rms(residual), MODEL_PX):
+            needed.add(name)  # its value is uncertain, but the specification's is far off
+            continue
         held[name] = doubtful[name]
-        names.remove(name)
+        names, (found, order, residual, slopes) = others, without
     fitted = _with(spec, dict(zip(names, found.tolist(), strict=True)))
     spec = revised(spec, camera=fitted.camera.model_dump(), pins=fitted.pins.model_dump())
     return spec, CameraReport(_rms(residual), len(pins_px), dict(zip(names, sd.tolist(), strict=True)), held)
@@ -193,7 +207,7 @@ def _range(name: str, value: float) -> float:
 
 
 def _fit(
-    spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str]
+    spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str], *, rematch: bool = True
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Match and fit alternately. Returns values (p,), order (n,), residual (2 n,) px and its derivatives (2 n, p) by the values."""
     known = _values(spec, names)
@@ -229,7 +243,8 @@ def _fit(
             args=(order,),
         )
         values = fit.x
-        order = _assigned(pins_px, caps_px(values))
+        if rematch:
+            order = _assigned(pins_px, caps_px(values))
         if np.array_equal(order, before):
             break
     return values, order, residual(values, before), slopes(values, before)

@@ -14,13 +14,13 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc
-from twin.errors import FrameError, OptionError
+from twin.errors import FrameError
 from twin.fit.camera_pose import fit_camera
 from twin.fit.caps import fit_caps
 from twin.fit.photometry import fit_photometry
 from twin.fit.response import fit_blur, fit_focus, fit_noise, fit_response, sharpness
 from twin.fit.rim import fit_rim
-from twin.fit.sensor_file import write_sensor
+from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.fit.surroundings import fit_surroundings
 from twin.frames import distinct_stems
 from twin.frames.images import read_image, write_image
@@ -348,16 +348,3 @@ def _shown(value: object) -> str:
             return f"{len(value)} entries"
         return ", ".join(_shown(each) for each in value)
     return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
-def folder_beside(out: Path, kind: str) -> Path:
-    """The folder for further files of a specification that will be written.
-
-    Raises
-    ------
-    FrameError
-        ``out`` is no name of a ``.toml`` file.
-    """
-    if out.suffix != ".toml":
-        raise OptionError(f"--out {out}: give the name of a .toml file")
-    return out.with_name(f"{out.stem}-{kind}")

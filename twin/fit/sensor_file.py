@@ -1,14 +1,16 @@
 """A sensor's specification as files."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from scenes.sensor import SensorSpec
 from scenes.write import sensor_files
+from twin.errors import OptionError
 from twin.store import write_text
 
 
-def write_sensor(path: Path, spec: SensorSpec, comment: str = "") -> Path:
-    """Write a specification, its tables beside it, and return the path.
+def write_sensor(path: Path, spec: SensorSpec, comment: str = "", notes: Mapping[str, str] | None = None) -> Path:
+    """Write a specification, its tables beside it, and return the path; ``comment`` and ``notes`` as ``sensor_files`` takes them.
 
     Each file is written whole or not at all; the TOML file comes last.
 
@@ -17,6 +19,19 @@ def write_sensor(path: Path, spec: SensorSpec, comment: str = "") -> Path:
     StoreError
         It can't be written.
     """
-    for name, text in sensor_files(spec, path.stem, comment).items():
+    for name, text in sensor_files(spec, path.stem, comment, notes).items():
         write_text(path.with_name(name), text)
     return path
+
+
+def folder_beside(out: Path, kind: str) -> Path:
+    """The folder for further files of a specification that will be written.
+
+    Raises
+    ------
+    OptionError
+        ``out`` is no name of a ``.toml`` file.
+    """
+    if out.suffix != ".toml":
+        raise OptionError(f"--out {out}: give the name of a .toml file")
+    return out.with_name(f"{out.stem}-{kind}")

@@ -11,6 +11,10 @@ from twin.types import Form
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"})
 IMAGE_FOLDERS = ("frames_bw", "sensor_images", "images", "processed_images")
+# Names of no-contact frames in use, beside init_*.
+NO_CONTACT_NAME = re.compile(
+    r"(init|rest|no[-_ ]?contact|undeformed|unloaded|background|reference)([-_ ]?(frame|image|raw|\d+))*", re.IGNORECASE
+)
 # Folders that are looked into, one inside the other, to say where pictures lie.
 SEARCH_DEPTH = 4
 
@@ -46,7 +50,7 @@ def odd_entries(folder: Path) -> list[str]:
 
 
 def _is_reference(path: Path) -> bool:
-    return path.name.lower().startswith("init_")
+    return path.name.lower().startswith("init_") or bool(NO_CONTACT_NAME.fullmatch(path.stem))
 
 
 def frames_in(folder: Path) -> list[Path]:
@@ -55,7 +59,7 @@ def frames_in(folder: Path) -> list[Path]:
 
 
 def references_in(folder: Path) -> list[Path]:
-    """No-contact frames (``init_*``) of a folder in natural order."""
+    """No-contact frames (``init_*``, ``no_contact``, ``rest``, ...) of a folder in natural order."""
     return [p for p in _files(folder, IMAGE_SUFFIXES) if _is_reference(p)]
 
 

@@ -19,6 +19,31 @@ from twin.frames.tables import TABLES, order_by_table, read_metadata
 from twin.types import Form, Frame
 
 MOST_NAMED = 20  # columns that a message names; the widest tables in use have about 40
+_ConcretePath: type[Path] = type(Path())
+
+
+class FramesAt(_ConcretePath):  # type: ignore[misc, valid-type]
+    """A path to frames, with the files that belong to them but do not lie beside them under a usual name. ``frames_at`` makes it.
+
+    Attributes
+    ----------
+    table : Path or None
+        Table of labels, in the place of the recording's own.
+    no_contact : Path or None
+        Frame without contact, in the place of the recording's own.
+    """
+
+    table: Path | None = None
+    no_contact: Path | None = None
+
+
+def frames_at(path: str | Path, table: Path | None = None, no_contact: Path | None = None) -> Path:
+    """A path to frames with a table and a no-contact frame from elsewhere. It stands wherever a path to frames does."""
+    if table is None and no_contact is None:
+        return Path(path)
+    at = FramesAt(path)
+    at.table, at.no_contact = table, no_contact
+    return at
 
 
 class BadFrame(TypedDict):
@@ -145,6 +170,22 @@ class Recording:
                 return
             self.problems.append(f"no-contact frame {candidate.name}: {times(got)}, the frames are {times(self.size_px)}; ignored")
 
+    def must_take_reference(self, file: Path) -> None:
+        """Take a picture that was given as the no-contact frame.
+
+        Raises
+        ------
+        FrameError
+            It cannot be read, or has another size than the frames.
+        """
+        if not file.is_file():
+            raise FrameError(f"{file}: no such no-contact frame; give the path of a picture with --no-contact")
+        before = len(self.problems)
+        self.reference = None
+        self.take_reference([file])
+        if self.reference is None:
+            raise FrameError(f"{'; '.join(self.problems[before:])}; give another one with --no-contact")
+
     def take_metadata(self, homes: list[Path]) -> None:
         """Read the JSON files of folders."""
         for file in (file for home in homes for file in sorted(home.glob("*.json"))):
@@ -242,7 +283,7 @@ def _choose_folder(
     raise FrameError(f"{first}: {reason}")
 
 
-def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
+def _open_folder(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
     if not any(path.iterdir()):
         raise FrameError(f"{path}: the folder is empty; give a folder of frames")
     problems: list[str] = []
@@ -253,8 +294,10 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Re
         # given the inner folder of a recording, its table and no-contact frame lie beside it
         inner = folder == path and path.name in IMAGE_FOLDERS
         homes = list(dict.fromkeys([path, folder] + ([path.parent] if inner else [])))
-        tables = [home / table for home in homes for table in TABLES if (home / table).is_file()]
+        tables = [home / name for home in homes for name in TABLES if (home / name).is_file()] if table is None else [table]
         files, labels = order_by_table(tables, files, problems)
+        if table is not None and not labels:
+            raise FrameError(f"{'; '.join(problems)}; give a table of these frames with --table")
         names = [p.name for p in files]
         recording = Recording(path, kind.form, names, kind.size_px, labels, problems=problems, _files=files, _bits=kind.bits)
     else:
@@ -265,13 +308,18 @@ def _open_folder(path: Path, known: KnownFrames | None, form: Form | None) -> Re
     return recording
 
 
-def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> Recording:
+def open_recording(
+    path: str | Path,
+    spec: SensorSpec | None = None,
+    form: Form | None = None,
+) -> Recording:
     """Open recorded frames.
 
     Parameters
     ----------
     path : path
-        A picture, a folder of pictures, a recording's folder, or a video or a folder with one.
+        A picture, a folder of pictures, a recording's folder, or a video or a folder with one. ``frames_at`` adds
+        a table and a no-contact frame from elsewhere.
     spec : SensorSpec, optional
         The sensor; frames must have the size of one of its forms. The size of most frames is the recording's.
     form : Form, optional
@@ -282,15 +330,27 @@ def open_recording(path: str | Path, spec: SensorSpec | None = None, form: Form 
     FrameError
         Nothing there, or no usable frame.
     """
+    table, no_contact = (path.table, path.no_contact) if isinstance(path, FramesAt) else (None, None)
     path = Path(path)
+    if table is not None and not table.is_file():
+        raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file with --table")
+    recording = _opened(path, None if spec is None else known_frames(spec), form, table)
+    if no_contact is not None:
+        recording.must_take_reference(no_contact)
+    return recording
+
+
+def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
+    """A recording with what lies beside it."""
     if not os.path.exists(path):  # unlike ``Path.exists`` also False for what is no path at all
         link = "a link to nothing" if os.path.islink(path) else "no such file or folder"
         raise FrameError(f"{shown(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
-    known = None if spec is None else known_frames(spec)
     if path.is_dir():
-        return _open_folder(path, known, form)
+        return _open_folder(path, known, form, table)
     if not path.is_file():
         raise FrameError(f"{path}: a named pipe or a device, not a file; give a picture, a folder of frames, a recording or a video")
+    if table is not None:
+        raise FrameError(f"{path}: a table needs a folder of frames; give the folder, or leave out --table")
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _open_video(path, known, form)
     kind = common_kind([path], known, form)

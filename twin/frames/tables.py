@@ -13,9 +13,19 @@ from scenes.files import read_regular
 from twin.frames.folders import IMAGE_SUFFIXES
 
 # Names of a recording's table, the likelier first.
-TABLES = ("targets.csv", "targets_images.csv")
+TABLES = ("targets.csv", "targets_images.csv", "metadata.csv")
 # Names of the columns that hold pictures' names, in any case.
-NAME_COLUMNS = ("image_name", "sensor_image")
+NAME_COLUMNS = ("image_name", "sensor_image", "file_name")
+# Names of label columns in other conventions, in lower case, by those used here: poses in mm and deg, and moves before the frame was taken.
+# tactile_data has pose_x and shear_x, LeRobot the names of a state vector.
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
+CALLED_HERE = {
+    **{f"pose_{axis}": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
+    **{f"shear_{axis}": f"move_{k}" for k, axis in enumerate(_AXES, 1)},
+    **{f"observation.state.{axis}": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
+    **{f"observation.state.{axis}.pos": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
+    **{axis: f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
+}
 # What may stand between the cells of a row; the one that is most frequent in the header counts.
 SEPARATORS = (",", ";", "\t")
 # Bytes of a table or of metadata: a million rows of a hundred characters.
@@ -201,6 +211,7 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
         problems.append(f"{table.name}: {counted(len(unlisted), what, [p.name for p in unlisted])}")
     rows = sorted(pairing.files)
     labels = {c: _as_array([cells[k] for k in rows] + [""] * len(unlisted)) for c, cells in table.columns.items()}
+    labels |= {here: labels[c] for c in table.columns if (here := CALLED_HERE.get(c.casefold())) and here not in labels}
     return [pairing.files[k] for k in rows] + unlisted, labels
 
 

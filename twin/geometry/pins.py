@@ -1,11 +1,22 @@
 """Where the pins of a sensor sit at rest, in the specification's pin order."""
 
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
+from scipy.spatial import Delaunay, cKDTree
 
+from scenes.pins import PinsSpec
 from scenes.sensor import GeometrySpec
-from twin.types import FloatArray
+from twin.types import FloatArray, IntArray
+
+LEAST_BORDER = 3
+"""A border has at least this many pins; where more of it is missing, it is found anew."""
+LONGEST_LINK = 1.8
+"""Longest side of a layout's border, in usual distances of neighbours. The diagonal of a square is 1.41."""
 
 
 @dataclass(frozen=True)
@@ -27,33 +38,137 @@ class PinRest:
     caps_mm: FloatArray
 
 
-def pin_lattice(layout: str, rings: int) -> FloatArray:
-    """Unit-disc lattice of a layout: (N, 2) of (radius / outermost radius, azimuth in rad).
+@dataclass(frozen=True)
+class Lattice:
+    """A layout laid flat, and how its pins hang together.
 
-    Order: the centre, then ring by ring, each from its first pin by increasing azimuth
-    (x towards y). A hexagonal ring's sides are divided into equal parts; its corners lie at
-    multiples of 60 deg.
+    Attributes
+    ----------
+    places : (N, 2) float
+        The outermost pin is at distance 1 from the middle.
+    outmost : (m,) int
+        The pins on the layout's border, in order around it.
+    slots : (S,) int
+        Ring after ring, each in order around the middle: the pin of each place of the complete layout, -1 where it is missing. A layout
+        without rings is one ring.
+    ring_ends : (R + 1,) int
+        Ring i's slots are ``ring_ends[i - 1]`` to ``ring_ends[i]``; ``ring_ends[0]`` leaves out a pin in the middle.
     """
-    points = [(0.0, 0.0)]
+
+    places: FloatArray
+    outmost: IntArray
+    slots: IntArray
+    ring_ends: IntArray
+
+
+@lru_cache(maxsize=32)
+def pin_lattice(pins: PinsSpec) -> Lattice:
+    """The layout of a specification's pins, unturned.
+
+    Order of the pins of rings and hexagons: the middle, then ring by ring, each from its first pin by increasing azimuth (x towards y).
+    A hexagonal ring's sides are divided into equal parts; its corners lie at multiples of 60 deg. Order of a grid: row by row, each from
+    small to large x. Missing pins are left out.
+    """
+    places, border, ring_ends = _COMPLETE[pins.layout](pins)
+    there = np.setdiff1d(np.arange(len(places)), pins.missing)
+    number = np.full(len(places), -1)
+    number[there] = np.arange(len(there))
+    places = places[there] / np.linalg.norm(places[there], axis=1).max()
+    outmost = border_of(places) if border is None else number[border][number[border] >= 0]
+    if len(outmost) < LEAST_BORDER:
+        outmost = border_of(places)
+    return Lattice(places, outmost, number, ring_ends)
+
+
+def _ringed(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
+    """Places of rings or of a hexagon, their outermost ring, and where the rings end."""
+    rings = pins.rings or 0
+    points = [0j]
     for ring in range(1, rings + 1):
-        for k in range(6 * ring):
-            if layout == "rings":
-                points.append((ring / rings, 2 * np.pi * k / (6 * ring)))
-            else:
-                side, step = divmod(k, ring)
-                start, end = np.exp(1j * np.pi / 3 * side), np.exp(1j * np.pi / 3 * (side + 1))
-                z = ring / rings * (start + (end - start) * step / ring)
-                points.append((abs(z), float(np.angle(z)) % (2 * np.pi)))
-    return np.array(points)
+        k = np.arange(6 * ring)
+        if pins.layout == "rings":
+            points += (ring * np.exp(2j * np.pi * k / (6 * ring))).tolist()
+        else:
+            side, step = np.divmod(k, ring)
+            start, end = np.exp(1j * np.pi / 3 * side), np.exp(1j * np.pi / 3 * (side + 1))
+            points += (ring * start + (end - start) * step).tolist()
+    z = np.array(points)
+    ends = 1 + 3 * np.arange(rings + 1) * np.arange(1, rings + 2)
+    return np.column_stack([z.real, z.imag]), np.arange(len(z) - 6 * rings, len(z)), ends
+
+
+def _grid(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
+    """Places of a grid, its border, and its one ring."""
+    columns, rows = pins.columns or 0, pins.rows or 0
+    y, x = np.mgrid[:rows, :columns]
+    number = np.arange(rows * columns).reshape(rows, columns)
+    border = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
+    places = np.column_stack([(x - (columns - 1) / 2).ravel(), pins.row_distance * (y - (rows - 1) / 2).ravel()])
+    return places, border, np.array([0, rows * columns])
+
+
+def _given(pins: PinsSpec) -> tuple[FloatArray, IntArray | None, IntArray]:
+    """Given places, and their one ring."""
+    return np.array(pins.positions, float), None, np.array([0, len(pins.positions)])
+
+
+_COMPLETE: dict[str, Callable[[PinsSpec], tuple[FloatArray, IntArray | None, IntArray]]] = {
+    "rings": _ringed,
+    "hexagon": _ringed,
+    "grid": _grid,
+    "positions": _given,
+}
+
+
+def border_of(places: FloatArray) -> IntArray:
+    """Indices (m,) of the outermost of some places (N, 2), in order around them: the border of their Delaunay triangles.
+
+    From outside, triangles with a side longer than ``LONGEST_LINK`` times the usual distance of neighbours are taken away as long as the
+    border stays one loop.
+    """
+    triangles = Delaunay(places).simplices
+    neighbour = cKDTree(places).query(places, k=2)[0][:, 1]
+    longest = LONGEST_LINK * float(np.median(neighbour))
+    kept = {tuple(sorted(t)) for t in triangles.tolist()}
+    while True:
+        uses = Counter(side for t in kept for side in combinations(t, 2))
+        on_border = {corner for side, n in uses.items() if n == 1 for corner in side}
+        loose = []
+        for triangle in kept:
+            open_sides = [side for side in combinations(triangle, 2) if uses[side] == 1]
+            (opposite,) = set(triangle) - set(open_sides[0]) if len(open_sides) == 1 else (None,)
+            if opposite is None or opposite in on_border:
+                continue
+            a, b = open_sides[0]
+            if np.linalg.norm(places[a] - places[b]) > longest:
+                loose.append((float(np.linalg.norm(places[a] - places[b])), triangle))
+        if not loose:
+            break
+        kept.remove(max(loose)[1])
+    following: dict[int, list[int]] = {}
+    for side, n in Counter(side for t in kept for side in combinations(t, 2)).items():
+        if n == 1:
+            following.setdefault(side[0], []).append(side[1])
+            following.setdefault(side[1], []).append(side[0])
+    first = min(following)
+    loop, before = [first], -1
+    while True:
+        here = loop[-1]
+        step = [there for there in following[here] if there != before][0]
+        if step == first:
+            break
+        before = here
+        loop.append(step)
+    return np.array(loop)
 
 
 def rest_pins(geometry: GeometrySpec) -> PinRest:
-    """Pins at rest of a sensor: the lattice wrapped onto the inside of the dome as ``PinsSpec.spacing`` says."""
+    """Pins at rest of a sensor: the layout wrapped onto the inside of the dome as ``PinsSpec.spacing`` says."""
     pins, skin = geometry.pins, geometry.skin
-    lattice = pin_lattice(pins.layout, pins.rings)
+    place = pin_lattice(pins).places @ [1, 1j]
     largest = np.radians(pins.max_polar_deg)
-    polar = largest * lattice[:, 0] if pins.spacing == "polar" else np.arcsin(np.sin(largest) * lattice[:, 0])
-    azimuth = lattice[:, 1] + np.radians(pins.phase_deg)
+    polar = largest * np.abs(place) if pins.spacing == "polar" else np.arcsin(np.sin(largest) * np.abs(place))
+    azimuth = np.angle(place) + np.radians(pins.phase_deg)
     outward = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=1)
     base = (skin.outer_radius_mm - skin.thickness_mm) * outward
     return PinRest(base, -outward, base - (pins.length_mm + pins.cap_height_mm / 2) * outward)

@@ -6,7 +6,7 @@ checks the condition of a sensor by a few of its frames.
 
 from twin.pins.check import Finding, Grade, examine
 from twin.pins.detector import Detector, Found, make_detector
-from twin.pins.detector_spec import METHODS, DetectorSpec, load_detector, shipped_detector, write_detector
+from twin.pins.detector_spec import METHODS, DetectorSpec, load_detector, shipped_detector, with_detector, write_detector
 from twin.pins.graph import features, make_graph
 from twin.pins.pipeline import Pipeline, measure_reference, require_untouched
 from twin.pins.reference import Reference, make_reference, nominal_reference
@@ -33,5 +33,6 @@ __all__ = [
     "require_untouched",
     "shipped_detector",
     "tune",
+    "with_detector",
     "write_detector",
 ]

@@ -30,8 +30,22 @@ GRAY = (28, 32, 38)
 """Background of a cell map."""
 FULL_CHANGE = 0.3
 """Relative change of a cell's area at both ends of the colour scale."""
+NO_REFERENCE = (
+    "no no-contact frame was used: the pins at rest are those of the specification, which makes errors of a pose up to three times larger; "
+    "record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+)
+"""What is said where a recording has no usable no-contact frame."""
+NO_OWN_REFERENCE = (
+    "no no-contact frame was used: the pins at rest are those that were measured before on this unit; if the camera or the tip was touched "
+    "since, record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
+)
+"""What is said where the specification holds the pins' measured places at rest."""
+MEASURED_BEFORE = "measured before"
+"""Stands in place of a no-contact frame's name where the pins' measured places of the specification are the reference."""
 FARTHEST_PX = 1e4
-"""Largest distance from the frame's origin, px, at which something is drawn. At larger ones OpenCV's integers would overflow."""
+"""What is drawn is at most this far from the frame's origin, px. Farther off, OpenCV's integers would overflow."""
+HALF, BRIGHTEST, DARKEST = 127.0, 98.0, 24.0
+"""In a picture this percentile of a frame's levels (at least the third number) is shown at half white, so that what is drawn is seen."""
 UNMEASURED = "specification"
 """Text instead of the name of a no-contact frame if the reference is the specification's layout."""
 
@@ -82,7 +96,7 @@ def preprocess_recording(
     pipeline = Pipeline(spec, recording.form, reference)
     names, observations, unfit = _observed(recording, pipeline, pictures_dir, progress)
     arrays = _arrays(names, observations, spec.pins.count)
-    all_found = arrays["valid"] & (arrays["found"] == spec.pins.count)
+    all_found = np.array([o.valid and o.found == o.expected for o in observations], bool)
     summary = {
         "sensor": spec.name,
         "frames": len(observations),
@@ -143,13 +157,18 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
             return measure_reference(spec, recording.form, recording.reference), recording.reference.name
         except FrameError as error:
             problems.append(str(error))
+    if blob_spec(spec.pipeline, recording.form).rest_px:
+        problems.append(NO_OWN_REFERENCE)
+        return nominal_reference(spec, recording.form), MEASURED_BEFORE
+    problems.append(NO_REFERENCE)
     return nominal_reference(spec, recording.form), UNMEASURED
 
 
 def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
     """Picture (H, W, 3) uint8 RGB: frame, graph, found pins (green), predicted places of lost pins (red), rejected blobs (yellow)."""
     gray = cv2.resize(gray_levels(frame.image), None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
-    canvas = cv2.cvtColor(gray // 2, cv2.COLOR_GRAY2RGB)
+    light = HALF / max(float(np.percentile(gray, BRIGHTEST)), DARKEST)  # a dark frame is shown lighter
+    canvas = cv2.cvtColor(np.minimum(gray * light, HALF).astype(np.uint8), cv2.COLOR_GRAY2RGB)
 
     def place(px: np.ndarray) -> list[list[int]]:
         px = px[np.isfinite(px).all(axis=1)]

@@ -7,6 +7,7 @@ import numpy as np
 
 from scenes.sensor import BlobSpec
 from twin.compiled import compiled
+from twin.pins.bumps import find_bumps
 
 GROWTH_PX = 4
 """Largest distance, px, by which a component is grown beyond its bounding box."""
@@ -198,3 +199,14 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     root = np.hypot(xx - yy, 2 * xy)
     elongation = (xx + yy + root) / np.maximum(xx + yy - root, 1e-3)
     return Blobs(mean + mask.corner_px, area[keep], elongation, keep, area, stats[:, :4], grown, gray, mask.corner_px)
+
+
+def find_spots(gray: np.ndarray, mask: Mask, blob: BlobSpec) -> Blobs:
+    """Bright spots of the size ``blob.spot_sigma_px`` in a mask's window (h, w) uint8. All count as of one area."""
+    spots = find_bumps(gray, blob.spot_sigma_px)
+    column, row = np.clip(np.round(spots.px).astype(int), 0, np.array(gray.shape[::-1]) - 1).T
+    px = spots.px[mask.disc[row, column] > 0]
+    area = np.full(len(px), 2 * np.pi * blob.spot_sigma_px**2)
+    nothing = np.zeros(gray.shape, np.uint16)
+    label = np.zeros(len(px), int)
+    return Blobs(px + mask.corner_px, area, np.ones(len(px)), label, np.zeros(1), np.zeros((1, 4), int), nothing, gray, mask.corner_px)

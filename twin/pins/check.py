@@ -18,9 +18,11 @@ from twin.frames.forms import gray_levels
 from twin.optics.preview import Preview
 from twin.pins.blobs import Mask
 from twin.pins.caps import Caps, measure_caps
-from twin.pins.detector_spec import DetectorSpec, shipped_detector
+from twin.pins.detector_spec import DetectorSpec, shipped_detector, with_detector
+from twin.pins.identify import judge_layout, spread
 from twin.pins.pipeline import Pipeline
-from twin.pins.reference import Reference, make_reference, nominal_reference
+from twin.pins.reference import Reference, nominal_reference
+from twin.pins.tune import other_layout
 from twin.progress import Step
 from twin.types import Form, Frame, Observation
 
@@ -40,7 +42,9 @@ CAPS_MEASURED = 3
 LEAST_DEFORMED = 0.3
 """Share of the frames, those with the least contact, by which the camera's place is measured."""
 TOLD_BULGE = 0.002
-"""Least relative change of the rim's size by a contact that is mentioned in a finding."""
+"""A contact that changes the rim's size by less than this share is not mentioned."""
+LAYOUT_JUDGED = 4
+"""Most frames on which the layout is judged, evenly spread."""
 LISTED = 8
 """Most pins that a sentence lists by number."""
 BRIGHT_PERCENTILE = 99
@@ -100,16 +104,13 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     """
     form = frames[0].form
     detector = detector or shipped_detector(spec, form)
-    section = spec.pipeline.model_copy(update={str(form): detector.blob})
-    tuned = spec.model_copy(update={"pipeline": section})
-    reference = make_reference(np.array(detector.pins_px), spec.pins.rings) if detector.pins_px else None
-    pipeline = Pipeline(tuned, form, reference)
+    pipeline = Pipeline(with_detector(spec, detector), form)
     seen = []
     for k, frame in enumerate(frames):
         seen.append(pipeline(frame))
         if progress:
             progress(k + 1, len(frames))
-    findings = [_pins(seen), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
+    findings = [_layout(frames, spec), _pins(seen), _spots(seen, pipeline), *_place(seen, nominal_reference(spec, form))]
     return findings if form == Form.RECORDING else [*_light(frames, seen, promised_caps(spec), pipeline.mask), *findings]
 
 
@@ -169,6 +170,18 @@ def _finding(name: str, value: float, limits: tuple[float, float], text: str, re
     """A finding with its verdict by the limits (watch, bad). If the verdict is good, there is no remedy."""
     verdict = _verdict(value, *limits)
     return Finding(name, verdict, float(value), text, "" if verdict is Grade.GOOD else remedy)
+
+
+def _layout(frames: list[Frame], spec: SensorSpec) -> Finding:
+    """Whether the frames show the sensor's layout of pins, wherever its camera is: only the layout of the specification is used."""
+    images = [gray_levels(frames[k].image) for k in spread(len(frames), LAYOUT_JUDGED)]
+    layout = judge_layout(spec.pins, images)
+    share = 0.0 if layout is None else layout.explained
+    doubts = [f"the frames do not show {spec.pins.in_words()}"] if layout is None else other_layout(layout, images)
+    text = f"{100 * share:.1f} % of pins in view and pin-like spots are one another's" + (f"; {doubts[0]}" if doubts else "")
+    wrong = bool(doubts) and "rather than" in doubts[0]
+    remedy = "give the --sensor that these frames are of, or make one with 'twin new'; look for stray light"
+    return _finding("layout", 0.0 if wrong else share, (0.9, 0.75), text, remedy)
 
 
 def _pins(seen: list[Observation]) -> Finding:

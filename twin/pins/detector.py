@@ -11,17 +11,18 @@ import numpy as np
 from scipy.spatial import QhullError, cKDTree
 from skimage.feature import blob_dog, blob_doh, blob_log
 
-from scenes.sensor import BlobSpec, PinsSpec, RecordingSpec, SensorSpec
+from scenes.pins import PinsSpec
+from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
 from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames.forms import frame_size, from_raw, gray_levels, recording_to_raw
 from twin.pins.blobs import Mask, circular_mask, threshold
-from twin.pins.detector_spec import DetectorSpec
+from twin.pins.detector_spec import DetectorSpec, with_detector
 from twin.pins.graph import make_graph
 from twin.pins.legacy import LegacyPipeline, legacy_graph
 from twin.pins.matching import match
 from twin.pins.pipeline import MIN_FOUND, Pipeline
-from twin.pins.reference import Reference, make_reference, nominal_reference
+from twin.pins.reference import Reference, nominal_reference
 from twin.types import Form, Frame, PinGraph
 
 LEVELS = 255.0
@@ -53,19 +54,21 @@ class Found:
     Attributes
     ----------
     claims_px : (K, 2) float
-        Places of all found pins, px of the frame, in any order.
-        pins_px : (N, 2) float or None
-            The same places in the specification's pin order, NaN if lost; None if the detector does not label pins.
-        graph : PinGraph or None
-            Its nodes have the order of ``pins_px`` if that is given, else of ``claims_px``. None if the frame is not valid.
-        valid : bool
-        reason : str
-            Why the frame is not valid; empty if it is.
+        Places where it claims pins, px of the frame, in any order.
+    pins_px : (N, 2) float or None
+        The same places in the specification's pin order, NaN where lost; None if it does not tell which pin is which.
+    graph : PinGraph or None
+        In the order of ``pins_px`` if it is given, else of the claims. None if the frame is not valid.
+    expected : int
+        Pins that should be in view.
+    valid : bool
+    reason : str
     """
 
     claims_px: np.ndarray
     pins_px: np.ndarray | None
     graph: PinGraph | None
+    expected: int
     valid: bool
     reason: str = ""
 
@@ -96,27 +99,25 @@ def make_detector(sensor: SensorSpec, detector: DetectorSpec, *, second_look: bo
         raise FrameError(
             f"'{detector.name}' was tuned for {len(detector.pins_px)} pins, {sensor.name} has {sensor.pins.count}: tune it for this sensor"
         )
+    sensor = with_detector(sensor, detector)
     if detector.method == "legacy":
         return LegacyDetector(sensor.pins, sensor.recording, detector)
-    reference = (
-        make_reference(np.array(detector.pins_px), sensor.pins.rings) if detector.pins_px else nominal_reference(sensor, detector.form)
-    )
+    reference = nominal_reference(sensor, detector.form)
     if detector.method == "twin":
-        return TwinDetector(sensor, detector, reference, second_look=second_look)
+        return TwinDetector(sensor, detector, second_look=second_look)
     return PlainDetector(frame_size(sensor, detector.form), detector, reference)
 
 
 class TwinDetector:
     """This program's pipeline."""
 
-    def __init__(self, sensor: SensorSpec, spec: DetectorSpec, reference: Reference, *, second_look: bool = True) -> None:
+    def __init__(self, sensor: SensorSpec, spec: DetectorSpec, *, second_look: bool = True) -> None:
         self.spec = spec
-        section = sensor.pipeline.model_copy(update={str(spec.form): spec.blob})
-        self._pipeline = Pipeline(sensor.model_copy(update={"pipeline": section}), spec.form, reference, second_look=second_look)
+        self._pipeline = Pipeline(sensor, spec.form, second_look=second_look)
 
     def __call__(self, frame: Frame) -> Found:
         seen = self._pipeline(frame)
-        return Found(seen.pins_px[np.isfinite(seen.pins_px[:, 0])], seen.pins_px, seen.graph, seen.valid, seen.reason)
+        return Found(seen.pins_px[np.isfinite(seen.pins_px[:, 0])], seen.pins_px, seen.graph, seen.expected, seen.valid, seen.reason)
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph:
         return make_graph("voronoi", nodes_px, outmost=self._pipeline.reference.outmost)
@@ -134,7 +135,7 @@ class PlainDetector:
         px, area = find(window, self._mask, self.spec)
         count = len(self._reference.pins_px)
         if len(px) > MOST_BLOBS * count:
-            return Found(px, np.full((count, 2), np.nan), None, False, f"too many blobs: {len(px)}")
+            return Found(px, np.full((count, 2), np.nan), None, count, False, f"too many blobs: {len(px)}")
         found = match(self._reference, px, area)
         paired = found.blob >= 0
         pins_px = np.full((count, 2), np.nan)
@@ -142,7 +143,7 @@ class PlainDetector:
         nodes_px = np.where(paired[:, None], pins_px, found.predicted_px)
         valid = bool(paired.sum() >= MIN_FOUND * count) and bool(np.isfinite(nodes_px).all())
         reason = "" if valid else f"too few pins: {int(paired.sum())} of {count}"
-        return Found(pins_px[paired], pins_px, self.graph_of(nodes_px) if valid else None, valid, reason)
+        return Found(pins_px[paired], pins_px, self.graph_of(nodes_px) if valid else None, count, valid, reason)
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph:
         return make_graph("voronoi", nodes_px, outmost=self._reference.outmost)
@@ -167,7 +168,7 @@ class LegacyDetector:
             frame = Frame(record(frame.image, self._recording), Form.RECORDING, frame.name)
         seen = self._pipeline(frame)
         px = recording_to_raw(self._recording, seen.nodes_px) if raw else seen.nodes_px
-        return Found(px, None, seen.graph, seen.valid, seen.reason)
+        return Found(px, None, seen.graph, self._pipeline.count, seen.valid, seen.reason)
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph | None:
         size = self._pipeline.parameters.size_px

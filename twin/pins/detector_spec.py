@@ -3,14 +3,17 @@
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+import numpy as np
 import tomlkit
 from pydantic import Field
 
 from scenes.base import Fraction, Name, Positive, Section, SpecError
 from scenes.load import read_section
-from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
+from scenes.sensor import BlobSpec, CameraSpec, RecordingSpec, SensorSpec
+from twin.camera.projection import project
 from twin.errors import FrameError
-from twin.frames.forms import blob_spec
+from twin.frames.forms import blob_spec, known_frames
+from twin.geometry.pins import rest_pins
 from twin.store import write_text
 from twin.types import Form
 
@@ -26,6 +29,8 @@ METHODS: dict[Method, str] = {
     "doh": "scikit-image's determinant of Hessian",
 }
 assert set(METHODS) == set(get_args(Method))
+# The threshold by which frames were made is not known from them; the recorder of the published TacTip recordings has this one.
+UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET = 61, -5.0
 LEAST_LEVEL = 0.5  # gray levels: no threshold goes below
 
 
@@ -50,13 +55,15 @@ class DetectorSpec(Section):
 
     ``blob`` as in a sensor's ``[pipeline.raw]``; its ``threshold`` is the contrast in gray levels that ``log``, ``dog`` and
     ``doh`` ask of a blob, and the lowest level that ``simple`` looks at. ``radius_px``: of the caps, from the smallest to the largest.
-    ``recording``: what the published method's recorder does to a raw frame. ``pins_px``: where the tuning saw the pins at
-    rest, in the specification's order (without them: the specification's own layout).
+    ``size_px``: width and height of the frames; without it those of the sensor's specification. ``recording``: what the published
+    method's recorder does to a raw frame. ``pins_px``: where the tuning saw the pins at rest, in the specification's order (without
+    them: the specification's own layout).
     """
 
     name: Name
     method: Method
     form: Annotated[Form, Field(strict=False)] = Form.RAW  # files hold its text
+    size_px: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = None
     blob: BlobSpec
     radius_px: tuple[Positive, Positive] = (2.0, 8.0)
     recording: RecordingSpec | None = None
@@ -78,6 +85,54 @@ class DetectorSpec(Section):
 def shipped_detector(spec: SensorSpec, form: Form, method: Method = "twin") -> DetectorSpec:
     """What a sensor's specification says: this program's pipeline, or the published method where the sensor has recordings."""
     return DetectorSpec(name=method, method=method, form=form, blob=blob_spec(spec.pipeline, form), recording=spec.recording)
+
+
+def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
+    """A sensor whose pins are found as a tuning found best, in frames of the size and form that it was made on.
+
+    The tuning's places of the pins at rest become the specification's. Where the frames have another size, so does the camera (or the
+    recording), and the camera's focal lengths and principal point are scaled and shifted as its view of the pins is.
+
+    Raises
+    ------
+    FrameError
+        The tuning is one of another number of pins.
+    """
+    if detector.pins_px and len(detector.pins_px) != spec.pins.count:
+        raise FrameError(
+            f"'{detector.name}' was tuned for {len(detector.pins_px)} pins, {spec.name} has {spec.pins.count}: tune it for this sensor"
+        )
+    blob = detector.blob.model_copy(update={"rest_px": detector.pins_px or detector.blob.rest_px})
+    pipeline = spec.pipeline.model_copy(update={str(detector.form): blob})
+    changed: dict[str, Section | None] = {"pipeline": pipeline}
+    size = detector.size_px
+    if size is not None and size != known_frames(spec).size_px.get(detector.form):
+        width, height = size
+        if detector.form == Form.RAW:
+            seen_px = np.array(detector.pins_px).reshape(-1, 2)
+            changed["camera"] = camera_seeing(spec, seen_px, np.arange(len(seen_px))).model_copy(
+                update={"width_px": width, "height_px": height}
+            )
+        elif spec.recording is not None:
+            changed["recording"] = spec.recording.model_copy(update={"width_px": width, "height_px": height})
+        else:
+            whole = (0, 0, spec.camera.width_px, spec.camera.height_px)
+            changed["recording"] = RecordingSpec(
+                crop_px=whole, width_px=width, height_px=height, threshold_block_px=UNKNOWN_BLOCK_PX, threshold_offset=UNKNOWN_OFFSET
+            )
+    return spec.model_copy(update=changed)
+
+
+def camera_seeing(spec: SensorSpec, pins_px: np.ndarray, known: np.ndarray) -> CameraSpec:
+    """The camera, scaled and shifted so that it sees the ``known`` (n,) of the pins at rest where pins (N, 2) are, by least squares."""
+    camera = spec.camera
+    if not len(known):
+        return camera
+    ours, seen = project(spec.view, rest_pins(spec.geometry).caps_mm[known]), pins_px[known]
+    middle, seen_middle = ours.mean(axis=0), seen.mean(axis=0)
+    scale = float(np.sqrt(np.sum((seen - seen_middle) ** 2) / np.sum((ours - middle) ** 2)))
+    cx, cy = (seen_middle + scale * (np.array([camera.cx_px, camera.cy_px]) - middle)).tolist()
+    return camera.model_copy(update={"fx_px": scale * camera.fx_px, "fy_px": scale * camera.fy_px, "cx_px": cx, "cy_px": cy})
 
 
 def load_detector(path: Path) -> DetectorSpec:

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, Voronoi
 
-from scenes.sensor import PinsSpec, RecordingSpec
+from scenes.pins import Layout, PinsSpec
+from scenes.sensor import RecordingSpec
 from twin.errors import FrameError
 from twin.frames.forms import gray_levels
 from twin.pins.voronoi import directed_edges
@@ -50,12 +51,25 @@ class LegacyParameters:
     virtual_scales: tuple[float, ...] = ()
 
 
-LEGACY = {
+LEGACY: dict[Layout, LegacyParameters] = {
     "rings": LegacyParameters(300, 100, (-1, -2), 14, 10.0),
     "hexagon": LegacyParameters(
         256, 80, (0, 2), 15, 1.0, (7.0, 12.0, 22.0, 30.0, 38.0, 48.0, 53.0), (0.95, 0.9, 0.85, 0.85, 0.85, 0.9, 0.95)
     ),
 }
+
+
+def legacy_parameters(layout: Layout) -> LegacyParameters:
+    """The release's constants for a layout.
+
+    Raises
+    ------
+    FrameError
+        The release has none for it.
+    """
+    if layout not in LEGACY:
+        raise FrameError(f"the published method knows only layouts of rings and hexagons, not '{layout}'; use another --method")
+    return LEGACY[layout]
 
 
 @dataclass(frozen=True)
@@ -152,7 +166,7 @@ class LegacyPipeline:
         if recording is None:
             raise FrameError("the published method takes recordings, and the sensor has no recording form ([recording])")
         self.count = pins.count
-        self.parameters = LEGACY[pins.layout]
+        self.parameters = legacy_parameters(pins.layout)
         self.size_px = recording.width_px, recording.height_px
         self._detector = legacy_detector(self.parameters)
         size = self.parameters.size_px

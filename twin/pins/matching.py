@@ -78,14 +78,15 @@ Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
 
 
 class Layout(NamedTuple):
-    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, ring_ends (R + 1,).
+    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, slots (S,), ring_ends (R + 1,).
 
-    Ring i's pins are ``ring_ends[i - 1]`` to ``ring_ends[i]``, in order around the layout.
+    Ring i's pins are ``slots[ring_ends[i - 1]:ring_ends[i]]``, in order around the layout, -1 where one is missing.
     """
 
     rest: np.ndarray
     neighbours: np.ndarray
     spacing: np.ndarray
+    slots: np.ndarray
     ring_ends: np.ndarray
 
 
@@ -138,7 +139,7 @@ def match(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> Match:
         start = np.full(n, -1)
         start[pin] = blob
         labels = _grow(*layout[:3], px, start, buckets, cell)
-        unwound = _unwound(layout.rest, px, labels, layout.ring_ends)
+        unwound = _unwound(layout.rest, px, labels, layout.slots, layout.ring_ends)
         if (unwound >= 0).any() and not np.array_equal(unwound, labels):
             labels = _grow(*layout[:3], px, unwound, buckets, cell)
         count = int((labels >= 0).sum())
@@ -332,8 +333,10 @@ def _grow(
 
 
 @compiled()
-def _ring_turns(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.ndarray, winding: int) -> tuple[np.ndarray, int]:
-    """Turns of the rings (R,) as unit complex numbers (0: unknown) with labels shifted back by ``winding``, and number of known turns."""
+def _ring_turns(
+    rest: np.ndarray, px: np.ndarray, blob: np.ndarray, slots: np.ndarray, ring_ends: np.ndarray, winding: int
+) -> tuple[np.ndarray, int]:
+    """Turn of each ring (R,) as a unit complex number (0: unknown) after its labels are shifted back by ``winding``; number known."""
     turns = np.zeros(len(ring_ends) - 1, np.complex128)
     known = 0
     for ring in range(len(turns)):
@@ -341,9 +344,10 @@ def _ring_turns(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: n
         count = 0
         at, to, product = 0j, 0j, 0j
         for k in range(size):
-            j = blob[first + (k - winding) % size]
+            pin, source = slots[first + k], slots[first + (k - winding) % size]
+            j = blob[source] if pin >= 0 and source >= 0 else -1
             if j >= 0:
-                a = complex(rest[first + k, 0], rest[first + k, 1])
+                a = complex(rest[pin, 0], rest[pin, 1])
                 b = complex(px[j, 0], px[j, 1])
                 at += a
                 to += b
@@ -358,14 +362,14 @@ def _ring_turns(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: n
 
 
 @compiled()
-def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.ndarray) -> np.ndarray:
-    """A labelling (N,) whose rings are shifted back by the number of pins with which their turns are most similar.
+def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, slots: np.ndarray, ring_ends: np.ndarray) -> np.ndarray:
+    """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
 
     If anything is shifted, the innermost rings lose their labels.
     """
-    best, most_alike = 0, abs(_ring_turns(rest, px, blob, ring_ends, 0)[0][BROKEN_RINGS:].sum())
+    best, most_alike = 0, abs(_ring_turns(rest, px, blob, slots, ring_ends, 0)[0][BROKEN_RINGS:].sum())
     for winding in range(-MAX_WINDING, MAX_WINDING + 1):
-        alike = abs(_ring_turns(rest, px, blob, ring_ends, winding)[0][BROKEN_RINGS:].sum())
+        alike = abs(_ring_turns(rest, px, blob, slots, ring_ends, winding)[0][BROKEN_RINGS:].sum())
         if alike > most_alike:
             best, most_alike = winding, alike
     if best == 0:
@@ -374,7 +378,9 @@ def _unwound(rest: np.ndarray, px: np.ndarray, blob: np.ndarray, ring_ends: np.n
     for ring in range(BROKEN_RINGS, len(ring_ends) - 1):
         first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
         for k in range(size):
-            out[first + k] = blob[first + (k - best) % size]
+            pin, source = slots[first + k], slots[first + (k - best) % size]
+            if pin >= 0 and source >= 0:
+                out[pin] = blob[source]
     return out
 
 
@@ -468,8 +474,8 @@ def _assign(n: int, blob_count: int, pins_list: list[int], blobs_list: list[int]
 
 
 def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, buckets: Buckets, cell: float) -> Match:
-    """Assign every pin anew to blobs near the place that its neighbours predict, until nothing changes."""
-    rest, neighbours, spacing, ring_ends = layout
+    """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
+    rest, neighbours, spacing, slots, ring_ends = layout
     for _ in range(REFINE_ROUNDS):
         moved, weight = _trust(rest, neighbours, spacing, px, blob)
         predicted = predict_all(rest, neighbours, spacing, moved, weight)
@@ -480,7 +486,7 @@ def _refine(layout: Layout, px: np.ndarray, area: np.ndarray, blob: np.ndarray, 
     blob = _adopt(layout, px, area, blob, predicted)
     found = blob >= 0
     residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * spacing[found]) ** 2
-    turns, count = _ring_turns(rest, px, blob, ring_ends, 0)
+    turns, count = _ring_turns(rest, px, blob, slots, ring_ends, 0)
     turned = 1.0 - turns.real.sum() / max(count, 1)
     return Match(blob, predicted, float(found.sum() - residual2.sum() - TURN_WEIGHT * len(rest) * turned))
 
@@ -514,10 +520,11 @@ def _middle(px: np.ndarray) -> np.ndarray:
 
 
 def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Pairs to start from: pins at the rim, where motion is least, then pins inside, each with its 1st, 2nd, 3rd nearest blob."""
-    rim, inside = reference.outmost, len(reference.pins_px) - len(reference.outmost)
+    """Pairs to start from: pins around the rim, where motion is least, then inside, with their 1st, 2nd, 3rd nearest blobs."""
+    rim = reference.outmost
+    inner = np.setdiff1d(np.arange(len(reference.pins_px)), rim)
     pins = np.concatenate(
-        [rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], [*range(0, inside, max(inside // INSIDE_SEEDS, 1))]]
+        [rim[np.linspace(0, len(rim), RIM_SEEDS, endpoint=False).astype(int)], inner[:: max(len(inner) // INSIDE_SEEDS, 1)]]
     )
     extent = _middle(px) - _middle(reference.pins_px)
     median = np.median(px, axis=0) - np.median(reference.pins_px, axis=0)
@@ -551,8 +558,4 @@ def _regrown(layout: Layout, px: np.ndarray, area: np.ndarray, found: Match, buc
 
 
 def _layout(reference: Reference) -> Layout:
-    """The reference's arrays and the ends of its rings. The outermost ring has as many pins as ``outmost``, each inner one six fewer."""
-    n, rings = len(reference.pins_px), len(reference.outmost) // 6
-    ring = np.arange(rings + 1)
-    ring_ends = n - 3 * (rings * (rings + 1) - ring * (ring + 1))
-    return Layout(reference.pins_px, reference.neighbours, reference.spacing_px, ring_ends)
+    return Layout(reference.pins_px, reference.neighbours, reference.spacing_px, reference.slots, reference.ring_ends)

@@ -6,12 +6,13 @@ way that no displacement of the camera explains (`require_untouched`).
 
 from time import perf_counter
 
+import cv2
 import numpy as np
 
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec, frame_size, gray_levels
-from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, own_threshold
+from twin.pins.blobs import Blobs, Mask, circular_mask, despeckled, find_blobs, find_spots, own_threshold
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.matching import Match, match, predict_all, rematch
 from twin.pins.reference import Reference, folded_fraction, make_reference, nominal_reference
@@ -20,6 +21,10 @@ from twin.types import Form, Frame, Observation
 
 MIN_FOUND = 0.8
 """Least share of the pins that must be found."""
+AT_BORDER = 1.0
+"""A pin is near the frame's border if it is less than this many spacings inside it at rest."""
+CUT = 0.35
+"""A cap is cut off by the border if its middle is less than this many spacings inside it."""
 MAX_EXTRA = 0.35
 """Most blobs among the pins that are not pins, as a share of the number of pins, in a frame in which pins are missing."""
 NEARLY_ALL = 0.97
@@ -47,7 +52,14 @@ REMASK_PX = 2.0
 MASK_MARGIN = 0.5
 """Distance from the mask's edge, in spacings, below which a pin may be cut off."""
 PLAUSIBLE = 0.5
-"""Least share of labelled pins of a labelling that is used for further steps."""
+"""Share of the pins above which a labelling is taken as a basis for further steps."""
+NEAREST, DARKER, BRIGHT, LEAST_ABOVE = 6, 35, 75, 0.15
+"""A pin stands on a cap if it is brighter than this percentile (the second) of the middles between it and this many nearest pins, by at
+least the last share of what this percentile (the third) of the pins is."""
+MOST_BETWEEN = 0.2
+"""Largest share of pins that may stand between caps: caps that touch have bright middles."""
+LEAST_COMPARED = 12
+"""Fewest pins of which that is asked."""
 PREDICTED_WEIGHT = 0.1
 """Weight of a predicted pin in the prediction of the next one. Pins in a gap are predicted from the gap's edge inwards."""
 MOST_DENT = 0.008
@@ -89,6 +101,7 @@ class Pipeline:
         self._max_area_px2 = MAX_BLOB_PITCHES2 * pitch**2
         self._center_px = np.median(self.reference.pins_px, axis=0)
         self._radius_px = float(np.linalg.norm(self.reference.pins_px - self._center_px, axis=1).max())
+        self._at_border = self._inside_px(self.reference.pins_px) < AT_BORDER * self.reference.spacing_px
 
     def __call__(self, frame: Frame) -> Observation:
         """Observe one frame. If it does not show enough pins, the result has ``valid=False`` and the reason.
@@ -103,7 +116,7 @@ class Pipeline:
         ms: dict[str, float] = {}
         blobs, found = self._look(frame, self.blob_spec, ms)
         now = perf_counter()
-        if self.second_look and self.blob_spec.threshold_block_px and not self._clear(blobs, found):
+        if self.second_look and self.blob_spec.threshold_block_px and not self.blob_spec.spot_sigma_px and not self._clear(blobs, found):
             blobs, found = self._with_own_threshold(frame, blobs, found)
         ms["look again"], now = _since(now)
         paired = found.blob >= 0
@@ -112,14 +125,18 @@ class Pipeline:
         nodes_px = self._complete(pins_px)
         predicted_px = np.where(paired[:, None], np.nan, nodes_px)
         extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
+        between = self._between_caps(frame, pins_px)
         ms["complete"], now = _since(now)
-        reason = self._reason(blobs, int(paired.sum()), nodes_px, extra_px)
+        expected = int((paired | ~self._cut_off(nodes_px)).sum())
+        reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px)
+        if not reason and between > MOST_BETWEEN:
+            reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
         graph = None
         if not reason:
             graph = make_graph(self.graph, nodes_px, outmost=self.reference.outmost)
         ms["graph"], now = _since(now)
         ms["total"], _ = _since(started)
-        return Observation(pins_px, predicted_px, int(paired.sum()), not reason, reason, graph, extra_px, ms)
+        return Observation(pins_px, predicted_px, int(paired.sum()), expected, not reason, reason, graph, extra_px, ms)
 
     def check(self, frame: Frame) -> None:
         """Raise ``FrameError`` if the size, type or form of a frame is not that of this sensor and form."""
@@ -170,7 +187,9 @@ class Pipeline:
         return despeckled(window) if self.blob_spec.threshold_block_px else window
 
     def _detect(self, frame: Frame, mask: Mask, blob: BlobSpec) -> Blobs:
-        """Blobs in the mask's window. A blob that is a chain of several caps is split."""
+        """Blobs in the mask's window, those that are several caps in a row split; or spots."""
+        if blob.spot_sigma_px:
+            return find_spots(gray_levels(np.ascontiguousarray(frame.image[mask.window])), mask, blob)
         return split_chains(find_blobs(self._window(frame, mask), mask, blob, max_area_px2=self._max_area_px2))
 
     def _plausible(self, found: Match) -> bool:
@@ -223,9 +242,29 @@ class Pipeline:
             known[new] = PREDICTED_WEIGHT
         return nodes_px
 
-    def _reason(self, blobs: Blobs, found: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
-        """Why an observation is not valid; "" if it is."""
-        n = len(nodes_px)
+    def _inside_px(self, px: np.ndarray) -> np.ndarray:
+        """How far inside the frame places (n, 2) are, px; negative outside."""
+        return np.minimum(px, np.array(self.size_px) - 1 - px).min(axis=1)
+
+    def _cut_off(self, nodes_px: np.ndarray) -> np.ndarray:
+        """Which pins (N,) the frame's border cuts off: they are near it at rest, and not whole in this frame."""
+        return self._at_border & (self._inside_px(nodes_px) < CUT * self.reference.spacing_px)
+
+    def _between_caps(self, frame: Frame, pins_px: np.ndarray) -> float:
+        """Share of the found pins (N, 2), NaN where lost, that are no brighter than the places between them and their neighbours."""
+        found = np.flatnonzero(np.isfinite(pins_px[:, 0]))
+        if len(found) < LEAST_COMPARED:
+            return 0.0
+        gray = cv2.blur(gray_levels(np.ascontiguousarray(frame.image)), (3, 3))
+        near = self.reference.neighbours[found, :NEAREST]
+        middle = (pins_px[found, None] + pins_px[near]) / 2
+        known = np.isfinite(middle[..., 0])
+        between = np.where(known, _levels(gray, np.where(known[..., None], middle, 0.0)), np.nan)[known.any(axis=1)]
+        above = _levels(gray, pins_px[found])[known.any(axis=1)] - np.nanpercentile(between, DARKER, axis=1)
+        return float(np.mean(above <= LEAST_ABOVE * np.percentile(above, BRIGHT))) if len(above) else 0.0
+
+    def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
+        """Why a frame, with ``n`` pins in view, is no valid observation; "" if it is one."""
         if len(blobs.px) < MIN_FOUND * n / 2:
             return f"no pins: {len(blobs.px)} blobs seen, {n} pins expected"
         if found < MIN_FOUND * n:
@@ -246,6 +285,13 @@ class Pipeline:
         if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         return ""
+
+
+def _levels(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """Gray levels (...,) of the pixels nearest to places (..., 2)."""
+    column, row = np.moveaxis(np.clip(np.round(px), 0, np.array(gray.shape[::-1]) - 1).astype(int), -1, 0)
+    levels: np.ndarray = gray[row, column].astype(float)
+    return levels
 
 
 def _extra(blobs: Blobs, found: Match) -> int:
@@ -277,7 +323,7 @@ def measure_reference(spec: SensorSpec, form: Form, frame: Frame) -> Reference:
         raise FrameError(
             f"{frame.name or 'frame'}: no use as no-contact reference, {observation.reason}; leave it out to use the specification's layout"
         )
-    return make_reference(observation.graph.nodes_px, spec.pins.rings)
+    return make_reference(observation.graph.nodes_px, spec.pins)
 
 
 def dent_of(pins_px: np.ndarray, reference: Reference) -> float:

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
+from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.frames.forms import from_raw
-from twin.geometry.pins import rest_pins
+from twin.geometry.pins import pin_lattice, rest_pins
 from twin.pins.voronoi import voronoi
 from twin.types import Form
 
@@ -38,6 +39,8 @@ class Reference:
         The outmost pins, in order around the layout.
     area_px2 : (N,) float
         Voronoi cell areas.
+    slots, ring_ends : (S,) int, (R + 1,) int
+        Which pins form rings: see ``twin.geometry.pins.Lattice``.
     """
 
     pins_px: np.ndarray
@@ -46,6 +49,8 @@ class Reference:
     triangles: np.ndarray
     outmost: np.ndarray
     area_px2: np.ndarray
+    slots: np.ndarray
+    ring_ends: np.ndarray
 
 
 def spread_out(pins_px: np.ndarray) -> bool:
@@ -55,14 +60,15 @@ def spread_out(pins_px: np.ndarray) -> bool:
     return bool(np.linalg.svd(pins_px - pins_px.mean(axis=0), compute_uv=False)[-1] > LEAST_SPREAD_PX)
 
 
-def make_reference(pins_px: np.ndarray, rings: int) -> Reference:
-    """Reference from rest positions (N, 2) of a layout whose last 6 ``rings`` pins are the outmost ones, in order.
+def make_reference(pins_px: np.ndarray, pins: PinsSpec) -> Reference:
+    """Reference from rest positions (N, 2) of the pins of a layout.
 
     Raises
     ------
     FrameError
         The pins lie in one place, on a line, or farther off than any camera sees.
     """
+    lattice = pin_lattice(pins)
     pins_px = np.ascontiguousarray(pins_px, float)
     if not spread_out(pins_px):
         raise FrameError(
@@ -74,16 +80,19 @@ def make_reference(pins_px: np.ndarray, rings: int) -> Reference:
     triangles = Delaunay(pins_px).simplices.astype(np.int64)
     area = _double_areas(pins_px, triangles)
     triangles[area < 0] = triangles[area < 0][:, ::-1]
-    inner = (triangles < n - 6 * rings).any(axis=1)  # thin triangles of outmost pins alone may turn over without an error
+    inner = ~np.isin(triangles, lattice.outmost).all(axis=1)  # thin triangles of outmost pins alone turn over without meaning
     triangles = triangles[inner]
-    outmost = np.arange(n - 6 * rings, n)
-    area_px2 = voronoi(pins_px, outmost=outmost).area_px2
-    return Reference(pins_px, np.ascontiguousarray(index[:, 1:]), distance[:, 1], triangles, outmost, area_px2)
+    area_px2 = voronoi(pins_px, outmost=lattice.outmost).area_px2
+    neighbours = np.ascontiguousarray(index[:, 1:])
+    return Reference(pins_px, neighbours, distance[:, 1], triangles, lattice.outmost, area_px2, lattice.slots, lattice.ring_ends)
 
 
 def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
-    """Reference from the specification alone: its camera's projection of the caps at rest."""
-    return make_reference(from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm)), spec.pins.rings)
+    """Reference from the specification alone: the measured places of its pins at rest, or its caps at rest projected by its camera."""
+    blob = spec.pipeline.raw if form == Form.RAW else spec.pipeline.recording
+    if blob is not None and blob.rest_px:
+        return make_reference(np.array(blob.rest_px), spec.pins)
+    return make_reference(from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm)), spec.pins)
 
 
 def _double_areas(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -1,19 +1,21 @@
 """Tuning: the parameters of a detector are found from frames and the pins' layout alone."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypedDict
 
 import numpy as np
 
-from scenes.sensor import BlobSpec, PinsSpec, RecordingSpec, SensorSpec
+from scenes.pins import Layout, PinsSpec
+from scenes.sensor import BlobSpec, RecordingSpec, SensorSpec
 from twin.errors import FrameError
 from twin.frames.forms import gray_levels
+from twin.geometry.pins import pin_lattice
 from twin.pins.detector import Found, make_detector
-from twin.pins.detector_spec import DetectorSpec, Evidence, Method
-from twin.pins.layout import Sighting, flat_layout, rest_of, see_layout
-from twin.pins.legacy import LEGACY
-from twin.pins.reference import Reference
+from twin.pins.detector_spec import DetectorSpec, Evidence, Method, with_detector
+from twin.pins.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, identify, judge_layout, spread, symmetries
+from twin.pins.legacy import legacy_parameters
+from twin.pins.reference import Reference, make_reference
 from twin.progress import Step
 from twin.types import Form, Frame
 
@@ -39,15 +41,19 @@ NEAR = 0.02
 LEAST_AREA = 0.2
 # Smallest and largest radius of a cap, relative to the median one.
 CAP_RADII = (0.6, 1.4)
-# Least score of a sighting that is used, relative to the best one's.
-LIKE_THE_BEST = 0.9
-# The recorder's threshold before it is tuned: side of the block, px, and offset, gray levels.
+# The recorder's threshold before it is tuned: side, px, and offset, gray levels.
 RECORDER_BLOCK_PX, RECORDER_OFFSET = 61, -5.0
 # Standard normal quantile of a two-sided 90 % interval.
 Z_90 = 1.645
 # A tuning is sure if the lower end of the interval of its exact rate is at least SURE_LOW_RATE, and its threshold may change by
 # SURE_SLACK gray levels.
 SURE_LOW_RATE, SURE_SLACK = 0.8, 1.0
+# A layout that explains less than this share of what the frames show is not seen in them; another one is named if it explains more by this.
+LEAST_SHOWN, MORE_EXPLAINED = 0.6, 0.02
+# Fewest pixels around a pin that tell of its cap.
+LEAST_PIXELS = 9
+# Sizes of spots that are tried (sd, in radii of the median cap); spots are preferred only if their rates, added, are better by this.
+SPOT_SIZES, SPOTS_AHEAD = (0.55, 0.7, 0.9), 0.03
 # Exact rate from which on a tuning that is not sure is fairly sure.
 FAIR_RATE = 0.5
 
@@ -82,73 +88,134 @@ class Tuned:
     notes: list[str]
 
 
-def tune(frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, progress: Step | None = None) -> Tuned:
+def tune(
+    frames: list[Frame], sensor: SensorSpec, method: Method = "twin", *, known: Candidate | None = None, progress: Step | None = None
+) -> Tuned:
     """Find mask, threshold and blob parameters from frames of one size and form.
 
-    Only the layout of the sensor's pins is used (count, rings, round or hexagon). The frames may show any contact.
+    Only the layout of the sensor's pins is used. The frames may show any contact, and be of any size.
+
+    Parameters
+    ----------
+    known : Candidate, optional
+        What the very same frames show of this layout, where the layout was identified in them. Without it the frames are also looked
+        through for other layouts, and the tuning is unsure where another one explains more.
 
     Raises
     ------
     FrameError
         No frame shows the layout.
     """
-    frames = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(TUNED_ON, len(frames))).round().astype(int))]
+    chosen = spread(len(frames), TUNED_ON)
+    frames = [frames[k] for k in chosen]
     form = frames[0].form
-    binary = form == Form.RECORDING
-    seen = _sightings(frames, flat_layout(sensor.geometry), sensor.pins, binary, progress)
-    reference = rest_of(seen, sensor.pins.rings)
-    start = _start(frames[0], reference, seen, method, form, sensor.pins.layout)
-    tried, judged = list(_settings(start, reference, seen, binary)), frames
+    images = [gray_levels(frame.image) for frame in frames]
+    doubts: list[str] = []
+    layout = judge_layout(sensor.pins, images) if known is None else replace(known, seen=tuple(known.seen[k] for k in chosen))
+    if layout is None or layout.explained < LEAST_SHOWN:
+        raise FrameError(
+            f"none of {len(frames)} frames shows {sensor.pins.in_words()}{_shown_instead(images)}; "
+            "check --sensor, focus and light, or give frames with less contact"
+        )
+    if known is None:
+        doubts = other_layout(layout, images)
+    shape = frames[0].image.shape
+    size_px = (shape[1], shape[0])
+    rest_px = turned_as(sensor.pins, layout.rest_px)
+    reference = make_reference(rest_px, sensor.pins)
+    caps = [caps_in(image, seen.pins_px, reference.spacing_px) for image, seen in zip(images, layout.seen, strict=True)]
+    area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))
+    start = _start(size_px, reference, layout, area, method, form, sensor.pins.layout)
+    sensor = with_detector(sensor, start)
+    tried, judged = list(_settings(start, reference, contrast, form == Form.RECORDING)), frames
     if method in SLOW:
         judged = frames[:: max(len(frames) // SLOW_TUNED_ON, 1)][:SLOW_TUNED_ON]
-    rates = [_rate(make_detector(sensor, detector, second_look=False), judged[::GLANCE], sensor.pins.count) for detector in tried]
+    rates = [_rate(make_detector(sensor, detector, second_look=False), judged[::GLANCE]) for detector in tried]
     hopeful = max(map(sum, rates)) - HOPELESS
     for k, detector in enumerate(tried):
         if sum(rates[k]) >= hopeful:
-            rates[k] = _rate(make_detector(sensor, detector, second_look=False), judged, sensor.pins.count)
+            rates[k] = _rate(make_detector(sensor, detector, second_look=False), judged)
         if progress:
-            progress(len(frames) + k + 1, len(frames) + len(tried))
+            progress(k + 1, len(tried))
     best = _middle_of_plateau(tried, rates)
     evidence = _evidence(tried, rates, best, judged, reference, start)
+    if doubts:
+        evidence = evidence.model_copy(update={"sure": "unsure"})
     table: list[RateRow] = [
         {"block_px": _block(d), "threshold": _threshold(d), "exact_rate": exact, "found_share": share}
         for d, (exact, share) in zip(tried, rates, strict=True)
     ]
-    return Tuned(tried[best].model_copy(update={"evidence": evidence}), table, _notes(evidence, len(seen), len(frames)))
+    seen = sum(one.explained >= SHOWN for one in layout.seen)
+    return Tuned(tried[best].model_copy(update={"evidence": evidence}), table, doubts + _notes(evidence, seen, len(frames)))
 
 
-def _sightings(frames: list[Frame], flat: np.ndarray, pins: PinsSpec, binary: bool, progress: Step | None) -> list[Sighting]:
-    """The sightings of the layout in the frames that show it clearly; ``flat`` (N, 2) as ``flat_layout`` gives it.
+def _shown_instead(images: list[np.ndarray]) -> str:
+    """What frames in which a layout is not seen do show, for an error; "" if nothing is recognised."""
+    try:
+        return f"; they show {identify(images).best.pins.in_words()}"
+    except FrameError:
+        return ""
 
-    Raises
-    ------
-    FrameError
-        No frame shows it.
+
+def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
+    """Why a layout that was given may be wrong: what it leaves unexplained, and which other one explains more."""
+    try:
+        other = identify(images).best
+    except FrameError:
+        return []
+    same = (other.pins.layout, other.pins.complete_count) == (layout.pins.layout, layout.pins.complete_count)
+    more = other.explained > layout.explained + MORE_EXPLAINED
+    smoother = other.explained > layout.explained - MORE_EXPLAINED and other.misfit < SAME_SHAPE * layout.misfit
+    if not same and (more or smoother):
+        return [
+            f"these frames show {other.pins.in_words()} rather than {layout.pins.in_words()}: {layout.left_over:g} pin-like spots of a "
+            f"frame are none of these pins, and {layout.not_seen:g} of the pins are not seen; give the right --sensor, or make one with "
+            "'twin new'"
+        ]
+    if layout.explained < SURE_EXPLAINED:
+        return [f"{layout.line()}; look at the frames: are there other pins, stray light or dirt?"]
+    return []
+
+
+def turned_as(pins: PinsSpec, rest_px: np.ndarray) -> np.ndarray:
+    """Pins (N, 2), px, in that order, of those in which the layout looks the same, in which it is turned least from the specification's."""
+    places = pin_lattice(pins).places @ [1, 1j] * np.exp(1j * np.radians(pins.phase_deg))
+    places -= places.mean()
+    orders = [rest_px[order] for order in symmetries(pins)]
+    turns = [abs(np.angle(np.vdot(places, (px - px.mean(axis=0)) @ [1, 1j]))) for px in orders]
+    return orders[int(np.argmin(turns))]
+
+
+def caps_in(gray: np.ndarray, pins_px: np.ndarray, spacing_px: np.ndarray) -> tuple[float, float]:
+    """Median area, px^2, of the caps at pins (N, 2) of a gray frame, and median contrast, gray levels; NaN where no pin is seen.
+
+    A cap's area is that of the pixels nearer to the pin than half a spacing whose level is above the middle between cap and skin.
     """
-    seen: list[Sighting] = []
-    for k, frame in enumerate(frames):
-        sighting = see_layout(gray_levels(frame.image), flat, pins.rings, binary=binary)
-        seen += [] if sighting is None else [sighting]
-        if progress:
-            progress(k + 1, 2 * len(frames))
-    if not seen:
-        raise FrameError(
-            f"none of {len(frames)} frames shows {pins.count} pins in {pins.rings} rings ({pins.layout}); "
-            "check --sensor, focus and light, or give frames with less contact"
-        )
-    best = max(s.score for s in seen)
-    return [s for s in seen if s.score > LIKE_THE_BEST * best]
+    areas, contrasts = [], []
+    for (x, y), spacing in zip(pins_px, spacing_px, strict=True):
+        half = spacing / 2
+        if not np.isfinite(x) or half < 1:
+            continue
+        left, top = max(int(x - half), 0), max(int(y - half), 0)
+        patch = gray[top : int(y + half) + 2, left : int(x + half) + 2].astype(float)
+        rows, columns = np.mgrid[: patch.shape[0], : patch.shape[1]]
+        near = patch[(columns + left - x) ** 2 + (rows + top - y) ** 2 <= half**2]
+        if near.size < LEAST_PIXELS:
+            continue
+        dark, light = np.percentile(near, (10, 95))
+        areas.append(float((near > (dark + light) / 2).sum()))
+        contrasts.append(light - dark)
+    return (float(np.median(areas)), float(np.median(contrasts))) if areas else (np.nan, np.nan)
 
 
 def _start(
-    frame: Frame, reference: Reference, seen: list[Sighting], method: Method, form: Form, layout: Literal["rings", "hexagon"]
+    size_px: tuple[int, int], reference: Reference, layout: Candidate, area: float, method: Method, form: Form, kind: Layout
 ) -> DetectorSpec:
     """A detector with the mask and the caps' size, before a threshold is chosen."""
     rim = reference.pins_px[reference.outmost]
     center = (rim.max(axis=0) + rim.min(axis=0)) / 2
-    reach = max(np.nanmax(np.linalg.norm(s.pins_px - center, axis=1)) for s in seen)
+    reach = max(np.nanmax(np.linalg.norm(s.pins_px - center, axis=1)) for s in layout.seen if s.explained >= LEAST_SHOWN)
     radius = reach + MASK_SPACINGS * np.median(reference.spacing_px[reference.outmost])
-    area = float(np.median([s.area_px2 for s in seen]))
     smallest, largest = (round(float(max(share * np.sqrt(area / np.pi), 1.0)), 2) for share in CAP_RADII)
     blob = BlobSpec(
         threshold=0.0,
@@ -160,20 +227,21 @@ def _start(
         name=method,
         method=method,
         form=form,
+        size_px=size_px,
         blob=blob,
         radius_px=(smallest, largest),
-        recording=_recorder(frame.image.shape, blob, layout) if method == "legacy" and form == Form.RAW else None,
+        recording=_recorder(size_px, blob, kind) if method == "legacy" and form == Form.RAW else None,
         pins_px=tuple(map(tuple, reference.pins_px.round(2).tolist())),
     )
 
 
-def _recorder(shape: tuple[int, ...], blob: BlobSpec, layout: Literal["rings", "hexagon"]) -> RecordingSpec:
-    """The published recorder, with a square crop in which the mask is at the place that the published method uses."""
-    release = LEGACY[layout]
+def _recorder(size_px: tuple[int, int], blob: BlobSpec, layout: Layout) -> RecordingSpec:
+    """The published recorder with a square crop that puts the mask where the published method looks."""
+    release = legacy_parameters(layout)
     half = release.size_px // 2
     side = 2 * blob.mask_radius_px * half / (half - release.mask_margin_px)
     corner = np.array(blob.mask_center_px) - side * (0.5 + np.array(release.mask_offset_px) / release.size_px)
-    height, width = shape[:2]
+    width, height = size_px
     side = int(min(round(side), width, height))
     x0, y0 = (int(np.clip(round(c), 0, extent - side)) for c, extent in zip(corner, (width, height), strict=True))
     return RecordingSpec(
@@ -185,11 +253,15 @@ def _recorder(shape: tuple[int, ...], blob: BlobSpec, layout: Literal["rings", "
     )
 
 
-def _settings(start: DetectorSpec, reference: Reference, seen: list[Sighting], binary: bool) -> Iterator[DetectorSpec]:
-    """All settings to try. Thresholds are in units of the caps' contrast, blocks in units of the pitch."""
-    contrast = max(float(np.median([s.contrast for s in seen])), LEAST_CONTRAST)
+def _settings(start: DetectorSpec, reference: Reference, contrast: float, binary: bool) -> Iterator[DetectorSpec]:
+    """Every setting to try: thresholds in the caps' contrast (gray levels), blocks in pitches, spots in caps' sizes."""
+    contrast = max(contrast, LEAST_CONTRAST)
     pitch = float(np.median(reference.spacing_px))
     levels = [round(share * contrast, 1) for share in STRICTNESS]
+    if start.method == "twin":
+        cap = start.radius_px[0] / CAP_RADII[0]
+        for share in SPOT_SIZES:
+            yield _with_blob(start, spot_sigma_px=round(share * cap, 2))
     if start.method == "legacy" and start.recording is not None:
         for block in (int(p * pitch) | 1 for p in RECORDER_BLOCKS_PITCHES):
             for level in levels:
@@ -215,9 +287,10 @@ def _with_blob(detector: DetectorSpec, **values: Any) -> DetectorSpec:
     return detector.model_copy(update={"blob": detector.blob.model_copy(update=values)})
 
 
-def _rate(detect: Callable[[Frame], Found], frames: list[Frame], count: int) -> Rate:
-    """Share of frames with exactly all pins, and mean share of found pins. An additional blob counts as a lost pin."""
-    found = np.array([len(detect(frame).claims_px) for frame in frames])
+def _rate(detect: Callable[[Frame], Found], frames: list[Frame]) -> Rate:
+    """Share of frames with exactly all pins in view, and mean share of them found; a blob too many counts as a pin lost."""
+    looks = [detect(frame) for frame in frames]
+    found, count = np.array([len(look.claims_px) for look in looks]), np.array([look.expected for look in looks])
     return float(np.mean(found == count)), float(np.mean(1 - np.minimum(np.abs(found - count) / count, 1)))
 
 
@@ -231,9 +304,14 @@ def _threshold(detector: DetectorSpec) -> float:
     return detector.recording.threshold_offset if detector.recording is not None else detector.blob.threshold
 
 
+def _series_of(d: DetectorSpec) -> tuple[int, int, float]:
+    """What settings of one series have in common."""
+    return _block(d), d.blob.erosion_px, d.blob.spot_sigma_px
+
+
 def _series(tried: list[DetectorSpec], k: int) -> list[int]:
-    """Indices of the settings that differ from the k-th only in the threshold, in the order of the threshold."""
-    same = [j for j, d in enumerate(tried) if _block(d) == _block(tried[k]) and d.blob.erosion_px == tried[k].blob.erosion_px]
+    """Settings that differ from the k-th in nothing but the threshold, in its order."""
+    same = [j for j, d in enumerate(tried) if (_block(d), d.blob.erosion_px, d.blob.spot_sigma_px) == _series_of(tried[k])]
     return sorted(same, key=lambda j: _threshold(tried[j]))
 
 
@@ -253,6 +331,9 @@ def _plateau(tried: list[DetectorSpec], rates: list[Rate], k: int) -> list[int]:
 def _middle_of_plateau(tried: list[DetectorSpec], rates: list[Rate]) -> int:
     """Index of the best setting in the middle of the widest plateau, which is as far as possible from thresholds that fail."""
     score = np.array([exact + share for exact, share in rates])
+    spots = np.array([d.blob.spot_sigma_px > 0 for d in tried])
+    if (~spots).any():
+        score = np.where(spots, score - SPOTS_AHEAD, score)  # a threshold's centroids are more exact
     best = np.flatnonzero(score >= score.max() - 1e-9)
     widest = max((_plateau(tried, rates, int(k)) for k in best), key=lambda p: abs(_threshold(tried[p[-1]]) - _threshold(tried[p[0]])))
     middle = (_threshold(tried[widest[0]]) + _threshold(tried[widest[-1]])) / 2

@@ -85,7 +85,7 @@ def tune_on_frames(
     """
     if out is not None and out.suffix != ".toml":
         raise OptionError(f"--out {out}: give the name of a .toml file")
-    recording = open_recording(path, sensor, form)
+    recording = open_recording(path, None, form)
     frames = evenly_read(recording, limit)
     with stage(progress, "tuning") as step:
         found = tune(frames, sensor, method, progress=step)

@@ -16,8 +16,7 @@ from twin.fit.contact.fit import fit_contact, held_out_px, simulate
 from twin.fit.contact.parameters import PARAMETERS, Parameter
 from twin.fit.contact.report import summary_of, write_calibration
 from twin.fit.contact.simulate import Setup
-from twin.fit.optics import folder_beside
-from twin.fit.sensor_file import write_sensor
+from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.judge.labelled.model import MeasuredFrames, measure_frames
 from twin.progress import Progress, Step, silent, stage
 from twin.rig.kinematics import rig_of

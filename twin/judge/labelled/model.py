@@ -69,8 +69,6 @@ def measure_frames(
     recording = open_recording(folder, spec, form)
     labels, problems = read_arm_labels(recording), list(recording.problems)
     reference, _ = recording_reference(spec, recording, problems)
-    if recording.reference is None:
-        problems.append("no no-contact frame (init_0.png): the specification's own layout stands for it")
     pipeline = Pipeline(spec, recording.form, reference)
     chosen = np.random.default_rng(seed).permutation(len(recording))[:count]
     kept, pins = [], []

@@ -141,6 +141,6 @@ class _Shooter:
     def __call__(self, real: RealFrame, state: FittedPins | ContactState, remainder_px: float, *, seed: int) -> Pair:
         image = expose(self._renderer.render(state, seed=seed), self._spec.capture, np.random.default_rng(seed))
         seen = self._pipeline(replace(real.frame, image=image))
-        exact = seen.valid and seen.found == len(seen.pins_px)
+        exact = seen.valid and seen.found == seen.expected
         recorded = real.frame.image if image.ndim == real.frame.image.ndim else real.gray
         return Pair(real, image, compare_images(recorded, image, self._disc.inside), remainder_px, exact)

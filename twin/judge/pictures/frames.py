@@ -101,8 +101,7 @@ def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc) -> Observation:
         if saturated > MOST_SATURATED:
             raise FrameError(f"{frame.name}: saturated ({saturated:.0%} of the disc); record it with a shorter exposure")
     observation = pipeline(frame)
-    count = len(observation.pins_px)
-    if observation.found != count or not observation.valid:
-        why = observation.reason or f"{observation.found} of {count} pins found, all are needed"
+    if observation.found != observation.expected or not observation.valid:
+        why = observation.reason or f"{observation.found} of {observation.expected} pins found, all are needed"
         raise FrameError(f"{frame.name}: {why}; leave it out, or give the right --sensor")
     return observation

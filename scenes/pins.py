@@ -1,0 +1,170 @@
+"""The pins of a TacTip: their layout as data, and their size."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from scenes.base import Positive, Section, SpecError
+
+MOST_PINS = 5000
+"""Largest number of pins. The finest printed sensors have about 3000."""
+
+LEAST_WIDTH = 0.01
+"""Places nearer to a line than this share of its length lie on it."""
+
+Layout = Literal["rings", "hexagon", "grid", "positions"]
+_OWN_KEYS: dict[Layout, tuple[str, ...]] = {
+    "rings": ("rings",),
+    "hexagon": ("rings",),
+    "grid": ("columns", "rows", "row_distance"),
+    "positions": ("positions",),
+}
+"""Keys that describe each layout, those that it cannot do without first (``row_distance`` has a default)."""
+
+
+class PinsSpec(Section):
+    """Pins on the skin's inside, normal to it.
+
+    Attributes
+    ----------
+    layout : {"rings", "hexagon", "grid", "positions"}
+        Rings and hexagon: a pin in the middle, and 6 i pins on ring i, which is a circle or a hexagon. Grid: rows and columns. Positions:
+        any other layout, by the place of each pin.
+    rings : int
+        Of ``rings`` and ``hexagon``: number of rings r; there are 1 + 3 r (r + 1) pins.
+    columns, rows : int
+        Of ``grid``: columns lie along x, rows along y, before ``phase_deg`` turns them.
+    row_distance : float
+        Of ``grid``: distance of neighbouring rows for a distance 1 of neighbouring columns.
+    positions : (N, 2) float
+        Of ``positions``: x and y of each pin seen along the axis, from the axis, in any one unit. The layout is scaled so that the
+        outermost pin lies at ``max_polar_deg``.
+    missing : tuple of int
+        Pins of the layout that are not there, by their number in the complete layout, from 0. The others keep their order.
+    spacing : {"polar", "plan"}
+        What is proportional to the distance from the middle of the layout: the polar angle, or its sine (the layout then keeps its shape
+        seen along the axis).
+    max_polar_deg : float
+        Polar angle of the outermost pins (of the corner pins of a hexagon or grid).
+    phase_deg : float
+        Turn of the layout from x towards y. At 0 the first pin of each ring lies on x.
+    length_mm, diameter_mm : float
+        Of the stem. The defaults of these and of the cap are those found for a printed TacTip of 331 pins.
+    cap_diameter_mm, cap_height_mm : float
+    """
+
+    layout: Layout = "rings"
+    rings: Annotated[int, Field(ge=1, le=40)] | None = None
+    columns: Annotated[int, Field(ge=2, le=100)] | None = None
+    rows: Annotated[int, Field(ge=2, le=100)] | None = None
+    row_distance: Annotated[float, Field(ge=0.1, le=10)] = 1.0
+    positions: Annotated[tuple[tuple[float, float], ...], Field(max_length=MOST_PINS)] = ()
+    missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    spacing: Literal["polar", "plan"] = "polar"
+    max_polar_deg: Annotated[float, Field(gt=0, lt=90)] = 64.0
+    phase_deg: float = 0.0
+    length_mm: Positive = 1.1
+    diameter_mm: Positive = 0.8
+    cap_diameter_mm: Positive = 1.18
+    cap_height_mm: Positive = 0.1
+
+    @property
+    def complete_count(self) -> int:
+        """Number of pins of the layout before any is missing."""
+        if self.layout == "grid":
+            return (self.columns or 0) * (self.rows or 0)
+        if self.layout == "positions":
+            return len(self.positions)
+        rings = self.rings or 0
+        return 1 + 3 * rings * (rings + 1)
+
+    @property
+    def count(self) -> int:
+        """Number of pins N."""
+        return self.complete_count - len(self.missing)
+
+    def in_words(self) -> str:
+        """The layout for people: '331 pins in 10 rings'."""
+        shape = {
+            "rings": f"in {self.rings} rings",
+            "hexagon": f"in a hexagon of {self.rings} rings",
+            "grid": f"in {self.rows} rows and {self.columns} columns",
+            "positions": "at given positions",
+        }[self.layout]
+        return f"{self.count} pins {shape}" + (f", {len(self.missing)} missing" if self.missing else "")
+
+    @model_validator(mode="after")
+    def _check_layout(self) -> Self:
+        own = _OWN_KEYS[self.layout]
+        for key in own:
+            if not getattr(self, key):
+                raise ValueError(f"layout = '{self.layout}' needs {key}")
+        for layout, keys in _OWN_KEYS.items():
+            for key in keys:
+                if key not in own and getattr(self, key) != PinsSpec.model_fields[key].default:
+                    raise ValueError(f"{key} belongs to layout = '{layout}', not to '{self.layout}'")
+        if len(set(self.missing)) < len(self.missing):
+            raise ValueError("missing names a pin twice")
+        if self.missing and max(self.missing) >= self.complete_count:
+            raise ValueError(f"missing names pin {max(self.missing)}, but the pins of this layout are 0 to {self.complete_count - 1}")
+        if 2 * len(self.missing) >= self.complete_count:
+            raise ValueError(f"missing names {len(self.missing)} of {self.complete_count} pins; at least half must be there")
+        if not 3 <= self.count <= MOST_PINS:
+            raise ValueError(f"a layout has 3 to {MOST_PINS} pins, this one has {self.count}")
+        if self.layout == "positions" and len(set(self.positions)) < len(self.positions):
+            raise ValueError("positions has two pins at one place")
+        if self.layout == "positions" and self._on_a_line():
+            raise ValueError("positions lie on one line; give a layout that covers an area")
+        return self
+
+    def _on_a_line(self) -> bool:
+        (x0, y0), *others = self.positions
+        far_x, far_y = max(((x - x0, y - y0) for x, y in others), key=lambda d: d[0] ** 2 + d[1] ** 2)
+        length2 = far_x**2 + far_y**2
+        return all(abs(far_x * (y - y0) - far_y * (x - x0)) <= LEAST_WIDTH * length2 for x, y in others)
+
+
+def layout_from(text: str) -> PinsSpec:
+    """A layout as people write it: ``rings:10``, ``hexagon:6``, ``grid:9x7`` (columns, rows) or ``positions:FILE.csv``.
+
+    Raises
+    ------
+    SpecError
+        It is none of these, or impossible.
+    """
+    kind, _, size = text.partition(":")
+    try:
+        if kind in ("rings", "hexagon"):
+            return PinsSpec(layout="rings" if kind == "rings" else "hexagon", rings=int(size))
+        if kind == "grid":
+            columns, _, rows = size.partition("x")
+            return PinsSpec(layout="grid", columns=int(columns), rows=int(rows))
+        if kind == "positions":
+            return PinsSpec(layout="positions", positions=_places_in(Path(size)))
+    except ValidationError as error:
+        raise SpecError(f"layout {text}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+    except ValueError as error:
+        raise SpecError(f"layout {text}: {error}; give rings:10, hexagon:6, grid:9x7 or positions:FILE.csv") from error
+    raise SpecError(f"layout {text}: not known; give rings:10, hexagon:6, grid:9x7 or positions:FILE.csv")
+
+
+def _places_in(path: Path) -> tuple[tuple[float, float], ...]:
+    """x and y in each line of a CSV file; lines that begin with # or hold no numbers (a header) are passed over."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpecError(f"{path}: not readable as text ({error}); give a CSV file with x,y of one pin in each line") from error
+    places: list[tuple[float, float]] = []
+    for number, line in enumerate(lines, 1):
+        cells = [cell.strip() for cell in line.replace(";", ",").split(",")]
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            x, y = map(float, cells)
+        except ValueError:
+            if places or number > 1:
+                raise SpecError(f"{path}, line {number}: expected two numbers, x,y, got {line[:40]!r}") from None
+            continue
+        places.append((x, y))
+    return tuple(places)

@@ -1,0 +1,130 @@
+"""A layout is identified from frames alone, and a wrong one is never sure: by drawn frames of cameras that nobody knows."""
+
+import cv2
+import numpy as np
+import pytest
+from drawn_frames import draw_discs, smooth_warp
+
+from scenes import load_sensor
+from scenes.pins import PinsSpec
+from twin.errors import FrameError
+from twin.geometry.pins import pin_lattice
+from twin.pins import tune
+from twin.pins.identify import identify, judge_layout, symmetries
+from twin.types import Form, Frame
+
+LAYOUTS = [
+    PinsSpec(rings=5),
+    PinsSpec(rings=10),
+    PinsSpec(rings=8, missing=(40,)),
+    PinsSpec(layout="hexagon", rings=6),
+    PinsSpec(layout="hexagon", rings=4),
+    PinsSpec(layout="grid", columns=9, rows=7),
+    PinsSpec(layout="grid", columns=10, rows=10),
+]
+
+
+def rest_of(pins, *, size=(500, 420), radius=180.0, turn_deg=11.0, bulge=-0.15):
+    """Where a camera that looks at a dome, turned and a little off, has the pins: px (N, 2)."""
+    place = pin_lattice(pins).places @ [1, 1j] * np.exp(1j * np.radians(turn_deg))
+    place = place * (1 + bulge * np.abs(place) ** 2) / (1 + bulge)
+    return np.column_stack([place.real, place.imag]) * radius + np.array(size) / 2 + [9.0, -6.0]
+
+
+def frames_of(rest, count=3, *, size=(500, 420), contact_px=7.0, ring=True, level=(20, 120), seed=0):
+    """Gray frames of contacts: caps, and the bright ring of the housing."""
+    spacing = np.median(np.sort(np.linalg.norm(rest[:, None] - rest, axis=2), axis=1)[:, 1])
+    images = []
+    for k in range(count):
+        rng = np.random.default_rng(100 * seed + k)
+        image = draw_discs(size, smooth_warp(rest, contact_px, rng), 0.27 * spacing, level=level, blur_px=0.8, noise_sd=1.0, rng=rng)
+        if ring:
+            middle, radius = tuple(int(v) for v in rest.mean(axis=0)), np.linalg.norm(rest - rest.mean(axis=0), axis=1).max()
+            cv2.circle(image, middle, int(1.16 * radius), 200, max(round(0.04 * radius), 1))
+        images.append(image)
+    return images
+
+
+def same(found, pins):
+    return (found.layout, found.rings, found.missing) == (pins.layout, pins.rings, pins.missing) and sorted(
+        (found.columns or 0, found.rows or 0)
+    ) == sorted((pins.columns or 0, pins.rows or 0))
+
+
+@pytest.mark.parametrize("pins", LAYOUTS, ids=lambda p: p.in_words())
+def test_the_layout_is_found_and_its_pins_named(pins):
+    rest = rest_of(pins)
+    found = identify(frames_of(rest))
+    assert same(found.best.pins, pins), found.best.line()
+    assert found.sure, found.doubts
+    nearest = np.linalg.norm(found.best.rest_px[:, None] - rest, axis=2).min(axis=1)
+    assert np.median(nearest) < 4.0  # the contacts' median is not the rest
+
+
+@pytest.mark.parametrize("scale", [0.27, 3.0])
+def test_the_frames_size_does_not_matter(scale):
+    pins = PinsSpec(layout="hexagon", rings=6) if scale < 1 else PinsSpec(rings=4)
+    size = (int(500 * scale), int(420 * scale))
+    rest = (rest_of(pins) + 0.5) * scale - 0.5
+    found = identify(frames_of(rest, 2, size=size, contact_px=6 * scale))
+    assert same(found.best.pins, pins) and found.sure, found.best.line()
+
+
+def test_a_rim_that_the_frame_cuts_is_told_from_what_is_in_view():
+    pins = PinsSpec(rings=6)
+    cut = [np.ascontiguousarray(image[55:365, 60:460]) for image in frames_of(rest_of(pins), ring=False)]
+    found = identify(cut)
+    assert same(found.best.pins, pins), found.best.line()
+
+
+def test_stray_light_and_specks_do_not_change_the_layout():
+    pins = PinsSpec(rings=6)
+    images = frames_of(rest_of(pins))
+    rng = np.random.default_rng(0)
+    for image in images:
+        glow = np.zeros(image.shape, np.float32)
+        cv2.circle(glow, (330, 160), 60, 90, -1)
+        np.copyto(image, np.clip(image + cv2.GaussianBlur(glow, (0, 0), 35), 0, 255).astype(np.uint8))
+        for x, y in rng.uniform((150, 120), (350, 300), (6, 2)).astype(int):
+            cv2.circle(image, (int(x), int(y)), 2, 255, -1)
+    found = identify(images)
+    assert same(found.best.pins, pins), found.best.line()
+
+
+@pytest.mark.parametrize(
+    ("shown", "offered"),
+    [
+        (PinsSpec(rings=10), PinsSpec(rings=9)),
+        (PinsSpec(rings=10), PinsSpec(rings=8)),
+        (PinsSpec(rings=9), PinsSpec(rings=10)),
+        (PinsSpec(rings=10), PinsSpec(layout="hexagon", rings=6)),
+        (PinsSpec(layout="hexagon", rings=6), PinsSpec(rings=6)),
+    ],
+    ids=lambda p: p.in_words(),
+)
+def test_a_wrong_layout_is_never_sure_and_the_right_one_is_named(shown, offered):
+    spec = load_sensor("mg400-331").model_copy(update={"pins": offered})
+    frames = [Frame(image, Form.RAW) for image in frames_of(rest_of(shown))]
+    try:
+        tuned = tune(frames, spec)
+    except FrameError as error:
+        assert shown.in_words() in str(error)
+    else:
+        assert tuned.detector.evidence.sure == "unsure"
+        assert any(shown.in_words() in note for note in tuned.notes), tuned.notes
+
+
+def test_frames_without_pins_are_refused_with_what_to_do():
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
+    for image in (np.zeros((240, 320), np.uint8), noise, np.zeros((1, 1), np.uint8), np.full((10, 800), 255, np.uint8)):
+        with pytest.raises(FrameError, match="positions"):
+            identify([image])
+
+
+def test_given_positions_are_seen_wherever_they_lie():
+    rng = np.random.default_rng(3)
+    places = pin_lattice(PinsSpec(rings=4)).places + rng.normal(0, 0.04, (61, 2))
+    pins = PinsSpec(layout="positions", positions=tuple(map(tuple, places.tolist())))
+    shown = judge_layout(pins, frames_of(rest_of(pins, turn_deg=140.0)))
+    assert shown is not None and shown.explained > 0.97
+    assert len(symmetries(pins)) == 1

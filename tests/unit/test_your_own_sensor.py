@@ -1,0 +1,192 @@
+"""From frames to a specification that the program reads: any size, tables and no-contact frames from anywhere, and no nonsense."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from drawn_frames import drawn_frame
+from test_identify import frames_of, rest_of
+
+from scenes import load_sensor
+from scenes.pins import PinsSpec
+from training.estimator import PoseEstimator
+from training.studies.evaluation import predict_frames
+from twin.errors import FrameError, TwinError
+from twin.fit.new_sensor import new_sensor
+from twin.fit.rest import rest_of as rest_found
+from twin.frames import frames_at, open_recording
+from twin.pins import Pipeline, tune, with_detector
+from twin.pins.identify import Candidate, Seen
+from twin.types import Form, Frame
+
+DOCS = Path(__file__).parents[2] / "docs" / "your-own-sensor.md"
+PINS = PinsSpec(rings=4)
+
+
+def folder_of(tmp_path, images, names=None):
+    folder = tmp_path / "mine"
+    folder.mkdir(exist_ok=True)
+    for k, image in enumerate(images):
+        cv2.imwrite(str(folder / (names[k] if names else f"frame_{k}.png")), image)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A new sensor from four contacts and a no-contact frame under another name than usual."""
+    tmp_path = tmp_path_factory.mktemp("new")
+    rest = rest_of(PINS)
+    images = [*frames_of(rest, 4), *frames_of(rest, 1, contact_px=1e-9)]
+    folder = folder_of(tmp_path, images, [*(f"frame_{k}.png" for k in range(4)), "no_contact.png"])
+    return new_sensor(folder, tmp_path / "mine.toml"), rest, folder
+
+
+def test_a_folder_of_frames_becomes_a_sensor(made):
+    found, rest, folder = made
+    spec = load_sensor(found.written[0])
+    assert (spec.pins.layout, spec.pins.rings) == ("rings", 4) and found.identified.sure
+    assert found.rest.source == "given" and found.rest.frame == "no_contact.png"
+    recording = open_recording(folder, spec)
+    seen = [Pipeline(spec, recording.form)(frame) for frame in recording]
+    assert all(o.valid and o.found == 61 for o in seen)
+    reference = Pipeline(spec, Form.RAW).reference.pins_px
+    assert np.linalg.norm(reference[:, None] - rest, axis=2).min(axis=1).max() < 0.6
+    assert found.camera.rms_px < 1.5 and found.health.all_pins == 1.0
+    page = found.written[1].read_text()
+    assert "What is assumed" in page and "overlay-1.png" in page
+
+
+def test_the_specification_is_short_and_commented(made):
+    text = made[0].written[0].read_text()
+    assert len([line for line in text.splitlines() if line.strip() and not line.startswith("#")]) < 35
+    assert "# assumed" in text and "# seen in the frames" in text
+
+
+def test_the_minimal_specification_of_the_documentation_is_one(tmp_path):
+    (block,) = re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.S)
+    file = tmp_path / "documented.toml"
+    file.write_text(block)
+    spec = load_sensor(file)
+    assert spec.pins.count == 331 and spec.skin.outer_radius_mm == 20.0
+    assert len([line for line in block.splitlines() if line.strip()]) <= 28
+
+
+def test_without_a_no_contact_frame_a_rest_layout_is_made_and_said():
+    rest = rest_of(PINS)
+    rng = np.random.default_rng(0)
+    contacts = []
+    for depth in np.linspace(0.2, 1.0, 12):  # a contact spreads the inner pins, and shears them
+        away = rest - rest.mean(axis=0)
+        fade = np.clip(1 - (np.linalg.norm(away, axis=1, keepdims=True) / 180) ** 2, 0, None)
+        contacts.append(rest + depth * fade * (0.25 * away + rng.normal(0, 3, 2)))
+    contacts = [px + rng.normal(0, 1.5, px.shape) for px in contacts]  # none looks like a frame without contact
+    nothing = np.zeros((0, 2))
+    seen = tuple(Seen(px, px, 0, nothing) for px in contacts)
+    layout = Candidate(PINS, 1.0, 1.0, 0, 0, 0.0, np.median(contacts, axis=0), np.ones(61), seen)
+    found = rest_found(layout, [str(k) for k in range(12)])
+    error = np.sqrt(np.mean(np.sum((found.pins_px - rest) ** 2, axis=1)))
+    median = np.sqrt(np.mean(np.sum((layout.rest_px - rest) ** 2, axis=1)))
+    assert found.source == "made" and "--no-contact" in found.line()
+    assert error < 0.6 * median
+
+
+def test_frames_of_another_size_are_tuned_and_then_observed():
+    spec = load_sensor("mg400-127")
+    rest = rest_of(spec.pins, turn_deg=spec.pins.phase_deg)
+    frames = [Frame(image, Form.RAW, f"f{k}") for k, image in enumerate(frames_of(rest, 2))]
+    with pytest.raises(FrameError, match="expected 640x480"):
+        Pipeline(spec, Form.RAW)(frames[0])
+    tuned = with_detector(spec, tune(frames, spec).detector)
+    assert (tuned.camera.width_px, tuned.camera.height_px) == (500, 420)
+    assert all(Pipeline(tuned, Form.RAW)(frame).found == 127 for frame in frames)
+
+
+def test_stray_pins_between_caps_are_not_valid():
+    spec = load_sensor("mg400-127")
+    rest = rest_of(spec.pins, turn_deg=spec.pins.phase_deg)
+    frame = Frame(frames_of(rest, 1, contact_px=1e-9)[0], Form.RAW)
+    tuned = with_detector(spec, tune([frame], spec).detector)
+    pipeline = Pipeline(tuned, Form.RAW)
+    moved = np.roll(frame.image, int(np.median(pipeline.reference.spacing_px) / 2), axis=1)
+    assert pipeline(frame).valid
+    assert pipeline._between_caps(Frame(moved, Form.RAW), pipeline(frame).pins_px) > 0.3
+
+
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("sensor_image,pose_x,pose_z,pose_Rx,shear_x", "{},0.5,2.5,-7,1.5"),
+        ("image_name;POSE_X;pose_z;pose_rx;Shear_X", "{};0,5;2,5;-7;1,5"),
+        ("file_name,observation.state.x,observation.state.z,observation.state.rx,shear_x", "{},0.5,2.5,-7,1.5"),
+    ],
+)
+def test_every_convention_of_labels_is_read_from_any_table(tmp_path, header, row):
+    folder = folder_of(tmp_path, [np.zeros((50, 60), np.uint8)] * 2)
+    table = tmp_path / "elsewhere.csv"
+    table.write_text("\ufeff" + "\n".join([header, *(row.format(f"frame_{k}.png") for k in (1, 0))]) + "\n", encoding="utf-8")
+    labels = open_recording(frames_at(folder, table)).labels
+    assert [labels[name][0] for name in ("pose_1", "pose_3", "pose_4", "move_1")] == [0.5, 2.5, -7, 1.5]
+
+
+def test_a_table_or_no_contact_frame_of_no_use_is_an_error(tmp_path):
+    folder = folder_of(tmp_path, [np.zeros((50, 60), np.uint8)] * 2)
+    table, small = tmp_path / "t.csv", tmp_path / "small.png"
+    table.write_text("image_name,pose_1\nother.png,1\n")
+    cv2.imwrite(str(small), np.zeros((9, 9), np.uint8))
+    for at in (
+        frames_at(folder, table),
+        frames_at(folder, tmp_path / "nowhere.csv"),
+        frames_at(folder, None, small),
+        frames_at(folder, None, tmp_path / "no.png"),
+    ):
+        with pytest.raises(FrameError, match="--table|--no-contact"):
+            open_recording(at)
+
+
+def _inverted(image):
+    return 255 - image
+
+
+FUZZ = {
+    "one pixel": lambda image: image[:1, :1],
+    "a line": lambda image: np.ascontiguousarray(np.repeat(image[200:201], 10, axis=0))[:, :300],
+    "long": lambda image: np.zeros((10, 8000), np.uint8),
+    "black": lambda image: np.zeros_like(image),
+    "white": lambda image: np.full_like(image, 255),
+    "inverted": _inverted,
+    "turned": lambda image: np.rot90(image).copy(),
+    "masked": lambda image: np.where(np.arange(image.shape[1]) < 250, image, 0).astype(np.uint8),
+    "colour": lambda image: np.repeat(image[..., None], 3, axis=2),
+    "16 bits": lambda image: image.astype(np.uint16) * 257,
+    "noise": lambda image: np.random.default_rng(0).integers(0, 255, image.shape).astype(np.uint8),
+}
+
+
+@pytest.mark.parametrize("change", FUZZ.values(), ids=FUZZ)
+def test_strange_frames_give_a_right_answer_or_an_error_in_words(tmp_path, change):
+    images = [change(image) for image in frames_of(rest_of(PINS), 2)]
+    try:
+        found = new_sensor(folder_of(tmp_path, images), tmp_path / "odd.toml", limit=2)
+    except (TwinError, ValueError) as error:
+        assert "\n" not in str(error).strip() and isinstance(error, TwinError)
+        assert not (tmp_path / "odd.toml").exists()
+    else:
+        right = (found.sensor.pins.layout, found.sensor.pins.rings) == ("rings", 4)
+        assert right or not found.identified.sure
+
+
+@pytest.mark.parametrize("name", ["mg400-127", "mg400-331"])
+def test_without_a_no_contact_frame_shipped_weights_count_from_their_units_pins(tmp_path, name):
+    """The frames show contacts of a unit whose pins stand a little beside the specification's, as the weights know."""
+    model = PoseEstimator.load(name)
+    known = np.array(model.recorded_sensor.pipeline.recording.rest_px)
+    image = drawn_frame(model.sensor, Form.RECORDING, known).image
+    cv2.imwrite(str(tmp_path / "f_0.png"), image)
+    predictions = predict_frames(name, tmp_path)
+    assert np.allclose(predictions.estimator.pipeline.reference.pins_px, known)
+    assert any("no no-contact frame was used" in problem for problem in predictions.recording.problems)
+    cv2.imwrite(str(tmp_path / "init_0.png"), image)
+    again = predict_frames(name, tmp_path)
+    assert not any("no-contact" in problem for problem in again.recording.problems)

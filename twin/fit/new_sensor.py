@@ -1,0 +1,444 @@
+"""From someone else's frames to a specification: layout, pins at rest, camera and pin detection of a sensor of which nothing is known."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scenes.pins import PinsSpec
+from scenes.sensor import BlobSpec, CameraSpec, PipelineSpec, RecordingSpec, SensorSpec
+from twin.errors import FrameError
+from twin.fit.camera_pose import CameraReport, fit_camera
+from twin.fit.rest import Rest, rest_of, turn_of
+from twin.fit.sensor_file import folder_beside, write_sensor
+from twin.frames import evenly_read, frames_at, open_recording
+from twin.frames.forms import gray_levels
+from twin.frames.images import write_image
+from twin.pins.batch import draw_overlay
+from twin.pins.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, with_detector
+from twin.pins.identify import STEADY, Candidate, Identified, identify, judge_layout
+from twin.pins.pipeline import Pipeline
+from twin.pins.tune import Tuned, tune, turned_as
+from twin.progress import Progress, silent, stage
+from twin.report.numbers import number
+from twin.report.page import Page, Picture
+from twin.store import output, writes_file
+from twin.types import Form, Frame
+
+LIMIT = 40
+"""Frames that are looked at, evenly spread: enough contacts to make a rest layout of."""
+JUDGED = 40
+"""Frames on which the result is judged."""
+SHOWN_FRAMES = 4
+"""Frames whose pictures are shown."""
+PINHOLE_MM, FISHEYE_MM = 45.0, 7.5
+"""Distance of the pupil from the dome's centre at which a fit starts: of two TacTips' cameras, with and without a wide-angle lens."""
+FITTED_PINHOLE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
+"""Parameters that pins at rest may tell (see ``twin.fit.camera_pose``)."""
+FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
+UNTUNED_OFFSET = -12.0
+"""Threshold, gray levels above the local mean, for raw frames of a sensor of which only thresholded ones were seen."""
+BETTER = 0.85
+"""A camera model is taken instead of a simpler one if its error is smaller by this factor."""
+GOOD_SHARE = 0.99
+"""From this share of frames with all pins on, a sensor is well seen."""
+FAIR_SHARE = 0.9
+
+
+@dataclass(frozen=True)
+class Health:
+    """How the new specification does on frames.
+
+    Attributes
+    ----------
+    frames : int
+    all_pins : float
+        Share of the frames in which every pin in view is found.
+    found : float
+        Mean share of the pins in view that are found.
+    valid : float
+        Share of the frames that can be used.
+    extra : float
+        Median number of pin-like spots that are no pins.
+    steadily_lost : tuple of int
+        Pins lost in at least half of the frames though they should be in view.
+    reasons : tuple of str
+        Why frames cannot be used, the first of each kind.
+    """
+
+    frames: int
+    all_pins: float
+    found: float
+    valid: float
+    extra: float
+    steadily_lost: tuple[int, ...]
+    reasons: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The same in words."""
+        lines = [
+            f"all pins in view found in {100 * self.all_pins:.1f} % of {self.frames} frames, {100 * self.found:.2f} % of all pins; "
+            f"{100 * self.valid:.0f} % of the frames can be used"
+        ]
+        if self.steadily_lost:
+            lines.append(
+                f"lost in most frames: pin {', '.join(map(str, self.steadily_lost))}; look for dirt, reflections or missing caps there"
+            )
+        return lines + [f"not usable, for example: {reason}" for reason in self.reasons]
+
+
+@dataclass(frozen=True)
+class NewSensor:
+    """A specification made from frames, and how sure it is.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    identified : Identified
+        The layout; other candidates come after it.
+    rest : Rest
+    camera : CameraReport
+    tuned : Tuned
+    health : Health
+    known, assumed, next_steps : tuple of str
+        What the frames tell, what was assumed instead, and what to do to know more.
+    written : list of Path
+    """
+
+    sensor: SensorSpec
+    identified: Identified
+    rest: Rest
+    camera: CameraReport
+    tuned: Tuned
+    health: Health
+    known: tuple[str, ...]
+    assumed: tuple[str, ...]
+    next_steps: tuple[str, ...]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """What was found, and what speaks against it; for people."""
+        lines = [f"{'sure' if self.identified.sure else 'unsure'}: {self.identified.best.line()}"]
+        lines += [f"doubt: {doubt}" for doubt in self.identified.doubts]
+        if not self.identified.sure:
+            lines += [f"or: {other.line()}" for other in self.identified.candidates[1:2]]
+        lines += [self.rest.line(), *self.known[2:], *self.health.lines()]
+        return lines + [f"next: {step}" for step in self.next_steps]
+
+
+@writes_file(".*.csv")
+def new_sensor(
+    frames: Path,
+    out: Path,
+    *,
+    layout: PinsSpec | None = None,
+    no_contact: Path | None = None,
+    table: Path | None = None,
+    form: Form | None = None,
+    limit: int = LIMIT,
+    progress: Progress = silent,
+) -> NewSensor:
+    """Make a specification from frames of a sensor of which nothing is known, and write it.
+
+    Beside it a folder ``NAME-new`` gets the overlay pictures and the page.
+
+    Parameters
+    ----------
+    frames : Path
+        Anything ``open_recording`` takes: frames of any one size, colour, gray or thresholded, in contact or not.
+    out : Path
+        The ``.toml`` file to write.
+    layout : PinsSpec, optional
+        The layout, where it is known. Otherwise it is identified.
+    no_contact : Path, optional
+        A frame without contact. Otherwise a file ``init_*`` beside the frames, a frame that shows none, or a rest layout made of contacts.
+    table : Path, optional
+        A table of labels that also gives the frames' order.
+    form : Form, optional
+        Thresholded (recording) or not (raw); told by the frames' content if not given.
+    limit : int
+        At most so many frames are looked at.
+
+    Raises
+    ------
+    FrameError
+        No frames, no layout in them, or ``out`` is no name of a ``.toml`` file.
+    """
+    folder = folder_beside(out, "new")
+    with output(folder, "index.html", "overlay-*.png"):
+        recording = open_recording(frames_at(frames, table, no_contact), None, form)
+        looked = evenly_read(recording, limit)
+        images = [gray_levels(frame.image) for frame in looked]
+        with stage(progress, "layout") as step:
+            found = identify(images, progress=step) if layout is None else _given(layout, images)
+        best = found.best
+        given = recording.reference
+        rest = rest_of(
+            best, [frame.name for frame in looked], None if given is None else gray_levels(given.image), given.name if given else ""
+        )
+        start = _started(out.stem, looked[0], best.pins, rest, frames.name)
+        with stage(progress, "camera"):
+            fitted, camera = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan))
+        with stage(progress, "pins") as step:
+            tuned = tune(looked, fitted, known=best, progress=step)
+        detector = _at_rest(tuned.detector, fitted, rest, best)
+        sensor = _with_pipeline(fitted, detector)
+        judged = looked if len(looked) >= min(JUDGED, len(recording)) else evenly_read(recording, JUDGED)
+        health, pictures = _health(sensor, looked[0].form, judged, folder)
+        known, assumed, steps = _told(sensor, found, rest, camera, tuned, health, recording.labels)
+        write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
+        page = _page(folder, sensor, found, health, pictures, known, assumed, steps, recording.problems)
+        return NewSensor(sensor, found, rest, camera, tuned, health, known, assumed, steps, [out, page])
+
+
+def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
+    """A layout that the user gives, as the frames show it."""
+    shown = judge_layout(layout, images)
+    if shown is None:
+        raise FrameError(f"none of {len(images)} frames shows {layout.in_words()}; leave the layout out to have it identified")
+    doubts: tuple[str, ...] = ()
+    if shown.explained < 0.9:
+        doubts = (f"{layout.in_words()} were given, but {shown.line()}",)
+    return Identified((shown,), not doubts, doubts, 0.0)
+
+
+def _started(name: str, frame: Frame, pins: PinsSpec, rest: Rest, source: str) -> SensorSpec:
+    """A specification of the right layout and frame size, and a camera that sees the pins about where they are."""
+    height, width = frame.image.shape[:2]
+    color = frame.image.ndim == 3 and frame.image.shape[2] == 3 and bool(np.ptp(frame.image.astype(int), axis=2).max() > 0)
+    seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
+    x, y = ((seen.max(axis=0) + seen.min(axis=0)) / 2).tolist()
+    radius = float(np.linalg.norm(seen - [x, y], axis=1).max())
+    turned = pins.model_copy(update={"phase_deg": round(turn_of(pins, rest.pins_px), 2)})
+    focal = radius * PINHOLE_MM / 17.0  # the outermost caps of a TacTip are about 17 mm from the axis
+    camera = CameraSpec(
+        width_px=width,
+        height_px=height,
+        channels="color" if color else "mono",
+        fx_px=focal,
+        fy_px=focal,
+        cx_px=x,
+        cy_px=y,
+        distance_mm=PINHOLE_MM,
+    )
+    anywhere = BlobSpec(threshold=UNKNOWN_OFFSET, threshold_block_px=UNKNOWN_BLOCK_PX, mask_center_px=(x, y), mask_radius_px=1.1 * radius)
+    thresholded = frame.form == Form.RECORDING
+    return SensorSpec(
+        name=name,
+        description=f"Made by 'twin new' from frames of {source}",
+        source="Layout, camera and pin detection: the frames. All else: the defaults of a printed TacTip",
+        pins=turned,
+        camera=camera,
+        recording=_whole(width, height) if thresholded else None,
+        pipeline=PipelineSpec(raw=anywhere, recording=anywhere if thresholded else None),
+    )
+
+
+def _whole(width: int, height: int) -> RecordingSpec:
+    """A recorder that keeps the whole frame; how frames were thresholded is not known from them."""
+    return RecordingSpec(
+        crop_px=(0, 0, width, height),
+        width_px=width,
+        height_px=height,
+        threshold_block_px=UNKNOWN_BLOCK_PX,
+        threshold_offset=UNKNOWN_OFFSET,
+    )
+
+
+def _camera(start: SensorSpec, pins_px: np.ndarray) -> tuple[SensorSpec, CameraReport]:
+    """The camera, of pinhole and fisheye, and the spacing of the pins that meet the pins at rest best; the simpler of nearly equal ones."""
+    best: tuple[SensorSpec, CameraReport] | None = None
+    for projection, spacing in (("perspective", "polar"), ("perspective", "plan"), ("fisheye", "polar"), ("fisheye", "plan")):
+        pins = start.pins.model_copy(update={"spacing": spacing})
+        camera = start.camera
+        if projection == "fisheye":
+            focal = camera.fx_px * FISHEYE_MM / PINHOLE_MM
+            camera = camera.model_copy(update={"projection": projection, "fx_px": focal, "fy_px": focal, "distance_mm": FISHEYE_MM})
+        trial = _scaled(start.model_copy(update={"pins": pins, "camera": camera}), pins_px)
+        fitted = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
+        if best is None or fitted[1].rms_px < BETTER * best[1].rms_px:
+            best = fitted
+    assert best is not None
+    return best
+
+
+def _scaled(sensor: SensorSpec, pins_px: np.ndarray) -> SensorSpec:
+    """The sensor with a camera whose view of the pins has the size and place of pins (N, 2), NaN where unknown."""
+    known = np.flatnonzero(np.isfinite(pins_px[:, 0]))
+    return sensor.model_copy(update={"camera": camera_seeing(sensor, pins_px, known)})
+
+
+def _at_rest(detector: DetectorSpec, sensor: SensorSpec, rest: Rest, best: Candidate) -> DetectorSpec:
+    """The detector with the pins' places at rest; pins out of view stand where the camera has them."""
+    unseen = ~np.isfinite(rest.pins_px[:, 0])
+    guess = turned_as(sensor.pins, best.rest_px)
+    places = np.where(unseen[:, None], guess, rest.pins_px)
+    return detector.model_copy(update={"pins_px": tuple(map(tuple, places.round(2).tolist()))})
+
+
+def _with_pipeline(sensor: SensorSpec, detector: DetectorSpec) -> SensorSpec:
+    """The specification with its pin detection; raw frames of a sensor that is known by thresholded ones get a usual threshold."""
+    tuned = with_detector(sensor, detector)
+    if detector.form == Form.RAW:
+        return tuned
+    usual = detector.blob.model_copy(
+        update={"threshold": -12.0, "threshold_block_px": UNKNOWN_BLOCK_PX, "rest_px": (), "spot_sigma_px": 0.0}
+    )
+    return tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={"raw": usual})})
+
+
+def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -> tuple[Health, list[Path]]:
+    """How a specification does on frames, and overlay pictures of some of them."""
+    pipeline = Pipeline(sensor, form)
+    seen = [pipeline(frame) for frame in frames]
+    lost = np.mean([np.isfinite(o.predicted_px[:, 0]) for o in seen], axis=0)
+    inside = [(o.predicted_px > 0).all(axis=1) & (o.predicted_px < np.array(pipeline.size_px) - 1).all(axis=1) for o in seen]
+    steadily = np.flatnonzero((lost >= 0.5) & (np.mean(inside, axis=0) >= 0.5))
+    reasons = list(dict.fromkeys(o.reason.split(":")[0] for o in seen if not o.valid))
+    first = [next(f"{f.name}: {o.reason}" for f, o in zip(frames, seen, strict=True) if o.reason.startswith(r)) for r in reasons]
+    health = Health(
+        len(seen),
+        float(np.mean([o.valid and o.found == o.expected for o in seen])),
+        float(np.mean([o.found / max(o.expected, 1) for o in seen])),
+        float(np.mean([o.valid for o in seen])),
+        float(np.median([len(o.extra_px) for o in seen])),
+        tuple(steadily.tolist()),
+        tuple(first[:3]),
+    )
+    worst = np.argsort([o.found / max(o.expected, 1) for o in seen], kind="stable")
+    chosen = dict.fromkeys([int(worst[-1]), int(worst[0]), *worst[:: max(len(worst) // SHOWN_FRAMES, 1)].tolist()])
+    pictures: list[Path] = []
+    for k in list(chosen)[:SHOWN_FRAMES]:
+        path = folder / f"overlay-{len(pictures) + 1}.png"
+        write_image(path, draw_overlay(frames[k], seen[k], scale=_enlarged(pipeline.size_px)))
+        pictures.append(path)
+    return health, pictures
+
+
+def _enlarged(size_px: tuple[int, int]) -> int:
+    """Factor by which a frame is enlarged so that its pins can be looked at."""
+    return int(np.clip(round(900 / max(size_px)), 1, 6))
+
+
+def _told(
+    sensor: SensorSpec, found: Identified, rest: Rest, camera: CameraReport, tuned: Tuned, health: Health, labels: dict[str, np.ndarray]
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """What is known, what is assumed, and what to do to know more."""
+    lens = "fisheye" if sensor.camera.projection == "fisheye" else "pinhole"
+    evidence = tuned.detector.evidence
+    known = (
+        f"Layout: {found.best.line()}",
+        rest.line(),
+        f"camera: {lens}, focal length {sensor.camera.fx_px:.0f} px, middle ({sensor.camera.cx_px:.0f}, {sensor.camera.cy_px:.0f}) px; "
+        f"it sees the {camera.pins} pins at rest within {camera.rms_px:.2f} px (rms)",
+        f"pin detection: {evidence.sure if evidence else 'unsure'}; "
+        + (
+            f"spots of {sensor_blob(sensor, tuned).spot_sigma_px:g} px"
+            if sensor_blob(sensor, tuned).spot_sigma_px
+            else f"threshold {sensor_blob(sensor, tuned).threshold:g}, slack {evidence.threshold_slack if evidence else 0:g} gray levels"
+        ),
+    )
+    assumed = [
+        f"Dome: radius {sensor.skin.outer_radius_mm:g} mm, skin {sensor.skin.thickness_mm:g} mm, of a printed TacTip. Frames do not tell "
+        "lengths in mm.",
+        f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: "
+        "pins at rest fit many pairs of them.",
+        "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",
+        "Light, colours, noise: those of another TacTip, until 'twin calibrate optics' has found this sensor's.",
+        *camera.held.values(),
+    ]
+    steps = []
+    if not found.sure and len(found.candidates) > 1:
+        steps.append(
+            f"decide between the layouts: {found.best.pins.in_words()}, or {found.candidates[1].pins.in_words()}; count them in the overlay"
+        )
+    if rest.source != "given":
+        steps.append("record a frame without contact and run this again with --no-contact FRAME")
+    if health.all_pins < FAIR_SHARE:
+        steps.append("look at the overlay pictures: better light, focus or exposure helps most; then run this again")
+    if any(name.startswith("pose_") for name in labels):
+        steps.append(
+            f"fit the contact to the labels: twin calibrate contact --sensor {sensor.name}.toml --frames FRAMES --out {sensor.name}-2.toml"
+        )
+    else:
+        steps.append("record labelled contacts (a table targets.csv beside the frames), then 'twin calibrate contact' and 'twin train'")
+    if sensor.camera.channels == "color":
+        steps.append(f"fit light and colours: twin calibrate optics --sensor {sensor.name}.toml --frames FRAMES --out {sensor.name}-2.toml")
+    return known, tuple(assumed), tuple(steps)
+
+
+def sensor_blob(sensor: SensorSpec, tuned: Tuned) -> BlobSpec:
+    """How pins are found in the form of frames that was tuned on."""
+    form = tuned.detector.form
+    return sensor.pipeline.recording if form == Form.RECORDING and sensor.pipeline.recording else sensor.pipeline.raw
+
+
+def _comment(source: str, found: Identified, rest: Rest) -> str:
+    """Lines above the specification."""
+    return "\n".join(
+        (
+            f"Made by 'twin new' from frames of {source}. Sections and keys that are not here have their defaults: a printed TacTip",
+            "(docs/your-own-sensor.md). The page beside this file says what is known, what is assumed, and what to do to know more.",
+            f"Layout: {'sure' if found.sure else 'UNSURE'}. {rest.line()}.",
+        )
+    )
+
+
+def _notes(found: Identified, rest: Rest, camera: CameraReport) -> dict[str, str]:
+    """Comments behind the values of a specification."""
+    sure = "seen in the frames" if found.sure else "unsure: see the page"
+    met = f"fitted: pins at rest within {camera.rms_px:.2f} px"
+    return {
+        "pins.layout": sure,
+        "pins.rings": sure,
+        "pins.columns": sure,
+        "pins.missing": "not seen in any frame, though in view",
+        "pins.phase_deg": "turn of the first pin of each ring",
+        "camera.fx_px": met,
+        "camera.distance_mm": "assumed: pins at rest do not tell it",
+        "recording.crop_px": "assumed: how the frames were made is not known",
+        "recording.threshold_block_px": "assumed",
+    }
+
+
+def _page(
+    folder: Path,
+    sensor: SensorSpec,
+    found: Identified,
+    health: Health,
+    pictures: list[Path],
+    known: tuple[str, ...],
+    assumed: tuple[str, ...],
+    steps: tuple[str, ...],
+    problems: list[str],
+) -> Path:
+    """The page: what is known, what is assumed, what to do; overlay pictures; candidates."""
+    page = Page(f"New sensor {sensor.name}", "twin new", topic="TacTip twin: a new sensor", lead=" ".join(health.lines()[:1]))
+    page.notice("Unsure", list(found.doubts), tone="bad")
+    page.notice("Noted", problems + list(health.lines()[1:]))
+    page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
+    page.figures(*(Picture(path, f"Frame with its pins, {path.stem}", "", kind="frame") for path in pictures))
+    page.section("What is known")
+    page.items(known)
+    page.section("What is assumed")
+    page.items(assumed)
+    page.section("What to do to know more")
+    page.items(steps)
+    page.section("Layouts that were considered")
+    page.table(
+        [
+            {
+                "layout": candidate.pins.in_words(),
+                "explained": f"{100 * candidate.explained:.1f} %",
+                "agreeing": f"{100 * candidate.agreeing:.0f} %",
+                "not_seen": number(candidate.not_seen, 3),
+                "left_over": number(candidate.left_over, 3),
+                "misfit": number(candidate.misfit, 2),
+            }
+            for candidate in found.candidates
+        ],
+        ["layout", "explained", "agreeing", "not_seen", "left_over", "misfit"],
+        caption="Explained: share of pins in view and pin-like spots that are one another's (median). Misfit: distance of the pins at "
+        "rest from a smooth view of the layout, in spacings.",
+    )
+    return page.write(folder / "index.html")

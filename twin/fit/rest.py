@@ -1,0 +1,129 @@
+"""Where a layout's pins are without contact, as frames of a sensor show it: in a no-contact frame, or made from many contacts."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scenes.pins import PinsSpec
+from twin.errors import FrameError
+from twin.geometry.pins import pin_lattice
+from twin.pins.identify import SHOWN, Candidate, judge_layout, smooth_view, symmetries
+
+STILL = 0.035
+"""Largest rms distance of pins without contact from a smooth view of their layout, in spacings. Measured: 0.028 in no-contact frames of
+two sensors; in contacts of 1 mm and more at least 0.042."""
+INNER = 0.5
+"""The pins nearer to the layout's middle than this share of its radius are spread by a contact; the rim hardly moves."""
+FEWEST_CONTACTS = 8
+"""A rest layout is extrapolated from at least this many contacts; from fewer it is their median."""
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Pins without contact.
+
+    Attributes
+    ----------
+    pins_px : (N, 2) float
+        NaN where a pin is not in view.
+    source : {"given", "found", "made"}
+        A frame that was given or named as the no-contact frame, a frame that shows none though nothing says so, or made from contacts.
+    frame : str
+        Name of the frame; "" if it was made.
+    """
+
+    pins_px: np.ndarray
+    source: Literal["given", "found", "made"]
+    frame: str = ""
+
+    def line(self) -> str:
+        """Where it comes from, in words."""
+        if self.source == "given":
+            return f"no contact: {self.frame}"
+        if self.source == "found":
+            return f"no contact: no frame is named as such; {self.frame} shows no contact as far as its pins tell"
+        return (
+            "no contact: no frame shows it. The pins' rest places were made from contacts; expect errors of a tenth of a spacing or so. "
+            "Record one frame without contact and give it with --no-contact"
+        )
+
+
+def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None, given_name: str = "") -> Rest:
+    """Pins at rest of a layout that was identified in frames with these names; ``given`` is a gray no-contact frame (H, W) uint8.
+
+    Raises
+    ------
+    FrameError
+        The given frame does not show the layout.
+    """
+    if given is not None:
+        shown = judge_layout(layout.pins, [given])
+        if shown is None or shown.explained < SHOWN:
+            raise FrameError(
+                f"{given_name}: no use as no-contact frame, it does not show {layout.pins.in_words()} as the other frames do; "
+                "give another one"
+            )
+        return Rest(_alike(layout, shown.seen[0].pins_px), "given", given_name)
+    places = pin_lattice(layout.pins).places
+    good = [k for k, seen in enumerate(layout.seen) if seen.explained >= SHOWN]
+    if good:
+        still = min(good, key=lambda k: unevenness(places, layout.seen[k].pins_px))
+        if unevenness(places, layout.seen[still].pins_px) < STILL:
+            return Rest(layout.seen[still].pins_px, "found", names[still])
+    return Rest(rest_from_contacts(layout), "made")
+
+
+def unevenness(places: np.ndarray, pins_px: np.ndarray) -> float:
+    """Rms distance of pins (N, 2), NaN where lost, from the smooth view of their layout (N, 2), in spacings."""
+    known = np.isfinite(pins_px[:, 0])
+    if known.sum() < 12:
+        return float("inf")
+    away = np.linalg.norm(pins_px - smooth_view(places, pins_px), axis=1)[known]
+    spacing = float(np.median(cKDTree(pins_px[known]).query(pins_px[known], k=2)[0][:, 1]))
+    return float(np.sqrt(np.mean(away**2)) / spacing)
+
+
+def rest_from_contacts(layout: Candidate) -> np.ndarray:
+    """Pins (N, 2), px, extrapolated from contacts to the least one; NaN for a pin that is never seen.
+
+    A contact flattens the dome, which spreads the inner pins and hardly moves the rim. Each pin's place is regressed on this spread (the
+    mean distance of the inner pins from their middle, relative to the rim's), and taken at the least spread of all frames.
+    """
+    pins_px = np.stack([seen.pins_px for seen in layout.seen])
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(pins_px[:, :, 0])
+        median = np.full(pins_px.shape[1:], np.nan)
+        median[known.any(axis=0)] = np.nanmedian(pins_px[:, known.any(axis=0)], axis=0)
+    good = np.array([seen.explained >= SHOWN for seen in layout.seen])
+    if good.sum() < FEWEST_CONTACTS:
+        return median
+    filled = np.where(known[..., None], pins_px, median)[good]
+    lattice = pin_lattice(layout.pins)
+    inner = (np.linalg.norm(lattice.places, axis=1) < INNER) & np.isfinite(median[:, 0])
+    rim = lattice.outmost[np.isfinite(median[lattice.outmost, 0])]
+    spread = np.array([_radius(frame[inner]) / _radius(frame[rim]) for frame in filled])
+    shape = filled.reshape(len(filled), -1)
+    away = spread - spread.mean()
+    slope = away @ (shape - shape.mean(axis=0)) / max(float(away @ away), 1e-12)
+    return (shape.mean(axis=0) + (spread.min() - spread.mean()) * slope).reshape(-1, 2)
+
+
+def _radius(px: np.ndarray) -> float:
+    """Mean distance of points (n, 2) from their mean."""
+    return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
+
+
+def _alike(layout: Candidate, pins_px: np.ndarray) -> np.ndarray:
+    """Pins (N, 2) of another frame in the order, of those in which the layout looks the same, that is nearest to the layout's."""
+    orders: list[np.ndarray] = symmetries(layout.pins)
+    away = [float(np.nanmedian(np.linalg.norm(pins_px[order] - layout.rest_px, axis=1))) for order in orders]
+    return pins_px[orders[int(np.argmin(away))]]
+
+
+def turn_of(pins: PinsSpec, pins_px: np.ndarray) -> float:
+    """Angle, deg, by which a layout must be turned from x towards y to lie as pins (N, 2) do; NaN pins do not count."""
+    known = np.isfinite(pins_px[:, 0])
+    places, seen = pin_lattice(pins).places[known] @ [1, 1j], pins_px[known] @ [1, 1j]
+    return float(np.degrees(np.angle(np.vdot(places - places.mean(), seen - seen.mean()))))

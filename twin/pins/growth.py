@@ -1,0 +1,190 @@
+"""Label bright spots by the places of a lattice, from a few labels outwards, whatever the view's size, turn and distortion.
+
+Where the next place of the lattice is seen is predicted by the local affine map of the places around it that are labelled already. So the
+lattice may be foreshortened, bulge or bend slowly; only its topology is known. All limits are relative to the local spacing, and were
+chosen, not derived.
+"""
+
+import numpy as np
+
+from twin.compiled import compiled
+
+NEIGHBOURS = 18
+"""Places around a place that its prediction is made from: two rings of a triangular lattice."""
+NEAR = 8
+"""A place is tried when one of this many nearest places is labelled."""
+GATES = (0.25, 0.38)
+"""Largest distance from a prediction to its spot: strict first, then looser."""
+LEAST_AROUND = (4, 3)
+"""Least number of labelled places for a prediction, with each of these gates."""
+FINAL_GATE = 0.42
+"""Largest distance of a spot from where all its labelled neighbours predict it."""
+MOST_STRETCH = 3.0
+"""Largest ratio of the local map's scales in two directions. A cap's surroundings at the rim of a dome have 2."""
+ROUNDS = 3
+"""Rounds in which labels that their neighbours do not bear out are taken back, and the labelling grows again."""
+
+
+@compiled()
+def predict_place(i: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndarray, px: np.ndarray) -> tuple[float, float, float, int]:
+    """Where place ``i`` is seen, by the labelled places around it: x, y, local spacing (px), and how many there are.
+
+    A weighted affine map; 0 places are returned where it is not determined, mirrors the lattice, or stretches it too much.
+    """
+    m = np.zeros((3, 3))
+    bx, by = np.zeros(3), np.zeros(3)
+    v = np.ones(3)
+    count = 0
+    for k in range(around.shape[1]):
+        j = around[i, k]
+        if spot[j] < 0:
+            continue
+        count += 1
+        v[1], v[2] = lattice[j, 0] - lattice[i, 0], lattice[j, 1] - lattice[i, 1]
+        w = 1.0 / (0.5 + v[1] * v[1] + v[2] * v[2])
+        for a in range(3):
+            bx[a] += w * v[a] * px[spot[j], 0]
+            by[a] += w * v[a] * px[spot[j], 1]
+            for b in range(3):
+                m[a, b] += w * v[a] * v[b]
+    if count < 3:
+        return 0.0, 0.0, 0.0, 0
+    c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
+    c01 = m[1, 2] * m[2, 0] - m[1, 0] * m[2, 2]
+    c02 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
+    det = m[0, 0] * c00 + m[0, 1] * c01 + m[0, 2] * c02
+    if abs(det) < 1e-6 * m[0, 0] ** 3:
+        return 0.0, 0.0, 0.0, 0
+    inverse = np.linalg.inv(m)
+    fx, fy = inverse @ bx, inverse @ by
+    area = fx[1] * fy[2] - fx[2] * fy[1]
+    size2 = fx[1] ** 2 + fx[2] ** 2 + fy[1] ** 2 + fy[2] ** 2
+    if area <= 0:
+        return 0.0, 0.0, 0.0, 0
+    root = np.sqrt(max(size2 * size2 / 4 - area * area, 0.0))
+    if size2 / 2 + root > MOST_STRETCH**2 * max(size2 / 2 - root, 1e-12):
+        return 0.0, 0.0, 0.0, 0
+    return fx[0], fy[0], np.sqrt(max(size2 / 2 - root, 0.0)), count
+
+
+@compiled()
+def _nearest(
+    x: float, y: float, reach: float, px: np.ndarray, head: np.ndarray, after: np.ndarray, grid: np.ndarray, owner: np.ndarray
+) -> int:
+    """Nearest free spot within reach of (x, y), -1 if there is none."""
+    x0, y0, cell, columns, rows = grid
+    best, best2 = -1, reach * reach
+    for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), int(rows) - 1) + 1):
+        for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), int(columns) - 1) + 1):
+            k = head[cy * int(columns) + cx]
+            while k >= 0:
+                d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
+                if owner[k] < 0 and d2 < best2:
+                    best, best2 = k, d2
+                k = after[k]
+    return best
+
+
+@compiled()
+def _cells(px: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Spots by square cell: first spot of each cell, next spot in the same cell, and (x0, y0, cell, columns, rows)."""
+    x0, y0 = px[:, 0].min(), px[:, 1].min()
+    columns, rows = int((px[:, 0].max() - x0) / cell) + 1, int((px[:, 1].max() - y0) / cell) + 1
+    head, after = np.full(columns * rows, -1), np.full(len(px), -1)
+    for k in range(len(px)):
+        c = int((px[k, 1] - y0) / cell) * columns + int((px[k, 0] - x0) / cell)
+        after[k] = head[c]
+        head[c] = k
+    return head, after, np.array([x0, y0, cell, columns, rows])
+
+
+@compiled()
+def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndarray, cell: float) -> np.ndarray:
+    """A labelling: the spot (M,) of each place of a lattice, -1 for none.
+
+    Parameters
+    ----------
+    lattice : (M, 2) float
+        Neighbouring places are about 1 apart.
+    around : (M, k) int
+        Places around each place, the nearest first.
+    px : (K, 2) float
+        The spots.
+    start : (M,) int
+        First labels, at least three, not on a line.
+    cell : float
+        Side, px, of the cells by which spots are looked up: about their spacing.
+    """
+    n = len(lattice)
+    spot = start.copy()
+    owner = np.full(len(px), -1)
+    for i in range(n):
+        if spot[i] >= 0:
+            owner[spot[i]] = i
+    head, after, grid = _cells(px, cell)
+    claim, claimed = np.full(len(px), -1), np.zeros(len(px))
+    near = min(NEAR, around.shape[1])
+    for round_ in range(ROUNDS):
+        for level in range(len(GATES)):
+            tried = np.zeros(n, np.int64)
+            growing = True
+            while growing:
+                growing = False
+                claim[:] = -1
+                for i in range(n):
+                    if spot[i] >= 0:
+                        continue
+                    touching = 0
+                    for k in range(near):
+                        touching += spot[around[i, k]] >= 0
+                    if touching < 2:
+                        continue
+                    labelled = 0
+                    for k in range(around.shape[1]):
+                        labelled += spot[around[i, k]] >= 0
+                    if labelled < LEAST_AROUND[level] or labelled == tried[i]:
+                        continue
+                    tried[i] = labelled
+                    x, y, spacing, count = predict_place(i, lattice, around, spot, px)
+                    if count == 0:
+                        continue
+                    k = _nearest(x, y, GATES[level] * spacing, px, head, after, grid, owner)
+                    if k >= 0:
+                        miss = ((px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2) / spacing**2
+                        if claim[k] < 0 or miss < claimed[k]:
+                            claim[k], claimed[k] = i, miss
+                for k in range(len(px)):
+                    if claim[k] >= 0:
+                        spot[claim[k]], owner[k] = k, claim[k]
+                        growing = True
+        if round_ == ROUNDS - 1:
+            break
+        kept = spot.copy()
+        for i in range(n):
+            if spot[i] >= 0:
+                x, y, spacing, count = predict_place(i, lattice, around, spot, px)
+                if count == 0 or (px[spot[i], 0] - x) ** 2 + (px[spot[i], 1] - y) ** 2 > (FINAL_GATE * spacing) ** 2:
+                    kept[i] = -1
+        if np.array_equal(kept, spot):
+            break
+        for i in range(n):
+            if spot[i] >= 0 and kept[i] < 0:
+                owner[spot[i]] = -1
+        spot = kept
+    return spot
+
+
+def seen_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """Places (M, 2), px, of a labelled lattice: those of the spots, else as predicted from labelled places; NaN where nothing tells.
+
+    A predicted place outside the frame is given as well: it tells that the frame cuts a pin off.
+    """
+    out = np.full((len(lattice), 2), np.nan)
+    for i in range(len(lattice)):
+        if spot[i] >= 0:
+            out[i] = px[spot[i]]
+        else:
+            x, y, _, count = predict_place(i, lattice, around, spot, px)
+            if count and -size_px[0] < x < 2 * size_px[0] and -size_px[1] < y < 2 * size_px[1]:
+                out[i] = x, y
+    return out

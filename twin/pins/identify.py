@@ -1,0 +1,534 @@
+"""Which layout of pins frames show, when nothing is known but the frames.
+
+Every family of layouts (rings, hexagon, grid) labels the pin-like spots of each frame by its lattice (`twin.pins.families`). The part of
+the lattice that holds them is a candidate. A candidate is judged by what it leaves unexplained: pins that should be in view but are not
+seen, and pin-like spots that are none of its pins, at its rim or just beyond too. So a layout that is one ring too small, or too large,
+explains less than the right one, and is never taken for it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scenes.pins import PinsSpec
+from twin.errors import FrameError
+from twin.geometry.pins import pin_lattice
+from twin.pins.bumps import Bumps, find_bumps
+from twin.pins.families import Family, family, family_of_positions, label_spots
+from twin.pins.growth import seen_places
+from twin.pins.matching import match
+from twin.pins.reference import make_reference
+from twin.progress import Step
+
+SIZES = tuple(0.003 * 1.4**k for k in range(8))
+"""Sizes of spots that are looked for: sd of a Gaussian, as a share of the frame's longer side. A cap is about three sds wide."""
+SIZED_ON = 3
+"""Frames on which the size is found."""
+FAMILIES = ("rings", "hexagon", "grid")
+FULL_RING = 0.5
+"""A ring, row or column belongs to the layout if at least this share of its places in view are seen."""
+LIKE_ITS_NEIGHBOURS = 0.45
+"""A spot is pin-like if it is at least this share as high as the pins around it."""
+BEYOND = 1.25
+"""Spots count as left over up to this many spacings from the nearest pin."""
+IN_VIEW = 1.0
+"""A pin is in view if it is at least this many sds of its spot inside the frame."""
+STEADY = 0.5
+"""A pin is in the rest layout if it was seen in this share of the frames."""
+NEVER_SEEN = 0.1
+"""A pin in view that is seen in less than this share of the frames is missing."""
+MOST_MISSING = 0.05
+"""Largest share of missing pins that a layout may have."""
+SHOWN = 0.9
+"""A frame shows a layout that explains at least this share of what is there."""
+AROUND = 6
+"""Pins around a spot that it is compared with."""
+MOST_GUESSES = 3
+"""Layouts that are matched to all frames."""
+NO_LAYOUT = (
+    "check focus and light, crop the frames to the sensor, give frames with less contact, or give the pins' places (layout = 'positions')"
+)
+SURE_EXPLAINED, SURE_AHEAD, SURE_AGREEING = 0.95, 0.04, 0.75
+"""A layout is sure if it explains at least the first share of what is there, as much more as the second than the next layout, and is
+that of at least the third share of the frames."""
+SAME_SHAPE = 0.8
+"""Two layouts that explain alike differ in shape: the ratio of their misfits to a smooth view must be below this to be sure."""
+LEAST_EXPLAINED = 0.6
+"""A candidate that explains less than this is none."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A layout's pins in one frame.
+
+    Attributes
+    ----------
+    pins_px : (N, 2) float
+        Places of the spots, NaN where there is none.
+    places_px : (N, 2) float
+        The same, and the predicted places of the others; NaN where nothing tells.
+    not_seen : int
+        Pins in view without a spot.
+    left_over_px : (k, 2) float
+        Pin-like spots that are none of the pins.
+    """
+
+    pins_px: np.ndarray
+    places_px: np.ndarray
+    not_seen: int
+    left_over_px: np.ndarray
+
+    @property
+    def explained(self) -> float:
+        """Share of pins in view and pin-like spots that are one another's."""
+        pins = int(np.isfinite(self.pins_px[:, 0]).sum())
+        return pins / max(pins + self.not_seen + len(self.left_over_px), 1)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A layout that frames may show.
+
+    Attributes
+    ----------
+    pins : PinsSpec
+        Layout, and pins that are missing; size of pins and caps are the defaults.
+    explained : float
+        Median share of the frames' pins and pin-like spots that it explains.
+    agreeing : float
+        Share of the frames that show the layout by at least ``SHOWN``.
+    not_seen, left_over : float
+        Median number, over the frames, of its pins in view that are not seen, and of pin-like spots that are none of its pins.
+    misfit : float
+        Rms distance of the pins at rest from the smoothest view of the layout, in spacings.
+    rest_px : (N, 2) float
+        Median place of each pin over the frames.
+    there : (N,) float
+        Share of the frames in which each pin is seen.
+    seen : tuple of Seen
+        What each frame shows of it.
+    """
+
+    pins: PinsSpec
+    explained: float
+    agreeing: float
+    not_seen: float
+    left_over: float
+    misfit: float
+    rest_px: np.ndarray
+    there: np.ndarray
+    seen: tuple[Seen, ...]
+
+    def line(self) -> str:
+        """The candidate in words."""
+        return (
+            f"{self.pins.in_words()}: explains {100 * self.explained:.1f} % of what is there; a frame has {self.not_seen:g} of its pins "
+            f"unseen and {self.left_over:g} pin-like spots besides (medians)"
+        )
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What frames say of their sensor's layout.
+
+    Attributes
+    ----------
+    candidates : tuple of Candidate
+        The likeliest first; at least one.
+    sure : bool
+    doubts : tuple of str
+        Why it is not sure, and what would decide.
+    sigma_px : float
+        Size of the spots, px of the frame: sd of the Gaussian that fits them best.
+    """
+
+    candidates: tuple[Candidate, ...]
+    sure: bool
+    doubts: tuple[str, ...]
+    sigma_px: float
+
+    @property
+    def best(self) -> Candidate:
+        return self.candidates[0]
+
+
+Look = Callable[[Bumps], Seen | None]
+"""What a frame's spots show."""
+
+
+def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Identified:
+    """The layout that gray frames (H, W) uint8 of one sensor show, in contact or not.
+
+    Each frame is labelled by itself first. The layouts found in most frames are then matched to every frame from where most frames have
+    their pins, so that a frame in which a contact hides the layout's middle counts too.
+
+    Raises
+    ------
+    FrameError
+        No frame shows a layout.
+    """
+    looks: list[Look] = [partial(_family_look, family(name)) for name in FAMILIES]
+    sizes = [_best_size(images[k], looks) for k in spread(len(images), SIZED_ON)]
+    if not any(sizes):
+        raise FrameError(f"none of {len(images)} frames shows pins in rings, a hexagon or a grid; {NO_LAYOUT}")
+    sigma = float(np.median([size for size in sizes if size]))
+    spots = [find_bumps(image, sigma) for image in images]
+    found: list[tuple[PinsSpec, list[Seen]]] = []
+    for k, name in enumerate(FAMILIES):
+        found += _first_guesses(family(name), spots)
+        if progress:
+            progress(k + 1, 2 * len(FAMILIES))
+    found = [guess for guess in found if np.median([one.explained for one in guess[1]]) >= LEAST_EXPLAINED]
+    found.sort(key=lambda guess: -sum(one.explained for one in guess[1]))
+    candidates = []
+    for k, (pins, seen) in enumerate(found[:MOST_GUESSES]):
+        candidates.append(_candidate(pins, seen, spots))
+        if progress:
+            progress(MOST_GUESSES + k, 2 * MOST_GUESSES)
+    candidates = sorted((c for c in candidates if c.explained >= LEAST_EXPLAINED), key=lambda c: -_merit(c))
+    if not candidates:
+        raise FrameError(f"none of {len(images)} frames shows a whole layout of pins; {NO_LAYOUT}")
+    doubts = _doubts(candidates)
+    return Identified(tuple(candidates), not doubts, tuple(doubts), sigma)
+
+
+def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
+    """How well a given layout explains gray frames (H, W) uint8; None where no frame shows it. Missing pins are taken as given."""
+    by = family_of_positions(pins) if pins.layout == "positions" or pins.missing else family(pins.layout)
+    look = partial(_layout_look, pins, by)
+    sizes = [size for k in spread(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
+    if not sizes:
+        return None
+    spots = [find_bumps(image, float(np.median(sizes))) for image in images]
+    seen = [shown for one in spots if (shown := look(one)) is not None]
+    return _candidate(pins, seen, spots, may_miss=False) if seen else None
+
+
+def spread(count: int, wanted: int) -> list[int]:
+    """At most ``wanted`` of ``count`` indices, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int)).tolist()
+
+
+def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:
+    """The size of spots by which most pins are seen, and fewest are missed or left over; None where nothing is seen."""
+    best, most = None, 0
+    for size in (share * max(image.shape) for share in SIZES):
+        spots = find_bumps(image, size)
+        for look in looks:
+            seen = look(spots)
+            if seen is not None:
+                score = int(np.isfinite(seen.pins_px[:, 0]).sum()) - seen.not_seen - len(seen.left_over_px)
+                if score > most:
+                    best, most = size, score
+    return best
+
+
+def _family_look(by: Family, spots: Bumps) -> Seen | None:
+    """The part of a family's lattice that a frame shows by itself; None if it shows none."""
+    spot = label_spots(spots, by)
+    part = None if spot is None else _part(by, spots, spot)
+    return None if part is None else part[1]
+
+
+def _layout_look(pins: PinsSpec, by: Family, spots: Bumps) -> Seen | None:
+    """A given layout in a frame by itself; None where it is not seen."""
+    spot = label_spots(spots, by)
+    return None if spot is None else _as_layout(pins, by, spots, spot)
+
+
+def _seen(spots: Bumps, spot: np.ndarray, by: Family, nodes: np.ndarray) -> Seen:
+    """What a labelled frame shows of the part ``nodes`` (N,) of a lattice."""
+    places = seen_places(by.lattice, by.around, spots.px, spot, spots.size_px)[nodes]
+    return _told(spots, spot[nodes], places)
+
+
+def _told(spots: Bumps, spot: np.ndarray, places: np.ndarray) -> Seen:
+    """What a frame shows: the spot (N,) of each pin, -1 for none, and the pins' places (N, 2)."""
+    there, taken = spot >= 0, spot[spot >= 0]
+    others = np.setdiff1d(np.arange(len(spots.px)), taken)
+    left_over = np.zeros(0, int)
+    if len(taken) > AROUND and len(others):
+        tree = cKDTree(spots.px[taken])
+        spacing = np.median(tree.query(spots.px[taken], k=4)[0][:, 1:], axis=1)
+        distance, nearest = tree.query(spots.px[others], k=AROUND)
+        near = distance[:, 0] < BEYOND * spacing[nearest[:, 0]]
+        high = spots.response[others] > LIKE_ITS_NEIGHBOURS * np.median(spots.response[taken][nearest], axis=1)
+        left_over = others[near & high]
+    not_seen = int((_in_frame(places, spots) & ~there).sum())
+    return Seen(np.where(there[:, None], places, np.nan), places, not_seen, spots.px[left_over])
+
+
+def _in_frame(places: np.ndarray, spots: Bumps) -> np.ndarray:
+    """Which places (n, 2), NaN where unknown, lie in the frame as a whole."""
+    margin = IN_VIEW * spots.sigma_px
+    with np.errstate(invalid="ignore"):
+        inside: np.ndarray = np.all((places >= margin) & (places <= np.array(spots.size_px) - 1 - margin), axis=1)
+    return inside
+
+
+def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[Seen]]]:
+    """The two layouts of one family that frames, each by itself, show most."""
+    votes: dict[tuple[int, ...], list[Seen]] = {}
+    for one in spots:
+        spot = label_spots(one, by)
+        if spot is not None and (part := _part(by, one, spot)) is not None:
+            votes.setdefault(part[0], []).append(part[1])
+    ranked = sorted(votes, key=lambda size: -sum(seen.explained for seen in votes[size]))
+    return [(_layout_of(by, size), votes[size]) for size in ranked[:2]]
+
+
+def _layout_of(by: Family, size: tuple[int, ...]) -> PinsSpec:
+    """The layout of a family with this number of rings, or of columns and rows."""
+    if by.name == "grid":
+        return PinsSpec(layout="grid", columns=size[0], rows=size[1])
+    return PinsSpec(layout="rings" if by.name == "rings" else "hexagon", rings=size[0])
+
+
+def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, ...], Seen] | None:
+    """The part of a lattice that a frame shows: its number of rings, or of columns and rows, and what is seen of it."""
+    if by.name == "grid":
+        part = _rectangle(by, spots, spot)
+        return None if part is None else (part[0], _seen(spots, spot, by, part[1]))
+    middle, rings = (0, _rings(by, spots, spot)) if by.name == "rings" else _hexagon(by, spots, spot)
+    return ((rings,), _seen(spots, spot, by, _ring_nodes(by, middle, rings))) if rings else None
+
+
+def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> Seen | None:
+    """A given layout of a family in a labelled frame, where it explains most; None where it does not fit in."""
+    if by.name == "positions":
+        return _seen(spots, spot, by, np.arange(len(by.lattice)))
+    if by.name == "rings":
+        return _seen(spots, spot, by, _ring_nodes(by, 0, pins.rings or 0)) if (pins.rings or 0) <= by.ring.max() else None
+    if by.name == "hexagon":
+        middle = _best_middle(by, spot, pins.rings or 0)
+        return None if middle is None else _seen(spots, spot, by, _ring_nodes(by, middle, pins.rings or 0))
+    nodes = _best_rectangle(by, spot, pins.columns or 0, pins.rows or 0)
+    return None if nodes is None else _seen(spots, spot, by, nodes)
+
+
+def _in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:
+    """Which places (M,) of a lattice lie in the frame, as far as that can be told."""
+    return _in_frame(seen_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)
+
+
+def _rings(by: Family, spots: Bumps, spot: np.ndarray) -> int:
+    """Number of rings that are seen, from the middle outwards."""
+    in_view = _in_view(by, spots, spot)
+    rings = 0
+    for ring in range(1, int(by.ring.max()) + 1):
+        here = by.ring == ring
+        there = (spot >= 0) & here
+        if there.sum() < FULL_RING * max((in_view & here).sum(), 1) or there.sum() < 2:
+            break
+        rings = ring
+    return rings
+
+
+def _hexagon(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[int, int]:
+    """Middle place and number of rings of the hexagon that holds most labels and fewest empty places in view."""
+    taken = np.flatnonzero(spot >= 0)
+    empty = np.flatnonzero((spot < 0) & _in_view(by, spots, spot))
+    q, labelled, bare = _axial(by.lattice), _axial(by.lattice[taken]), _axial(by.lattice[empty])
+    best, most, rings = 0, -np.inf, 0
+    for middle in taken:
+        widest = int(by.ring.max() - by.ring[middle]) + 1
+        full = np.bincount(_steps(labelled - q[middle]), minlength=widest)[:widest]
+        hollow = np.bincount(_steps(bare - q[middle]), minlength=widest)[:widest]
+        gain = np.cumsum(full - hollow)
+        r = int(gain.argmax())
+        if gain[r] > most:
+            best, most, rings = int(middle), float(gain[r]), r
+    return best, rings
+
+
+def _best_middle(by: Family, spot: np.ndarray, rings: int) -> int | None:
+    """Middle of the hexagon of this many rings that holds most labels; None if it does not fit in the lattice."""
+    taken = np.flatnonzero(spot >= 0)
+    q, labelled = _axial(by.lattice), _axial(by.lattice[taken])
+    fitting = [m for m in taken if by.ring[m] + rings <= by.ring.max()]
+    if not fitting:
+        return None
+    return int(max(fitting, key=lambda m: int((_steps(labelled - q[m]) <= rings).sum())))
+
+
+def _axial(places: np.ndarray) -> np.ndarray:
+    """Whole coordinates (n, 2) of places of a triangular lattice with neighbours at distance 1, the first axis along x."""
+    r = places[:, 1] / (np.sqrt(3) / 2)
+    return np.round(np.column_stack([places[:, 0] - r / 2, r])).astype(int)
+
+
+def _steps(axial: np.ndarray) -> np.ndarray:
+    """Distance (n,) in steps over a triangular lattice."""
+    return np.max(np.abs(np.column_stack([axial, axial.sum(axis=1)])), axis=1)
+
+
+def _ring_nodes(by: Family, middle: int, rings: int) -> np.ndarray:
+    """Places of a lattice, in the order of a specification with this many rings about a middle."""
+    count = 1 + 3 * rings * (rings + 1)
+    if middle == 0:
+        return np.arange(count)
+    distance, node = cKDTree(by.lattice).query(by.lattice[:count] + by.lattice[middle])
+    return np.where(distance < 0.1, node, middle)
+
+
+def _rectangle(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, int], np.ndarray] | None:
+    """Columns and rows of the rectangle that holds most labels and fewest empty places, and its places."""
+    side = int(round(np.sqrt(len(by.lattice))))
+    there = (spot >= 0).reshape(side, side)
+    gain = np.where(there, 1, np.where(_in_view(by, spots, spot).reshape(side, side), -1, 0))
+    sums = np.pad(gain.cumsum(axis=0), ((1, 0), (0, 0)))
+    best, most = None, 0
+    rows = np.flatnonzero(there.any(axis=1))
+    for top in rows:
+        for bottom in rows[rows > top]:
+            line = sums[bottom + 1] - sums[top]  # the best run of columns (Kadane)
+            run, first = 0, 0
+            for column in range(side):
+                if run <= 0:
+                    run, first = 0, column
+                run += int(line[column])
+                if run > most and column > first:
+                    best, most = (top, bottom, first, column), run
+    if best is None:
+        return None
+    top, bottom, left, right = best
+    y, x = np.mgrid[top : bottom + 1, left : right + 1]
+    return (int(right - left + 1), int(bottom - top + 1)), (y * side + x).ravel()
+
+
+def _best_rectangle(by: Family, spot: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
+    """Places of the rectangle of this size that holds most labels; None if it is larger than the lattice."""
+    side = int(round(np.sqrt(len(by.lattice))))
+    if max(columns, rows) > side:
+        return None
+    there = np.pad((spot >= 0).reshape(side, side).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    held = there[rows:, columns:] - there[:-rows, columns:] - there[rows:, :-columns] + there[:-rows, :-columns]
+    top, left = np.unravel_index(held.argmax(), held.shape)
+    y, x = np.mgrid[top : top + rows, left : left + columns]
+    return (y * side + x).ravel()
+
+
+def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss: bool = True) -> Candidate:
+    """A layout with what all frames show of it, from what some frames, each by itself, show of it."""
+    rest = _rest(pins, _turned_alike(pins, seen))
+    again = [_matched(pins, rest, one) for one in spots]
+    good = [k for k, one in enumerate(again) if one.explained > LEAST_EXPLAINED]
+    if good:
+        rest = _rest(pins, [again[k] for k in good])
+        again = [_matched(pins, rest, one) for one in spots]
+    there = np.mean([np.isfinite(one.pins_px[:, 0]) for one in again], axis=0)
+    in_view = np.mean([_in_frame(one.places_px, a) for one, a in zip(again, spots, strict=True)], axis=0) > STEADY
+    never = np.flatnonzero((there < NEVER_SEEN) & in_view)
+    if may_miss and not pins.missing and len(spots) > 1 and 0 < len(never) <= MOST_MISSING * pins.count:
+        kept = np.setdiff1d(np.arange(pins.count), never)
+        less = PinsSpec.model_validate(pins.model_dump() | {"missing": tuple(never.tolist())})
+        return _candidate(less, [replace(one, pins_px=one.pins_px[kept], places_px=one.places_px[kept]) for one in again], spots)
+    share = np.array([one.explained for one in again])
+    return Candidate(
+        pins,
+        float(np.median(share)),
+        float(np.mean(share >= SHOWN)),
+        float(np.median([one.not_seen for one in again])),
+        float(np.median([len(one.left_over_px) for one in again])),
+        _misfit(pins, rest),
+        rest,
+        there,
+        tuple(again),
+    )
+
+
+def _rest(pins: PinsSpec, seen: list[Seen]) -> np.ndarray:
+    """Places (N, 2), px, of the pins as most frames have them; those seen in too few frames as the others let expect."""
+    pins_px, places = np.stack([one.pins_px for one in seen]), np.stack([one.places_px for one in seen])
+    rest = np.full(places.shape[1:], np.nan)
+    anywhere, steady = np.isfinite(places[:, :, 0]).any(axis=0), np.isfinite(pins_px[:, :, 0]).mean(axis=0) >= STEADY
+    for chosen, known in ((places, anywhere), (pins_px, steady)):
+        rest[known] = np.nanmedian(chosen[:, known], axis=0)
+    return np.where(np.isfinite(rest), rest, smooth_view(pin_lattice(pins).places, rest))
+
+
+def _matched(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> Seen:
+    """What a frame shows of a layout whose pins at rest are known."""
+    found = match(make_reference(rest_px, pins), spots.px, np.ones(len(spots.px)))
+    places = np.where((found.blob >= 0)[:, None], spots.px[found.blob] if len(spots.px) else np.nan, found.predicted_px)
+    return _told(spots, found.blob, np.where(np.isfinite(places), places, rest_px))
+
+
+def symmetries(pins: PinsSpec) -> list[np.ndarray]:
+    """Orders (N,) of the pins under which a layout looks the same after a turn, the unchanged one first."""
+    places = pin_lattice(pins).places
+    if pins.layout == "grid" and pins.row_distance == 1 and pins.columns == pins.rows:
+        turns = 4
+    else:
+        turns = {"rings": 6, "hexagon": 6, "grid": 2}.get(pins.layout, 1)
+    orders = []
+    for k in range(turns):
+        turn = np.exp(2j * np.pi * k / turns)
+        turned = places @ np.array([[turn.real, turn.imag], [-turn.imag, turn.real]])
+        distance, order = cKDTree(turned).query(places)
+        if distance.max() < 1e-6:
+            orders.append(order)
+    return orders
+
+
+def _turned_alike(pins: PinsSpec, seen: list[Seen]) -> list[Seen]:
+    """The same with each frame's labels turned as the fullest frame's are: a layout looks the same after a part of a turn."""
+    orders = symmetries(pins)
+    guide = max(seen, key=lambda one: one.explained).places_px
+    out = []
+    for one in seen:
+        with np.errstate(invalid="ignore"):
+            away = [np.linalg.norm(one.places_px[order] - guide, axis=1) for order in orders]
+        order = orders[int(np.argmin([np.median(a[np.isfinite(a)]) if np.isfinite(a).any() else np.inf for a in away]))]
+        out.append(replace(one, pins_px=one.pins_px[order], places_px=one.places_px[order]))
+    return out
+
+
+def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """The pins (N, 2), px, where a smooth view of the layout's places (N, 2) has them, fitted to pins (N, 2), NaN where unknown.
+
+    The view is a polynomial of the third degree with radial terms of the fifth: it holds a camera's place, turn, tilt and distortion, and
+    the dome's projection.
+    """
+    known = np.isfinite(px[:, 0])
+    x, y = places.T
+    r2 = x * x + y * y
+    one = np.ones_like(x)
+    terms = np.column_stack([one, x, y, x * x, x * y, y * y, x * r2, y * r2, x * r2 * r2, y * r2 * r2])
+    solved = np.linalg.lstsq(terms[known], px[known], rcond=None)[0]
+    return terms @ solved
+
+
+def _misfit(pins: PinsSpec, rest_px: np.ndarray) -> float:
+    """Rms distance of pins (N, 2) from the smooth view of their layout, in their median spacing."""
+    known = np.isfinite(rest_px[:, 0])
+    if known.sum() < 12:
+        return np.inf
+    away = np.linalg.norm(rest_px - smooth_view(pin_lattice(pins).places, rest_px), axis=1)[known]
+    spacing = float(np.median(cKDTree(rest_px[known]).query(rest_px[known], k=2)[0][:, 1]))
+    return float(np.sqrt(np.mean(away**2)) / max(spacing, 1e-9))
+
+
+def _merit(candidate: Candidate) -> float:
+    """How good a candidate is: what it explains, how many frames agree, and how smooth a view it takes."""
+    return candidate.explained + 0.1 * candidate.agreeing - 0.2 * min(candidate.misfit, 1.0)
+
+
+def _doubts(found: list[Candidate]) -> list[str]:
+    """Why the first candidate is not sure, and what would decide; nothing if it is."""
+    best, doubts = found[0], []
+    if best.explained < SURE_EXPLAINED:
+        doubts.append(
+            f"{best.pins.in_words()} explain only {100 * best.explained:.1f} % of the pins in view and pin-like spots; "
+            "look at the overlay: are these all pins? Better light, focus, or frames with less contact decide"
+        )
+    if best.agreeing < SURE_AGREEING:
+        doubts.append(f"only {100 * best.agreeing:.0f} % of the frames show {best.pins.in_words()}; give frames with less contact")
+    for other in found[1:]:
+        if other.explained > best.explained - SURE_AHEAD and (other.misfit == np.inf or best.misfit > SAME_SHAPE * other.misfit):
+            doubts.append(f"{other.pins.in_words()} explain nearly as much; count the pins of one ring or row, and give the layout")
+            break
+    return doubts

@@ -14,9 +14,9 @@ from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.charts import save_figure
 from twin.report.plots import Look, contact_panel
-from twin.report.skin3d import displaced_skin, draw_contact_skin
+from twin.report.skin3d import displaced_skin, draw_contact_skin, write_surface
 from twin.simulator import Shot, Simulator
-from twin.store import made_by, write_by, write_json, write_npz, writes
+from twin.store import made_by, write_json, write_npz, writes
 from twin.types import ContactState, FloatArray, Form
 
 FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
@@ -112,7 +112,7 @@ def write_contact(out: Path, simulator: Simulator, touched: ObjectSpec, pose: Po
     write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, touched, pose])})
 
     mesh = simulator.solver.mesh
-    write_by(out / "skin.vtp", displaced_skin(mesh, state).save)
+    write_surface(out / "skin.vtp", displaced_skin(mesh, state))
     draw_contact_skin(mesh, spec.pins, state, build_field(touched), out / "skin.png")
     look = look_at(simulator, shot)
     title = f"{spec.name} against {touched.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"

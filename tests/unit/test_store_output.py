@@ -3,16 +3,20 @@
 import errno
 import json
 import os
+import resource
 import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+import pyvista as pv
 
 from twin.cli import main
 from twin.errors import StoreError
-from twin.store import contents, locked, output, output_file, overwriting, write_by, write_text, writes, writes_file, written_by_us
+from twin.report.skin3d import write_surface
+from twin.store import contents, locked, output, output_file, overwriting, write_text, writes, writes_file, written_by_us
 from twin.store.output import WRITTEN
 
 NAMES = ("table.csv", "page.html", "pictures")
@@ -206,19 +210,23 @@ def test_a_function_that_is_to_write_has_the_parameter(tmp_path: Path) -> None:
         writes("a", to="nowhere")(work)
 
 
-def test_a_file_written_by_its_path_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
-    path = write_by(tmp_path / "skin.vtp", lambda part: part.write_text("whole"))
-    assert path.read_text() == "whole"
+def test_a_surface_is_there_whole_or_not_at_all_and_a_full_disk_ends_no_process(tmp_path: Path) -> None:
+    """VTK's own writer ends the process by a segmentation fault where the disk is full."""
+    surface = pv.Sphere()
+    surface.point_data["displacement_mm"] = np.linspace(0, 1, surface.n_points)
+    path = write_surface(tmp_path / "skin.vtp", surface)
+    whole, read = path.read_bytes(), pv.read(path)
+    assert np.array_equal(read.points, surface.points) and np.array_equal(read.faces, surface.faces)
+    assert np.array_equal(read.point_data["displacement_mm"], surface.point_data["displacement_mm"])
 
-    def fails(part: Path) -> None:
-        part.write_text("half")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    for save in (fails, lambda part: None):  # the second is VTK, which writes nothing and raises nothing
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+    try:
         with pytest.raises(StoreError, match=r"skin\.vtp: can't be written"):
-            write_by(path, save)
-        assert path.read_text() == "whole"
-        assert contents(tmp_path) == [path.name]
+            write_surface(path, surface)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.read_bytes() == whole and contents(tmp_path) == [path.name]
 
 
 def test_a_full_standard_output_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

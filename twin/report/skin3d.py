@@ -20,7 +20,7 @@ from scenes.sensor import PinsSpec
 from twin.geometry.mesh import SensorMesh, skin_surface
 from twin.objects import ObjectField
 from twin.report.charts import save_figure
-from twin.store import write_bytes
+from twin.store import write_bytes, write_text
 from twin.types import ContactState
 
 # Box of the sensor frame that the picture shows: x0, x1, y0, y1, z0, z1, mm.
@@ -40,6 +40,23 @@ def displaced_skin(mesh: SensorMesh, state: ContactState) -> pv.PolyData:
     moved = state.nodes_mm - mesh.nodes_mm
     data = {"displacement_mm": np.linalg.norm(moved, axis=1), "displacement_xyz_mm": moved}
     return skin_surface(mesh, nodes_mm=state.nodes_mm, point_data=data)
+
+
+def write_surface(path: Path, surface: pv.PolyData) -> Path:
+    """Write a surface and its data as a ``.vtp`` file, and return the path.
+
+    VTK gives the content as text and writes no file itself, because on a full disk it kills the whole process.
+
+    Raises
+    ------
+    StoreError
+        The file cannot be written.
+    """
+    writer = pv.XMLPolyDataWriter(path, surface)
+    writer.data_format = "binary"  # base64
+    writer.writer.WriteToOutputStringOn()
+    writer.write()
+    return write_text(path, writer.writer.GetOutputString())
 
 
 def pins_surface(pins: PinsSpec, state: ContactState) -> pv.PolyData:
@@ -72,7 +89,7 @@ def draw_skin(skin: pv.PolyData, pins: pv.PolyData, touched: pv.PolyData, path: 
     """
     with tempfile.TemporaryDirectory() as folder:
         for name, surface in (("skin", skin), ("pins", pins), ("object", touched)):
-            surface.save(Path(folder) / f"{name}.vtp")
+            write_surface(Path(folder) / f"{name}.vtp", surface)
         drawn = Path(folder) / "drawn.png"
         reason = _run_child(folder, str(drawn))
         if not reason:
@@ -86,7 +103,7 @@ def probe_offscreen() -> str:
     """Empty if VTK can draw without a window on this machine, else the reason why not."""
     with tempfile.TemporaryDirectory() as folder:
         for name in ("skin", "pins", "object"):
-            pv.Sphere().save(Path(folder) / f"{name}.vtp")
+            write_surface(Path(folder) / f"{name}.vtp", pv.Sphere())
         return _run_child(folder, str(Path(folder) / "probe.png"))
 
 

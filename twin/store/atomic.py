@@ -15,7 +15,6 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 import numpy as np
@@ -98,20 +97,6 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool 
     """Write arrays by name in the format that ``np.load`` reads; raises as ``write_with``."""
     save: Callable[..., None] = np.savez_compressed if compressed else np.savez
     return write_with(path, lambda file: save(file, **arrays))
-
-
-def write_by(path: Path, save: Callable[[Path], object]) -> Path:
-    """Write a file by a function that takes a path and no open file; errors as of ``write_with``."""
-    try:
-        with TemporaryDirectory(prefix=".", suffix=PART, dir=path.parent) as folder:
-            part = Path(folder) / path.name
-            save(part)
-            if not part.is_file():  # VTK prints its errors and raises none
-                raise StoreError(f"{path}: can't be written; {_ANY_REMEDY}")
-            os.replace(part, path)
-    except OSError as error:
-        raise unwritten(path, error) from error
-    return path
 
 
 def replace_folder(part: Path, path: Path) -> Path:

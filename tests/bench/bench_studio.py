@@ -25,7 +25,7 @@ def start(sensor: str, touched: str, out: Path) -> tuple[subprocess.Popen, str, 
     """A studio in a process of its own, its address, and the time in s until it said it."""
     begun = time.monotonic()
     code = "from twin.cli import main; main()"
-    command = [sys.executable, "-c", code, "studio", "--sensor", sensor, "--object", touched, "--out", str(out)]
+    command = [sys.executable, "-c", code, "studio", "--sensor", sensor, "--object", touched, "--saves", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     for line in process.stdout:
         if found := re.search(r"http://\S+", line):

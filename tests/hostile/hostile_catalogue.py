@@ -179,6 +179,7 @@ READ_FRAMES = {  # with the exit codes that are right where one picture of four 
     "check": (f"check {{data}} {S}", (DONE, REFUSED, BAD_SENSOR)),
     "tune": (f"tune {S} --frames {{data}} --out {{out}}/mine.toml --limit 4", ANY),
     "live": (f"live --model {SENSOR} --camera {{data}} --headless", (DONE,)),
+    "new": ("new {data} --out {out}/mine.toml --limit 4", ANY),
 }
 READ_RAW = {
     "realism": f"realism {{data}} {U} --out {{out}} --limit 2 --quality preview --no-two-sample",
@@ -282,6 +283,11 @@ READ_SPECIFICATIONS = {
         f"collect --camera twin --arm simulated {S} --limits {{spec}} --count 1 --out {{out}}",
     ),
     "emulate camera": ("emulate camera --arm mg400:127.0.0.1 --sensor {spec} --object plane",),
+    "studio": (
+        "studio --sensor {spec} --seconds 1 --plain",
+        f"studio {S} --object {{spec}} --seconds 1",
+        "studio --state {spec} --seconds 1",
+    ),
     "study servo": (f"study servo --model {SENSOR} --objects {{spec}} --out {{out}}",),
     "study objects": (f"study objects {S} --experiment {{spec}} --out {{out}}",),
     "study sim-to-real": (f"study sim-to-real {S} --frames {{recording}} --experiment {{spec}} --out {{out}}",),
@@ -526,8 +532,19 @@ def _numbers() -> list[Entry]:
 
 EVERY = (
     *("audit", "calibrate contact", "calibrate optics", "check", "collect", "dataset", "demo", "doctor", "emulate camera"),
-    *("emulate magician", "emulate mg400", "evaluate", "experiments", "graph", "live", "objects", "pack", "predict", "preprocess"),
-    *("randomisations", "realism", "render", "robustness", "sensors", "servo", "study objects", "study servo", "study sim-to-real"),
+    *("emulate magician", "emulate mg400", "evaluate", "experiments", "graph", "live", "new", "objects", "pack", "predict", "preprocess"),
+    *(
+        "randomisations",
+        "realism",
+        "render",
+        "robustness",
+        "sensors",
+        "servo",
+        "studio",
+        "study objects",
+        "study servo",
+        "study sim-to-real",
+    ),
     *("study tac-vgnn", "train", "tune", "validate"),
 )
 
@@ -541,6 +558,7 @@ WRITE = {
     "graph": f"graph {{frames}} {S} --out {{there}}",
     "pack": "pack {run} --out {there}",
     "tune": f"tune {S} --frames {{frames}} --out {{there}}/mine.toml --limit 2",
+    "new": "new {frames} --out {there}/mine.toml --limit 2",
     "dataset": f"dataset --experiment {{experiment}} {S} --count 1 --images none --across 6 --workers 1 --out {{there}}",
     "render": f"render {S} --object plane --indent-mm 1 --quality preview --out {{there}}",
     "realism": f"realism {{raw}} {U} --out {{there}} --limit 1 --quality preview --no-two-sample",
@@ -596,6 +614,7 @@ OVERWRITTEN = {  # files of the user's own in --out that a command of the same n
     "preprocess": ("pins.npz", "summary.json"),
     "graph": ("graph.npz", "graph.png"),
     "tune": ("mine.toml",),
+    "new": ("mine.toml",),
     "dataset": ("targets.csv", "meta.json", "generation.json"),
     "pack": ("config.json", "weights.safetensors"),
     "render": ("frame.png", "truth.json"),

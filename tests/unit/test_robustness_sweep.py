@@ -51,7 +51,7 @@ def shot_of(rest, gone=()):
 
 def found_of(detector, pins_px, extra=()):
     claims = np.concatenate([pins_px[np.isfinite(pins_px[:, 0])], np.reshape(extra, (-1, 2))])
-    return Found(claims, pins_px, detector.graph_of(pins_px) if np.isfinite(pins_px).all() else None, True)
+    return Found(claims, pins_px, detector.graph_of(pins_px) if np.isfinite(pins_px).all() else None, len(pins_px), True)
 
 
 def test_a_perfect_answer_is_perfect(detector, rest):

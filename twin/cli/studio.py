@@ -44,7 +44,7 @@ def studio(
     recording: Annotated[str, typer.Option("--recording", metavar="DIR", help="recording for the mode 'Recording'")] = "",
     camera: Annotated[str, typer.Option("--camera", metavar="C", help="camera for the mode 'Live', as 'twin live' takes it")] = "",
     arm: Annotated[str, typer.Option("--arm", metavar="A", help="arm for the mode 'Live'; read only until the page arms it")] = "",
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for what the page saves")] = Path("out/studio"),
+    saves: Annotated[Path, typer.Option("--saves", metavar="DIR", help="folder for what the page saves")] = Path("out/studio"),
     host: Annotated[str, typer.Option("--host", help="address to listen on; another one than this machine's is warned of")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="port of the page; the next free one if it is taken")] = 8090,
     plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay drawn")] = False,
@@ -56,7 +56,7 @@ def studio(
     from twin.studio.studio import StudioPlan, run_studio
 
     first = first_state(state, sensor, object_name)
-    plan = StudioPlan(first, out, host=host, port=port, traces=not plain, recording=recording, camera=camera, arm=arm, seconds=seconds)
+    plan = StudioPlan(first, saves, host=host, port=port, traces=not plain, recording=recording, camera=camera, arm=arm, seconds=seconds)
     say(plan.warnings)
     with signals_as_ctrl_c():
         run_studio(plan, models_when_asked(model), CameraFeed, on_open=tell_page)

@@ -64,10 +64,10 @@ class RandomisationSpec(Section):
         Share of the contacts in which the move is executed before the frame is taken.
     pin_noise_px : float
         Standard deviation of the noise that is added to the stored pins. Pictures have the camera's noise instead.
-        friction : FrictionSpread, optional
-            Without it every contact has the friction of the rig or of the object.
-        sensor : dict of str to Spread
-            The numbers of the sensor's specification that are drawn, by dotted key: material, geometry, camera, light, rig.
+    friction : FrictionSpread, optional
+        Without it every contact has the friction of the rig or of the object.
+    sensor : dict of str to Spread
+        The numbers of the sensor's specification that are drawn, by dotted key: material, geometry, camera, light, rig.
     """
 
     name: Name

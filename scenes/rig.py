@@ -21,9 +21,9 @@ class RigSpec(Section):
         lies in front of the centre; for a tool point at the tip it is minus the dome's radius.
     tcp_lateral_mm : float
         Distance from the tool point to the dome's centre along the direction across.
-        tcp_aside_mm : float
-            Distance from the tool point to the dome's centre along approach x across (the cross product). It matters only if the sensor is
-            turned out of the plane of approach and across.
+    tcp_aside_mm : float
+        Distance from the tool point to the dome's centre along approach x across (the cross product). It matters only if the sensor is
+        turned out of the plane of approach and across.
     turn_offset_deg : three numbers
         Added to ``pose_4..6``.
     turn_sign : 1 or -1

@@ -45,10 +45,10 @@ class ServoSpec(Section):
         Depths and angles that a sensor in contact can have. An estimate outside of them is not used, and the arm holds still.
     blind_mm : float
         Largest distance of the tool from the place at which the newest frame was exposed.
-        max_frame_age_s : float
-            Largest age of a frame that is used. If there is none so new, the arm stops and holds.
-        placement : PlacementSpec
-            The object's place.
+    max_frame_age_s : float
+        Largest age of a frame that is used. If there is none so new, the arm stops and holds.
+    placement : PlacementSpec
+        The object's place.
     """
 
     name: Name

@@ -38,9 +38,9 @@ class Ensemble:
     model : Model
     reference : Reference
         The pins at rest in training.
-        content : dict
-            As ``calibrate`` returns it and ``weights.pt`` holds it. If it has the key ``beside``, the arrays of a process of two
-            fidelities, this process is averaged with the labels in view 0.
+    content : dict
+        As ``calibrate`` returns it and ``weights.pt`` holds it. If it has the key ``beside``, the arrays of a process of two
+        fidelities, this process is averaged with the labels in view 0.
     size : dict
         Sizes of the networks that differ from the model's own.
     """

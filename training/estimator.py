@@ -37,15 +37,15 @@ class PoseEstimate:
         Name and unit of each of the K labels.
     value : (K,) float
         Estimates in mm and deg; NaN if ``valid`` is false.
-        low, high : (K,) float
-            Ends of the 90 % intervals.
-        executed : float
-            Probability that the shear move was executed; NaN if the model does not estimate it.
+    low, high : (K,) float
+        Ends of the 90 % intervals.
+    executed : float
+        Probability that the shear move was executed; NaN if the model does not estimate it.
     valid : bool
     reason : str
         Why the estimate is not valid; empty if it is.
-        ms : float
-            Time from the frame to the estimate.
+    ms : float
+        Time from the frame to the estimate.
     """
 
     names: tuple[str, ...]

@@ -113,8 +113,8 @@ class Leak:
     slope : float or None
         Slope of (predicted - corrected angle) on ``move_6``, over the frames whose move was not executed. A model that reads the
         contact has 0. None if the check can't be made.
-        reason : str
-            Why the check can't be made; empty if it was made.
+    reason : str
+        Why the check can't be made; empty if it was made.
     """
 
     slope: float | None

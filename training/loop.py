@@ -32,12 +32,12 @@ class Rows:
     inputs : Inputs
     labels : (M, K) float32
         Scaled labels.
-        weight : (K,) float32
-            Weight of each label in the loss.
-        executed : (M,) float32
-            Whether the move was executed: 1, 0, or NaN if that is not known.
-        train, held : (m,) int64
-            Rows to train on, and rows by which the error is watched.
+    weight : (K,) float32
+        Weight of each label in the loss.
+    executed : (M,) float32
+        Whether the move was executed: 1, 0, or NaN if that is not known.
+    train, held : (m,) int64
+        Rows to train on, and rows by which the error is watched.
     """
 
     inputs: Inputs
@@ -63,8 +63,8 @@ class Loop:
     rows : Rows
     seed : int
         Seed of the order of the rows.
-        penalty : callable, optional
-            ``penalty(network)`` is added to the loss of every batch.
+    penalty : callable, optional
+        ``penalty(network)`` is added to the loss of every batch.
     """
 
     network: nn.Module

@@ -38,10 +38,10 @@ class PinTable:
     image_name : (M,) str
     nodes_px : (M, N, 2) float
         Places of the pins; that of a lost pin is predicted. NaN for frames that are not valid.
-        area_px2 : (M, N) float
-            Voronoi areas; NaN for frames that are not valid.
-        lost : (M, N) bool
-            Pins for which no blob was found.
+    area_px2 : (M, N) float
+        Voronoi areas; NaN for frames that are not valid.
+    lost : (M, N) bool
+        Pins for which no blob was found.
     valid : (M,) bool
     measured : bool
         Whether the reference was measured with the camera of these frames. Otherwise it is computed from the specification.

@@ -24,17 +24,17 @@ class Recipe:
     patience : int
         Number of epochs without a smaller error on the held-out fold after which training stops. With 0 it never stops early, and the
         result are the last, averaged weights.
-        decay : float
-            Weight decay (AdamW); 0 for Adam.
-        average : float
-            Decay of the exponential average of the weights over steps, in (0, 1); 0: no average.
+    decay : float
+        Weight decay (AdamW); 0 for Adam.
+    average : float
+        Decay of the exponential average of the weights over steps, in (0, 1); 0: no average.
     loss : {"l1", "l2"}
     scaling : {"standard", "unit", "none"}
         Scaling of the labels: to mean 0 and variance 1, to the range [-1, 1], or none (mm and deg).
-        members : int
-            Number of networks in the ensemble; each holds out another fold.
-        kernel : bool
-            Whether a Gaussian process is averaged with the networks; the model must have modes.
+    members : int
+        Number of networks in the ensemble; each holds out another fold.
+    kernel : bool
+        Whether a Gaussian process is averaged with the networks; the model must have modes.
     """
 
     epochs: int = 100

@@ -45,8 +45,8 @@ class Targets:
         depth and the angle of the touched surface, of any shape.
     executed : (M,) float
         Whether each move was executed: 1, 0, or NaN if that is not known.
-        move : (M, 2) float
-            ``move_1`` (mm) and ``move_6`` (deg) as in the table; NaN if the table does not have them.
+    move : (M, 2) float
+        ``move_1`` (mm) and ``move_6`` (deg) as in the table; NaN if the table does not have them.
     """
 
     names: tuple[str, ...]

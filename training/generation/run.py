@@ -24,8 +24,8 @@ class Summary:
     ----------
     contacts, frames : int
         Number in the whole data set.
-        before : int
-            Contacts that the folder held before this run.
+    before : int
+        Contacts that the folder held before this run.
     failed : int
         Draws that failed in this run.
     """

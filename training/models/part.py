@@ -47,10 +47,10 @@ class Prepared:
     ----------
     inputs : Inputs
         ``views`` times M rows: row v M + k is frame k in view v. View 0 is the unchanged frame.
-        learnt : dict
-            Arrays learnt from the training frames; they are stored with the weights.
-        views : int
-            Number of versions of each frame that the network is trained on.
+    learnt : dict
+        Arrays learnt from the training frames; they are stored with the weights.
+    views : int
+        Number of versions of each frame that the network is trained on.
     """
 
     inputs: Inputs
@@ -66,10 +66,10 @@ class Prediction:
     ----------
     mean, half_width : (B, K) float
         Estimated labels in mm and deg, and half of the 90 % interval for the kind of label that the model was trained on.
-        half_width_raw : (B, K) float
-            Half of the 90 % interval for raw labels, whose moves may not have been executed.
-        executed : (B,) float
-            Probability that the shear move was executed; NaN if the model does not estimate it.
+    half_width_raw : (B, K) float
+        Half of the 90 % interval for raw labels, whose moves may not have been executed.
+    executed : (B,) float
+        Probability that the shear move was executed; NaN if the model does not estimate it.
     """
 
     mean: np.ndarray
@@ -132,8 +132,8 @@ class Variant:
     ----------
     size : dict
         Sizes of the network that differ from the model's own.
-        recipe : dict
-            Settings of the recipe that differ from the model's own.
+    recipe : dict
+        Settings of the recipe that differ from the model's own.
     """
 
     size: Mapping[str, int] = field(default_factory=dict)
@@ -148,20 +148,20 @@ class Model(ABC):
     ----------
     name : str
         Name by which a user chooses the model.
-        description : str
-            One line.
-        recipe : Recipe
-            Settings of its training, where the user gives no others.
-        variants : dict of str to Variant
-            Variants by the name of the part that is left out. ``NAME-without-PART`` can be trained.
+    description : str
+        One line.
+    recipe : Recipe
+        Settings of its training, where the user gives no others.
+    variants : dict of str to Variant
+        Variants by the name of the part that is left out. ``NAME-without-PART`` can be trained.
     published_mm_deg : (float, float), optional
         Mean absolute errors of depth (mm) and angle (deg) that its authors published.
-        timed_batches : int, optional
-            Number of batches that a speed measurement runs, for models whose epoch takes many minutes on a CPU. None: a whole epoch.
-        counts_from_rest : bool
-            Whether its inputs are displacements from the pins at rest, so that a frame without contact of the sensor in use improves them.
-        has_modes : bool
-            Whether it has ``modes``, so that a Gaussian process can be averaged with its networks.
+    timed_batches : int, optional
+        Number of batches that a speed measurement runs, for models whose epoch takes many minutes on a CPU. None: a whole epoch.
+    counts_from_rest : bool
+        Whether its inputs are displacements from the pins at rest, so that a frame without contact of the sensor in use improves them.
+    has_modes : bool
+        Whether it has ``modes``, so that a Gaussian process can be averaged with its networks.
     """
 
     name: str

@@ -115,14 +115,14 @@ class Evaluation:
     ----------
     metrics : dict
         Content of ``metrics.json``.
-        changes : list of dict
-            Errors on changed images; empty if they were not asked for.
-        units : dict of str to str
-            Unit of each label.
-        frames : int
-            Number of judged frames.
-        problems : list of str
-            Irregularities of the recordings.
+    changes : list of dict
+        Errors on changed images; empty if they were not asked for.
+    units : dict of str to str
+        Unit of each label.
+    frames : int
+        Number of judged frames.
+    problems : list of str
+        Irregularities of the recordings.
     written : list of Path
     """
 

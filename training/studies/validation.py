@@ -76,8 +76,8 @@ def validate_contacts(
         The experiment's own object by default.
     limit : int, optional
         Number of frames, chosen at random with ``seed``; all by default.
-        friction_frames : int
-            Number of frames for which an individual friction is fitted.
+    friction_frames : int
+        Number of frames for which an individual friction is fitted.
     across : int
         Elements along each side of the skin's grid.
 

@@ -21,8 +21,8 @@ class CapTruth:
         Cap centres, sensor frame.
     caps_px, rest_px : (N, 2) float
         Projections of the cap centres in px of the frame, in the contact and at rest.
-        visible : (N,) bool
-            The cap's centre is inside the frame, and the line of sight to it meets no other pin.
+    visible : (N,) bool
+        The cap's centre is inside the frame, and the line of sight to it meets no other pin.
     """
 
     caps_mm: FloatArray

@@ -31,8 +31,8 @@ class Demo:
     ----------
     tables : dict of str to list of DepthRow
         Displacement by depth, by the sensor's name.
-        written : list of Path
-            The files, the page first.
+    written : list of Path
+        The files, the page first.
     """
 
     tables: dict[str, list[DepthRow]]

@@ -35,8 +35,8 @@ class ContactContent:
     title, description : str
     pictures : dict of str to Path
         Pictures from `contact_pictures`, and ``skin``.
-        raw_size : str
-            Size of the raw frame.
+    raw_size : str
+        Size of the raw frame.
     figures : list of (str, str)
         As `contact_figures` gives them.
     """

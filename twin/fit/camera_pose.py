@@ -53,8 +53,8 @@ class CameraParameter:
         Standard deviation of its plausible values, in the parameter's unit; relative to its value if ``relative``.
         relative : bool
         bounds : (float, float)
-        instead : str
-            Data that determine the parameter if the pins do not.
+    instead : str
+        Data that determine the parameter if the pins do not.
     """
 
     section: str
@@ -90,8 +90,8 @@ class CameraReport:
     ----------
     rms_px : float
         Rms distance between pins and projected caps, raw-frame px.
-        pins : int
-            Number of pins that were used.
+    pins : int
+        Number of pins that were used.
     sd : dict of str to float
         Standard deviation of each fitted parameter, in its own unit, from the Jacobian and the residuals.
     held : dict of str to str

@@ -95,10 +95,10 @@ class _Reflections:
     ----------
     leds : list of int
         Index of the LED of each reflection.
-        azimuth_rad : (n,) float
-            Azimuth of each reflection's middle, which is that of its LED.
-        radius_mm, z_mm : float
-            The LEDs' radius from the reflections' middles, and their height, which is held.
+    azimuth_rad : (n,) float
+        Azimuth of each reflection's middle, which is that of its LED.
+    radius_mm, z_mm : float
+        The LEDs' radius from the reflections' middles, and their height, which is held.
     rays : (n, s, s, SUBPIXELS, SUBPIXELS, 2) float
         Tangents in air of the places in the squares that are compared.
     used : (n, s, s) bool

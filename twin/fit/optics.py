@@ -70,10 +70,10 @@ class Calibration:
         The fitted specification.
     before, after : dict of str to float
         Image figures over the disc, mean over the frames: ``psnr_db``, ``ssim`` (colour) and others.
-        notes : list of str
-            Parameters that the frames do not determine, and what was left out.
-        frames : list of Aligned
-            The frames of the fit.
+    notes : list of str
+        Parameters that the frames do not determine, and what was left out.
+    frames : list of Aligned
+        The frames of the fit.
     first, last : list of (H, W[, 3]) uint8
         Renders with the specification at the start and at the end.
     """
@@ -146,8 +146,8 @@ def calibrate_optics(
     ----------
     sensor : SensorSpec
         The specification at the start of the fit.
-        out : Path
-            The ``.toml`` file to write.
+    out : Path
+        The ``.toml`` file to write.
         limit, no_contact
             As in ``fit_optics``.
 
@@ -183,10 +183,10 @@ def fit_optics(
         Folder of raw frames.
     spec : SensorSpec
         The specification at the start of the fit: geometry and camera of the same type of sensor.
-        work : Path
-            Folder for the results of the stages. A second run with the same frames, start and code continues from them.
-        limit : int
-            Number of frames to fit.
+    work : Path
+        Folder for the results of the stages. A second run with the same frames, start and code continues from them.
+    limit : int
+        Number of frames to fit.
     no_contact : Path, optional
         A raw frame without contact, to which the camera is fitted first.
     progress : Progress

@@ -54,8 +54,8 @@ class Samples:
         Gray levels.
     veil : (n, channels) float
         Light of the blurred frame, which the haze adds.
-        caps : (n,) bool
-            Whether the place is on a cap; otherwise it is on bare skin.
+    caps : (n,) bool
+        Whether the place is on a cap; otherwise it is on bare skin.
     """
 
     pixels: np.ndarray
@@ -96,10 +96,10 @@ def sample_frame(
     response : ResponseSpec
     gel : GelSpec
         Gives the width of the haze.
-        blob : BlobSpec
-            Gives the mask.
-        rng : numpy.random.Generator
-            Generator that chooses the pixels of bare skin.
+    blob : BlobSpec
+        Gives the mask.
+    rng : numpy.random.Generator
+        Generator that chooses the pixels of bare skin.
     """
     image = frame.image if frame.image.ndim == 3 else frame.image[..., None]
     mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)

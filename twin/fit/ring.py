@@ -132,14 +132,14 @@ class _Wall:
     ----------
     at_mm : (h, w, 2) float
         Place at which each pixel's ray meets the housing's plane.
-        wall, compared : (h, w) bool
-            Pixels that show the wall; pixels whose misfit is fitted.
-        levels, inside : (h, w, 3) float
-            Gray levels; their light, which is not modelled inside the disc.
-        loss : (h, w, 1) float
-            Factor of the vignetting.
-        haze : GelSpec
-            The gel, with the haze's width in thinned-out pixels.
+    wall, compared : (h, w) bool
+        Pixels that show the wall; pixels whose misfit is fitted.
+    levels, inside : (h, w, 3) float
+        Gray levels; their light, which is not modelled inside the disc.
+    loss : (h, w, 1) float
+        Factor of the vignetting.
+    haze : GelSpec
+        The gel, with the haze's width in thinned-out pixels.
     """
 
     at_mm: np.ndarray

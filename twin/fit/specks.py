@@ -60,14 +60,14 @@ class _WindowView:
     pins_px : (M, N, 2) float
     spacing_px : float
         Spacing of the pins in the first frame.
-        usable : (H, W) bool
-            Pixels in the disc that are away from the LEDs' reflections, and clear of pins in enough frames.
+    usable : (H, W) bool
+        Pixels in the disc that are away from the LEDs' reflections, and clear of pins in enough frames.
     behind : (H, W) float32
         Median gray level over the frames in which a pixel is clear; 0 if it is not usable.
-        ground : (H, W) float32
-            ``behind`` without small bright spots.
-        place_mm : (H, W, 2) float
-            Place at which each pixel's ray passes from the window into the gel.
+    ground : (H, W) float32
+        ``behind`` without small bright spots.
+    place_mm : (H, W, 2) float
+        Place at which each pixel's ray passes from the window into the gel.
     """
 
     gray: np.ndarray

@@ -31,8 +31,8 @@ def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, 
         Camera, response, ``leds.power``, ``leds.balance`` and ``gel.haze`` are known and not changed.
     images : (M, H, W, 3) or (M, H, W) uint8
         Raw frames with different contacts, RGB or gray.
-        pins_px : (M, N, 2) float
-            Pins in raw-frame px; NaN if not found.
+    pins_px : (M, N, 2) float
+        Pins in raw-frame px; NaN if not found.
     progress : callable, optional
         Called with (done, total).
 

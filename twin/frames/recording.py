@@ -76,8 +76,8 @@ class Recording:
         The no-contact frame (``init_*``).
     problems : list of str
         Irregularities, one line each.
-        failed : list of BadFrame
-            Frames that could not be read so far, and the reasons.
+    failed : list of BadFrame
+        Frames that could not be read so far, and the reasons.
     """
 
     path: Path

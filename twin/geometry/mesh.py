@@ -49,8 +49,8 @@ class SensorMesh:
         normals point away from the dome's centre and the camera sees the back of these quads.
     disc : (k,) complex
         Place of each column of nodes on the dome (see ``chart``).
-        grid : (3,) int
-            Number of layers of nodes, and of nodes along each side of the square.
+    grid : (3,) int
+        Number of layers of nodes, and of nodes along each side of the square.
     skin_layers : int
     """
 

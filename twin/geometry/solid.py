@@ -51,10 +51,10 @@ class Cells:
     ----------
     controls : (m, b) int
         Indices of the b controls of each element, in the order depth, row, column (the column varies fastest).
-        gradients : (m, 8, 3, b) float
-            Gradients of the shape functions at rest at 2x2x2 Gauss points, 1/mm. The first four points are the outer ones.
-        weights_mm3 : (m, 8) float
-            Volume at rest that each Gauss point stands for.
+    gradients : (m, 8, 3, b) float
+        Gradients of the shape functions at rest at 2x2x2 Gauss points, 1/mm. The first four points are the outer ones.
+    weights_mm3 : (m, 8) float
+        Volume at rest that each Gauss point stands for.
     """
 
     controls: IntArray
@@ -74,22 +74,22 @@ class Solid:
     control_mm : (n, 3) float
     fixed : (n,) bool
         Clamped controls: at the rim, the wall and the lens.
-        skin, gel_top, gel_deep : Cells
-            The skin's elements, layer by layer from the outside; the gel's first layer of elements, whose outer side has the skin's grid
-            and whose inner side has the coarse one; the other elements of the gel.
+    skin, gel_top, gel_deep : Cells
+        The skin's elements, layer by layer from the outside; the gel's first layer of elements, whose outer side has the skin's grid
+        and whose inner side has the coarse one; the other elements of the gel.
     boxes : tuple of (m, 4) int
         For each kind of cells: first and last row, first and last column (last: exclusive) on the skin's grid.
     chart : Chart
     basis, coarse, through : Basis
         Splines along the square's sides in the skin and in the gel, and through the gel (depth 1 at the skin, 2 at the lens).
-        inner : slice
-            Controls of the skin's inside.
-        pin_value, pin_slope_u, pin_slope_v : (N, side^2) float
-            Coefficients by which the controls of the skin's inside give place and derivatives of the skin's inside at the pins' feet.
-        pin_base_mm, pin_axis : (N, 3) float
-            Feet and axes of the pins at rest.
-        pin_cap_length_mm : float
-            Distance from a pin's foot to the centre of its cap.
+    inner : slice
+        Controls of the skin's inside.
+    pin_value, pin_slope_u, pin_slope_v : (N, side^2) float
+        Coefficients by which the controls of the skin's inside give place and derivatives of the skin's inside at the pins' feet.
+    pin_base_mm, pin_axis : (N, 3) float
+        Feet and axes of the pins at rest.
+    pin_cap_length_mm : float
+        Distance from a pin's foot to the centre of its cap.
     """
 
     control_mm: FloatArray

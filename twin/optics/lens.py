@@ -100,8 +100,8 @@ class CameraRays:
         -------
         place : mi.Point3f
             Places on the window's gel side.
-            direction : mi.Vector3f
-                Unit vectors in the gel.
+        direction : mi.Vector3f
+            Unit vectors in the gel.
         transmittance : mi.Float
         """
         x, y = mi.Float(pixel % self._columns), mi.Float(pixel // self._columns)

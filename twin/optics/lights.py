@@ -20,8 +20,8 @@ class Patch:
     center_mm : (3,) float
     half_mm : (2, 2) float
         Half of a square's edge vectors in x and y; zero for the annulus.
-        radii_mm : (2,) float
-            Inner and outer radius of an annulus; zero for a square.
+    radii_mm : (2,) float
+        Inner and outer radius of an annulus; zero for a square.
     radiance : (3,) float
         Linear RGB.
     """

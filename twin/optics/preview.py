@@ -76,13 +76,13 @@ class _Drawing:
     ----------
     corners_px : (v, 2) float
         Corners of the skin, px of the window.
-        outlines_px : (s, K, 2) float
-            Outlines of the visible stems, sides and faces, from far to near.
-        seen : (s,) int
-            Row of each outline in the pins' lights (3 N), whose order is: stem, side and face of the first pin, of the second pin, ...
-        direct, ambient : list of (v, 3) or (N, 3) float
-            Irradiance of each material by the lamps, and by unit light from all directions. Both are multiplied by the gel's transmittance
-            to the camera.
+    outlines_px : (s, K, 2) float
+        Outlines of the visible stems, sides and faces, from far to near.
+    seen : (s,) int
+        Row of each outline in the pins' lights (3 N), whose order is: stem, side and face of the first pin, of the second pin, ...
+    direct, ambient : list of (v, 3) or (N, 3) float
+        Irradiance of each material by the lamps, and by unit light from all directions. Both are multiplied by the gel's transmittance
+        to the camera.
     """
 
     corners_px: FloatArray
@@ -105,8 +105,8 @@ class Preview:
         default.
     shading : Shading, optional
         By default direct light alone.
-        static : (light, cover), optional
-            Static layer; by default the result of `static_layer`.
+    static : (light, cover), optional
+        Static layer; by default the result of `static_layer`.
     """
 
     def __init__(

@@ -52,8 +52,8 @@ class Renderer:
         Part of the raw frame to render, end exclusive; the whole frame by default.
     spp : int, optional
         Samples of a pixel that shows a pin, instead of the quality's number. Pixels of bare skin get a quarter (`twin.optics.sampling`).
-        bounces : int
-            Number of scatterings of a light path after the first.
+    bounces : int
+        Number of scatterings of a light path after the first.
     """
 
     def __init__(

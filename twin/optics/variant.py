@@ -106,8 +106,8 @@ def choose_variant(channels: str = "color", prefer: str | None = None, *, llvm_s
     ----------
     channels : {"color", "mono"}
         Channels of the camera.
-        prefer : {"cuda", "llvm", "scalar", "auto"} or a full variant name, optional
-            The backend that must be used; the environment variable TACTIP_VARIANT takes precedence.
+    prefer : {"cuda", "llvm", "scalar", "auto"} or a full variant name, optional
+        The backend that must be used; the environment variable TACTIP_VARIANT takes precedence.
     llvm_search : sequence of Path, optional
         As for `find_llvm`.
 

@@ -33,10 +33,10 @@ class Window:
         -------
         place : mi.Point3f
             Place on the gel side of the window.
-            inward : mi.Vector3f
-                Unit direction in the gel.
-            transmittance : mi.Float
-                Transmittance for radiance, without the factor n^2 of the denser medium.
+        inward : mi.Vector3f
+            Unit direction in the gel.
+        transmittance : mi.Float
+            Transmittance for radiance, without the factor n^2 of the denser medium.
         """
         place = origin + direction * ((self.back - origin.z) / direction.z)
         in_window = _bent(dr, mi, direction, 1 / self.window_index)
@@ -51,11 +51,11 @@ class Window:
         -------
         toward : mi.Vector3f
             Unit direction in the gel, from the point to the place at which the ray leaves the gel.
-            length : mi.Float
-                Length of the ray in the gel, mm.
-            factor : mi.Float
-                Solid angle at the point per area of the light, times transmittance and n^2. Times the light's radiance in air and the
-                cosine at the point, it is the irradiance per area of the light. Light from behind has the factor zero.
+        length : mi.Float
+            Length of the ray in the gel, mm.
+        factor : mi.Float
+            Solid angle at the point per area of the light, times transmittance and n^2. Times the light's radiance in air and the
+            cosine at the point, it is the irradiance per area of the light. Light from behind has the factor zero.
         """
         across = mi.Vector2f(light.x - point.x, light.y - point.y)
         rho2 = dr.squared_norm(across)

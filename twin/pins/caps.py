@@ -36,13 +36,13 @@ class Caps:
     ----------
     level, contrast, skin : (N,) float
         Gray levels: of the plateau, of the plateau minus the skin around it, and of that skin.
-        diameter_px : float
-            Diameter of the disc whose area is that above half level.
-        eccentricity : float
-            Eccentricity of the ellipse with the second moments of that area: 0 for a circle, near 1 for a bar.
-        edge_px : float
-            Distance in which the mean profile across the outline falls from 90 to 10 % of the contrast. For a straight edge blurred by a
-            Gaussian it is 2.563 sigma.
+    diameter_px : float
+        Diameter of the disc whose area is that above half level.
+    eccentricity : float
+        Eccentricity of the ellipse with the second moments of that area: 0 for a circle, near 1 for a bar.
+    edge_px : float
+        Distance in which the mean profile across the outline falls from 90 to 10 % of the contrast. For a straight edge blurred by a
+        Gaussian it is 2.563 sigma.
     """
 
     level: np.ndarray

@@ -73,10 +73,10 @@ class Finding:
     verdict : Grade
     value : float
         The number that is compared with the check's limits; NaN if it can't be measured.
-        text : str
-            Description of the result, with the number and what was expected.
-        remedy : str
-            What to do; "" if nothing.
+    text : str
+        Description of the result, with the number and what was expected.
+    remedy : str
+        What to do; "" if nothing.
     """
 
     name: str
@@ -94,8 +94,8 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     frames : list of Frame
     spec : SensorSpec
         The specification that the frames are compared with.
-        detector : DetectorSpec, optional
-            Parameters that ``twin tune`` found for the method ``twin``; by default those of the specification.
+    detector : DetectorSpec, optional
+        Parameters that ``twin tune`` found for the method ``twin``; by default those of the specification.
 
     Raises
     ------

@@ -33,10 +33,10 @@ class LegacyParameters:
         Side of the square that a frame is resized to.
     threshold : int
         Threshold of the detector, gray levels.
-        mask_offset_px : (int, int)
-            Offset of the mask's centre from the image's centre, x and y.
-        mask_margin_px : int
-            Distance between the mask and the image's border.
+    mask_offset_px : (int, int)
+        Offset of the mask's centre from the image's centre, x and y.
+    mask_margin_px : int
+        Distance between the mask and the image's border.
     min_area_px2 : float
     virtual_rotations_deg, virtual_scales : tuple of float
         Turns and scales of the copies of the hull that fill the concave sides of a hexagon.
@@ -80,14 +80,14 @@ class LegacyObservation:
     ----------
     nodes_px : (K, 2) float
         Blobs in the detector's order, px of the input frame.
-        found : int
-            Number of blobs.
-        valid : bool
-            Whether exactly the sensor's number of pins was found.
-        reason : str
-            Why the frame is not valid; empty if it is.
-        graph : PinGraph or None
-            Nodes, cells and areas are in the release's unit: px of the resized image, centred by the scalar median.
+    found : int
+        Number of blobs.
+    valid : bool
+        Whether exactly the sensor's number of pins was found.
+    reason : str
+        Why the frame is not valid; empty if it is.
+    graph : PinGraph or None
+        Nodes, cells and areas are in the release's unit: px of the resized image, centred by the scalar median.
     ms : dict of str to float
     """
 

@@ -76,11 +76,11 @@ class Pipeline:
     spec : SensorSpec
     form : Form
         Form of the frames.
-        reference : Reference, optional
-            Layout without contact; by default that of the specification.
+    reference : Reference, optional
+        Layout without contact; by default that of the specification.
         graph : {"voronoi", "delaunay", "knn"}
-        second_look : bool
-            If an adaptive threshold loses pins, or finds many other blobs, also try thresholds from the frame's own contrast.
+    second_look : bool
+        If an adaptive threshold loses pins, or finds many other blobs, also try thresholds from the frame's own contrast.
     """
 
     def __init__(

@@ -32,8 +32,8 @@ class Tessellation:
     area_px2 : (N,) float
     cells : list of (k, 2) float
         Cell polygons. Nodes at the same place have the same cell, and each has an equal part of its area.
-        region_px : (m, 2) float
-            The polygon that the cells tile.
+    region_px : (m, 2) float
+        The polygon that the cells tile.
     """
 
     area_px2: np.ndarray

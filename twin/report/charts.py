@@ -49,8 +49,8 @@ def write_chart(path: Path, draw: Callable[[], Figure], *, dpi: int = DPI) -> Pa
     ----------
     path : Path
         A PNG file.
-        draw : callable
-            Makes the figure with `new_figure` or `sized_figure`. It is called once for each theme.
+    draw : callable
+        Makes the figure with `new_figure` or `sized_figure`. It is called once for each theme.
     dpi : int
     """
     for theme, target in ((LIGHT, path), (DARK, dark_of(path))):

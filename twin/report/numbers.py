@@ -29,10 +29,10 @@ def number(value: object, digits: int = 3, *, decimals: int | None = None, signe
     ----------
     value : int, float, bool, str or None
         A bool becomes yes or no, None and NaN become a dash, a text is not changed.
-        digits : int
-            Significant digits of a number that is not whole; digits before the point are always written.
-        decimals : int, optional
-            Number of digits after the point instead, also for whole numbers.
+    digits : int
+        Significant digits of a number that is not whole; digits before the point are always written.
+    decimals : int, optional
+        Number of digits after the point instead, also for whole numbers.
     signed : bool
         Write a plus sign before positive numbers.
     """

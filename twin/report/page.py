@@ -37,11 +37,11 @@ class Picture:
     ----------
     path : Path
         Relative to the page's folder, or absolute and inside this folder.
-        alt : str
-            Description of the picture for readers who can't see it.
+    alt : str
+        Description of the picture for readers who can't see it.
         caption : str or Markup
-        kind : {"chart", "frame", "photo"}
-            A chart has a second file for the dark theme (`twin.report.charts.write_chart`). The pixels of a frame are not smoothed.
+    kind : {"chart", "frame", "photo"}
+        A chart has a second file for the dark theme (`twin.report.charts.write_chart`). The pixels of a frame are not smoothed.
     width_px : int, optional
         Largest width on the page.
     """
@@ -159,8 +159,8 @@ class Page:
         ----------
         path : Path
             The HTML file.
-            embed : bool
-                Embed the pictures in the file, so that it can be sent alone.
+        embed : bool
+            Embed the pictures in the file, so that it can be sent alone.
         """
         return write_text(path, self.html(path.parent, embed=embed))
 

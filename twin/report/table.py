@@ -26,20 +26,20 @@ class Column:
     ----------
     key : str
         Key of the rows; a row without it has an empty value.
-        title, unit : str
-            Text of the heading.
+    title, unit : str
+        Text of the heading.
     digits : int
         Significant digits of the column's median.
     decimals : int, optional
         Number of digits after the point instead.
-        signed : bool
-            Write a plus sign before positive numbers.
-        best : {"", "least", "most"}
-            Which value is marked as the best.
-        scale : float
-            Factor on the numbers: 100 for a share that is shown in percent.
-        align : {"", "right"}
-            ``right`` for texts that are numbers, each with its own number of decimals.
+    signed : bool
+        Write a plus sign before positive numbers.
+    best : {"", "least", "most"}
+        Which value is marked as the best.
+    scale : float
+        Factor on the numbers: 100 for a share that is shown in percent.
+    align : {"", "right"}
+        ``right`` for texts that are numbers, each with its own number of decimals.
     """
 
     key: str
@@ -74,8 +74,8 @@ class Cell:
         Small text below.
     bar : float, optional
         Share in [0, 1] that is drawn as a bar below.
-        href : str
-            Address of a link within the page.
+    href : str
+        Address of a link within the page.
     """
 
     value: object

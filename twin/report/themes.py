@@ -16,10 +16,10 @@ class Theme:
     ----------
     page, surface, tint : str
         Backgrounds: of the page, of figures and tables, and of marked parts.
-        ink, muted, accent, good, bad : str
-            Text: normal, secondary, links, values that meet their target, values that miss it.
-        line : str
-            Rules between rows, borders, the grid of a chart.
+    ink, muted, accent, good, bad : str
+        Text: normal, secondary, links, values that meet their target, values that miss it.
+    line : str
+        Rules between rows, borders, the grid of a chart.
     """
 
     page: str

@@ -56,10 +56,10 @@ def made_by(*by: Maker, inputs: object = None, dated: bool = True) -> dict[str, 
     ----------
     by : functions, classes or names of modules
         The code that made the result; the record has the name of the first one.
-        inputs : object, optional
-            The inputs of the result, as ``inputs_digest`` takes them.
-        dated : bool
-            Whether the record has a date. It must be False if the same work must give the same bytes.
+    inputs : object, optional
+        The inputs of the result, as ``inputs_digest`` takes them.
+    dated : bool
+        Whether the record has a date. It must be False if the same work must give the same bytes.
 
     Returns
     -------

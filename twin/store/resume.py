@@ -37,10 +37,10 @@ class Item:
     ----------
     name : str
         Readable beginning of the file's name.
-        by : tuple of functions, classes or names of modules
-            The code that makes the result.
-        inputs : object
-            All inputs of the result, as ``inputs_digest`` takes them.
+    by : tuple of functions, classes or names of modules
+        The code that makes the result.
+    inputs : object
+        All inputs of the result, as ``inputs_digest`` takes them.
     """
 
     name: str
@@ -124,8 +124,8 @@ def require_same_code(folder: Path, *by: Maker, begun: bool) -> None:
     folder : Path
     by : functions, classes or names of modules
         The code that makes each of the parts.
-        begun : bool
-            Whether the folder may already have parts. It must then have a record of the code that made them.
+    begun : bool
+        Whether the folder may already have parts. It must then have a record of the code that made them.
 
     Raises
     ------

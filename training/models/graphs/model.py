@@ -21,8 +21,8 @@ class GraphModel(PinModel):
     ----------
     edges : {"knn", "delaunay"}
         Edges between nearest neighbours, with the node features x and y; or Delaunay's, with x, y and the Voronoi area.
-        dense : {"paper", "release"}
-            Dense layers as the paper states them, or as in the published code.
+    dense : {"paper", "release"}
+        Dense layers as the paper states them, or as in the published code.
     """
 
     edges: Literal["knn", "delaunay"]

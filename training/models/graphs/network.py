@@ -28,8 +28,8 @@ class GraphRows:
     ----------
     start : (M, N + 1) int32
         Index of each node's first entry, counted from the graph's first entry.
-        first : (M + 1,) int64
-            Index of each graph's first entry in ``column`` and ``weight``.
+    first : (M + 1,) int64
+        Index of each graph's first entry in ``column`` and ``weight``.
     column : (nnz,) int16
     weight : (nnz,) float32
     """
@@ -107,8 +107,8 @@ class GraphConvolution(torch.autograd.Function):
         weight : (D, C) float
         gain, offset : (D,) float
             Parameters of the norm.
-            eps : float
-                Added to the variance, so that a constant channel does not lead to a division by 0.
+        eps : float
+            Added to the variance, so that a constant channel does not lead to a division by 0.
         """
         around = _product(matrix, h)
         mean = around.mean(dim=0)

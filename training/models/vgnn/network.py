@@ -49,8 +49,8 @@ class Vgnn(nn.Module):
         Directed edges of the layout at rest, in both directions.
     pins : int
         Number N of pins.
-        outputs : int
-            Number K of labels.
+    outputs : int
+        Number K of labels.
     """
 
     adjacency: torch.Tensor  # (N, N) 1 if the column's pin is a neighbour of the row's pin, else 0

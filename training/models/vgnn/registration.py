@@ -47,8 +47,8 @@ class Registration:
     components : (2 N, m) float
     weight : (q, 4) float
         Coefficients for the logarithm of scale, turn (rad), shift in x and y (px).
-        usual : (4,) float
-            Root mean square difference between observed and expected similarity; the fit that predicts a training frame leaves it out.
+    usual : (4,) float
+        Root mean square difference between observed and expected similarity; the fit that predicts a training frame leaves it out.
     """
 
     rest_px: np.ndarray
@@ -71,10 +71,10 @@ class Registration:
         -------
         nodes_px, area_px2
             Unchanged if the camera sits as in training.
-            taken : (M, 4) float
-                What was taken out: logarithm of scale, turn (rad), shift (px).
-            share : (M,) float
-                Share of the frame's own difference that was taken out, 0 to 1.
+        taken : (M, 4) float
+            What was taken out: logarithm of scale, turn (rad), shift (px).
+        share : (M,) float
+            Share of the frame's own difference that was taken out, 0 to 1.
         """
         difference = self.difference(nodes_px)
         common = np.zeros(4)
@@ -157,8 +157,8 @@ def align(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[np.ndarray, np.nda
     -------
     aligned : (M, N, 2) float
         Displacement from rest without the similarity, px.
-        similarity : (M, 4) float
-            Logarithm of scale, turn (rad), shift of the centre in x and y (px), from rest to the frame.
+    similarity : (M, 4) float
+        Logarithm of scale, turn (rad), shift of the centre in x and y (px), from rest to the frame.
     """
     middle = rest_px.mean(axis=0)
     shift = nodes_px.mean(axis=1) - middle

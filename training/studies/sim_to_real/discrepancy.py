@@ -67,8 +67,8 @@ class Residuals:
         Real minus simulated displacements; 0 for lost pins.
     friction : (K,) float
         Estimated friction of each frame; NaN if no move was executed, because only a move shows the friction.
-        friction_px : (K,) float
-            Rms change of the pins' places by a change of 1 in the logarithm of friction. If it is small, the friction is uncertain.
+    friction_px : (K,) float
+        Rms change of the pins' places by a change of 1 in the logarithm of friction. If it is small, the friction is uncertain.
     """
 
     axes: np.ndarray

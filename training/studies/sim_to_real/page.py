@@ -51,16 +51,16 @@ def write_page(
     sensor : str
     tested, frames, labelled : int
         Number of frames that are judged, of all frames of the recording, and of frames that are labelled for the twin.
-        seed : int
-            Seed with which the frames were drawn.
+    seed : int
+        Seed with which the frames were drawn.
     calibrated : bool
         Whether the specification was fitted to the labelled frames.
     error_px : float
         Mean distance between the twin's pins and those of the labelled frames.
-        modes : sequence
-            First modes of the discrepancy: the ``share`` of each, and the part of it that the label explains (``told``).
-        friction : FrictionSpread or None
-            Range in which friction was drawn for simulated contacts; None if all of them had the rig's friction.
+    modes : sequence
+        First modes of the discrepancy: the ``share`` of each, and the part of it that the label explains (``told``).
+    friction : FrictionSpread or None
+        Range in which friction was drawn for simulated contacts; None if all of them had the rig's friction.
     simulated, contacts : int
         Number of simulated states, and of the contacts that they belong to.
     names : sequence of str

@@ -49,10 +49,10 @@ class Frames:
     ----------
     test : (t,) int
         A random fifth, on which all models are judged and none is trained.
-        few : (n,) int
-            The labelled frames, drawn at random from the others.
-        trained : dict of str to (m,) int
-            Frames to train on without the twin: ``few``, more of them, and all that are not judged on. Each set contains those before it.
+    few : (n,) int
+        The labelled frames, drawn at random from the others.
+    trained : dict of str to (m,) int
+        Frames to train on without the twin: ``few``, more of them, and all that are not judged on. Each set contains those before it.
     """
 
     test: np.ndarray
@@ -170,9 +170,9 @@ class Beside:
     ----------
     left_out : (K,) float
         Mean absolute error (mm, deg) of the Gaussian process alone on each labelled frame, predicted from the others.
-        intervals : dict of str to array
-            Intervals of the original run, widened to its errors on the labelled frames, by their names in ``weights.pt``; see
-            ``widen_intervals``.
+    intervals : dict of str to array
+        Intervals of the original run, widened to its errors on the labelled frames, by their names in ``weights.pt``; see
+        ``widen_intervals``.
     """
 
     left_out: np.ndarray
@@ -198,10 +198,10 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
         Folder of the new run; made if missing.
     simulated : Dataset
         Contacts simulated without a drawn discrepancy, with labels like those of the labelled frames (``states_like``).
-        labelled : Dataset
-            The n labelled frames.
-        seed : int
-            Seed with which simulated states are drawn.
+    labelled : Dataset
+        The n labelled frames.
+    seed : int
+        Seed with which simulated states are drawn.
 
     Raises
     ------

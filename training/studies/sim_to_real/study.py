@@ -56,24 +56,24 @@ class Plan:
         A labelled real recording.
     experiment : ExperimentSpec
         The experiment that the recording was made with. It also names the labels that are learnt.
-        contacts : ExperimentSpec or None
-            The experiment that is simulated; None: the one that ``experiment`` names as wider, else ``experiment``.
-        labels : int
-            Number of labelled frames that are used with the simulated contacts.
-        seed : int
-            Seed of the choice of frames, the contacts and the weights.
-        draws : int
-            Number of discrepancies that are drawn for each contact.
-        count : int
-            Number of contacts to simulate.
-        simulated : tuple of Path
-            Finished data sets to use instead of simulating contacts for the twin with all ingredients; several are joined.
-        calibrate : bool
-            Fit the specification to the labelled frames first.
-        ablate : bool
-            Also train without one ingredient at a time.
-        epochs : int or None
-            Epochs of every training; None: the default of that training.
+    contacts : ExperimentSpec or None
+        The experiment that is simulated; None: the one that ``experiment`` names as wider, else ``experiment``.
+    labels : int
+        Number of labelled frames that are used with the simulated contacts.
+    seed : int
+        Seed of the choice of frames, the contacts and the weights.
+    draws : int
+        Number of discrepancies that are drawn for each contact.
+    count : int
+        Number of contacts to simulate.
+    simulated : tuple of Path
+        Finished data sets to use instead of simulating contacts for the twin with all ingredients; several are joined.
+    calibrate : bool
+        Fit the specification to the labelled frames first.
+    ablate : bool
+        Also train without one ingredient at a time.
+    epochs : int or None
+        Epochs of every training; None: the default of that training.
     workers : int
         Processes that simulate.
     across : int
@@ -159,15 +159,15 @@ class _Ground:
     ----------
     sensor : SensorSpec
         The sensor as shipped, or fitted to the labelled frames.
-        real, few : Dataset
-            The recording, and its labelled frames.
+    real, few : Dataset
+        The recording, and its labelled frames.
     chosen : Frames
     measured : MeasuredFrames
         Pins and arm's labels of the labelled frames.
     residuals : Residuals
         Residuals of the twin with all ingredients on the labelled frames.
-        full : Twin
-            The twin with all ingredients. ``twins``: this twin and those without one ingredient.
+    full : Twin
+        The twin with all ingredients. ``twins``: this twin and those without one ingredient.
     """
 
     plan: Plan

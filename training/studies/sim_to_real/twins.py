@@ -32,17 +32,17 @@ class Twin:
     ----------
     name : str
         Name of the run's folder.
-        says : str
-            Name in the study's table.
-        contacts : str
-            Name of the set of contacts; several twins may have the same set.
+    says : str
+        Name in the study's table.
+    contacts : str
+        Name of the set of contacts; several twins may have the same set.
     randomisation : RandomisationSpec
     across : int
         Elements along each side of the skin's grid.
     learns : bool
         Whether a discrepancy is learnt from the labelled frames and added to the pins.
-        share : float
-            Share of the set's contacts, the first ones, that are used for training.
+    share : float
+        Share of the set's contacts, the first ones, that are used for training.
     """
 
     name: str
@@ -105,10 +105,10 @@ def without_one_ingredient(
     ----------
     uncalibrated : SensorSpec
         The sensor without any measurement of labelled frames; see ``as_mounted``.
-        any_friction : RandomisationSpec
-            Draws friction from a range that does not depend on labelled frames.
-        every_tolerance : RandomisationSpec
-            Also draws properties of skin and gel.
+    any_friction : RandomisationSpec
+        Draws friction from a range that does not depend on labelled frames.
+    every_tolerance : RandomisationSpec
+        Also draws properties of skin and gel.
     """
 
     def but(name: str, says: str, *, shared: bool = False, **changes: Any) -> Twin:

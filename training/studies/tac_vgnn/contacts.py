@@ -93,12 +93,12 @@ class AreaChange:
     name : str
     depth_mm : float
         Depth beyond first touch.
-        graph : PinGraph
-            Voronoi graph of the contact.
-        rest_area_px2 : (N,) float
-            Areas without contact.
-        source : str
-            ``twin``, or the name of the recorded frame.
+    graph : PinGraph
+        Voronoi graph of the contact.
+    rest_area_px2 : (N,) float
+        Areas without contact.
+    source : str
+        ``twin``, or the name of the recorded frame.
     """
 
     name: str

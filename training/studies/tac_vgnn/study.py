@@ -41,27 +41,27 @@ class Plan:
     sensor : SensorSpec
     models : tuple of str
         Names of models, as ``plan_run`` takes them.
-        seeds : tuple of int
-            Seeds of the weights and of the order of rows; every model is trained with each seed.
-        labels : {"raw", "corrected"}
-            Kind of labels that are learnt.
-        target : str or tuple of str
-            A preset, or the label columns.
-        split : int
-            Seed of the random fifth of the rows that is kept out of training.
-        epochs : int or None
-            Number of epochs; None: each model's own number.
-        max_minutes : float or None
-            Time for all trainings together.
-        batches : tuple of int
-            Batch sizes of the efficiency figure; if empty, there is no figure.
-        contacts : bool
-            Simulate and render the contacts of the area figure.
+    seeds : tuple of int
+        Seeds of the weights and of the order of rows; every model is trained with each seed.
+    labels : {"raw", "corrected"}
+        Kind of labels that are learnt.
+    target : str or tuple of str
+        A preset, or the label columns.
+    split : int
+        Seed of the random fifth of the rows that is kept out of training.
+    epochs : int or None
+        Number of epochs; None: each model's own number.
+    max_minutes : float or None
+        Time for all trainings together.
+    batches : tuple of int
+        Batch sizes of the efficiency figure; if empty, there is no figure.
+    contacts : bool
+        Simulate and render the contacts of the area figure.
         device : {"auto", "cpu", "cuda"}
-        threads : int or None
-            Number of CPU threads.
-        form : Form or None
-            Form of the frames; None: recognised by size and content.
+    threads : int or None
+        Number of CPU threads.
+    form : Form or None
+        Form of the frames; None: recognised by size and content.
     """
 
     data: Path
@@ -104,10 +104,10 @@ class Result:
     ----------
     rows : list of dict
         A row for each run, see ``table_row``.
-        graphs, efficiency, contacts : list of dict
-            Rows of the other tables; the last two are empty if they were not asked for.
-        names : tuple of str
-            Names of the labels.
+    graphs, efficiency, contacts : list of dict
+        Rows of the other tables; the last two are empty if they were not asked for.
+    names : tuple of str
+        Names of the labels.
     written : list of Path
     """
 

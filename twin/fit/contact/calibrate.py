@@ -138,8 +138,8 @@ def calibrate_to_file(
         The ``.toml`` file to write.
     touched : ObjectSpec, optional
         The object; the experiment's own by default.
-        labels : int
-            Number of frames to fit to; they are chosen at random.
+    labels : int
+        Number of frames to fit to; they are chosen at random.
     seed : int
         Seed of this choice.
     hold : collection of str

@@ -55,15 +55,15 @@ class ContactFit:
     sensor : SensorSpec
     start, value, sd : (P,) float
         Fitted quantities of the setup's parameters (see ``Parameter.scale``) at the start and at the end, and their standard deviations.
-        told : (P,) float
-            Share of the prior's variance that the frames removed: 1 if the frames determine the parameter, 0 if it stayed at its start.
+    told : (P,) float
+        Share of the prior's variance that the frames removed: 1 if the frames determine the parameter, 0 if it stayed at its start.
     correlation : (P, P) float
     executed : (M,) float
         Probability that each frame's move was executed.
     trust : (M,) float
         1 for a frame that one story fits; near 0 for a frame that none fits.
-        before_px, after_px : (M,) float
-            Mean pin error of each frame for the story that fits it better.
+    before_px, after_px : (M,) float
+        Mean pin error of each frame for the story that fits it better.
     share : float
         Share of the moves that were executed.
     """

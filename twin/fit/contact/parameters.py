@@ -21,10 +21,10 @@ class Parameter:
     ----------
     name : str
         Dotted key. Of ``rig.turn_offset_deg`` only the turn in the plane of approach and across is fitted.
-        prior : float
-            Prior standard deviation of the fitted quantity around its start.
-        step : float
-            Step of the fitted quantity for difference quotients.
+    prior : float
+        Prior standard deviation of the fitted quantity around its start.
+    step : float
+        Step of the fitted quantity for difference quotients.
     scale : {"plain", "log", "volume"}
         The fitted quantity: the number itself, its logarithm, or, for a Poisson's ratio nu, log(1 - 2 nu), which measures how
         compressible the volume is.

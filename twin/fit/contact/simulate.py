@@ -29,8 +29,8 @@ class Setup:
     ----------
     sensor : SensorSpec
         The sensor at the start of the fit.
-        experiment : ExperimentSpec
-            The experiment that the frames were recorded with.
+    experiment : ExperimentSpec
+        The experiment that the frames were recorded with.
     touched : ObjectSpec
     form : Form
         Form of the frames, in whose px the displacements are.
@@ -38,10 +38,10 @@ class Setup:
         Elements along each side of the skin's grid.
     folder : Path
         Folder for the simulated contacts.
-        workers : int
-            Number of processes.
-        parameters : tuple of Parameter
-            The fitted parameters.
+    workers : int
+        Number of processes.
+    parameters : tuple of Parameter
+        The fitted parameters.
     """
 
     sensor: SensorSpec

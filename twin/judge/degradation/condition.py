@@ -28,12 +28,12 @@ class View:
     spec : SensorSpec
         The rendered specification, including its degradations.
         center_px : (2,) float
-        radius_px : float
-            Centre and radius of the disc through which the gel is seen.
-        px_per_mm : float
-            Scale at the caps at rest.
-        caps_px : (N, 2) float
-            Places of the caps in this frame.
+    radius_px : float
+        Centre and radius of the disc through which the gel is seen.
+    px_per_mm : float
+        Scale at the caps at rest.
+    caps_px : (N, 2) float
+        Places of the caps in this frame.
     """
 
     spec: SensorSpec
@@ -107,20 +107,20 @@ class Condition:
     nominal, severe : float
     spec : callable, optional
         ``spec(spec, value, rng)`` returns the degraded specification, before anything is rendered; ``OnSection`` if one section changes.
-        solves : bool
-            Whether the mechanics of the specification change, so that contacts must be solved anew.
+    solves : bool
+        Whether the mechanics of the specification change, so that contacts must be solved anew.
     light : callable, optional
         ``light(light, value, view, rng)`` returns the degraded linear light on the film, before the camera's response.
-        frame : callable, optional
-            ``frame(image, value, view, rng)`` returns the degraded gray levels or RGB (uint8).
-        moves : callable, optional
-            ``moves(px, value, view)`` returns the places to which ``light`` or ``frame`` moves points (n, 2) of the picture.
-        hides : callable, optional
-            ``hides(value, view, rng)`` returns the caps that are gone, (N,) bool.
-        setting : callable, optional
-            ``setting(detector, value)`` returns a `DetectorSpec` with a wrong setting.
-        image_level : bool
-            Whether the condition acts on a frame alone, so that real frames can also be degraded.
+    frame : callable, optional
+        ``frame(image, value, view, rng)`` returns the degraded gray levels or RGB (uint8).
+    moves : callable, optional
+        ``moves(px, value, view)`` returns the places to which ``light`` or ``frame`` moves points (n, 2) of the picture.
+    hides : callable, optional
+        ``hides(value, view, rng)`` returns the caps that are gone, (N,) bool.
+    setting : callable, optional
+        ``setting(detector, value)`` returns a `DetectorSpec` with a wrong setting.
+    image_level : bool
+        Whether the condition acts on a frame alone, so that real frames can also be degraded.
     """
 
     name: str

@@ -55,12 +55,12 @@ class Envelope:
     pipeline : str
     severity : float
         Severity at which the first measure crosses its limit; inf if none does up to the last step.
-        measure : str
-            Name of that measure; "" if none.
-        looked : float
-            Severity of the last step.
-        interval : (2,) float
-            Severities at which the ends of that measure's 90 % band cross the limit; inf if one does not.
+    measure : str
+        Name of that measure; "" if none.
+    looked : float
+        Severity of the last step.
+    interval : (2,) float
+        Severities at which the ends of that measure's 90 % band cross the limit; inf if one does not.
     """
 
     case: Case

@@ -26,10 +26,10 @@ class Measure:
     name, title, unit : str
     limit : float
         Limit of the mean over the contacts.
-        least : bool
-            Whether the limit is a least value instead of a largest value.
-        in_pitches : bool
-            Whether the limit is in mean distances of neighbouring pins instead of ``unit``.
+    least : bool
+        Whether the limit is a least value instead of a largest value.
+    in_pitches : bool
+        Whether the limit is in mean distances of neighbouring pins instead of ``unit``.
     """
 
     name: str

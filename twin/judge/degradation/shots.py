@@ -75,10 +75,10 @@ class DegradedShot:
     frame : Frame
     caps_px : (N, 2) float
         True places of the pins.
-        visible : (N,) bool
-            Whether the cap exists, is within the frame, and is not hidden.
-        touched : bool
-            Whether there is a contact. Real frames are assumed to show one.
+    visible : (N,) bool
+        Whether the cap exists, is within the frame, and is not hidden.
+    touched : bool
+        Whether there is a contact. Real frames are assumed to show one.
     """
 
     name: str

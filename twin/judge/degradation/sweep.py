@@ -36,12 +36,12 @@ class Plan:
     detectors : tuple of DetectorSpec
         Pictures are written of the first one.
         cases : tuple of Case
-        severities : tuple of float
-            Increasing; the first is 0.
-        models : callable, optional
-            Returns models by name; each process calls it once.
-        model_digests : dict of str to str
-            Digest of everything that a model's estimates depend on, by the model's name.
+    severities : tuple of float
+        Increasing; the first is 0.
+    models : callable, optional
+        Returns models by name; each process calls it once.
+    model_digests : dict of str to str
+        Digest of everything that a model's estimates depend on, by the model's name.
     """
 
     source: RenderedSource | RealSource

@@ -26,16 +26,16 @@ class Comparison:
     measured : MeasuredFrames
     simulated_px : (M, N, 2) float
         NaN if the contact failed.
-        error_px : (M,) float
-            Mean error over the pins; NaN if the contact failed.
+    error_px : (M,) float
+        Mean error over the pins; NaN if the contact failed.
     executed : (M,) bool
         Whether the arm executed the frame's move.
     by : dict of str to (M,) float
         ``depth_mm`` (the label along the approach), ``angle_deg`` (size of all turns), ``shear_mm`` (size of the executed move).
     friction, friction_error_px : (M,) float
         Individual friction of a frame, and the error with it; NaN for frames for which it was not fitted.
-        failures : dict of str to str
-            Reasons of failed contacts, by image name.
+    failures : dict of str to str
+        Reasons of failed contacts, by image name.
     """
 
     measured: MeasuredFrames

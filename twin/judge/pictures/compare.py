@@ -49,8 +49,8 @@ class Pair:
     figures : ImageFigures
     remainder_px : float
         Median distance between the fitted skin's pins and the real ones (pin-aligned), or mean error of the pins (pose-aligned).
-        exact : bool
-            Whether the detector finds exactly all pins in the render.
+    exact : bool
+        Whether the detector finds exactly all pins in the render.
     """
 
     real: RealFrame
@@ -68,10 +68,10 @@ class PoseAligned:
     ----------
     rig : RigSpec
         The fitted rig.
-        fitted : (M,) bool
-            The frames that the rig was fitted to.
-        contacts : (M, 3) float
-            Indentation in mm, n_x and n_y of each frame's contact.
+    fitted : (M,) bool
+        The frames that the rig was fitted to.
+    contacts : (M, 3) float
+        Indentation in mm, n_x and n_y of each frame's contact.
     pairs : list of Pair
     """
 

@@ -30,8 +30,8 @@ class RealFrame:
     frame : Frame
     pins_px : (N, 2) float
         Raw-frame px, in the specification's order.
-        label : dict of str to float
-            The numbers in the frame's row of the recording's table.
+    label : dict of str to float
+        The numbers in the frame's row of the recording's table.
     """
 
     frame: Frame

@@ -164,8 +164,8 @@ def fit_rig(
     ----------
     start : RigSpec
         The rig at the start. Its friction, compliances and plate tilt are not changed.
-        simulate : callable, optional
-            Returns the simulated pins (m, N, 2) px of the labels with a rig. If it is given, there is a second round.
+    simulate : callable, optional
+        Returns the simulated pins (m, N, 2) px of the labels with a rig. If it is given, there is a second round.
 
     Raises
     ------

@@ -59,8 +59,8 @@ class Statistics:
     spectrum_db : float
         Difference of the mean spectra (see ``log_distance_db``).
         real_spots, rendered_spots : Spots
-        spots_apart_px : (m,) float
-            Distances of spots that have a counterpart.
+    spots_apart_px : (m,) float
+        Distances of spots that have a counterpart.
     """
 
     radial: list[RadialRow]

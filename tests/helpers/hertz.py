@@ -15,7 +15,6 @@ from block import build_block
 
 from twin.mechanics.balance import Body, Friction, LoadState
 from twin.mechanics.contact import ContactPoints
-from twin.mechanics.linear import FrontalSolver
 from twin.mechanics.newton import LoadStepper
 from twin.objects.analytic import Sphere
 
@@ -79,10 +78,7 @@ def indent(spec, *, fine: float, size: float = SIZE, steps: int = 4) -> Indented
     fixed[-1] = fixed[:, [0, -1]] = fixed[:, :, [0, -1]] = True
     fixed = fixed.ravel()
     points = contact_points(block, 1.5 * RADIUS_MM)
-    keep = np.zeros(len(fixed), bool)
-    keep[np.unique(points.controls)] = True
     elements = block.elements(spec)
-    frontal = FrontalSolver([block.cells.controls], [block.boxes], fixed, keep & ~fixed)
     count = len(points.area_mm2)
     state = LoadState(
         control_mm=block.control_mm,
@@ -94,7 +90,7 @@ def indent(spec, *, fine: float, size: float = SIZE, steps: int = 4) -> Indented
         penalty_mpa_mm=30.0,
         T=np.eye(4),
     )
-    stepper = LoadStepper(Body((elements,), points, ~fixed, False), frontal, Sphere(SPHERE_MM), Friction(0.0, 0.0), 0.0)
+    stepper = LoadStepper(Body((elements,), points, ~fixed, False), [block.boxes], Sphere(SPHERE_MM), Friction(0.0, 0.0), 0.0)
     for step in range(1, steps + 1):
         T = np.eye(4)
         T[2, 3] = -depth_mm * step / steps

@@ -108,6 +108,8 @@ class Result:
         Rows of the other tables; the last two are empty if they were not asked for.
     names : tuple of str
         Names of the labels.
+    frames : int
+        Labelled frames that the models learnt from and were judged on.
     written : list of Path
     """
 
@@ -116,11 +118,13 @@ class Result:
     efficiency: list[dict[str, Any]]
     contacts: list[dict[str, Any]]
     names: tuple[str, ...]
+    frames: int
     written: list[Path]
 
     def lines(self) -> list[str]:
-        """The result as lines of text, one for each run."""
-        return [f"{row['model']}, seed {row['seed']}: {row['state']}{self._errors(row)}" for row in self.rows]
+        """The result as lines of text: the number of frames, then one for each run."""
+        runs = [f"{row['model']}, seed {row['seed']}: {row['state']}{self._errors(row)}" for row in self.rows]
+        return [f"{self.frames} labelled frames", *runs]
 
     def _errors(self, row: dict[str, Any]) -> str:
         if "epochs" not in row:
@@ -164,7 +168,7 @@ def run(plan: Plan, out: Path, *, progress: Progress = silent) -> Result:
     notes = {"device": device, "threads": torch.get_num_threads(), "labels": plan.labels, "max_minutes": plan.max_minutes}
     notes["columns"] = [*SHOWN, *error_columns(data)]
     written.append(write_page(out, data=data, models=rows, graphs=graphs, efficiency=efficiency, contacts=contacts, notes=notes))
-    return Result(rows, graphs, efficiency, contacts, data.targets.names, written)
+    return Result(rows, graphs, efficiency, contacts, data.targets.names, len(data), written)
 
 
 def _efficiency(plan: Plan, runs: list[PlannedRun], data: Dataset, device: str, progress: Progress) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ import typer
 from command import run_twin
 from typer.testing import CliRunner
 
+from hardware.errors import DeviceNotConnectedError
 from twin.cli import command_line, main
 
 ROOT = Path(__file__).parents[2]
@@ -251,3 +252,17 @@ def test_a_letter_that_the_terminal_lacks_is_printed_by_its_number(monkeypatch):
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 0 and written.getvalue() == b"f_\\xe4.png\nf_\\udcc3\\udca4.png\n"
+
+
+def test_a_missing_device_is_one_line_though_it_is_also_an_error_of_the_system(monkeypatch, capsys):
+    """DeviceNotConnectedError is a ConnectionError, as LeRobot expects it, and so an OSError."""
+
+    def absent(*_: object) -> None:
+        raise DeviceNotConnectedError("MG400 at 127.0.0.1: no connection; check that the arm is on")
+
+    monkeypatch.setattr("scenes.catalog.sensors", absent)
+    monkeypatch.setattr("sys.argv", ["twin", "sensors"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().err
+    assert end.value.code == 1 and said == "twin: error: MG400 at 127.0.0.1: no connection; check that the arm is on\n"

@@ -80,11 +80,9 @@ def main() -> None:
         command_line()(prog_name="twin")
     except KeyboardInterrupt as interrupt:  # before a command runs
         _end_interrupted(interrupt)
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            raise
-        _end_without_room(error)
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            _end_without_room(error)
         if not _for_user(error):
             raise
         print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -5,6 +5,7 @@
 
 import time
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Self
@@ -27,7 +28,29 @@ PATIENCE_S, PATIENCE = 10.0, 5.0
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
-class RobotController:
+class Closing(ABC):
+    """What ``cri`` closes at the end of a ``with`` block."""
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__} ({self.info})"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+        leave(self.close, error)
+
+    @property
+    @abstractmethod
+    def info(self) -> str:
+        """Which arm it is."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of the arm."""
+
+
+class RobotController(Closing):
     """An arm with the interface of ``cri``. It is connected and enabled when it is made.
 
     Parameters
@@ -62,15 +85,6 @@ class RobotController:
         except BaseException as error:
             leave(self.arm.disconnect, error)
             raise
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__} ({self.info})"
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
-        leave(self.close, error)
 
     @property
     def info(self) -> str:

@@ -5,12 +5,10 @@
 
 from collections.abc import Callable
 from threading import Thread
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
-from hardware.arms.cri.controller import NO_POSE, RobotController
+from hardware.arms.cri.controller import NO_POSE, Closing, RobotController
 from hardware.arms.cri.transforms import (
     EULER_AXES,
     InvalidEulerAxes,
@@ -22,7 +20,7 @@ from hardware.arms.cri.transforms import (
     quat2euler,
     quat2mat,
 )
-from hardware.errors import DeviceError, leave
+from hardware.errors import DeviceError
 
 # Numbers of joints that arms have.
 FEWEST_JOINTS, MOST_JOINTS = 4, 7
@@ -40,7 +38,7 @@ class AsyncNotBusy(DeviceError):  # noqa: N818  (cri's name)
     """No move was begun."""
 
 
-class SyncRobot:
+class SyncRobot(Closing):
     """An arm with a tool and a work frame; poses are 6-tuples in mm and deg.
 
     As in ``cri``, the flange goes to ``coord_frame * pose * tcp``: ``tcp`` is where the flange sits seen from the tool's tip.
@@ -52,15 +50,6 @@ class SyncRobot:
         self.controller = controller
         self._axes = "sxyz"
         self._T_base_work = self._T_tip_flange = np.eye(4)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__} ({self.info})"
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
-        leave(self.close, error)
 
     @property
     def info(self) -> str:

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -23,7 +24,38 @@ Wish = tuple[ObjectPose, float]
 """A pose, and the time (``time.monotonic``) at which it was wished."""
 
 
-class Worker:
+class _OwnThread(ABC):
+    """Work in a thread of its own, which waits for news.
+
+    Parameters
+    ----------
+    name : str
+        Of the thread.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._news = threading.Condition()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End; waits for what is being done."""
+        with self._news:
+            self._ended = True
+            self._news.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Work until it is ended."""
+
+
+class Worker(_OwnThread):
     """Moves a contact in a thread of its own. A context manager.
 
     Parameters
@@ -46,16 +78,14 @@ class Worker:
     ) -> None:
         self._contact, self._tracer = contact, tracer
         self._on_answer, self._on_message = on_answer, on_message
-        self._news = threading.Condition()
+        super().__init__("studio-worker")
         self._wish: Wish | None = None
         self._jobs: deque[Callable[[], None]] = deque()
         self._way: deque[Wish] = deque()
-        self._ended = False
         self._asked_trace = 0
         self._moved_s = time.monotonic()
         self._newest: Answer | None = None
         self._traces = tracer is not None
-        self._thread = threading.Thread(target=self._run, name="studio-worker", daemon=True)
 
     @property
     def newest(self) -> Answer | None:
@@ -94,15 +124,11 @@ class Worker:
             self._publish(answer)
 
     def __enter__(self) -> "Worker":
-        self._thread.start()
+        self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        with self._news:
-            self._ended = True
-            self._news.notify()
-        if self._thread.is_alive():
-            self._thread.join()
+        self.stop()
 
     def _run(self) -> None:
         while True:
@@ -190,7 +216,7 @@ class Worker:
 T = TypeVar("T")
 
 
-class Newest(Generic[T]):
+class Newest(_OwnThread, Generic[T]):
     """Calls a function with the newest of the things it is given, in a thread of its own, one at a time.
 
     Parameters
@@ -203,15 +229,9 @@ class Newest(Generic[T]):
     """
 
     def __init__(self, take: Callable[[T], None], name: str, failed: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(name)
         self._take, self._failed = take, failed
-        self._news = threading.Condition()
         self._waiting: list[T] = []
-        self._ended = False
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-
-    def start(self) -> None:
-        """Begin."""
-        self._thread.start()
 
     def give(self, thing: T) -> None:
         """Take this next; what has not been taken yet is forgotten."""
@@ -223,14 +243,6 @@ class Newest(Generic[T]):
     def overtaken(self) -> bool:
         """Whether something newer waits. For a ``take`` that can stop early."""
         return bool(self._waiting) or self._ended
-
-    def stop(self) -> None:
-        """End; waits for what is being taken."""
-        with self._news:
-            self._ended = True
-            self._news.notify()
-        if self._thread.is_alive():
-            self._thread.join()
 
     def _run(self) -> None:
         while True:

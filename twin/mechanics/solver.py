@@ -34,6 +34,8 @@ _FOCUS_POINTS = 2000
 _FOCUS_GAP_MM = 0.5
 """At a first touch a direction counts for the focus with exp(-gap / this): the object's local shape decides, not how deep it will press."""
 
+_KEPT_SOLIDS = 4
+"""Solids that are kept, about 8 MB each: another pose has a focus of its own, and only the same pose or the rest state asks again."""
 _GRID_TURN_RAD = np.radians(30.0)
 """Turn of the grid's rows against the object's x axis. Rows along an edge would all cross it at the same moment."""
 _LEAST_FOCUS_RAD = np.radians(28.0)
@@ -66,7 +68,7 @@ class SkinSolver:
         self.spec, self.resolution = spec, resolution or Resolution()
         self.mesh = build_mesh(spec.geometry)
         self._blas = ThreadpoolController()
-        self._setting = lru_cache(maxsize=32)(self._set_up)
+        self._setting = lru_cache(maxsize=_KEPT_SOLIDS)(self._set_up)
 
     def rest(self, *, T_sensor_object: FloatArray | None = None) -> ContactState:
         """The undeformed sensor."""

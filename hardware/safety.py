@@ -30,7 +30,10 @@ Range = Annotated[tuple[float, float], AfterValidator(_rising)]
 
 
 class SafetyLimits(Section):
-    """Limits of an arm's moves in a loop. A limit that is left out does not exist.
+    """Limits of an arm's moves in a loop.
+
+    An optional limit that is left out does not exist. The defaults are cautious numbers for a desktop arm with a soft sensor; nothing in
+    the arms' manuals asks for them.
 
     Attributes
     ----------

@@ -54,7 +54,7 @@ class FrictionSpread(Section):
     stick_share : float
         Share of the contacts that have the coefficient ``stick`` instead.
     stick : float
-        Coefficient so large that nothing slides.
+        Coefficient of friction; the default is so large that nothing slides.
     """
 
     low: Positive

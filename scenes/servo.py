@@ -29,6 +29,8 @@ class PlacementSpec(Section):
 class ServoSpec(Section):
     """Following a surface: a proportional and integral law on depth and angle with a feed along the surface.
 
+    The default gains and bounds of the integrals are those of the sensor group's public servo code.
+
     Attributes
     ----------
     name : str

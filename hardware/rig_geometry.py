@@ -1,7 +1,6 @@
 """Where tool, sensor and object are: poses of the arm as matrices, and what a sensor at a pose truly touches."""
 
 from dataclasses import fields
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,11 +9,6 @@ from scenes.object import ObjectSpec
 from scenes.servo import PlacementSpec
 from twin.rig.mounting import Mounting
 from twin.rig.touch import Surface, Touch
-
-# Distance between two points of an outline, in mm.
-OUTLINE_STEP_MM = 0.5
-# An outline that is not closed after this length (mm) ends there: the object has no end.
-LONGEST_OUTLINE_MM = 2000.0
 
 
 def matrix_of(pose: np.ndarray) -> np.ndarray:
@@ -39,19 +33,6 @@ def moved(pose: np.ndarray, step_mm: np.ndarray) -> np.ndarray:
     return out
 
 
-def sensor_in_tool(mounting: Mounting) -> np.ndarray:
-    """``T_tool_sensor`` (4, 4)."""
-    axis, across = mounting.axis, mounting.across
-    turn = np.radians(mounting.image_turn_deg)
-    side = np.cross(axis, across)  # where the sensor's azimuth goes on to, a quarter turn after ``across``
-    T = np.eye(4)
-    T[:3, 0] = np.cos(turn) * across - np.sin(turn) * side
-    T[:3, 1] = np.sin(turn) * across + np.cos(turn) * side
-    T[:3, 2] = axis
-    T[:3, 3] = mounting.centre_mm
-    return T
-
-
 def object_in_base(placement: PlacementSpec) -> np.ndarray:
     """``T_base_object`` (4, 4)."""
     c, s = np.cos(np.radians(placement.turn_deg)), np.sin(np.radians(placement.turn_deg))
@@ -74,7 +55,7 @@ class PlacedObject:
     def __init__(self, spec: ObjectSpec, placement: PlacementSpec, mounting: Mounting) -> None:
         self.spec, self.mounting = spec, mounting
         self.T_base_object = object_in_base(placement)
-        self._T_tool_sensor = sensor_in_tool(mounting)
+        self._T_tool_sensor = mounting.T_tool_sensor
         self._surface = Surface(spec)
 
     def seen_from(self, pose: np.ndarray) -> np.ndarray:
@@ -102,24 +83,5 @@ class PlacedObject:
         return float(self._surface.field.distance(local[None])[0]) - self._surface.raised_mm
 
     def outline(self) -> np.ndarray:
-        """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x; read-only."""
-        return self._outline
-
-    @cached_property
-    def _outline(self) -> np.ndarray:
-        at, points = np.zeros(3), [np.zeros(2)]
-        while len(points) * OUTLINE_STEP_MM < LONGEST_OUTLINE_MM:
-            _, gradient, _ = self._surface.field.probe(at[None])
-            outward = gradient[0] * [1, 0, 1]
-            outward /= np.linalg.norm(outward)
-            at = at + OUTLINE_STEP_MM * np.array([-outward[2], 0.0, outward[0]])
-            for _ in range(4):
-                distance, gradient, _ = self._surface.field.probe(at[None])
-                at = at - distance[0] * gradient[0] * [1, 0, 1]
-            points.append(at[[0, 2]])
-            if len(points) > 10 and np.linalg.norm(points[-1]) < 0.75 * OUTLINE_STEP_MM:
-                points[-1] = np.zeros(2)
-                break
-        outline = np.array(points)
-        outline.flags.writeable = False
-        return outline
+        """The object's section through its origin (see ``Surface.outline``)."""
+        return self._surface.outline

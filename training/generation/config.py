@@ -120,19 +120,20 @@ def draw_contact(config: GenerationConfig, index: int, attempt: int) -> Draw:
     streams = [np.random.default_rng([config.seed, index, attempt, part]) for part in range(5)]
     how = config.randomisation
     label = draw_label(config.experiment, streams[0], how.executed_share if how else 1.0)
-    friction = _friction(how.friction, streams[1]) if how and how.friction else config.friction
-    sensor, values = _sensor(config.sensor, how, streams[2]) if how and how.sensor else (config.sensor, {})
+    friction = draw_friction(how.friction, streams[1]) if how and how.friction else config.friction
+    sensor, values = draw_sensor(config.sensor, how, streams[2]) if how and how.sensor else (config.sensor, {})
     return Draw(label, sensor, friction, values, int(streams[3].integers(2**31)), streams[4])
 
 
-def _friction(spread: FrictionSpread, rng: np.random.Generator) -> float:
+def draw_friction(spread: FrictionSpread, rng: np.random.Generator) -> float:
+    """Draw a coefficient of friction."""
     kind, value = rng.random(), float(np.exp(rng.uniform(np.log(spread.low), np.log(spread.high))))
     if kind < spread.free_share:
         return 0.0
     return spread.stick if kind > 1 - spread.stick_share else value
 
 
-def _sensor(nominal: SensorSpec, how: RandomisationSpec, rng: np.random.Generator) -> tuple[SensorSpec, dict]:
+def draw_sensor(nominal: SensorSpec, how: RandomisationSpec, rng: np.random.Generator) -> tuple[SensorSpec, dict]:
     """A copy of a sensor with randomly drawn values, and these values by key. They are drawn in the alphabetical order of the keys."""
     plain = nominal.model_dump(mode="json") | {"rig": rig_of(nominal).model_dump(mode="json")}
     values = {}

@@ -75,6 +75,18 @@ class Mounting:
         return point
 
     @property
+    def T_tool_sensor(self) -> np.ndarray:
+        """(4, 4) pose of the sensor's frame in the tool's."""
+        turn = np.radians(self.image_turn_deg)
+        side = np.cross(self.axis, self.across)  # where the sensor's azimuth goes on to, a quarter turn after ``across``
+        T = np.eye(4)
+        T[:3, 0] = np.cos(turn) * self.across - np.sin(turn) * side
+        T[:3, 1] = np.sin(turn) * self.across + np.cos(turn) * side
+        T[:3, 2] = self.axis
+        T[:3, 3] = self.centre_mm
+        return T
+
+    @property
     def label_turn(self) -> np.ndarray:
         """(3,) axis in the sensor frame about which the tool turns, right-handed, while the angle's label grows."""
         axis: np.ndarray = self.angle_sign * np.cross(self.across_in_sensor, _SENSOR_AXIS)

@@ -8,6 +8,7 @@ centre from the tool point along the axis and across it,
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,11 @@ from scenes.object import ObjectSpec
 from scenes.rig import RigSpec
 from twin.objects import build_field
 from twin.rig.mounting import Mounting
+
+OUTLINE_STEP_MM = 0.5
+"""Distance between two points of an outline."""
+LONGEST_OUTLINE_MM = 2000.0
+"""An outline that is not closed after this length ends there: the object has no end."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,26 @@ class Surface:
     def __init__(self, spec: ObjectSpec) -> None:
         self.field = build_field(spec.model_copy(update={"texture": None}))
         self.raised_mm = spec.texture.wire_diameter_mm if spec.texture else 0.0
+
+    @cached_property
+    def outline(self) -> np.ndarray:
+        """The object's section through its origin: (M, 2), x and z of the object frame in mm, from the origin on along x; read-only."""
+        at, points = np.zeros(3), [np.zeros(2)]
+        while len(points) * OUTLINE_STEP_MM < LONGEST_OUTLINE_MM:
+            _, gradient, _ = self.field.probe(at[None])
+            outward = gradient[0] * [1, 0, 1]
+            outward /= np.linalg.norm(outward)
+            at = at + OUTLINE_STEP_MM * np.array([-outward[2], 0.0, outward[0]])
+            for _ in range(4):
+                distance, gradient, _ = self.field.probe(at[None])
+                at = at - distance[0] * gradient[0] * [1, 0, 1]
+            points.append(at[[0, 2]])
+            if len(points) > 10 and np.linalg.norm(points[-1]) < 0.75 * OUTLINE_STEP_MM:
+                points[-1] = np.zeros(2)
+                break
+        outline = np.array(points)
+        outline.flags.writeable = False
+        return outline
 
     def touched(self, mounting: Mounting, T_sensor_object: np.ndarray) -> Touch:
         """What a mounted sensor touches with the object in poses (M, 4, 4)."""

@@ -1,0 +1,177 @@
+"""The environments' own laws: geometry of tasks, options, spaces, seeds. Contacts are solved on few poses, by the finite elements."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from scipy.spatial.transform import Rotation
+
+from scenes import load_experiment, load_object, load_sensor
+from training.environments import ids
+from training.environments.batch import Batch, Options
+from training.environments.felt import Felt
+from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
+from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, work_frame
+from twin.errors import OptionError
+
+PLACE_TOLERANCE_MM = 1e-6  # of geometry computed in double precision
+FAST = {"backend": "fem", "sensor": "mg400-127", "observation": "oracle"}
+
+
+def tool_of(sensor="mg400-331", experiment="surface-2d"):
+    return Tool.of(load_sensor(sensor), load_experiment(experiment))
+
+
+def test_a_motion_is_the_rotation_of_its_turn_vector():
+    rng = np.random.default_rng(0)
+    steps = np.concatenate([rng.uniform(-2, 2, (20, 3)), rng.uniform(-90, 90, (20, 3))], axis=1)
+    steps[0, 3:] = 0.0
+    T = motions(steps)
+    assert np.allclose(T[:, :3, :3], Rotation.from_rotvec(steps[:, 3:], degrees=True).as_matrix())
+    assert np.allclose(T[:, :3, 3], steps[:, :3])
+    assert np.allclose(inverse(T) @ T, np.eye(4))
+
+
+@pytest.mark.parametrize("thing", ["plane", "can", "ball-40", "square", "mesh-can"])
+@pytest.mark.parametrize("sensor", ["mg400-331", "ur5-331"])
+def test_a_tool_stands_as_deep_and_as_turned_as_it_is_put(thing, sensor):
+    tool, surface = tool_of(sensor), Surfaces()[load_object(thing)]
+    T = standing_on(tool, surface, 4.0, 2.3, 7.0)
+    touch = surface.touched(tool.mounting, tool.seen(T[None], np.eye(4)[None]))
+    assert touch.indent_mm[0] == pytest.approx(2.3, abs=PLACE_TOLERANCE_MM)
+    assert abs(touch.angle_deg[0]) == pytest.approx(7.0, abs=PLACE_TOLERANCE_MM)
+
+
+def test_z_goes_towards_the_object_and_ry_turns_the_tool():
+    tool, surface = tool_of(), Surfaces()[load_object("plane")]
+    T = standing_on(tool, surface, 0.0, 2.0, 0.0)[None]
+
+    def touched(step):
+        return surface.touched(tool.mounting, tool.seen(T @ motions(np.array([step])), np.eye(4)[None]))
+
+    assert touched([0, 0, 0.5, 0, 0, 0]).indent_mm[0] == pytest.approx(2.5)
+    assert touched([1.0, 0, 0, 0, 0, 0]).indent_mm[0] == pytest.approx(2.0)
+    assert abs(touched([0, 0, 0, 0, 5.0, 0]).angle_deg[0]) == pytest.approx(5.0)
+
+
+def test_the_work_frame_is_right_handed():
+    for experiment in ("surface-2d", "edge-2d"):
+        turn = work_frame(tool_of(experiment=experiment).mounting)[:3, :3]
+        assert np.linalg.det(turn) == pytest.approx(1.0)
+
+
+def test_a_ball_rolls_without_sliding():
+    """Its middle moves half as far as the sensor, and the place that it touches of the table does not move."""
+    task, tool = ObjectRoll(), tool_of(experiment="edge-2d")
+    task.prepare(1)
+    start = task.begin(0, tool, load_object("sphere"), Surfaces(), np.random.default_rng(1))
+    before, T_object = start.T_work[None], start.T_object[None]
+    moved = before @ motions(np.array([[0.2, -0.1, 0, 0, 0, 0]]))
+    after = task.carried(moved, before, T_object, tool)
+    middle = [T[0, :3, 3] + task.kept[0, 0] * T[0, :3, 2] for T in (T_object, after)]
+    assert middle[1] - middle[0] == pytest.approx([0.1, -0.05, 0.0])
+    bottom = np.append(middle[0] + [0, 0, task.kept[0, 0]], 1.0)  # of the ball, on the table
+    carried = after[0] @ np.linalg.inv(T_object[0]) @ bottom
+    assert np.linalg.norm(carried[:3] - bottom[:3]) < 2e-3  # mm; second order in the step
+
+
+def test_a_block_rests_while_the_push_is_within_its_friction_and_slides_beyond():
+    task, tool = ObjectPush(), tool_of()
+    task.prepare(1)
+    start = task.begin(0, tool, load_object("square"), Surfaces(), np.random.default_rng(0))
+    felt = Felt.at_rest(1, 331)
+    T_work, T_object = start.T_work[None], start.T_object[None]
+    forward = (T_work @ tool.T_work_sensor)[0, :3, :3].T @ [0.0, 0.0, 1.0]
+    felt.force_n[0] = 0.9 * task.kept[0, 0] * forward * 0.5
+    assert task.pushed(felt, T_work, T_object, tool) is None
+    felt.force_n[0] = 3.0 * task.kept[0, 0] * forward
+    pushed = task.pushed(felt, T_work, T_object, tool)
+    assert pushed is not None and pushed[0, 2, 3] > 0.1
+
+
+def test_reward_is_largest_where_the_task_wants_the_sensor():
+    batch = Batch("SurfaceFollow", 1, Options(**FAST))
+    batch.begin(0, np.random.default_rng(0), {"object": "plane"})
+    surface = Surfaces()[load_object("plane")]
+    rewards = []
+    for off_mm in (0.0, 0.5, 1.0):
+        batch.T_work[0] = standing_on(batch.tool, surface, 0.0, batch.goal[0, 0] + off_mm, 0.0)
+        rewards.append(float(batch.task.judge(batch._seen_now()).reward[0]))
+    assert rewards[0] == pytest.approx(1.0) and rewards == sorted(rewards, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"observaton": "pins"}, "did you mean 'observation'"),
+        ({"observation": "touch"}, "observation='touch'"),
+        ({"stack": 0}, "stack=0"),
+        ({"axes": ("x", "w")}, "axes="),
+        ({"axes": ("x", "x")}, "each once"),
+        ({"backend": "cuda"}, "backend='cuda'"),
+        ({"steps": -1}, "steps=-1"),
+        ({"pictures": "photo"}, "pictures='photo'"),
+        ({"backend": "fem", "friction_memory": False}, "friction_memory"),
+    ],
+)
+def test_an_option_that_cannot_be_meant_is_named(given, named):
+    with pytest.raises(OptionError, match=named.replace("(", r"\(")):
+        Options.given(given)
+
+
+@pytest.mark.parametrize(("task", "thing"), [("ObjectRoll", "can"), ("EdgeFollow", "plane")])
+def test_an_object_that_the_task_cannot_use_is_refused(task, thing):
+    with pytest.raises(OptionError, match=thing):
+        Batch(task, 1, Options(objects=(thing,), **FAST))
+
+
+def test_wrong_calls_are_named():
+    env = gymnasium.make("tactip/SurfaceFollow-v0", disable_env_checker=True, **FAST).unwrapped
+    with pytest.raises(OptionError, match="reset"):
+        env.step(np.zeros(2))
+    with pytest.raises(OptionError, match="'colour'"):
+        env.reset(options={"colour": "red"})
+    env.reset(seed=0)
+    with pytest.raises(OptionError, match="NaN"):
+        env.step(np.array([np.nan, 0.0]))
+    with pytest.raises(OptionError, match="shape"):
+        env.step(np.zeros(3))
+    env.close()
+    env.close()  # gymnasium: a second close has no effect
+    with pytest.raises(OptionError, match="closed"):
+        env.step(np.zeros(2))
+    with pytest.raises(OptionError, match="render_mode"):
+        gymnasium.make("tactip/SurfaceFollow-v0", render_mode="ansi", disable_env_checker=True, **FAST)
+
+
+def test_every_task_is_registered():
+    assert {name.split("/")[1].split("-")[0] for name in ids()} == set(TASKS)
+    for name in ids():
+        assert gymnasium.spec(name).vector_entry_point is not None
+
+
+def test_the_same_seed_gives_the_same_episode_on_finite_elements():
+    def episode():
+        env = gymnasium.make("tactip/SurfaceFollow-v0", disable_env_checker=True, randomise="moves", **{**FAST, "observation": "pins"})
+        seen, _ = env.reset(seed=7)
+        told = [seen["tactile"]]
+        for action in ([0.3, -0.2], [-0.1, 0.5]):
+            told.append(env.step(np.array(action, np.float32))[0]["tactile"])
+        return np.array(told)
+
+    first = episode()
+    assert np.array_equal(first, episode())
+    assert np.abs(first).max() > 0.1  # the sensor feels something
+
+
+def test_gymnasium_accepts_an_environment_on_finite_elements():
+    check_env(gymnasium.make("tactip/SurfaceFollow-v0", steps=2, **FAST).unwrapped, skip_render_check=True)
+
+
+def test_goals_of_a_follower_lie_in_its_range():
+    task, tool = SurfaceFollow(), tool_of()
+    task.prepare(1)
+    rng = np.random.default_rng(0)
+    goals = [task.begin(0, tool, load_object("plane"), Surfaces(), rng).goal[0] for _ in range(50)]
+    low, high = task.indents_mm
+    assert low <= min(goals) and max(goals) <= high and max(goals) - min(goals) > 0.5 * (high - low)

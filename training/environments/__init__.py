@@ -1,0 +1,38 @@
+"""Gymnasium environments of a TacTip's tasks, on the finite elements or on their surrogate.
+
+Importing this package registers them: ``gymnasium.make("tactip/EdgeFollow-v0")``. Where the package is installed, gymnasium finds them
+without an import.
+"""
+
+try:
+    import gymnasium
+except ImportError as error:  # an extra: the rest of the package works without it
+    raise ImportError("the environments need gymnasium: pip install 'tactip-twin[gym]'") from error
+
+from gymnasium.envs.registration import register, registry
+
+from training.environments.batch import Options
+from training.environments.environment import TactileEnv, TactileVectorEnv
+from training.environments.tasks import TASKS
+
+NAMESPACE = "tactip"
+"""First part of the environments' ids."""
+VERSION = 0
+
+
+def ids() -> tuple[str, ...]:
+    """The ids of all environments."""
+    return tuple(f"{NAMESPACE}/{name}-v{VERSION}" for name in TASKS)
+
+
+def register_all() -> None:
+    """Register the environments; a second call has no effect. Gymnasium calls it where the package is installed."""
+    for name, full in zip(TASKS, ids(), strict=True):
+        if full not in registry:
+            where = "training.environments.environment"
+            register(id=full, entry_point=f"{where}:TactileEnv", vector_entry_point=f"{where}:TactileVectorEnv", kwargs={"task": name})
+
+
+register_all()
+
+__all__ = ["NAMESPACE", "Options", "TactileEnv", "TactileVectorEnv", "gymnasium", "ids", "register_all"]

@@ -1,0 +1,341 @@
+"""Several environments of one task, stepped together; a single environment is a batch of one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from typing import Any, Literal, get_args
+
+import numpy as np
+from gymnasium import spaces
+
+from scenes import load_experiment, load_object, load_randomisation, load_sensor
+from training.environments.felt import Backend, Contact, FiniteElements
+from training.environments.observe import IMAGE_PX, KINDS, LARGEST, PICTURES, Eye, Kind, Pictures
+from training.environments.tasks import TASKS, Judged, Seen
+from training.environments.world import AXES, Surfaces, Tool, motions
+from training.generation.config import draw_friction, draw_sensor
+from twin.errors import OptionError
+from twin.rig.contact import contact_law
+from twin.rig.touch import Touch
+from twin.types import BoolArray, FloatArray, ImageArray, IntArray
+
+BackendName = Literal["fem"]
+BACKENDS: tuple[str, ...] = get_args(BackendName)
+"""What solves the contacts."""
+Control = Literal["increment", "velocity"]
+CONTROLS: tuple[str, ...] = get_args(Control)
+"""What actions mean: the motion of a step, or a speed during a step."""
+PERIOD_S = 0.1
+"""Time that a step stands for: an agent decides ten times a second."""
+LARGEST_MM, LARGEST_DEG = 1.0, 5.0
+"""Motion of a step by an increment of 1, along and about each axis."""
+LARGEST_MM_S, LARGEST_DEG_S = 10.0, 50.0
+"""Speed that a velocity of 1 means."""
+MOST_TRIALS = 4
+"""Trials in which an object that is pushed finds its place in a step."""
+MOST_STACK = 16
+"""Most observations that can be stacked."""
+MOST_ORACLE = 100.0
+"""What only a simulation knows is clipped to this."""
+RESET_OPTIONS = ("object",)
+"""What ``reset(options=...)`` takes."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What an environment can be asked for, by keyword.
+
+    Attributes
+    ----------
+    sensor : str
+        Name or file.
+    observation : {"pins", "oracle", "graph", "image", "pose"}
+        What ``tactile`` holds: displacements of the pins in spacings (N, 2); what no sensor knows; the graph's node features (N, 5); a
+        small gray picture (128, 128); the shipped estimator's pose.
+    stack : int
+        Newest observations that are given together, the newest last.
+    axes : tuple of str, optional
+        Axes that are moved, of x, y, z, Rx, Ry, Rz in the tool's work frame; the task's by default.
+    action : {"increment", "velocity"}
+    backend : {"fem"}
+    objects : tuple of str, optional
+        Names or files, of which one is drawn for each episode; the task's by default.
+    randomise : str, optional
+        Name or file of a randomisation: friction, camera and other numbers of the sensor, noise of the pins; drawn for each episode.
+    pictures : {"none", "preview", "traced"}
+        Find the pins by the real pipeline in rendered frames. Observation "image" draws previews if none are asked for.
+    friction_memory : bool
+        False forgets in each step how the object came to where it is (only for ``surrogate``; to measure what the memory is worth).
+    steps : int, optional
+        Of an episode; the task's by default.
+    """
+
+    sensor: str = "mg400-331"
+    observation: Kind = "pins"
+    stack: int = 1
+    axes: tuple[str, ...] | None = None
+    action: Control = "increment"
+    backend: BackendName = "fem"
+    objects: tuple[str, ...] | None = None
+    randomise: str | None = None
+    pictures: Pictures = "none"
+    friction_memory: bool = True
+    steps: int | None = None
+
+    def __post_init__(self) -> None:
+        known: list[tuple[str, tuple[str, ...]]] = [
+            ("observation", KINDS),
+            ("action", CONTROLS),
+            ("backend", BACKENDS),
+            ("pictures", PICTURES),
+        ]
+        for name, values in known:
+            if getattr(self, name) not in values:
+                raise OptionError(f"{name}={getattr(self, name)!r}: expected one of {', '.join(values)}")
+        if not isinstance(self.stack, int) or not 1 <= self.stack <= MOST_STACK:
+            raise OptionError(f"stack={self.stack!r}: expected a whole number from 1 to {MOST_STACK}")
+        if self.steps is not None and (not isinstance(self.steps, int) or self.steps < 1):
+            raise OptionError(f"steps={self.steps!r}: expected a whole number of at least 1")
+        for name in ("axes", "objects"):
+            given = getattr(self, name)
+            if given is not None:
+                object.__setattr__(self, name, (given,) if isinstance(given, str) else tuple(given))
+        if self.axes is not None and (not self.axes or len(set(self.axes)) < len(self.axes) or not set(self.axes) <= set(AXES)):
+            raise OptionError(f"axes={self.axes!r}: expected some of {', '.join(AXES)}, each once")
+        if self.objects is not None and not self.objects:
+            raise OptionError("objects=(): expected at least one object")
+        if self.backend == "fem" and not self.friction_memory:
+            raise OptionError("friction_memory=False goes with backend='surrogate' alone: finite elements always remember")
+
+    @classmethod
+    def given(cls, options: Mapping[str, Any]) -> "Options":
+        """Options from keywords.
+
+        Raises
+        ------
+        OptionError
+            There is no such option, or a value can't be meant.
+        """
+        known = [field.name for field in fields(cls)]
+        for name in options:
+            if name not in known:
+                near = get_close_matches(name, known, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+                raise OptionError(f"an environment has no option {name!r}; {hint}")
+        return cls(**options)
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """What a step of B environments gives: as in gymnasium, with arrays (B,) for each number of ``info``."""
+
+    reward: FloatArray
+    terminated: BoolArray
+    truncated: BoolArray
+    info: dict[str, FloatArray | BoolArray]
+
+
+class Batch:
+    """``count`` environments of one task.
+
+    Parameters
+    ----------
+    task : str
+        Name, of ``TASKS``.
+    count : int
+    options : Options
+
+    Raises
+    ------
+    OptionError, SpecError, ContactError
+        Something that is asked for can't be had.
+    """
+
+    def __init__(self, task: str, count: int, options: Options) -> None:
+        self.options, self.count = options, count
+        self.task = TASKS[task]()
+        self.task.prepare(count)
+        self.sensor = load_sensor(options.sensor)
+        self.tool = Tool.of(self.sensor, load_experiment(self.task.experiment))
+        self.objects = {name: load_object(name) for name in options.objects or self.task.objects}
+        for thing in self.objects.values():
+            self.task.require(thing)
+        self.randomisation = load_randomisation(options.randomise) if options.randomise else None
+        self.steps = options.steps or self.task.steps
+        self._surfaces = Surfaces()
+        self.backend = self._make_backend()
+        self.eye = self._make_eye()
+        self.axes = options.axes or self.task.axes
+        self._scale = self._action_scale()
+        self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
+        self.contacts: list[Contact | None] = [None] * count
+        self.T_work, self.T_object = np.tile(np.eye(4), (2, count, 1, 1))
+        self.goal = np.zeros((count, len(self.task.goal_names)))
+        self.steps_done = np.zeros(count, int)
+        self._good = np.zeros(count, int)
+        self._action = np.zeros((count, len(self.axes)))
+        self._seen: FloatArray | ImageArray | None = None
+
+    def action_space(self) -> spaces.Box:
+        """Of one environment."""
+        return spaces.Box(-1.0, 1.0, (len(self.axes),), np.float32)
+
+    def observation_space(self) -> spaces.Dict:
+        """Of one environment: ``tactile`` and ``goal``."""
+        goal = spaces.Box(-100.0, 100.0, (len(self.task.goal_names),), np.float32)
+        stack = self.options.stack
+        if self.options.observation == "image":
+            return spaces.Dict({"tactile": spaces.Box(0, 255, (IMAGE_PX, IMAGE_PX, stack), np.uint8), "goal": goal})
+        shape = (len(self.task.oracle_names),) if self.eye is None else self.eye.shape
+        limit = MOST_ORACLE if self.eye is None else LARGEST
+        return spaces.Dict({"tactile": spaces.Box(-limit, limit, (stack, *shape), np.float32), "goal": goal})
+
+    def begin(self, row: int, rng: np.random.Generator, asked: Mapping[str, Any] | None = None) -> None:
+        """Draw an episode of one environment: object, friction, sensor, start and goal. ``settle`` then makes the first contact."""
+        asked = dict(asked or {})
+        for name in asked:
+            if name not in RESET_OPTIONS:
+                raise OptionError(f"reset(options=...) has no {name!r}; it takes {', '.join(RESET_OPTIONS)}")
+        name = asked.get("object") or str(rng.choice(list(self.objects)))
+        touched = self.objects.get(name) or load_object(name)
+        self.task.require(touched)
+        how, sensor, friction = self.randomisation, self.sensor, None
+        if how is not None and how.friction is not None:
+            friction = draw_friction(how.friction, rng)
+        if how is not None and how.sensor:
+            sensor, _ = draw_sensor(self.sensor, how, rng)
+        contact = Contact(sensor, touched, contact_law(sensor.rig, self.tool.mounting, touched, friction=friction))
+        self.backend.begin(row, contact)
+        if self.eye is not None:
+            self.eye.begin(row, sensor)
+        start = self.task.begin(row, self.tool, touched, self._surfaces, rng)
+        self.T_work[row], self.T_object[row], self.goal[row] = start.T_work, start.T_object, start.goal
+        self._rngs[row], self.contacts[row] = rng, contact
+        self.steps_done[row] = self._good[row] = 0
+        self._action[row] = 0.0
+
+    def settle(self, rows: IntArray) -> None:
+        """Make the first contact of some rows that ``begin`` drew, and fill their stacks of observations."""
+        self._move(rows)
+        self._look(rows, first=True)
+
+    def step(self, actions: FloatArray, rows: IntArray) -> Stepped:
+        """Move the tools of some rows by actions (B, A); the other rows of the results are zero.
+
+        Raises
+        ------
+        OptionError
+            An action is not finite or has a wrong shape.
+        """
+        actions = np.asarray(actions, float)
+        if actions.shape != self._action.shape:
+            raise OptionError(f"actions of shape {self._action.shape} are expected ({', '.join(self.axes)}), got {actions.shape}")
+        if not np.isfinite(actions[rows]).all():
+            raise OptionError(f"an action is not a finite number: {actions[rows]}; look for NaN in the policy")
+        self._action[rows] = np.clip(actions[rows], -1.0, 1.0)
+        steps = np.zeros((self.count, 6))
+        steps[:, [AXES.index(axis) for axis in self.axes]] = self._action * self._scale
+        steps[:, :3] += self.task.feed_mm
+        before = self.T_work.copy()
+        self.T_work[rows] = before[rows] @ motions(steps)[rows]
+        carried = self.task.carried(self.T_work, before, self.T_object, self.tool)
+        self.T_object[rows] = carried[rows]
+        self.steps_done[rows] += 1
+        self._move(rows)
+        for _ in range(MOST_TRIALS):
+            pushed = self.task.pushed(self.backend.felt, self.T_work, self.T_object, self.tool)
+            if pushed is None:
+                break
+            self.T_object[rows] = pushed[rows]
+            self._move(rows)
+        self._look(rows, first=False)
+        return self._judged(rows)
+
+    def observation(self) -> dict[str, FloatArray | ImageArray]:
+        """The newest observations of all rows; copies."""
+        assert self._seen is not None, "settle first"
+        seen = np.moveaxis(self._seen, 1, -1) if self.options.observation == "image" else self._seen
+        return {"tactile": seen.copy(), "goal": self.goal.astype(np.float32)}
+
+    def picture(self, row: int) -> ImageArray:
+        """(H, W, 3) uint8: the sensor's frame of one environment."""
+        eye = self.eye or Eye(self.sensor, self.count, "pins", pictures="none", pin_noise_px=0.0)
+        image = eye.frame(self.backend.felt, row, np.random.default_rng(int(self.steps_done[row]))).image
+        return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+    def object_name(self, row: int) -> str:
+        """Name of the object of one environment's episode."""
+        contact = self.contacts[row]
+        return "" if contact is None else contact.touched.name
+
+    def touch(self) -> Touch:
+        """What rigid sensors would touch in all rows."""
+        T = self.tool.seen(self.T_work, self.T_object)
+        parts = {field.name: np.zeros((self.count, 3) if field.name == "place_mm" else self.count) for field in fields(Touch)}
+        things = [None if contact is None else contact.touched for contact in self.contacts]
+        for thing in {id(one): one for one in things if one is not None}.values():
+            rows = [row for row, one in enumerate(things) if one is thing]
+            found = self._surfaces[thing].touched(self.tool.mounting, T[rows])
+            for key, values in parts.items():
+                values[rows] = getattr(found, key)
+        return Touch(**parts)
+
+    def _seen_now(self) -> Seen:
+        return Seen(self.touch(), self.backend.felt, self.T_work, self.T_object, self.goal, self._action)
+
+    def _judged(self, rows: IntArray) -> Stepped:
+        seen = self._seen_now()
+        judged: Judged = self.task.judge(seen)
+        active = np.zeros(self.count, bool)
+        active[rows] = True
+        lost = np.array([bool(why) for why in self.backend.felt.lost])
+        failed, reached = (judged.failed | lost) & active, judged.reached & active & ~lost
+        late = self.steps_done > self.steps // 2
+        self._good += judged.good & active & late
+        ended = (self.steps_done >= self.steps) & active
+        enough = self._good >= self.task.success_share * np.maximum(self.steps_done - self.steps // 2, 1)
+        success = reached | (ended & ~failed & enough & (self.task.success_share > 0))
+        reward = np.where(active, np.where(lost, np.minimum(judged.reward, -5.0), judged.reward), 0.0)
+        info: dict[str, FloatArray | BoolArray] = {
+            "indent_mm": seen.touch.indent_mm,
+            "angle_deg": seen.touch.angle_deg,
+            "force_n": np.linalg.norm(seen.felt.force_n, axis=1),
+            "slip": seen.felt.slip.copy(),
+            "is_success": success,
+            "outside": lost & active,
+        }
+        return Stepped(reward, failed | reached, ended & ~(failed | reached), info)
+
+    def _move(self, rows: IntArray) -> None:
+        T = self.tool.seen(self.T_work, self.T_object)
+        self.backend.move(rows, T[rows], self.steps_done[rows] * PERIOD_S)
+
+    def _look(self, rows: IntArray, *, first: bool) -> None:
+        newest: FloatArray | ImageArray
+        if self.eye is None:
+            newest = np.clip(self.task.oracle(self._seen_now())[rows], -MOST_ORACLE, MOST_ORACLE).astype(np.float32)
+            valid = np.ones(len(rows), bool)
+        else:
+            newest, valid = self.eye.look(self.backend.felt, rows, self._rngs)
+        if self._seen is None:
+            self._seen = np.zeros((self.count, self.options.stack, *newest.shape[1:]), newest.dtype)
+        if first:
+            self._seen[rows] = newest[:, None]
+            return
+        kept = np.where(valid.reshape(-1, *[1] * (newest.ndim - 1)), newest, self._seen[rows, -1])
+        self._seen[rows] = np.concatenate([self._seen[rows, 1:], kept[:, None]], axis=1)
+
+    def _action_scale(self) -> FloatArray:
+        mm, deg = (LARGEST_MM, LARGEST_DEG) if self.options.action == "increment" else (LARGEST_MM_S * PERIOD_S, LARGEST_DEG_S * PERIOD_S)
+        return np.array([deg if axis.startswith("R") else mm for axis in self.axes])
+
+    def _make_backend(self) -> Backend:
+        return FiniteElements(self.sensor, self.count)
+
+    def _make_eye(self) -> Eye | None:
+        options = self.options
+        if options.observation == "oracle":
+            return None
+        noise_px = self.randomisation.pin_noise_px if self.randomisation else 0.0
+        pictures: Pictures = "preview" if options.observation == "image" and options.pictures == "none" else options.pictures
+        return Eye(self.sensor, self.count, options.observation, pictures=pictures, pin_noise_px=noise_px)

@@ -1,0 +1,201 @@
+"""The environments as gymnasium knows them: a single one, and a vector of them in one process."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from training.environments.batch import Batch, Options
+from twin.errors import OptionError
+from twin.types import FloatArray, ImageArray
+
+RENDER_MODES = ("rgb_array",)
+"""What ``render_mode`` may be besides None."""
+RENDER_FPS = 10
+"""Pictures a second at the pace of the steps."""
+
+Seen = dict[str, Any]
+
+
+def _render_mode(mode: str | None) -> str | None:
+    if mode is not None and mode not in RENDER_MODES:
+        raise OptionError(f"render_mode={mode!r}: expected None or {', '.join(RENDER_MODES)}; to move a contact by hand use 'twin studio'")
+    return mode
+
+
+class TactileEnv(gymnasium.Env[Seen, FloatArray]):
+    """One environment of a task.
+
+    Parameters
+    ----------
+    task : str
+        EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ObjectRoll or ObjectPush.
+    render_mode : {None, "rgb_array"}
+    options
+        See ``training.environments.batch.Options``.
+
+    Raises
+    ------
+    OptionError
+        An option is unknown, or its value can't be meant.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}  # type: ignore[misc]
+
+    def __init__(self, task: str, *, render_mode: str | None = None, **options: Any) -> None:
+        self.render_mode = _render_mode(render_mode)
+        self.batch = Batch(task, 1, Options.given(options))
+        self.observation_space = self.batch.observation_space()
+        self.action_space = cast(spaces.Space[FloatArray], self.batch.action_space())
+        self._state = "new"
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
+        """Begin an episode; ``options`` may name its ``object``."""
+        self._require_open()
+        super().reset(seed=seed)
+        self.batch.begin(0, self.np_random, options)
+        self.batch.settle(np.zeros(1, int))
+        self._state = "begun"
+        return _row(self.batch.observation()), {"object": self.batch.object_name(0)}
+
+    def step(self, action: FloatArray) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+        """Move the tool; see gymnasium."""
+        self._require_open()
+        if self._state == "new":
+            raise OptionError("step() before reset(); call reset() first")
+        done = self.batch.step(np.asarray(action, float)[None], np.zeros(1, int))
+        info = {name: values[0].item() for name, values in done.info.items()}
+        if info.pop("outside"):
+            info["outside"] = self.batch.backend.felt.lost[0]
+        return _row(self.batch.observation()), float(done.reward[0]), bool(done.terminated[0]), bool(done.truncated[0]), info
+
+    def render(self) -> ImageArray | None:
+        """The sensor's frame, (H, W, 3) uint8, if the render mode is ``rgb_array``."""
+        self._require_open()
+        if self.render_mode is None:
+            return None
+        if self._state == "new":
+            raise OptionError("render() before reset(); call reset() first")
+        return self.batch.picture(0)
+
+    def close(self) -> None:
+        """End; a second call has no effect, as gymnasium wants it."""
+        self._state = "closed"
+
+    def _require_open(self) -> None:
+        if self._state == "closed":
+            raise OptionError("the environment is closed; make a new one")
+
+
+class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
+    """Several environments of a task, stepped together in this process. Row i with seed s is the single environment with seed s + i.
+
+    Parameters
+    ----------
+    task : str
+    num_envs : int
+    autoreset_mode : AutoresetMode or str
+        When an ended episode is followed by the next: in the step after its end (gymnasium's default), or in the same step.
+    render_mode, options
+        As for ``TactileEnv``.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **options: Any,
+    ) -> None:
+        mode = AutoresetMode(autoreset_mode)
+        if mode is AutoresetMode.DISABLED:
+            raise OptionError("autoreset_mode='Disabled' is not offered; give 'NextStep' or 'SameStep'")
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise OptionError(f"num_envs={num_envs!r}: expected a whole number of at least 1")
+        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS, "autoreset_mode": mode}
+        self.render_mode = _render_mode(render_mode)
+        self.num_envs, self._mode = num_envs, mode
+        self.batch = Batch(task, num_envs, Options.given(options))
+        self.single_observation_space = self.batch.observation_space()
+        self.single_action_space = self.batch.action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._rngs: list[np.random.Generator] = []
+        self._ended = np.zeros(num_envs, bool)
+        self._begun = False
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Seen, dict[str, Any]]:
+        """Begin an episode in every row."""
+        self._require_open()
+        if not self._rngs or seed is not None:
+            seeds = list(seed) if isinstance(seed, Sequence) else [None if seed is None else seed + row for row in range(self.num_envs)]
+            if len(seeds) != self.num_envs:
+                raise OptionError(f"reset(seed=...) got {len(seeds)} seeds for {self.num_envs} environments")
+            self._rngs = [seeding.np_random(one)[0] for one in seeds]
+        rows = np.arange(self.num_envs)
+        self._restart(rows, options)
+        self._ended[:] = False
+        self._begun = True
+        return self.batch.observation(), {}
+
+    def step(self, actions: FloatArray) -> tuple[Seen, FloatArray, Any, Any, dict[str, Any]]:
+        """Step every row; a row whose episode ended in the last step begins the next one instead (see ``autoreset_mode``)."""
+        self._require_open()
+        if not self._begun:
+            raise OptionError("step() before reset(); call reset() first")
+        again = np.flatnonzero(self._ended)
+        rows = np.flatnonzero(~self._ended)
+        if len(again):
+            self._restart(again, None)
+        done = self.batch.step(actions, rows) if len(rows) else None
+        if done is None:
+            nothing = np.zeros(self.num_envs, bool)
+            self._ended = nothing.copy()
+            return self.batch.observation(), np.zeros(self.num_envs), nothing, nothing.copy(), {}
+        here = np.zeros(self.num_envs, bool)
+        here[rows] = True
+        info: dict[str, Any] = {}
+        for name, values in done.info.items():
+            info[name], info[f"_{name}"] = np.where(here, values, np.zeros_like(values)), here.copy()
+        ended = done.terminated | done.truncated
+        if self._mode is AutoresetMode.NEXT_STEP:
+            self._ended = ended
+        elif ended.any():
+            last = self.batch.observation()
+            final = np.full(self.num_envs, None, object)
+            for row in np.flatnonzero(ended):
+                final[row] = {key: values[row] for key, values in last.items()}
+            info["final_obs"], info["_final_obs"] = final, ended.copy()
+            self._restart(np.flatnonzero(ended), None)
+        return self.batch.observation(), done.reward, done.terminated, done.truncated, info
+
+    def render(self) -> tuple[ImageArray, ...] | None:
+        """The frames of all rows, if the render mode is ``rgb_array``."""
+        self._require_open()
+        return tuple(self.batch.picture(row) for row in range(self.num_envs)) if self.render_mode else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Nothing is held open."""
+
+    def _restart(self, rows: np.ndarray, options: Mapping[str, Any] | None) -> None:
+        for row in rows.tolist():
+            self.batch.begin(row, self._rngs[row], options)
+        self.batch.settle(rows)
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise OptionError("the environments are closed; make new ones")
+
+
+def _row(seen: Seen) -> Seen:
+    """The observation of the only environment."""
+    return {key: values[0] for key, values in seen.items()}

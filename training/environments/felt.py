@@ -1,0 +1,112 @@
+"""What solves the contacts of several environments at once: the finite elements, or their surrogate."""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+
+from scenes.object import ObjectSpec
+from scenes.sensor import SensorSpec
+from twin.errors import ContactError
+from twin.mechanics.follow import Follower
+from twin.mechanics.law import ContactLaw
+from twin.mechanics.solver import SkinSolver
+from twin.types import FloatArray, IntArray
+
+_KEPT_SOLVERS = 4
+"""Solvers that are kept: of the sensor as specified, and of a few randomised ones."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One environment's contact: the sensor and object as drawn for the episode, and how the two rub and give way."""
+
+    sensor: SensorSpec
+    touched: ObjectSpec
+    law: ContactLaw
+
+
+@dataclass
+class Felt:
+    """The sensors' states of B environments with N pins each (sensor frame).
+
+    Attributes
+    ----------
+    base_mm, axis, caps_mm : (B, N, 3) float
+        As ``ContactState``.
+    force_n : (B, 3) float
+        Of the skin on the object.
+    torque_nmm : (B, 3) float
+        About the sensor's origin.
+    area_mm2 : (B,) float
+        In contact.
+    slip : (B,) float
+        Share of that area that slides.
+    lost : list of str
+        Why a contact could not be computed ("" where it could); its row then holds the last state that could.
+    """
+
+    base_mm: FloatArray
+    axis: FloatArray
+    caps_mm: FloatArray
+    force_n: FloatArray
+    torque_nmm: FloatArray
+    area_mm2: FloatArray
+    slip: FloatArray
+    lost: list[str] = field(default_factory=list)
+
+    @classmethod
+    def at_rest(cls, count: int, pins: int) -> "Felt":
+        """``count`` rows to be filled."""
+        base, axis, caps = np.zeros((3, count, pins, 3))
+        force, torque = np.zeros((2, count, 3))
+        return cls(base, axis, caps, force, torque, np.zeros(count), np.zeros(count), [""] * count)
+
+
+class Backend(Protocol):
+    """Solves contacts with all that they remember, pose after pose."""
+
+    felt: Felt
+
+    def begin(self, row: int, contact: Contact) -> None:
+        """Begin an environment's episode, the sensor at rest.
+
+        Raises
+        ------
+        ContactError
+            The backend does not know such a sensor, object or friction.
+        """
+
+    def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
+        """Bring the objects of some rows (R,) to their poses (R, 4, 4) at times (R,); ``felt`` then holds what the sensors feel."""
+
+
+class FiniteElements:
+    """The skin's finite elements, one ``Follower`` for each environment."""
+
+    def __init__(self, sensor: SensorSpec, count: int) -> None:
+        self.felt = Felt.at_rest(count, sensor.pins.count)
+        self._followers: list[Follower | None] = [None] * count
+        self._solver = lru_cache(maxsize=_KEPT_SOLVERS)(SkinSolver)
+
+    def begin(self, row: int, contact: Contact) -> None:
+        """See ``Backend``; a sensor that was drawn anew needs a solver of its own, which takes about a second."""
+        self._followers[row] = Follower(self._solver(contact.sensor), contact.touched, contact.law)
+        self.felt.lost[row] = ""
+
+    def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
+        """See ``Backend``."""
+        felt = self.felt
+        for row, T, now_s in zip(rows.tolist(), T_sensor_object, time_s.tolist(), strict=True):
+            follower = self._followers[row]
+            assert follower is not None, "begin first"
+            try:
+                state = follower.move(T, now_s)
+            except ContactError as error:
+                felt.lost[row] = str(error)
+                continue
+            felt.lost[row] = ""
+            felt.base_mm[row], felt.axis[row], felt.caps_mm[row] = state.base_mm, state.axis, state.caps_mm
+            felt.force_n[row], felt.torque_nmm[row], felt.area_mm2[row] = state.force_n, state.torque_nmm, state.area_mm2
+            felt.slip[row] = float(state.point_area_mm2[state.slipping].sum()) / max(state.area_mm2, 1e-9)

@@ -1,0 +1,206 @@
+"""What an agent sees of a sensor: pins, their graph, pictures, the estimator's pose, or what no real sensor knows."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from training.environments.felt import Felt
+from training.estimator import PoseEstimator
+from training.packed import shipped_names
+from training.pins import PinTable
+from twin.camera.capture import expose, record
+from twin.camera.projection import project
+from twin.errors import OptionError
+from twin.frames.forms import frame_size, from_raw, gray_levels
+from twin.geometry.pins import rest_pins
+from twin.optics.preview import Preview
+from twin.optics.render import Renderer
+from twin.pins import Pipeline, features, make_graph, measure_reference, nominal_reference
+from twin.types import BoolArray, ContactState, FloatArray, Form, Frame, ImageArray, IntArray
+
+Kind = Literal["oracle", "pins", "graph", "image", "pose"]
+KINDS: tuple[str, ...] = get_args(Kind)
+"""What can be observed."""
+Pictures = Literal["none", "preview", "traced"]
+PICTURES: tuple[str, ...] = get_args(Pictures)
+"""How frames are made: not at all, drawn, or path-traced."""
+IMAGE_PX = 128
+"""Side of the pictures that an agent sees, as in Tactile Gym."""
+LARGEST = 10.0
+"""Observations are clipped to this: no pin moves by ten spacings."""
+POSE_SCALES = {"mm": 1.0, "deg": 10.0}
+"""What counts as 1 in an estimated pose."""
+
+
+@dataclass(frozen=True)
+class View:
+    """How an episode's sensor sees: its specification as drawn, and the pins at rest in px of its frames, (N, 2)."""
+
+    sensor: SensorSpec
+    rest_px: FloatArray
+
+
+class Eye:
+    """Makes observations of the states of B environments.
+
+    Parameters
+    ----------
+    sensor : SensorSpec
+    kind : {"oracle", "pins", "graph", "image", "pose"}
+    pictures : {"none", "preview", "traced"}
+        With pictures the pins are found by the real pipeline in frames, otherwise they are the projected caps. Kind "image" needs them.
+    pin_noise_px : float
+        Standard deviation of the noise of pins without pictures.
+
+    Raises
+    ------
+    OptionError
+        The sensor has no estimator for kind "pose".
+    """
+
+    def __init__(self, sensor: SensorSpec, count: int, kind: Kind, *, pictures: Pictures, pin_noise_px: float) -> None:
+        self.sensor, self.kind, self.pictures, self._noise_px = sensor, kind, pictures, pin_noise_px
+        self.form = Form.RECORDING if sensor.recording else Form.RAW
+        self.reference = nominal_reference(sensor, self.form)
+        self._spacing = float(self.reference.spacing_px.mean())
+        self._views: list[View] = [View(sensor, caps_px(sensor, self.form, rest_pins(sensor.geometry).caps_mm))] * count
+        self._nominal = self._views[0]
+        self._painter: Callable[[Felt, int, np.random.Generator], Frame] | None = None
+        self._pipeline: Pipeline | None = None
+        self._estimator: PoseEstimator | None = None
+        if kind == "pose":
+            if sensor.name not in shipped_names():
+                known = ", ".join(shipped_names())
+                raise OptionError(
+                    f"observation 'pose' needs weights that go with the package; {sensor.name} has none (those of {known} have)"
+                )
+            self._estimator = PoseEstimator.load(sensor.name)
+        if pictures != "none":
+            self._painter = _painter(sensor, self.form, pictures)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one observation of one environment, without the stack of earlier ones."""
+        pins = self.sensor.pins.count
+        if self.kind == "image":
+            return IMAGE_PX, IMAGE_PX
+        if self.kind == "pose":
+            assert self._estimator is not None
+            return (len(self._estimator.names) + 1,)
+        return (pins, 2) if self.kind == "pins" else (pins, 5)
+
+    def begin(self, row: int, sensor: SensorSpec) -> None:
+        """Look through the camera that was drawn for an environment's episode."""
+        self._views[row] = (
+            self._nominal if sensor is self.sensor else View(sensor, caps_px(sensor, self.form, rest_pins(sensor.geometry).caps_mm))
+        )
+
+    def frame(self, felt: Felt, row: int, rng: np.random.Generator) -> Frame:
+        """The frame of one environment, drawn where no kind of pictures was chosen."""
+        if self._painter is None:
+            self._painter = _painter(self.sensor, self.form, "preview")
+        return self._painter(felt, row, rng)
+
+    def look(self, felt: Felt, rows: IntArray, rngs: list[np.random.Generator]) -> tuple[FloatArray | ImageArray, BoolArray]:
+        """Observations of some rows (R, ...), and which of them could be made (R,); the others are zero."""
+        if self.kind == "image" or self.pictures != "none":
+            frames = [self.frame(felt, row, rngs[row]) for row in rows.tolist()]
+            if self.kind == "image":
+                return np.stack([_small(frame.image) for frame in frames]), np.ones(len(rows), bool)
+            return self._of_frames(frames)
+        pins_px = self.pins_px(felt, rows)
+        if self._noise_px:
+            pins_px = pins_px + self._noise_px * np.stack([rngs[row].standard_normal(pins_px.shape[1:]) for row in rows.tolist()])
+        rest_px = np.stack([self._views[row].rest_px for row in rows.tolist()])
+        return self._of_pins(self.reference.pins_px + (pins_px - rest_px)), np.ones(len(rows), bool)
+
+    def pins_px(self, felt: Felt, rows: IntArray) -> FloatArray:
+        """Projected caps (R, N, 2) of some rows, px of the sensor's frames."""
+        caps = felt.caps_mm[rows]
+        if all(self._views[row] is self._nominal for row in rows.tolist()):
+            return caps_px(self.sensor, self.form, caps)
+        return np.stack([caps_px(self._views[row].sensor, self.form, seen) for row, seen in zip(rows.tolist(), caps, strict=True)])
+
+    def _of_pins(self, pins_px: FloatArray) -> FloatArray:
+        """Observations (R, ...) of pins (R, N, 2) counted from the nominal layout."""
+        if self.kind == "pins":
+            return np.clip((pins_px - self.reference.pins_px) / self._spacing, -LARGEST, LARGEST).astype(np.float32)
+        graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost) for pins in pins_px]
+        if self.kind == "graph":
+            seen = np.stack([features(graph, self.reference) for graph in graphs])
+            return np.clip(seen, -LARGEST, LARGEST).astype(np.float32)
+        assert self._estimator is not None
+        count = len(pins_px)
+        table = PinTable(
+            self.sensor,
+            self.form,
+            self.reference,
+            np.full(count, ""),
+            pins_px,
+            np.stack([graph.area_px2 for graph in graphs]),
+            np.zeros(pins_px.shape[:2], bool),
+            np.ones(count, bool),
+            measured=True,
+        )
+        told = self._estimator.predict_table(table)
+        return self._scaled(told.mean, told.executed)
+
+    def _of_frames(self, frames: list[Frame]) -> tuple[FloatArray, BoolArray]:
+        """The same from frames, through the real pipeline."""
+        if self._pipeline is None:
+            rest = self.frame(_resting(self.sensor), 0, np.random.default_rng(0))
+            self._pipeline = Pipeline(self.sensor, self.form, measure_reference(self.sensor, self.form, rest))
+        seen = [self._pipeline(frame) for frame in frames]
+        valid = np.array([one.valid for one in seen])
+        reference = self._pipeline.reference
+        places = np.stack([one.graph.nodes_px if one.graph is not None else reference.pins_px for one in seen])
+        return self._of_pins(self.reference.pins_px + (places - reference.pins_px)), valid
+
+    def _scaled(self, value: FloatArray, executed: FloatArray) -> FloatArray:
+        assert self._estimator is not None
+        scale = np.array([POSE_SCALES[unit] for unit in self._estimator.units])
+        known = np.nan_to_num(np.asarray(executed, float).reshape(len(value), 1), nan=1.0)
+        return np.clip(np.concatenate([value / scale, known], axis=1), -LARGEST, LARGEST).astype(np.float32)
+
+
+def caps_px(sensor: SensorSpec, form: Form, caps_mm: FloatArray) -> FloatArray:
+    """Caps (..., 3) in px (..., 2) of the sensor's frames of a form."""
+    return from_raw(sensor.recording, form, project(sensor.view, caps_mm))
+
+
+def _resting(sensor: SensorSpec) -> Felt:
+    """A sensor that nothing touches."""
+    rest = rest_pins(sensor.geometry)
+    felt = Felt.at_rest(1, sensor.pins.count)
+    felt.base_mm[0], felt.axis[0], felt.caps_mm[0] = rest.base_mm, rest.axis, rest.caps_mm
+    return felt
+
+
+def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[Felt, int, np.random.Generator], Frame]:
+    """Makes a frame of one environment's state."""
+    recording = sensor.recording if form is Form.RECORDING else None
+    window_px = recording.crop_px if recording else None
+    preview = Preview(sensor, window_px=window_px)
+    renderer = Renderer(sensor, quality="preview", window_px=window_px) if pictures == "traced" else None
+    frame_size(sensor, form)
+
+    def paint(felt: Felt, row: int, rng: np.random.Generator) -> Frame:
+        state = ContactState.untouched(np.zeros((0, 3)), felt.base_mm[row], felt.axis[row], felt.caps_mm[row])
+        light = preview.render(state) if renderer is None else renderer.render(state, seed=int(rng.integers(2**31)))
+        image = expose(light, sensor.capture, rng, origin_px=preview.window_px[:2])
+        return Frame(record(image, recording, origin_px=preview.window_px[:2]) if recording else image, form)
+
+    return paint
+
+
+def _small(image: ImageArray) -> ImageArray:
+    """The picture that an agent sees: gray, small and square."""
+    gray = gray_levels(image)
+    side = min(gray.shape)
+    top, left = (gray.shape[0] - side) // 2, (gray.shape[1] - side) // 2
+    seen = gray[top : top + side, left : left + side]
+    return np.asarray(cv2.resize(seen, (IMAGE_PX, IMAGE_PX), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,425 @@
+"""The tasks: where an episode begins, what is wanted, and how good a state is. All for B environments at once."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.object import ObjectSpec, SphereShape
+from training.environments.felt import Felt
+from training.environments.world import Surfaces, Tool, motions, standing_on, turn_about
+from twin.errors import OptionError
+from twin.rig.touch import Touch
+from twin.types import BoolArray, FloatArray
+
+LOST_MM = -1.0
+"""Indentation at which a sensor has lost its object: it is then 1 mm clear of it."""
+DEEPEST_MM = 5.5
+"""Indentation at which an episode ends as failed. The published recordings go to 5 mm."""
+STEEPEST_DEG = 40.0
+"""Angle from the surface's normal at which an episode ends as failed."""
+FORCE_N = 1.0
+"""Force that counts as 1 in observations."""
+TURN_DEG = 10.0
+"""Angle that counts as 1 in observations and rewards."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where an episode begins.
+
+    Attributes
+    ----------
+    T_work : (4, 4) float
+        Work frame of the tool in the world; the object's frame is the world's at the start, unless ``T_object`` says otherwise.
+    goal : tuple of float
+        What is wanted, by the task's ``goal_names``.
+    T_object : (4, 4) float
+    """
+
+    T_work: FloatArray
+    goal: tuple[float, ...]
+    T_object: FloatArray
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The world after a step, for a task to judge; rows are environments.
+
+    Attributes
+    ----------
+    touch : Touch
+        What rigid sensors would touch.
+    felt : Felt
+    T_work, T_object : (B, 4, 4) float
+    goal : (B, G) float
+    action : (B, A) float
+        In [-1, 1].
+    """
+
+    touch: Touch
+    felt: Felt
+    T_work: FloatArray
+    T_object: FloatArray
+    goal: FloatArray
+    action: FloatArray
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A task's opinion of a state.
+
+    Attributes
+    ----------
+    reward : (B,) float
+    failed : (B,) bool
+        The episode ends: the object is lost, or the sensor too deep.
+    reached : (B,) bool
+        The episode ends well.
+    good : (B,) bool
+        The state itself is as wanted. Most states of the second half of a successful episode are.
+    """
+
+    reward: FloatArray
+    failed: BoolArray
+    reached: BoolArray
+    good: BoolArray
+
+
+class Task(ABC):
+    """One task. What it remembers of an episode lies in ``kept`` (B, columns), which ``begin`` sets to zero.
+
+    Attributes
+    ----------
+    name : str
+    experiment : str
+        Gives the approach, and so the work frame.
+    objects : tuple of str
+        Of which one is drawn for each episode.
+    axes : tuple of str
+        Axes that an agent moves by default.
+    goal_names, oracle_names : tuple of str
+        What the observations ``goal`` and ``oracle`` hold.
+    steps : int
+        Of an episode.
+    feed_mm : (3,) float
+        Motion in the work frame that every step adds to the agent's.
+    success_share : float
+        Least share of good states in the second half of a successful episode; 0: only ``reached`` counts.
+    """
+
+    name: str
+    experiment: str
+    objects: tuple[str, ...]
+    axes: tuple[str, ...]
+    goal_names: tuple[str, ...]
+    oracle_names: tuple[str, ...] = ("indent_mm", "angle / 10 deg", "force_n x", "force_n y", "force_n z", "area / 100 mm2", "slip share")
+    steps: int = 60
+    feed_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    success_share: float = 0.9
+    columns = 1
+
+    def require(self, touched: ObjectSpec) -> None:
+        """Raise ``OptionError`` where the task can't be done with an object; most can be done with any."""
+        return
+
+    def prepare(self, count: int) -> None:
+        """Make room for ``count`` environments."""
+        self.kept = np.zeros((count, self.columns))
+
+    @abstractmethod
+    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        """Draw where an episode begins."""
+
+    @abstractmethod
+    def judge(self, seen: Seen) -> Judged:
+        """Judge the state after a step."""
+
+    def pushed(self, felt: Felt, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
+        """How the object's pose answers to what the skin feels: poses (B, 4, 4) to try next, or None where the object is held."""
+        return None
+
+    def carried(self, T_work: FloatArray, before: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray:
+        """The object's poses (B, 4, 4) after the tools moved from ``before`` to ``T_work``; held objects stay."""
+        return T_object
+
+    def oracle(self, seen: Seen) -> FloatArray:
+        """What a real sensor can't know, (B, K), by ``oracle_names``."""
+        felt, touch = seen.felt, seen.touch
+        columns = [touch.indent_mm, touch.angle_deg / TURN_DEG, felt.force_n / FORCE_N, felt.area_mm2 / 100.0, felt.slip]
+        return np.column_stack(columns)
+
+
+def out_of_touch(touch: Touch) -> BoolArray:
+    """Rows (B,) where the object is lost, or the sensor too deep or too steep."""
+    return (touch.indent_mm < LOST_MM) | (touch.indent_mm > DEEPEST_MM) | (np.abs(touch.angle_deg) > STEEPEST_DEG)
+
+
+class SurfaceFollow(Task):
+    """Follow a surface: hold depth and angle while the sensor is fed along it."""
+
+    name, experiment = "SurfaceFollow", "surface-2d"
+    objects: tuple[str, ...] = ("plane", "can", "ball-80", "ball-40")
+    axes = ("z", "Ry")
+    goal_names = ("indent_mm", "angle / 10 deg")
+    feed_mm = (1.0, 0.0, 0.0)
+    indents_mm = (2.0, 3.5)
+    off_mm, off_deg, beside_mm = 1.0, 12.0, 5.0
+    good_mm, good_deg = 0.5, 5.0
+
+    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        self.kept[row] = 0.0
+        goal = float(rng.uniform(*self.indents_mm))
+        indent = max(goal + rng.uniform(-self.off_mm, self.off_mm), 0.8)
+        beside = rng.uniform(-self.beside_mm, self.beside_mm)
+        T = standing_on(tool, surfaces[touched], beside, indent, rng.uniform(-self.off_deg, self.off_deg))
+        return Start(T, (goal, 0.0), np.eye(4))
+
+    def judge(self, seen: Seen) -> Judged:
+        off_mm = np.abs(seen.touch.indent_mm - seen.goal[:, 0])
+        off_turn = np.abs(seen.touch.angle_deg / TURN_DEG - seen.goal[:, 1])
+        failed = out_of_touch(seen.touch)
+        good = (off_mm <= self.good_mm) & (off_turn <= self.good_deg / TURN_DEG)
+        reward = np.maximum(1.0 - off_mm - off_turn, -1.0)
+        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), good)
+
+
+class ContourFollow(SurfaceFollow):
+    """Go once around an object of the paper, holding depth and angle."""
+
+    name = "ContourFollow"
+    objects = ("can", "mesh-can", "square", "prism", "tin-box")
+    steps = 600
+    indents_mm = (3.0, 3.0)
+    beside_mm = 0.0
+    covered_share = 0.98
+    success_share = 0.0
+    columns = 4  # way covered, its length, and the place (x, z) that was touched last
+
+    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        start = super().begin(row, tool, touched, surfaces, rng)
+        outline = surfaces[touched].outline
+        self.kept[row, 1] = np.linalg.norm(np.diff(outline, axis=0), axis=1).sum()
+        return start
+
+    def judge(self, seen: Seen) -> Judged:
+        judged = super().judge(seen)
+        place = seen.touch.place_mm[:, [0, 2]]
+        moved = np.linalg.norm(place - self.kept[:, 2:], axis=1)
+        self.kept[:, 0] += np.where(judged.failed, 0.0, np.minimum(moved, 2 * self.feed_mm[0] + 2.0))
+        self.kept[:, 2:] = place
+        reached = (self.kept[:, 0] >= self.covered_share * self.kept[:, 1]) & ~judged.failed
+        return Judged(judged.reward, judged.failed, reached, judged.good)
+
+
+class EdgeFollow(Task):
+    """Follow an edge that lies under the sensor: hold the place across it and its direction while the sensor is fed along it."""
+
+    name, experiment = "EdgeFollow", "edge-2d"
+    objects = ("edge",)
+    axes = ("x", "Rz")
+    goal_names = ("across_mm", "direction / 10 deg")
+    oracle_names = ("across_mm", "direction / 10 deg", *Task.oracle_names[2:])
+    feed_mm = (0.0, 1.0, 0.0)
+    indent_mm = 3.0
+    off_mm, off_deg = 3.0, 25.0
+    good_mm, good_deg = 1.0, 6.0
+    farthest_mm = 6.0
+
+    def require(self, touched: ObjectSpec) -> None:
+        if touched.shape.kind != "edge":
+            raise OptionError(f"EdgeFollow follows edges; {touched.name} is none, give objects such as 'edge'")
+
+    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        dome = tool.T_work_sensor[:3, 3]
+        T = turn_about((0, 0, 1), rng.uniform(-self.off_deg, self.off_deg))
+        centre = np.array([rng.uniform(-self.off_mm, self.off_mm), 0.0, self.indent_mm - tool.mounting.radius_mm])
+        T[:3, 3] = centre - T[:3, :3] @ dome
+        return Start(T, (0.0, 0.0), np.eye(4))
+
+    def place(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
+        """Place of the dome's apex across the edge (B,), mm, and the sensor's direction against it (B,), deg."""
+        turn = np.degrees(np.arctan2(seen.T_work[:, 1, 0], seen.T_work[:, 0, 0]))
+        return seen.T_work[:, 0, 3], turn
+
+    def judge(self, seen: Seen) -> Judged:
+        across, turn = self.place(seen)
+        off_mm, off_turn = np.abs(across - seen.goal[:, 0]), np.abs(turn / TURN_DEG - seen.goal[:, 1])
+        failed = (off_mm > self.farthest_mm) | (np.abs(turn) > STEEPEST_DEG + self.off_deg) | (seen.touch.indent_mm > DEEPEST_MM)
+        good = (off_mm <= self.good_mm) & (off_turn <= self.good_deg / TURN_DEG)
+        reward = np.maximum(1.0 - off_mm / 2 - off_turn / 2, -1.0)
+        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), good)
+
+    def oracle(self, seen: Seen) -> FloatArray:
+        across, turn = self.place(seen)
+        return np.column_stack([across, turn / TURN_DEG, super().oracle(seen)[:, 2:]])
+
+
+class GentlePress(Task):
+    """Come to an object, reach a force and hold it, without slip."""
+
+    name, experiment = "GentlePress", "surface-2d"
+    objects = ("plane", "can", "ball-40", "sphere", "cylinder")
+    axes = ("x", "z")
+    goal_names = ("force_n",)
+    steps = 40
+    forces_n = (0.5, 2.0)
+    off_deg = 10.0
+    drift_mm = 0.25
+    good_share, slip_share = 0.1, 0.5
+    columns = 1  # sideways drift of every step
+    success_share = 0.8
+
+    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        self.kept[row] = rng.uniform(-self.drift_mm, self.drift_mm)
+        T = standing_on(tool, surfaces[touched], 0.0, -0.5, rng.uniform(-self.off_deg, self.off_deg))
+        return Start(T, (float(rng.uniform(*self.forces_n)),), np.eye(4))
+
+    def carried(self, T_work: FloatArray, before: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray:
+        drifted = T_object.copy()
+        drifted[:, 0, 3] += self.kept[:, 0]
+        return drifted
+
+    def judge(self, seen: Seen) -> Judged:
+        force = np.linalg.norm(seen.felt.force_n, axis=1)
+        off = np.abs(force - seen.goal[:, 0]) / seen.goal[:, 0]
+        slips = (seen.felt.slip > self.slip_share) & (force > 0.2)
+        failed = (seen.touch.indent_mm > DEEPEST_MM) | (seen.touch.indent_mm < 2 * LOST_MM)
+        reward = 1.0 - np.minimum(off, 1.5) - 0.5 * slips
+        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), (off <= self.good_share) & ~slips)
+
+
+class ObjectRoll(Task):
+    """Roll a ball between the sensor and a table to a place under the dome; the ball rolls on both without sliding."""
+
+    name, experiment = "ObjectRoll", "edge-2d"
+    objects = ("ball-10", "sphere")
+    axes = ("x", "y")
+    goal_names = ("x_mm", "y_mm")
+    oracle_names = ("ball x_mm", "ball y_mm", *Task.oracle_names[2:])
+    steps = 40
+    farthest_mm = 6.0
+    near_mm = 0.6
+    columns = 1  # radius of the ball
+
+    def require(self, touched: ObjectSpec) -> None:
+        if touched.shape.kind != "sphere":
+            raise OptionError(f"ObjectRoll rolls balls; {touched.name} is none, give objects such as 'ball-10'")
+
+    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        assert isinstance(touched.shape, SphereShape)  # required
+        self.kept[row] = touched.shape.radius_mm
+        self._apex = tool.T_work_sensor[:2, 3]
+        indent = rng.uniform(1.0, 2.0)
+        start, goal = rng.uniform(-4.0, 4.0, (2, 2))
+        T = np.eye(4)
+        T[:3, 3] = [0.0, 0.0, indent - tool.mounting.radius_mm] - tool.T_work_sensor[:3, 3]
+        T_object = np.eye(4)  # the ball lies beside the dome's apex, as deep as it would lie under it
+        T_object[:2, 3] = start
+        return Start(T, tuple(map(float, goal)), T_object)
+
+    def carried(self, T_work: FloatArray, before: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray:
+        moved = 0.5 * (T_work[:, :3, 3] - before[:, :3, 3])  # a ball between two plates moves half as far as the upper one
+        turn = np.cross([0.0, 0.0, -1.0], moved)  # about its middle, which lies a radius along z from its pole
+        step = np.concatenate([np.zeros_like(moved), np.degrees(turn / self.kept)], axis=1)
+        out = T_object.copy()
+        middle = T_object[:, :3, 3] + self.kept * T_object[:, :3, 2] + moved * [1.0, 1.0, 0.0]
+        out[:, :3, :3] = motions(step)[:, :3, :3] @ T_object[:, :3, :3]
+        out[:, :3, 3] = middle - self.kept * out[:, :3, 2]
+        return out
+
+    def place(self, seen: Seen) -> FloatArray:
+        """Place of the ball's middle from the dome's apex, (B, 2) mm, in the work frame."""
+        middle = seen.T_object[:, :3, 3] + self.kept * seen.T_object[:, :3, 2]
+        turned: FloatArray = np.einsum("bji,bj->bi", seen.T_work[:, :3, :3], middle - seen.T_work[:, :3, 3])
+        return turned[:, :2] - self._apex
+
+    def judge(self, seen: Seen) -> Judged:
+        place = self.place(seen)
+        off = np.linalg.norm(place - seen.goal, axis=1)
+        failed = np.linalg.norm(place, axis=1) > self.farthest_mm
+        reward = np.maximum(1.0 - off / 2, -1.0)
+        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), off <= self.near_mm)
+
+    def oracle(self, seen: Seen) -> FloatArray:
+        return np.column_stack([self.place(seen), super().oracle(seen)[:, 2:]])
+
+
+class ObjectPush(Task):
+    """Push a block over a table to a place, with the sensor held level; the block slides where the push overcomes its friction.
+
+    The friction of the block's support is an ellipsoid in the space of force and torque (Goyal, Ruina & Papadopoulos 1991): inside it
+    the block rests; on it the block moves along the ellipsoid's normal.
+    """
+
+    name, experiment = "ObjectPush", "surface-2d"
+    objects = ("square-rod", "round-bar", "square")
+    axes = ("x", "Ry")
+    goal_names = ("x_mm", "z_mm")
+    oracle_names = ("goal x_mm / 10", "goal z_mm / 10", *Task.oracle_names[2:])
+    steps = 80
+    feed_mm = (0.0, 0.0, 1.0)
+    near_mm = 3.0
+    holds_n = (0.6, 1.5)
+    """Friction force of the support, drawn for each episode."""
+    lever_mm = 15.0
+    """Torque of the support's friction, over its force."""
+    give_mm_per_n = 0.7
+    """How far a block is moved for each N by which the push exceeds the support's friction, in one of the trials of a step."""
+    columns = 1  # friction force of the support
+    success_share = 0.0
+
+    def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
+        self.kept[row] = rng.uniform(*self.holds_n)
+        T = standing_on(tool, surfaces[touched], 0.0, 0.5, rng.uniform(-8.0, 8.0))
+        goal = rng.uniform(-12.0, 12.0), rng.uniform(40.0, 60.0)
+        return Start(T, (float(goal[0]), float(goal[1])), np.eye(4))
+
+    def pushed(self, felt: Felt, T_work: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray | None:
+        T_sensor = T_work @ tool.T_work_sensor
+        force = np.einsum("bij,bj->bi", T_sensor[:, :3, :3], felt.force_n)
+        torque = np.einsum("bij,bj->bi", T_sensor[:, :3, :3], felt.torque_nmm)
+        middle = self._middle(T_object)
+        about = torque + np.cross(T_sensor[:, :3, 3] - middle, force)  # of the force on the object about its middle
+        load = np.stack([force[:, 0], force[:, 2], about[:, 1] / self.lever_mm], axis=1)
+        size = np.linalg.norm(load, axis=1)
+        over = np.maximum(size - self.kept[:, 0], 0.0)
+        if not over.any():
+            return None
+        way = (self.give_mm_per_n * over / np.maximum(size, 1e-9))[:, None] * load
+        out = T_object.copy()
+        step = np.zeros((len(way), 6))
+        step[:, 4] = np.degrees(way[:, 2] / self.lever_mm)
+        turn = motions(step)[:, :3, :3]
+        out[:, :3, :3] = turn @ T_object[:, :3, :3]
+        shifted = middle.copy()
+        shifted[:, 0] += way[:, 0]
+        shifted[:, 2] += way[:, 1]
+        out[:, :3, 3] = shifted + np.einsum("bij,bj->bi", turn, T_object[:, :3, 3] - middle)
+        return out
+
+    def _middle(self, T_object: FloatArray) -> FloatArray:
+        """Where a block's weight rests: ``lever_mm`` behind its touched face, (B, 3)."""
+        return T_object[:, :3, 3] + self.lever_mm * T_object[:, :3, 2]
+
+    def place(self, seen: Seen) -> FloatArray:
+        """From the block's middle to the goal, (B, 2) mm: x and z of the world."""
+        return seen.goal - self._middle(seen.T_object)[:, [0, 2]]
+
+    def judge(self, seen: Seen) -> Judged:
+        off = np.linalg.norm(self.place(seen), axis=1)
+        beyond = self.place(seen)[:, 1] < -self.near_mm
+        failed = out_of_touch(seen.touch) | beyond
+        reached = (off <= self.near_mm) & ~failed
+        reward = 0.5 - off / 60.0 + 5.0 * reached
+        return Judged(np.where(failed, -5.0, reward), failed, reached, reached)
+
+    def oracle(self, seen: Seen) -> FloatArray:
+        away = self.place(seen)
+        turned = np.column_stack([away[:, 0], np.zeros(len(away)), away[:, 1]])
+        here: FloatArray = np.einsum("bji,bj->bi", seen.T_work[:, :3, :3], turned)
+        return np.column_stack([here[:, [0, 2]] / 10.0, super().oracle(seen)[:, 2:]])
+
+
+TASKS: dict[str, type[Task]] = {task.name: task for task in (EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ObjectRoll, ObjectPush)}
+"""All tasks by their names."""

@@ -1,0 +1,121 @@
+"""Where tools and objects are: the motions of a tool, and what a rigid sensor would touch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
+from scenes.sensor import SensorSpec
+from twin.rig.mounting import Mounting
+from twin.rig.touch import Surface
+from twin.types import FloatArray
+
+AXES = ("x", "y", "z", "Rx", "Ry", "Rz")
+"""Motions of a tool in its work frame: z out of the dome's apex, x across it in the plane in which a surface is followed."""
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A sensor on a tool. The work frame has its origin at the tool point, x along the mounting's ``across`` and z along its ``axis``.
+
+    Attributes
+    ----------
+    mounting : Mounting
+    T_work_sensor : (4, 4) float
+    """
+
+    mounting: Mounting
+    T_work_sensor: FloatArray
+
+    @classmethod
+    def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Tool":
+        """The tool of a sensor's own rig, approaching as an experiment does."""
+        mounting = Mounting.of(sensor, experiment)
+        return cls(mounting, np.linalg.inv(work_frame(mounting)) @ mounting.T_tool_sensor)
+
+    def seen(self, T_world_work: FloatArray, T_world_object: FloatArray) -> FloatArray:
+        """``T_sensor_object`` (B, 4, 4) of tools and objects in poses (B, 4, 4)."""
+        return inverse(T_world_work @ self.T_work_sensor) @ T_world_object
+
+
+def work_frame(mounting: Mounting) -> FloatArray:
+    """``T_tool_work`` (4, 4): the frame in which tasks and policies move a tool."""
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([mounting.across, np.cross(mounting.axis, mounting.across), mounting.axis])
+    return T
+
+
+def inverse(T: FloatArray) -> FloatArray:
+    """Inverses of rigid motions (B, 4, 4)."""
+    out = np.zeros_like(T)
+    turn = np.swapaxes(T[:, :3, :3], 1, 2)
+    out[:, :3, :3] = turn
+    out[:, :3, 3] = -np.einsum("bij,bj->bi", turn, T[:, :3, 3])
+    out[:, 3, 3] = 1.0
+    return out
+
+
+def motions(step: FloatArray) -> FloatArray:
+    """Rigid motions (B, 4, 4) of steps (B, 6): a shift in mm, and a turn vector in deg about the frame's origin."""
+    shift, turn = step[:, :3], np.radians(step[:, 3:])
+    angle = np.linalg.norm(turn, axis=1)
+    safe = np.maximum(angle, 1e-12)
+    x, y, z = (turn / safe[:, None]).T
+    sine, rest = np.sin(angle), 1 - np.cos(angle)
+    T = np.zeros((len(step), 4, 4))
+    T[:, 0, 0], T[:, 1, 1], T[:, 2, 2] = (1 - rest * (1 - a * a) for a in (x, y, z))
+    for i, j, a, b, c in ((0, 1, x, y, z), (1, 2, y, z, x), (2, 0, z, x, y)):
+        T[:, i, j], T[:, j, i] = rest * a * b - sine * c, rest * a * b + sine * c
+    still = angle < 1e-12
+    T[still, :3, :3] = np.eye(3)
+    T[:, :3, 3], T[:, 3, 3] = shift, 1.0
+    return T
+
+
+def turn_about(axis: Sequence[float], deg: float) -> FloatArray:
+    """A turn (4, 4) about an axis (3,) through the origin."""
+    return motions(np.concatenate([np.zeros(3), deg * np.asarray(axis, float)])[None])[0]
+
+
+def place_beside(surface: Surface, along_mm: float) -> tuple[FloatArray, float]:
+    """The place (3,) of a surface beside its object's origin along x, and the surface's turn about y there (deg)."""
+    at = np.array([[along_mm, 0.0, 0.0]])
+    for _ in range(20):
+        distance, normal, _ = surface.field.probe(at)
+        at = at - distance[:, None] * normal * [1.0, 0.0, 1.0]
+    return at[0], float(np.degrees(np.arctan2(-normal[0, 0], -normal[0, 2])))
+
+
+def standing_on(tool: Tool, surface: Surface, along_mm: float, indent_mm: float, angle_deg: float) -> FloatArray:
+    """``T_object_work`` (4, 4) of a tool that presses the dome against a surface beside its object's origin.
+
+    Parameters
+    ----------
+    along_mm : float
+        How far beside, along the object's x.
+    indent_mm : float
+        Of the dome.
+    angle_deg : float
+        Of the tool from the surface's normal, about the work frame's y.
+    """
+    place, turned_deg = place_beside(surface, along_mm)
+    outward = turn_about((0, 1, 0), turned_deg)[:3, :3] @ [0.0, 0.0, -1.0]
+    T = turn_about((0, 1, 0), turned_deg + angle_deg)
+    dome = tool.T_work_sensor[:3, 3]
+    centre = place + (tool.mounting.radius_mm + surface.raised_mm - indent_mm) * outward
+    T[:3, 3] = centre - T[:3, :3] @ dome
+    return T
+
+
+class Surfaces:
+    """The surfaces of the objects that a task uses, each built once."""
+
+    def __init__(self) -> None:
+        self._built: dict[str, Surface] = {}
+
+    def __getitem__(self, touched: ObjectSpec) -> Surface:
+        if touched.name not in self._built:
+            self._built[touched.name] = Surface(touched)
+        return self._built[touched.name]

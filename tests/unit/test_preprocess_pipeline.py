@@ -14,6 +14,7 @@ from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.pins.blobs import SPECK_LEVELS, circular_mask, despeckled, find_blobs
 from twin.pins.legacy import LegacyPipeline
 from twin.pins.matching import match, rematch
+from twin.pins.pipeline import lower_levels
 from twin.pins.reference import folded_fraction
 from twin.pins.split import split_chains
 from twin.types import Form, Frame
@@ -432,3 +433,12 @@ def test_published_method_throws_away_what_it_did(real_dir):
     pipeline = LegacyPipeline(spec.pins, spec.recording)
     found = np.array([pipeline(recording.read(k)).found for k in range(0, len(recording), 10)])
     assert 0.01 < np.mean(found != spec.pins.count) < 0.055  # published: 0.032; three standard errors of the sample
+
+
+def test_percentiles_of_rows_are_those_without_nan():
+    rng = np.random.default_rng(0)
+    levels = rng.normal(size=(200, 6))
+    levels[rng.random(levels.shape) < 0.4] = np.nan
+    levels = levels[np.isfinite(levels).any(axis=1)]
+    for percent in (0.0, 30.0, 50.0, 100.0):
+        assert np.allclose(lower_levels(levels, percent), np.nanpercentile(levels, percent, axis=1))

@@ -260,7 +260,7 @@ class Pipeline:
         middle = (pins_px[found, None] + pins_px[near]) / 2
         known = np.isfinite(middle[..., 0])
         between = np.where(known, _levels(gray, np.where(known[..., None], middle, 0.0)), np.nan)[known.any(axis=1)]
-        above = _levels(gray, pins_px[found])[known.any(axis=1)] - np.nanpercentile(between, DARKER, axis=1)
+        above = _levels(gray, pins_px[found])[known.any(axis=1)] - lower_levels(between, DARKER)
         return float(np.mean(above <= LEAST_ABOVE * np.percentile(above, BRIGHT))) if len(above) else 0.0
 
     def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
@@ -292,6 +292,16 @@ def _levels(gray: np.ndarray, px: np.ndarray) -> np.ndarray:
     column, row = np.moveaxis(np.clip(np.round(px), 0, np.array(gray.shape[::-1]) - 1).astype(int), -1, 0)
     levels: np.ndarray = gray[row, column].astype(float)
     return levels
+
+
+def lower_levels(levels: np.ndarray, percent: float) -> np.ndarray:
+    """Percentile of each row of (n, k) levels without its NaN, (n,): what ``np.nanpercentile`` gives, for all rows at once."""
+    rank = (np.isfinite(levels).sum(axis=1) - 1) * (percent / 100)
+    low = np.floor(rank).astype(int)
+    ordered, row = np.sort(levels, axis=1), np.arange(len(levels))  # NaN come last
+    below, above = ordered[row, low], ordered[row, np.ceil(rank).astype(int)]
+    lower: np.ndarray = below + (rank - low) * (above - below)
+    return lower
 
 
 def _extra(blobs: Blobs, found: Match) -> int:

@@ -1,6 +1,6 @@
 """Watching a camera, or replaying a session: from a plan to estimates, figures and, if wanted, a recorded session.
 
-``watch`` runs the model on every frame. ``LiveSession`` is its loop; ``Shower`` draws the newest frame in a thread of its own.
+``watch`` runs the model on every frame. ``LiveSession`` is its loop; ``Shower`` shows the newest frame in a thread of its own.
 """
 
 import threading
@@ -17,16 +17,15 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.recorded import SequentialSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
+from hardware.rerun_view import RerunView
 from hardware.rig import counting_from_first, given_frame
 from hardware.session import SESSION_FILES, SessionSource, SessionWriter
 from hardware.timing import Spread, Timing
-from hardware.view.draw import WindowView, draw_view, has_window
-from hardware.view.rerun import RerunView
-from hardware.view.server import BrowserView
-from twin.errors import FrameError, OptionError
+from twin.errors import FrameError, OptionError, TwinError
 from twin.estimate import Estimate, Estimator, SensorModel
 from twin.pins import Pipeline
 from twin.store import output
+from twin.studio.live_page import LivePage, LiveShot
 from twin.types import FIRST, NONE, Frame
 
 # Newest times of each kind that the figures are computed from.
@@ -42,9 +41,7 @@ FRAME_TIMEOUT_S = 5.0
 # Port of the page that shows the frames.
 PORT = 8080
 
-View = RerunView | WindowView | BrowserView
-Draw = Callable[[Frame, Estimate, list[str]], np.ndarray]
-"""From a frame, its estimate and lines of text to a picture (H, W, 3) uint8 RGB."""
+View = RerunView | LivePage
 
 
 @dataclass
@@ -151,13 +148,13 @@ def same_estimates(steps: list[dict], estimates: list[Estimate]) -> int:
 
 
 class Shower:
-    """Draws the newest frame in a thread of its own, so that drawing does not delay the session. A context manager.
+    """Shows the newest frame in a thread of its own, so that drawing does not delay the session. A context manager.
 
     Parameters
     ----------
     session : LiveSession
-    draw : callable
-        See ``Draw``.
+    pipeline : Pipeline
+        Finds what is drawn over a frame.
     view : View
 
     Raises
@@ -166,15 +163,15 @@ class Shower:
         On entering if the view can't be opened, on leaving if it broke.
     """
 
-    def __init__(self, session: LiveSession, draw: Draw, view: View) -> None:
-        self._session, self._draw, self._view = session, draw, view
+    def __init__(self, session: LiveSession, pipeline: Pipeline, view: View) -> None:
+        self._session, self._pipeline, self._view = session, pipeline, view
         self._opened, self._end = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
         self._error: Exception | None = None
 
     @property
     def open(self) -> bool:
-        """Whether the user has not closed the view, and it has not broken."""
+        """Whether the view has not broken."""
         return not self._end.is_set()
 
     def __enter__(self) -> "Shower":
@@ -191,7 +188,7 @@ class Shower:
 
     def _tell(self) -> None:
         """Raise the error with which the view ended, if there is one."""
-        if isinstance(self._error, DeviceError):
+        if isinstance(self._error, TwinError):
             raise self._error
         if self._error is not None:
             raise DeviceError(f"the view broke ({self._error}); without --rerun, --headless shows nothing") from self._error
@@ -218,8 +215,7 @@ class Shower:
                 except RuntimeError:  # the session added a time while it was read
                     continue
                 shown = newest
-                if not view.show(self._draw(*newest, lines), {str(k): line for k, line in enumerate(lines)}):
-                    self._end.set()
+                view.show(LiveShot(*newest, tuple(lines[1:])), self._pipeline(newest[0]))
 
 
 @dataclass(frozen=True)
@@ -235,7 +231,7 @@ class WatchPlan:
     record : Path or None
         New folder for a session.
     shown : bool
-        Show the frames: in a window where there is a display, else on a page.
+        Show the frames on a page for the browser.
     rerun : str or None
         A target of ``RerunView``: show the frames there instead, whatever ``shown`` says.
     seconds, count : float or None, int or None
@@ -344,9 +340,10 @@ def watch(
         stack.enter_context(source)
         model, rest = _at_rest(plan, model, source, rest)
         session, shower = LiveSession(source, model, on_estimate=keep), None
-        view = _view(plan, f"{model.sensor.name}, {source.name}")
+        pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)  # of the view's own thread
+        view = _view(plan, f"{model.sensor.name}, {source.name}", pipeline)
         if view is not None:
-            shower = stack.enter_context(Shower(session, _drawing(view, model), view))
+            shower = stack.enter_context(Shower(session, pipeline, view))
             if on_shown is not None:
                 on_shown(view.url)
         if plan.record is not None:  # the last step: no folder is made if one of the steps before fails
@@ -376,24 +373,8 @@ def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Fra
     return model, rest
 
 
-def _view(plan: WatchPlan, title: str) -> View | None:
+def _view(plan: WatchPlan, title: str, pipeline: Pipeline) -> View | None:
     """The view of the plan, not yet open; None if nothing is shown."""
     if plan.rerun is not None:
         return RerunView(title, plan.rerun)
-    if not plan.shown:
-        return None
-    return WindowView(title) if has_window() else BrowserView(title, port=plan.port)
-
-
-def _drawing(view: View, model: SensorModel) -> Draw:
-    """The function that draws a frame with its pins and its estimate, in the thread of the view."""
-    pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)
-    rest_px2 = pipeline.reference.area_px2
-
-    def draw(frame: Frame, estimate: Estimate, lines: list[str]) -> np.ndarray:
-        seen = pipeline(frame)
-        if isinstance(view, RerunView):
-            view.log(frame, seen, estimate)
-        return draw_view(frame, seen, rest_px2, lines)
-
-    return draw
+    return LivePage(title, pipeline.spec, pipeline.reference, port=plan.port) if plan.shown else None

@@ -17,7 +17,7 @@ from hardware.safety import SHIPPED_LIMITS, load_limits
 from hardware.session import SessionWriter
 from twin.errors import TwinError
 from twin.estimate import Estimate, SensorModel
-from twin.studio.live_mode import LiveShot
+from twin.studio.live_page import LiveShot
 from twin.types import Frame
 
 # Speed of an arm that the page moves, in mm/s and deg/s: slow enough to be watched.

@@ -23,7 +23,7 @@ def open_page(url: str, *, chromium: str = "/usr/bin/chromium", width: int = 128
         page.on("pageerror", lambda error: messages.append(str(error)))
         page.on("request", lambda request: request.url.startswith((url, "data:", "blob:")) or messages.append(f"outside: {request.url}"))
         page.goto(url)
-        page.wait_for_selector("[data-number]", state="attached", timeout=60_000)
+        page.wait_for_selector(".studio", state="attached", timeout=60_000)
         try:
             close = page.get_by_text("Software WebGL rendering detected")
             if close.count():

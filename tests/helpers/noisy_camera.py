@@ -9,12 +9,12 @@ from twin.types import Form
 
 
 class NoisyCamera(LiveSource):
-    """Pictures (48, 64) or (48, 64, 3); ``number_of`` tells which one a frame is."""
+    """Pictures (H, W) or (H, W, 3), by default of 64 x 48 px; ``number_of`` tells which one a frame is."""
 
-    def __init__(self, *, fps: float = 100.0, color: bool = False) -> None:
+    def __init__(self, *, fps: float = 100.0, color: bool = False, size_px: tuple[int, int] = (64, 48)) -> None:
         super().__init__("noisy camera", Form.RAW)
         self.fps = fps
-        self._period_s, self._shape = 1.0 / fps, (48, 64, 3) if color else (48, 64)
+        self._period_s, self._shape = 1.0 / fps, (*size_px[::-1], 3) if color else size_px[::-1]
         self._rng, self._number = np.random.default_rng(0), 0
 
     def _open(self) -> None:

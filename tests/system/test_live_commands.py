@@ -2,11 +2,11 @@
 
 import csv
 import json
+import re
 import signal
 import subprocess
 import sys
 import time
-import urllib.request
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from drawn_frames import drawn_frame
 from free_ports import free_offset
-from noisy_camera import NoisyCamera, number_of
+from noisy_camera import NoisyCamera
+from studio_client import StudioClient
 from true_estimator import TrueEstimate, TrueEstimator
 from typer.testing import CliRunner
 
 from hardware import following
 from hardware.arms.simulated import SimulatedArm
-from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.twin import preview_of
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import run_until_told
@@ -29,8 +29,6 @@ from hardware.live import LiveSession, Shower
 from hardware.rig import build_rig, steps_round
 from hardware.rig_geometry import PlacedObject
 from hardware.session import SessionSource
-from hardware.view.draw import draw_view
-from hardware.view.server import BrowserView
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.estimator import PoseEstimator
 from twin.camera.capture import expose, record
@@ -41,6 +39,7 @@ from twin.frames.images import write_image
 from twin.pins import Pipeline
 from twin.pins.batch import voronoi_map
 from twin.rig.mounting import Mounting
+from twin.studio.live_page import LivePage, shot_pictures
 from twin.types import Form, Frame
 
 STEPS = 6
@@ -195,21 +194,17 @@ def test_live_records_and_replays_the_same(stand_in, tmp_path):
     assert "5 of 5 estimates" in run("live", "--replay", tmp_path / "s", "--model", "any", "--headless")
 
 
-def test_the_browser_shows_the_newest_annotated_frame_and_figures():
-    view = BrowserView("TacTip <live>")
-    with NoisyCamera(fps=50) as source:
+def test_the_page_shows_the_newest_frame_with_estimate_and_rates():
+    pipeline = Pipeline(load_sensor("mg400-331"), Form.RAW)
+    view = LivePage("TacTip <live>", pipeline.spec, pipeline.reference)
+    with NoisyCamera(fps=50, size_px=pipeline.size_px) as source:
         session = LiveSession(source, lambda frame: TrueEstimate(("pose_2",), np.ones(1), np.zeros(1), np.full(1, 2.0)))
-        with Shower(session, lambda frame, _, lines: frame.image, view):
+        with Shower(session, pipeline, view):
             session.run(most=20)
-            page = urllib.request.urlopen(view.url, timeout=5).read().decode()
-            assert "TacTip &lt;live&gt;" in page and "stream.mjpg" in page
-            with MjpegCamera(view.url + "stream.mjpg") as watcher:
-                first = watcher.read(timeout_s=5)
-                session.run(most=60)
-                watcher.read_after(first.time_s, timeout_s=5)
-            stats = json.loads(urllib.request.urlopen(view.url + "stats.json", timeout=5).read())
-            assert "pose_2 +1.00 [+0.00, +2.00]" in stats["0"] and "frames/s" in stats["1"]
-    assert 0 <= number_of(first.image) < 20
+            with StudioClient(view.url) as client:
+                session.run(seconds=30.0, going=lambda: "frames/s" not in client.html())
+                html = client.html()
+    assert "+1.00" in html and "+0.00 to +2.00" in html and "TacTip &lt;live&gt;" in html and re.search(r"pins found: \d+ of 331", html)
 
 
 def test_a_view_draws_pins_graph_cells_and_text():
@@ -226,8 +221,9 @@ def test_a_view_draws_pins_graph_cells_and_text():
     other = voronoi_map(image.shape, seen, 0.5 * seen.graph.area_px2)
     inside = tuple(np.round(seen.graph.nodes_px[0]).astype(int)[::-1])
     assert tuple(same[inside]) != tuple(other[inside])
-    picture = draw_view(frame, seen, pipeline.reference.area_px2, ["a line", "another"])
-    assert picture.shape[1] == 2 * image.shape[1] and picture.shape[0] > image.shape[0]
+    camera, cells = shot_pictures(sensor, pipeline.reference, frame, seen)
+    assert camera.shape == cells.shape == (*image.shape, 3)
+    assert (camera[inside] != image[inside]).any() and tuple(cells[inside]) == tuple(same[inside])
 
 
 def test_a_round_takes_the_tools_way():
@@ -263,9 +259,14 @@ def test_a_model_that_tells_something_else_is_refused_before_anything_moves(stan
 
 
 def test_a_view_that_breaks_ends_the_session_with_its_error():
-    session = LiveSession(NoisyCamera(fps=50), lambda frame: TrueEstimate(("pose_2",), *np.zeros((3, 1))))
-    view = BrowserView("live")
-    shower = Shower(session, lambda *_: (_ for _ in ()).throw(ValueError("no such colour")), view)
+    class Broken(LivePage):
+        def show(self, *_):
+            raise ValueError("no such colour")
+
+    pipeline = Pipeline(load_sensor("mg400-331"), Form.RAW)
+    camera = NoisyCamera(fps=50, size_px=pipeline.size_px)
+    session = LiveSession(camera, lambda frame: TrueEstimate(("pose_2",), *np.zeros((3, 1))))
+    shower = Shower(session, pipeline, Broken("live", pipeline.spec, pipeline.reference))
     with session.source, pytest.raises(DeviceError, match="no such colour.*--headless"), shower:
         session.run(seconds=30.0, going=lambda: shower.open)
     assert session.timing().steps < 1000  # it did not go on for half a minute

@@ -70,9 +70,8 @@ def test_a_typed_number_moves_the_object(studio):
 def test_each_mode_opens(studio, mode):
     with open_page(studio.page.url) as (page, messages):
         studio.page.choose(mode)
-        page.wait_for_timeout(1500)
         wanted = {"Degrade": "Find the edge", "Recording": "Next doubt", "Live": "EMERGENCY STOP", "Twin": "Begin the contact anew"}[mode]
-        assert page.get_by_text(wanted).first.is_visible()
+        page.get_by_text(wanted).first.wait_for(state="visible", timeout=20_000)
         assert not messages
 
 

@@ -29,7 +29,6 @@ from twin.judge.pictures.spectra import RadialRow
 from twin.judge.pictures.statistics import RADIAL_MEASURES
 from twin.pins import make_graph, nominal_reference
 from twin.report.charts import new_figure, write_chart
-from twin.report.page import render_page
 from twin.report.table import write_table
 from twin.types import Form, Frame
 
@@ -252,12 +251,6 @@ def demo(out: Path) -> Path:
     )
 
 
-def live(out: Path) -> Path:
-    path = out / "index.html"
-    path.write_text(render_page("hardware.view", title=HOSTILE), encoding="utf-8")
-    return path
-
-
 PAGES = {
     "sim-to-real": sim_to_real,
     "across-objects": across_objects,
@@ -267,5 +260,4 @@ PAGES = {
     "realism": realism_page,
     "calibration": calibration,
     "demo": demo,
-    "live": live,
 }

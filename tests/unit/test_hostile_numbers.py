@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from noisy_camera import NoisyCamera
 
 from hardware.cameras.choose import open_camera
 from hardware.collect import CollectPlan
+from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.running import emulate_magician, emulate_mg400
 from hardware.emulators.twin_camera import emulate_camera
@@ -18,7 +20,6 @@ from hardware.errors import DeviceError
 from hardware.following import FollowPlan
 from hardware.safety import load_limits
 from hardware.servo_study import folder_name
-from hardware.view.server import BrowserView
 from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
 from scenes.load import SHIPPED
 from scenes.sensor import MOST_POISSON
@@ -91,11 +92,11 @@ def test_an_address_of_no_machine_here_and_a_port_in_use_have_remedies_of_their_
     with pytest.raises(DeviceError, match=r"can't listen on 999\.1\.1\.1:\d+ .*; give an address of this machine with --host"):
         Mg400Emulator(host="999.1.1.1").start()
     with pytest.raises(DeviceError, match=r"can't listen on 192\.0\.2\.1:\d+ .*; give an address of this machine with --host"):
-        BrowserView("x", host="192.0.2.1")
+        CameraEmulator(NoisyCamera(), host="192.0.2.1").start()
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(DeviceError, match=f"can't listen on 127.0.0.1:{port} .*; end what uses the port, or give another --port"):
-            BrowserView("x", port=port)
+            CameraEmulator(NoisyCamera(), port=port).start()
 
 
 @pytest.mark.parametrize("part", ["skin", "gel"])

@@ -33,9 +33,9 @@ from twin.types import FIRST, NONE
 
 HELP_LIVE = """Show a model's estimates on a camera's frames.
 
-It shows pins, graph, Voronoi map, the pose with its 90 % interval, and rates. They are shown in a window if there is a display and an
-OpenCV that can open a window. Otherwise a page is served for the browser, and its address is printed. With --rerun (package
-rerun-sdk) they go to Rerun's viewer or to a file: frame, pins, graph and pose on a time line.
+It shows pins, graph, Voronoi map, the pose with its 90 % interval, and rates on a page for the browser, and prints the page's address.
+With --rerun (package rerun-sdk) they go to Rerun's viewer or to a file: frame, pins, graph and pose on a time line. The studio shows
+the same in its mode 'Live', with an arm and the sensor's health beside it.
 
 With --record DIR every frame is kept, lossless, with its estimate. The folder can be read even if the program was killed. --replay
 DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
@@ -63,7 +63,7 @@ def live(
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="stop after this time")] = None,
     count: Annotated[int | None, typer.Option("--count", min=1, help="stop after this number of frames")] = None,
     at_rest: AtRest = NONE,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; 0: a free one")] = 8080,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
 ) -> None:
     from hardware.live import WatchPlan, watch
     from hardware.rig import signals_as_ctrl_c

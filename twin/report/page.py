@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
 
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from twin.report.charts import dark_of
@@ -181,14 +181,6 @@ class Page:
         )
 
 
-def render_page(package: str, **content: object) -> str:
-    """Render a package's own ``page.html.j2``, which extends ``base.html.j2``, as HTML. It is for pages with more than results.
-
-    Every name that the template uses must be given, except ``stylesheet``.
-    """
-    return _render("page.html.j2", ChoiceLoader([PackageLoader(package, "."), PackageLoader("twin.report", ".")]), **content)
-
-
 def provenance(made_by: str) -> Markup:
     """The line that states the command, the version of this package and the time at which a page was made."""
     try:
@@ -233,7 +225,7 @@ def link_to(anchor: str) -> str:
     return f"#{quote(anchor, safe='')}"
 
 
-def _render(template: str, loader: PackageLoader | ChoiceLoader, **content: object) -> str:
+def _render(template: str, loader: PackageLoader, **content: object) -> str:
     environment = Environment(loader=loader, undefined=StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.get_template(template).render(stylesheet=stylesheet(), **content)
 

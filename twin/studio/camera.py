@@ -32,6 +32,14 @@ def dome_window(spec: SensorSpec) -> tuple[int, int, int, int]:
     return max(0, int(box[0])), max(0, int(box[1])), min(width, int(np.ceil(box[2]))), min(height, int(np.ceil(box[3])))
 
 
+def dome_part(spec: SensorSpec, image: ImageArray, form: Form) -> ImageArray:
+    """The dome's part of a raw frame; a recording's frame shows nothing else."""
+    if form is Form.RECORDING:
+        return image
+    x0, y0, x1, y1 = dome_window(spec)
+    return image[y0:y1, x0:x1]
+
+
 def static_light(spec: SensorSpec) -> tuple[FloatArray, FloatArray]:
     """Light and cover of the whole raw frame that no contact changes (``static_layer``), kept between runs."""
 
@@ -107,7 +115,4 @@ class DomeCamera:
 
     def crop(self, image: ImageArray, form: Form) -> ImageArray:
         """The dome's part of a frame, for the page."""
-        if form is Form.RECORDING:
-            return image
-        x0, y0, x1, y1 = self.window_px
-        return image[y0:y1, x0:x1]
+        return dome_part(self.spec, image, form)

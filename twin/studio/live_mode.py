@@ -5,31 +5,21 @@ Camera and arm are handed in (``LiveFeed``, ``LiveArm``); this package knows no 
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from twin.errors import TwinError
-from twin.estimate import Estimate, SensorModel
+from twin.estimate import SensorModel
 from twin.pins.check import Grade, examine
 from twin.pins.pipeline import Pipeline
-from twin.studio.page import Chart, Page, put
-from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.studio.live_page import LiveShot, charted, live_chart, shot_numbers, shot_pictures
+from twin.studio.page import Page, put
+from twin.studio.pictures import badge, paragraph
 from twin.studio.twin_mode import TwinMode
 from twin.studio.worker import Newest
-from twin.types import Form, Frame
 
 NUDGES = ("x -1", "x +1", "y -1", "y +1", "z -1", "z +1")
 """Moves of an armed arm, mm in its base frame."""
-
-
-@dataclass(frozen=True)
-class LiveShot:
-    """A live frame, what the model makes of it, and lines about rates and losses."""
-
-    frame: Frame
-    estimate: Estimate
-    lines: tuple[str, ...]
 
 
 class LiveArm(Protocol):
@@ -134,8 +124,7 @@ class LiveMode:
         self._armed.on_update(self._guarded(self._toggle_armed))
         nudges.on_click(self._guarded(lambda: self._nudge(nudges.value)))
         gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(self._guarded(self.emergency_stop))
-        with page.charts_tab:
-            self._chart = Chart(gui, "live estimates", ("1", "2", "3"))
+        self._chart = live_chart(page)
 
     def _guarded(self, action: Callable[[], None]) -> Callable[[object], None]:
         def called(event: object) -> None:
@@ -252,27 +241,21 @@ class LiveMode:
         if feed is None or pipeline is None or not self._active:
             return
         seen = pipeline(shot.frame)
-        camera = camera_picture(shot.frame, seen, pipeline.reference.pins_px, Drawn.GRAPH)
-        cells = cell_picture(shot.frame, seen, pipeline.reference.area_px2)
-        if shot.frame.form is Form.RAW:
-            camera, cells = (self._twin.contact.camera.crop(picture, Form.RAW) for picture in (camera, cells))
+        pictures = shot_pictures(feed.model.sensor, pipeline.reference, shot.frame, seen)
         robot = feed.robot
         numbers = [
             badge("live", "moving") + (badge("recording", "moving") if self._record.value else ""),
             paragraph(feed.name, "note"),
-            estimate_table(shot.estimate, {}),
-            paragraph(f"pins found: {seen.found} of {len(seen.pins_px)}", "note"),
-            *(paragraph(line, "note") for line in shot.lines),
+            *shot_numbers(shot, seen),
             "" if robot is None else badge("ARMED" if robot.armed else "arm: read only", "moving" if robot.armed else ""),
             "" if robot is None else paragraph(robot.words(), "note"),
             *(paragraph(line, "said") for line in self._health),
         ]
-        values = list(shot.estimate.value[:3]) if shot.estimate.valid else []
 
         def change() -> None:
             if self._active:
-                self._page.show_pictures(camera, cells, f"live {shot.frame.form} frame {shot.frame.sequence}")
+                self._page.show_pictures(*pictures, f"live {shot.frame.form} frame {shot.frame.sequence}")
                 self._page.show_numbers(*numbers)
-                self._chart.add([*map(float, values), *[float("nan")] * (3 - len(values))])
+                self._chart.add(charted(shot.estimate))
 
         self._page.together(change)

@@ -12,8 +12,8 @@ import numpy as np
 
 from hardware.errors import DeviceError
 from twin.errors import OptionError
-from twin.estimate import Estimate
-from twin.types import Frame, Observation
+from twin.studio.live_page import LiveShot
+from twin.types import Observation
 
 if TYPE_CHECKING:
     import rerun
@@ -89,9 +89,9 @@ class RerunView:
             raise DeviceError(f"--rerun {self._target}: not open; use the view as a context manager")
         return self._stream
 
-    def log(self, frame: Frame, seen: Observation, estimate: Estimate) -> None:
-        """A frame with its pins and graph, and the estimate's values with their intervals, on the timelines ``frame`` and ``time``."""
-        rerun, stream = self._rerun, self._opened()
+    def show(self, shot: LiveShot, seen: Observation) -> None:
+        """A frame with its pins and graph, the estimate's values with their intervals, and the lines, on ``frame`` and ``time``."""
+        rerun, stream, frame, estimate = self._rerun, self._opened(), shot.frame, shot.estimate
         stream.set_time("frame", sequence=frame.sequence)
         stream.set_time("time", duration=frame.time_s)
         stream.log("camera", rerun.Image(frame.image))
@@ -101,12 +101,7 @@ class RerunView:
             stream.log("camera/pins", rerun.Points2D(nodes))
         for name, value, low, high in zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True):
             stream.log(f"pose/{name}", rerun.Scalars([value, low, high]))
-
-    def show(self, picture: np.ndarray, stats: dict[str, object]) -> bool:
-        """Show a picture (H, W, 3) RGB and figures by name; False once the user closed the view (never, in Rerun)."""
-        self._opened().log("view", self._rerun.Image(picture))
-        self._opened().log("figures", self._rerun.TextDocument("\n".join(map(str, stats.values()))))
-        return True
+        stream.log("figures", rerun.TextDocument("\n".join(shot.lines)))
 
 
 def _address(target: str) -> tuple[str, int]:

@@ -1,0 +1,99 @@
+"""Live frames on a page: pictures, estimate and rates as they come. ``twin live`` opens it; the studio's mode 'Live' shows the same.
+
+Frames and estimates are handed in; this package knows no device.
+"""
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from scenes.sensor import SensorSpec
+from twin.estimate import Estimate
+from twin.pins.reference import Reference
+from twin.studio.camera import dome_part
+from twin.studio.page import Chart, Page
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, paragraph
+from twin.types import Frame, ImageArray, Observation
+
+CHARTED = 3
+"""Number of labels that the chart shows."""
+
+
+@dataclass(frozen=True)
+class LiveShot:
+    """A live frame, what the model makes of it, and lines about rates and losses."""
+
+    frame: Frame
+    estimate: Estimate
+    lines: tuple[str, ...]
+
+
+def shot_pictures(sensor: SensorSpec, reference: Reference, frame: Frame, seen: Observation) -> tuple[ImageArray, ImageArray]:
+    """The dome's part of a frame with pins and graph, and its Voronoi cells by their change of area; (h, w, 3) uint8 RGB each."""
+    pictures = camera_picture(frame, seen, reference.pins_px, Drawn.GRAPH), cell_picture(frame, seen, reference.area_px2)
+    camera, cells = (dome_part(sensor, picture, frame.form) for picture in pictures)
+    return camera, cells
+
+
+def shot_numbers(shot: LiveShot, seen: Observation) -> list[str]:
+    """HTML of the estimate, the pins that were found, and the lines."""
+    found = f"pins found: {seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}")
+    return [estimate_table(shot.estimate, {}), *(paragraph(line, "note") for line in (found, *shot.lines))]
+
+
+def charted(estimate: Estimate) -> list[float]:
+    """The values that the chart shows, NaN where there is none."""
+    values = [float(value) for value in estimate.value[:CHARTED]] if estimate.valid else []
+    return values + [float("nan")] * (CHARTED - len(values))
+
+
+def live_chart(page: Page) -> Chart:
+    """A chart of the first labels over the last seconds."""
+    with page.charts_tab:
+        return Chart(page.gui, "live estimates", [str(k + 1) for k in range(CHARTED)])
+
+
+class LivePage:
+    """A page that shows what it is given, to any number of browsers. A context manager.
+
+    Parameters
+    ----------
+    title : str
+    sensor : SensorSpec
+    reference : Reference
+        Where the pins are without contact.
+    host, port : str, int
+        As for ``Page``.
+
+    Raises
+    ------
+    TwinError
+        On entering: nothing can listen there.
+    """
+
+    def __init__(self, title: str, sensor: SensorSpec, reference: Reference, *, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._title, self._sensor, self._reference = title, sensor, reference
+        self._host, self._port = host, port
+        self._stack = ExitStack()
+        self.url = ""
+
+    def __enter__(self) -> "LivePage":
+        self._page = self._stack.enter_context(Page(self._title, host=self._host, port=self._port))
+        self._chart = live_chart(self._page)
+        self._page.show_nothing("Waiting for the first frame.")
+        self.url = self._page.url
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def show(self, shot: LiveShot, seen: Observation) -> None:
+        """Show a frame with what the pipeline saw in it; browsers get pictures and numbers together."""
+        pictures = shot_pictures(self._sensor, self._reference, shot.frame, seen)
+        numbers = [badge("live", "moving"), paragraph(self._title, "note"), *shot_numbers(shot, seen)]
+
+        def change() -> None:
+            self._page.show_pictures(*pictures, f"live {shot.frame.form} frame {shot.frame.sequence}")
+            self._page.show_numbers(*numbers)
+            self._chart.add(charted(shot.estimate))
+
+        self._page.together(change)

@@ -80,4 +80,6 @@ def test_a_narrow_window_has_the_controls(studio):
         page.wait_for_timeout(2000)
         assert np.percentile(shown(page), 99) > LEAST_LIT
         assert page.locator("[data-depth]").count() == 1
+        page.locator("text=Camera >> visible=true").first.click()  # the pictures' section is closed at first
+        page.locator("img >> visible=true").first.wait_for(timeout=10_000)
         assert not messages

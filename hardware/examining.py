@@ -85,7 +85,7 @@ def frames_of(source: str, sensor: SensorSpec | None, form: Form | None, limit: 
     camera = open_camera(source, sensor, form)
     if not camera.is_live:
         recording = open_recording(Path(source), sensor, form)
-        return evenly_read(recording, limit), recording.problems
+        return evenly_read(recording, limit), recording.notes()
     if limit > MOST_LIVE:
         raise FrameError(f"--limit {limit}: at most {MOST_LIVE} frames of a camera, as they are kept until the end")
     with camera:

@@ -116,7 +116,6 @@ class Rig:
 
     @property
     def mounting(self) -> Mounting:
-        """How the arm holds the sensor."""
         return self.placed.mounting
 
     @property

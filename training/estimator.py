@@ -67,6 +67,11 @@ class PoseEstimator:
     config, content : dict
         Content of a run's ``config.json`` and ``weights.pt``.
 
+    Attributes
+    ----------
+    learnt_from : (m, 2) int64 or None
+        Marks of the frames that the model learnt from (``training.identity.frame_marks``); None if the run does not hold them.
+
     Raises
     ------
     TrainingError
@@ -86,6 +91,7 @@ class PoseEstimator:
         known = config.get("known_rest_px")  # of each pin without contact, measured on the unit that the weights are for
         self._known_rest_px = None if known is None else np.array(known, float)
         learnt = {group: {key: value.numpy() for key, value in arrays.items()} for group, arrays in content["aside"].items()}
+        self.learnt_from: np.ndarray | None = content["learnt_from"].numpy() if "learnt_from" in content else None
         self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
 
     @classmethod

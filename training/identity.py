@@ -1,11 +1,12 @@
 """What a run learnt from, by the names of its frames: told apart from other data, and found again in a table of another order."""
 
+import hashlib
 from collections.abc import Mapping
 
 import numpy as np
 
 from training.dataset import Dataset
-from training.models.part import Model
+from training.models.part import SEEN_DECIMALS, Model
 from training.recipes import TrainingError
 from training.targets import TARGET_COLUMNS
 from twin.store import inputs_digest
@@ -19,6 +20,7 @@ ASIDE = ("problems", "data")  # keys of a run's configuration that its result do
 COUNTED = "parameters"  # key that only a finished run's configuration has: how many its networks have
 EXACT = 9  # decimals of labels that count, mm and deg: the last bits of a sum may differ between machines
 NAMED = 3  # frames, or settings, that a message names
+MARK_BYTES = 8  # of a frame's mark: of a million frames two have the same by chance once in 37 million
 
 
 def identity_of(data: Dataset, model: Model) -> dict[str, str]:
@@ -51,6 +53,30 @@ def rows_named(data: Dataset, names: list[str]) -> np.ndarray:
             "give exactly what the run was trained on, or --rows all for a recording it has not seen"
         )
     return np.array([row for name in names for row in found[name]], int)
+
+
+def frame_marks(data: Dataset) -> np.ndarray:
+    """Two marks (M, 2) int64 of each frame, by which it is known again under another name or in another recording.
+
+    The first is of its pins' places, the second of their displacements: a data set that is joined to others keeps the second alone.
+    """
+    pins = data.pins
+    places = [np.round(px, SEEN_DECIMALS) + 0.0 for px in (pins.nodes_px, pins.nodes_px - pins.reference.pins_px)]
+    digests = [[hashlib.blake2b(frame.tobytes(), digest_size=MARK_BYTES).digest() for frame in kind] for kind in places]
+    return np.array([[int.from_bytes(digest, "little", signed=True) for digest in kind] for kind in digests], np.int64).reshape(2, -1).T
+
+
+def learnt_before(learnt: np.ndarray | None, data: Dataset) -> list[str]:
+    """A line if a run learnt from frames of a data set, by the marks of those (m, 2); if it does not tell its frames, that it does not."""
+    if learnt is None:
+        return ["the run does not tell from which frames it learnt: whether these are among them is not known; train again to know"]
+    known = np.isin(frame_marks(data), learnt).any(axis=1)
+    if not known.any():
+        return []
+    return [
+        f"{int(known.sum())} of these {len(data)} frames are frames that the run learnt from (first {data.pins.image_name[known][0]}): "
+        "errors on them are smaller than on new ones; give a recording it has not seen, or --rows validation"
+    ]
 
 
 def changed_since(config: Mapping, data: Dataset, model: Model) -> list[str]:

@@ -29,7 +29,7 @@ LARGE = 1000  # numbers; a larger array is kept in half precision
 NETWORKS = "networks"  # the networks' weights, in ``weights.pt``
 BESIDE = "beside"  # the arrays of the Gaussian process beside the networks, in ``weights.pt``
 SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; the shipped copies were made before there was one
-NOT_PACKED = ("kernels", "kernel_labels", "parameters")  # entries of ``weights.pt`` that a small copy leaves out
+NOT_PACKED = ("kernels", "kernel_labels", "parameters", "learnt_from")  # entries of ``weights.pt`` that a small copy leaves out
 
 
 def shipped_names() -> list[str]:

@@ -22,7 +22,7 @@ import torch
 
 from training.assemble import calibrate
 from training.dataset import Dataset, split_rows
-from training.identity import ASIDE, difference, identity_of
+from training.identity import ASIDE, difference, frame_marks, identity_of
 from training.loop import Loop, Rows
 from training.models import model_named
 from training.models.part import Prepared
@@ -280,7 +280,7 @@ def _assemble(
         size=config.size,
         seed=config.seed,
     )
-    content |= {"aside": dict(prepared.learnt), "reference_px": data.pins.reference.pins_px}
+    content |= {"aside": dict(prepared.learnt), "reference_px": data.pins.reference.pins_px, "learnt_from": frame_marks(data)[train]}
     content["parameters"] = parameter_count(model.build(data.pins.reference, len(data.targets.names), config.size))
     write_tensors(out / TENSORS, content)
     write_text(out / CONFIG, json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")

@@ -1,7 +1,9 @@
 """Errors and warnings that a user can act on; the command line prints each as one line."""
 
 import warnings
+from collections.abc import Mapping
 from functools import cache
+from types import MappingProxyType
 
 
 class TwinError(Exception):
@@ -29,7 +31,15 @@ class RenderError(TwinError):
 
 
 class StoreError(TwinError):
-    """A result can't be written, a folder holds results that were made otherwise, or another run works in it."""
+    """A result can't be written, a folder holds results that were made otherwise, or another run works in it.
+
+    Attributes
+    ----------
+    unsaved : dict of str to str
+        Texts by the names of their files, where a result that took long could not be written; the command line prints them.
+    """
+
+    unsaved: Mapping[str, str] = MappingProxyType({})
 
 
 class DatasetError(TwinError):

@@ -20,20 +20,16 @@ class Estimate(Protocol):
     def value(self) -> np.ndarray: ...
 
     @property
-    def low(self) -> np.ndarray:
-        """Lower ends of the 90 % intervals."""
+    def low(self) -> np.ndarray: ...
 
     @property
-    def high(self) -> np.ndarray:
-        """Upper ends of the 90 % intervals."""
+    def high(self) -> np.ndarray: ...
 
     @property
-    def valid(self) -> bool:
-        """Whether the pins allow an estimate."""
+    def valid(self) -> bool: ...
 
     @property
-    def reason(self) -> str:
-        """Why it is not valid; "" if it is."""
+    def reason(self) -> str: ...
 
 
 Estimator = Callable[[Frame], Estimate]

@@ -68,14 +68,11 @@ class PinState(Protocol):
     """
 
     @property
-    def base_mm(self) -> FloatArray:
-        """Where the pins stand on the skin (N, 3)."""
-
+    def base_mm(self) -> FloatArray: ...
     @property
     def axis(self) -> FloatArray: ...
     @property
-    def caps_mm(self) -> FloatArray:
-        """Middles of the caps (N, 3)."""
+    def caps_mm(self) -> FloatArray: ...
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import numpy as np
 from hardware.cameras.reader import LiveSource, Picture, ReadFailed, capture
 from hardware.errors import DeviceError
 from scenes.sensor import SensorSpec
-from twin.frames.images import quiet
+from twin.errors import FrameError
+from twin.frames.images import picture_of
 from twin.types import Form
 
 BOUNDARY = "frame"
@@ -60,11 +61,9 @@ def hold_little(connection: socket.socket) -> None:
 class Readable(Protocol):
     """A stream of bytes."""
 
-    def readline(self, limit: int, /) -> bytes:
-        """The next line, of at most ``limit`` bytes."""
+    def readline(self, limit: int, /) -> bytes: ...
 
-    def read(self, amount: int, /) -> bytes:
-        """The next ``amount`` bytes."""
+    def read(self, amount: int, /) -> bytes: ...
 
 
 class MjpegCamera(LiveSource):
@@ -171,14 +170,13 @@ def next_part(stream: Readable) -> tuple[dict[str, str], bytes]:
 
 
 def decode_jpeg(data: bytes) -> np.ndarray:
-    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8. An incomplete one raises ``ReadFailed``: decoders would fill the rest with gray."""
+    """A JPEG as gray (H, W) or RGB (H, W, 3) uint8. An incomplete or damaged one raises ``ReadFailed``: decoders guess the rest."""
     if not data.startswith(START) or not data.rstrip(b"\0\r\n").endswith(END):
         raise ReadFailed(f"a torn JPEG ({len(data)} bytes, without its {'end' if data.startswith(START) else 'start'})")
-    with quiet():
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise ReadFailed("a damaged JPEG")
-    return image if image.ndim == 2 else image[..., ::-1].copy()
+    try:
+        return picture_of(data)[0]
+    except FrameError as error:
+        raise ReadFailed(f"a damaged JPEG: {error}") from error
 
 
 def stamped_s(headers: dict[str, str]) -> float:

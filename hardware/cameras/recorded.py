@@ -83,8 +83,7 @@ class RecordedSource(SequentialSource):
         super().__init__(str(path), self.recording.form)
 
     def notes(self) -> list[str]:
-        failed = (f"skipped {bad['image_name']}: {bad['reason']}" for bad in self.recording.failed)
-        return [*self.recording.problems, *failed]
+        return self.recording.notes()
 
     def _frames(self) -> Iterator[Frame]:
         return iter(self.recording)

@@ -25,8 +25,7 @@ class FrameSource(Protocol):
         """Longest time from ``connect`` to the first frame."""
 
     @property
-    def is_connected(self) -> bool:
-        """Whether frames can be read."""
+    def is_connected(self) -> bool: ...
 
     @property
     def dropped(self) -> int:

@@ -169,6 +169,7 @@ def _serve() -> list[str] | None:
 
 def _become(asked: dict, limits: Limits, out: int, err: int, *, keep_not: tuple[int, ...]) -> None:
     os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that starts tests in the background has it ignored
     os.dup2(out, 1)
     os.dup2(err, 2)
     for descriptor in (out, err, *keep_not):

@@ -177,10 +177,11 @@ READ_FRAMES = {  # with the exit codes that are right where one picture of four 
     "graph": (f"graph {{data}} {S} --out {{out}}", (DONE,)),
     "predict": (f"predict {SENSOR} {{data}}", (DONE,)),
     "check": (f"check {{data}} {S}", (DONE, REFUSED, BAD_SENSOR)),
-    "tune": (f"tune {S} --frames {{data}} --out {{out}}/mine.toml --limit 4", ANY),
+    "tune": (f"tune {S} --frames {{data}} --out {{out}}/mine.toml --limit 4", (DONE,)),
     "live": (f"live --model {SENSOR} --camera {{data}} --headless", (DONE,)),
-    "new": ("new {data} --out {out}/mine.toml --limit 4", ANY),
+    "new": ("new {data} --out {out}/mine.toml --limit 4", (DONE,)),
 }
+TAKE_ANY_SIZE = ("tune", "new")
 READ_RAW = {
     "realism": f"realism {{data}} {U} --out {{out}} --limit 2 --quality preview --no-two-sample",
     "calibrate optics": f"calibrate optics {U} --frames {{data}} --out {{out}}/spec.toml --limit 1",
@@ -198,18 +199,22 @@ def _pictures() -> list[Entry]:
             if command not in READ_ALL_PICTURES and what not in SOME_PICTURES:
                 continue
             make = {"data": edited("frames", BAD, edit)}
-            says = (BAD,) if command in ("preprocess", "graph", "predict") else ()
+            says = () if command == "check" and what in NOT_TOLD else (BAD,)
             sample = command == "preprocess" and what in ("cut", "text", "half the size", "folder")
             found.append(Entry("pictures", what, call, make, right, says, sample=sample))
             alone = {"data": _alone(edit)}
-            ends = ANY if what in ("animated", "two pages", *NOT_TOLD) else (REFUSED,)
+            usable = what in ("animated", "two pages", *NOT_TOLD) or (what == "half the size" and command in TAKE_ANY_SIZE)
+            ends = ANY if usable else (REFUSED,)
             ends = (*ends, BAD_SENSOR) if command == "check" else ends
             leaves = ("pins.npz", "summary.json") if command == "preprocess" and what in NOT_TOLD else ()
             found.append(Entry("a picture", what, call, alone, ends, (BAD,) if ends == (REFUSED,) else (), leaves))
         for what, edit in given.VIDEOS.items():
             partly = what.startswith(("damaged", "a picture"))  # some of it can be read
             ends = (DONE, REFUSED, BAD_SENSOR) if partly or what == "cut at half" else (REFUSED,)
-            make, says = {"data": edited("video", "", edit)}, () if partly else ("clip", "cut") if what == "cut at half" else ("clip",)
+            make, says = (
+                {"data": edited("video", "", edit)},
+                ("clip", *{"cut at half": ("cut",), "damaged in the middle": ("damaged|cut",)}.get(what, ())),
+            )
             leaves = ("pins.npz", "summary.json") if partly else ()
             found.append(Entry("videos", what, call, make, ends, says, leaves, sample=command == "predict" and what == "text"))
         for what, make in FOLDERS.items():

@@ -7,9 +7,11 @@ from drawn_frames import draw_discs, drawn_frame, smooth_warp
 
 from scenes import load_sensor
 from twin.errors import FrameError
+from twin.frames.forms import known_frames
 from twin.geometry.pins import pin_lattice
 from twin.pins import METHODS, load_detector, make_detector, shipped_detector, tune, write_detector
 from twin.pins.reference import nominal_reference
+from twin.pins.tune_files import tune_on_frames
 from twin.types import Form, Frame
 
 # scale spaces give whole pixels; DoH, from an integral image, is off by about one
@@ -62,6 +64,20 @@ def test_every_method_tunes_itself_and_finds_the_pins(spec, foreign, method):
         assert np.sqrt(np.mean(nearest**2)) < CENTROID_PX[method]
         assert found.valid and (method == "legacy" or found.graph.nodes_px.shape == truth.shape)
     assert detector.evidence.exact_rate == 1.0
+
+
+def test_a_tuning_tells_what_it_left_out_and_frames_of_another_size(spec, tuned, tmp_path, monkeypatch):
+    monkeypatch.setattr("twin.pins.tune_files.tune", lambda frames, sensor, method, progress: tuned)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"f_{k}.png"), np.full((240, 320), 40 * k, np.uint8))
+    (tmp_path / "f_1.png").write_bytes(b"no picture")
+    told = tune_on_frames(tmp_path, spec, limit=3).odd
+    assert any(note.startswith("skipped f_1.png: not a readable picture") for note in told)
+    assert any("f_0.png: 320x240" in note and "mg400-127" in note for note in told)
+    width, height = known_frames(spec).size_px[Form.RAW]
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"f_{k}.png"), np.full((height, width), 40 * k, np.uint8))
+    assert not tune_on_frames(tmp_path, spec, limit=3).odd
 
 
 def test_names_are_those_of_the_layout(spec, foreign, tuned):

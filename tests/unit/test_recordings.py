@@ -15,9 +15,9 @@ from PIL import Image
 from scenes import load_sensor
 from training.targets import choose_targets
 from twin.errors import FrameError, StoreError
-from twin.frames import natural_key, open_recording, read_image
+from twin.frames import evenly_read, natural_key, open_recording, read_image
 from twin.frames.images import write_image
-from twin.frames.recording import _is_cut
+from twin.frames.videos import is_cut
 from twin.pins import Pipeline, nominal_reference
 from twin.pins.batch import overlay_name, preprocess_recording
 from twin.rig.labels import read_arm_labels
@@ -215,9 +215,66 @@ def test_a_video_cut_within_its_first_frame_is_refused(video, spec, monkeypatch)
         video.write_bytes(data[:at])
         with pytest.raises(FrameError, match="tap.avi: (no frame can be decoded|cut within its first frame)"):
             open_recording(video, spec)
-    monkeypatch.setattr("twin.frames.recording._count_frames", lambda path: (1, 12, np.zeros((480, 640, 3), np.uint8)))
+    made_up = [(0, 0.0, np.zeros((480, 640, 3), np.uint8), "")]
+    monkeypatch.setattr("twin.frames.videos._read", lambda path: iter(made_up))
     with pytest.raises(FrameError, match="tap.avi: cut within its first frame"):  # where the decoder made it up
         open_recording(video, spec)
+
+
+def in_frame(data: bytes, number: int) -> int:
+    """A place in the middle of a frame of an AVI file."""
+    starts = [k for k in range(data.index(b"movi"), len(data)) if data.startswith(b"00dc", k)][number:]
+    return starts[0] + 8 + int.from_bytes(data[starts[0] + 4 : starts[0] + 8], "little") // 2
+
+
+def test_a_damaged_frame_of_a_video_is_left_out_and_told(video, spec):
+    whole = {frame.name: frame.image for frame in open_recording(video, spec)}
+    data = video.read_bytes()
+    at = in_frame(data, 5)
+    video.write_bytes(data[:at] + bytes(400) + data[at + 400 :])
+    recording = open_recording(video, spec)
+    frames = list(recording)
+    assert len(frames) == 11 and all(np.array_equal(frame.image, whole[frame.name]) for frame in frames), "the others keep their names"
+    (bad,) = recording.failed
+    assert bad["image_name"] == "tap_000005" and "damaged" in bad["reason"]
+    with pytest.raises(FrameError, match="tap_000005.*damaged"):
+        recording.read(5)
+    assert len(evenly_read(recording, 12)) == 11 and recording.notes()[-1].startswith("skipped tap_000005: ")
+
+
+def test_a_damaged_jpeg_is_refused_and_bytes_behind_it_are_told(tmp_path, pictures):
+    data, path = cv2.imencode(".jpg", pictures[1])[1].tobytes(), tmp_path / "f.jpg"
+    half = len(data) // 2
+    for damaged in (data[:half] + bytes(200) + data[half + 200 :], data[:half] + b"\xff" * 200 + data[half + 200 :], data[:half]):
+        path.write_bytes(damaged)
+        with pytest.raises(FrameError, match="f.jpg"):
+            read_image(path)
+    path.write_bytes(data[:-2] + b"\x5a\xa5" * 20 + data[-2:])
+    image, note = read_image(path)
+    path.write_bytes(data)
+    assert "bytes that belong to no part" in note and np.array_equal(image, read_image(path)[0]) and read_image(path)[1] == ""
+
+
+def test_a_tiff_with_a_damaged_strip_is_refused(tmp_path, pictures):
+    path = tmp_path / "f.tiff"
+    cv2.imwrite(str(path), pictures[1])
+    data = path.read_bytes()
+    half = len(data) // 2
+    path.write_bytes(data[:half] + bytes(300) + data[half + 300 :])
+    with pytest.raises(FrameError, match="f.tiff: damaged"):
+        read_image(path)
+
+
+def test_frames_evenly_read_leave_out_what_cannot_be_read(tmp_path, spec, pictures):
+    names = write_set(tmp_path / "set", "frames_bw", "frame_{}_0.png", pictures, (1, 2, 3))
+    break_picture(tmp_path / "set" / "frames_bw" / names[1], "truncated", pictures)
+    recording = open_recording(tmp_path / "set", spec)
+    assert [frame.name for frame in evenly_read(recording, 3)] == [names[0], names[2]]
+    assert f"skipped {names[1]}: truncated" in recording.notes()[-1]
+    for name in names:
+        break_picture(tmp_path / "set" / "frames_bw" / name, "truncated", pictures)
+    with pytest.raises(FrameError, match=f"{names[0]}: truncated"):
+        evenly_read(recording, 3)
 
 
 def test_an_mp4_whose_data_come_last_is_cut_where_a_box_says_so(tmp_path):
@@ -233,7 +290,7 @@ def test_an_mp4_whose_data_come_last_is_cut_where_a_box_says_so(tmp_path):
         (b"\x1a\x45\xdf\xa3" + bytes(20), False),  # another container
     ):
         path.write_bytes(data)
-        assert _is_cut(path) is cut
+        assert is_cut(path) is cut
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")

@@ -16,7 +16,7 @@ import pyvista as pv
 from twin.cli import main
 from twin.errors import StoreError
 from twin.report.skin3d import write_surface
-from twin.store import contents, locked, output, output_file, overwriting, write_text, writes, writes_file, written_by_us
+from twin.store import contents, locked, output, output_file, overwriting, write_result, write_text, writes, writes_file, written_by_us
 from twin.store.output import WRITTEN
 
 NAMES = ("table.csv", "page.html", "pictures")
@@ -239,6 +239,28 @@ def test_a_full_standard_output_is_one_line(tmp_path: Path, monkeypatch: pytest.
     error = capsys.readouterr().err
     assert error.startswith("twin: error: the standard output or a cache: can't be written (No space left on device); free")
     assert error.count("\n") == 1
+
+
+def test_a_result_that_cannot_be_written_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    texts = {"mine.pins.csv": "1,2\n", "mine.toml": "a = 1\n"}
+    with pytest.raises(StoreError, match=r"mine\.pins\.csv: can't be written.*printed") as error:
+        write_result(tmp_path / "nowhere", texts)
+    assert error.value.unsaved == texts
+
+    def fail() -> None:
+        raise error.value
+
+    monkeypatch.setattr("twin.cli.command_line", lambda: lambda prog_name: fail())
+    with pytest.raises(SystemExit):
+        main()
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1 and all(name in said.out and text in said.out for name, text in texts.items())
+    with Path("/dev/full").open("w") as full, pytest.raises(SystemExit) as end:
+        monkeypatch.setattr(sys, "stdout", full)
+        main()
+    assert end.value.code == 1 and capsys.readouterr().err.count("\n") == 1
+    write_result(tmp_path, texts)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == texts
 
 
 def test_a_file_that_a_run_goes_on_from_is_left_to_that_run(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from scenes import load_sensor
 from training.dataset import Dataset, joined
 from training.estimator import PoseEstimator, digest_of, folder_of
 from training.evaluate import judge, leak_check, rows_to_judge, write_evaluation
-from training.identity import changed_since
+from training.identity import changed_since, learnt_before
 from training.models import recipe_of
 from training.models.part import Prediction
 from training.pins import PinTable
@@ -116,6 +116,20 @@ def test_the_frames_kept_out_are_judged_whatever_the_order_of_the_table(data, tr
     assert not changed_since(estimator.config, mixed, estimator.part)
     (said,) = changed_since(estimator.config, with_other_labels(data), estimator.part)
     assert "other labels" in said
+
+
+def test_frames_that_a_run_learnt_from_are_known_again_under_any_name(data, trained, tmp_path):
+    learnt = PoseEstimator.load(trained).learnt_from
+    kept = np.isin(data.pins.image_name, json.loads((trained / "config.json").read_text())["rows"]["kept_out"])
+    (said,) = learnt_before(learnt, data)
+    assert said.startswith(f"{(~kept).sum()} of these {FRAMES} frames") and "the run learnt from" in said
+    assert not learnt_before(learnt, data.rows(np.flatnonzero(kept)))
+    few = in_another_order(data.rows(np.flatnonzero(~kept)[:7]))
+    renamed = replace(few, pins=replace(few.pins, image_name=np.array([f"other_{k}.png" for k in range(7)])))
+    assert learnt_before(learnt, renamed)[0].startswith("7 of these 7 frames")
+    other = replace(data.rows(np.flatnonzero(kept)), folders=(tmp_path / "a",))
+    assert learnt_before(learnt, joined([other, replace(renamed, folders=(tmp_path / "b",))]))[0].startswith("7 of these 25 frames")
+    assert "not known" in learnt_before(None, data)[0]
 
 
 def test_a_run_of_an_earlier_version_is_judged_and_says_what_it_cannot_tell(data, trained, tmp_path):

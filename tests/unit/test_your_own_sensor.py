@@ -40,6 +40,7 @@ def made(tmp_path_factory):
     rest = rest_of(PINS)
     images = [*frames_of(rest, 4), *frames_of(rest, 1, contact_px=1e-9)]
     folder = folder_of(tmp_path, images, [*(f"frame_{k}.png" for k in range(4)), "no_contact.png"])
+    (folder / "frame_4.png").write_bytes((folder / "frame_3.png").read_bytes()[:5000])
     return new_sensor(folder, tmp_path / "mine.toml"), rest, folder
 
 
@@ -56,6 +57,8 @@ def test_a_folder_of_frames_becomes_a_sensor(made):
     assert found.camera.rms_px < 1.5 and found.health.all_pins == 1.0
     page = found.written[1].read_text()
     assert "What is assumed" in page and "overlay-1.png" in page
+    (note,) = [line for line in found.lines() if line.startswith("note: ")]
+    assert "skipped frame_4.png: truncated PNG" in note and "skipped frame_4.png" in page, "what was left out is told"
 
 
 def test_the_specification_is_short_and_commented(made):

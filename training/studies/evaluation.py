@@ -8,7 +8,7 @@ from typing import Any
 from training.dataset import joined, load_dataset
 from training.estimator import PoseEstimate, PoseEstimator
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
-from training.identity import changed_since
+from training.identity import changed_since, learnt_before
 from training.recipes import TrainingError
 from twin.errors import FrameError
 from twin.frames import Recording, open_recording
@@ -196,6 +196,8 @@ def evaluate_run(
     chosen = rows_to_judge(estimator, found, rows)
     if rows == "validation":
         found.problems.extend(changed_since(estimator.config, found, estimator.part))
+    else:
+        found.problems.extend(learnt_before(estimator.learnt_from, found))
     made = estimator.predict_rows(found, chosen)
     metrics = {"model": estimator.model, "rows": rows, **judge(made, found, chosen), "ms_per_frame": time_frames(estimator, found)}
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []

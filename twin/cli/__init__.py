@@ -10,53 +10,24 @@ import logging
 import os
 import sys
 import warnings
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
 
-from twin.errors import OptionError, TwinError
+from twin.errors import OptionError, StoreError, TwinError
 
-# Modules of commands, in the order in which 'twin --help' lists them, and the title that their commands stand under there.
-COMMANDS = {
-    "start": "Begin",
-    "studio": "Begin",
-    "frames": "Frames and pins",
-    "calibration": "Your own sensor, and how true its twin is",
-    "learning": "Data sets and models",
-    "studies": "Studies",
-    "live": "Cameras and arms",
-}
+# Modules of commands, in the order in which 'twin --help' lists them.
+COMMANDS = ("start", "studio", "frames", "calibration", "learning", "studies", "live")
 
 # Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as shells count).
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130
 
 
 class _Commands(TyperGroup):
-    """All commands, listed by the kind of work. After Ctrl-C typer alone would end the program without a word."""
-
-    def titled(self, ctx: Any) -> dict[str, list[str]]:
-        """Names of the commands under each title of ``COMMANDS``."""
-        found: dict[str, list[str]] = {title: [] for title in COMMANDS.values()}
-        for name in self.list_commands(ctx):
-            command: Any = self.get_command(ctx, name)
-            while hasattr(command, "commands"):  # a group of commands stands where its own stand
-                command = next(iter(command.commands.values()))
-            found[COMMANDS[command.callback.__module__.rpartition(".")[2]]].append(name)
-        return {title: names for title, names in found.items() if names}
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        width = max(map(len, self.list_commands(ctx)))
-        for title, names in self.titled(ctx).items():
-            commands = [self.get_command(ctx, name) for name in names]
-            rows = [
-                (f"{name:{width}}", command.get_short_help_str(formatter.width - width - 6))
-                for name, command in zip(names, commands, strict=True)
-                if command
-            ]
-            with formatter.section(title):
-                formatter.write_dl(rows)
+    """All commands. After Ctrl-C typer alone would end the program without a word."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -117,6 +88,8 @@ def main() -> None:
             raise
         print(f"twin: error: {' '.join(str(error).split())}", file=sys.stderr)
         _print_notes(error)
+        if isinstance(error, StoreError):
+            _print_unsaved(error.unsaved)
         sys.exit(MISUSED if isinstance(error, OptionError) else FAILED)
 
 
@@ -132,6 +105,15 @@ def _end_without_room(error: OSError) -> NoReturn:
     place = error.filename or "the standard output or a cache"
     print(f"twin: error: {place}: can't be written ({error.strerror}); free some space and give the same command again", file=sys.stderr)
     sys.exit(FAILED)
+
+
+def _print_unsaved(texts: Mapping[str, str]) -> None:
+    """Print what could not be written, each text below its file's name where there are several."""
+    try:
+        for name, text in texts.items():
+            print(text if len(texts) == 1 else f"--- {name}\n{text}", flush=True)
+    except OSError:  # the standard output lies on the same full disk
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _for_user(error: Exception) -> bool:

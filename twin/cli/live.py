@@ -42,7 +42,6 @@ DIR runs the model on the same frames again, and says whether the estimates are 
 contact at the start; the first frame is then kept with the session.
 
 \b
-Example:
   twin live --camera /dev/video0 --model RUN
   twin live --camera http://127.0.0.1:8081/stream.mjpg --model RUN \\
       --record out/session --headless --seconds 60
@@ -103,7 +102,6 @@ The folder has the recordings' own format (targets.csv, frames_bw/ or images/, i
 contacts.jsonl. The same command continues an interrupted collection.
 
 \b
-Example:
   twin collect --camera twin --arm simulated --sensor mg400-331 \\
       --experiment surface-2d --count 200 --out data/first
   twin collect --camera /dev/video0 --arm mg400 --sensor mg400-331 \\
@@ -170,7 +168,6 @@ Before the arm touches anything, a frame is taken from which the model counts pi
 specification's layout, as models on graphs always do.
 
 \b
-Example:
   twin servo --object can --model RUN --out out/servo
   twin emulate mg400 &  twin emulate camera --arm mg400:127.0.0.1 \\
       --sensor mg400-331 --object can --port 8081 &
@@ -272,11 +269,7 @@ def mg400(
 
     The ports are 29999 (dashboard), 30003 (motion), and 30004 (every 8 ms), 30005 (200 ms) and 30006 (50 ms) for feedback.
 
-    In Python: open_arm("mg400:127.0.0.1").
-
-    \b
-    Example:
-      twin emulate mg400
+    Try it: twin emulate mg400 &  then in Python: open_arm("mg400:127.0.0.1").
     """
     from hardware.emulators.mg400 import FAULTS
     from hardware.emulators.running import emulate_mg400
@@ -295,11 +288,7 @@ def magician(
 
     The name of its device is printed.
 
-    In Python: open_arm("magician:/tmp/magician").
-
-    \b
-    Example:
-      twin emulate magician --link /tmp/magician
+    Try it: twin emulate magician --link /tmp/magician &  then in Python: open_arm("magician:/tmp/magician").
     """
     from hardware.emulators.magician import FAULTS
     from hardware.emulators.running import emulate_magician
@@ -314,7 +303,6 @@ The stream of JPEGs shows the contact at the pose of an emulated arm. The pose c
 may run in different processes.
 
 \b
-Example:
   twin emulate mg400 &
   twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can \\
       --port 8081

@@ -102,6 +102,8 @@ class NewSensor:
     health : Health
     known, assumed, next_steps : tuple of str
         What the frames tell, what was assumed instead, and what to do to know more.
+    odd : tuple of str
+        What was odd in the recording.
     written : list of Path
     """
 
@@ -114,6 +116,7 @@ class NewSensor:
     known: tuple[str, ...]
     assumed: tuple[str, ...]
     next_steps: tuple[str, ...]
+    odd: tuple[str, ...]
     written: list[Path]
 
     def lines(self) -> list[str]:
@@ -123,7 +126,7 @@ class NewSensor:
         if not self.identified.sure:
             lines += [f"or: {other.line()}" for other in self.identified.candidates[1:2]]
         lines += [self.rest.line(), *self.known[2:], *self.health.lines()]
-        return lines + [f"next: {step}" for step in self.next_steps]
+        return lines + [f"next: {step}" for step in self.next_steps] + [f"note: {note}" for note in self.odd]
 
 
 @writes_file(".*.csv")
@@ -168,6 +171,7 @@ def new_sensor(
     with output(folder, "index.html", "overlay-*.png"):
         recording = open_recording(frames_at(frames, table, no_contact), None, form)
         looked = evenly_read(recording, limit)
+        odd = recording.notes()
         images = [gray_levels(frame.image) for frame in looked]
         with stage(progress, "layout") as step:
             found = identify(images, progress=step) if layout is None else _given(layout, images)
@@ -183,12 +187,13 @@ def new_sensor(
             tuned = tune(looked, fitted, known=best, progress=step)
         detector = _at_rest(tuned.detector, fitted, rest, best)
         sensor = _with_pipeline(fitted, detector)
-        judged = looked if len(looked) >= min(JUDGED, len(recording)) else evenly_read(recording, JUDGED)
+        judged = looked if limit >= min(JUDGED, len(recording)) else evenly_read(recording, JUDGED)
+        odd = list(dict.fromkeys([*odd, *recording.notes()]))
         health, pictures = _health(sensor, looked[0].form, judged, folder)
         known, assumed, steps = _told(sensor, found, rest, camera, tuned, health, recording.labels)
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
-        page = _page(folder, sensor, found, health, pictures, known, assumed, steps, recording.problems)
-        return NewSensor(sensor, found, rest, camera, tuned, health, known, assumed, steps, [out, page])
+        page = _page(folder, sensor, found, health, pictures, known, assumed, steps, odd)
+        return NewSensor(sensor, found, rest, camera, tuned, health, known, assumed, steps, tuple(odd), [out, page])
 
 
 def _given(layout: PinsSpec, images: list[np.ndarray]) -> Identified:

@@ -6,7 +6,7 @@ from pathlib import Path
 from scenes.sensor import SensorSpec
 from scenes.write import sensor_files
 from twin.errors import OptionError
-from twin.store import write_text
+from twin.store import write_result
 
 
 def write_sensor(path: Path, spec: SensorSpec, comment: str = "", notes: Mapping[str, str] | None = None) -> Path:
@@ -17,10 +17,9 @@ def write_sensor(path: Path, spec: SensorSpec, comment: str = "", notes: Mapping
     Raises
     ------
     StoreError
-        It can't be written.
+        It can't be written; the error's ``unsaved`` has the texts.
     """
-    for name, text in sensor_files(spec, path.stem, comment, notes).items():
-        write_text(path.with_name(name), text)
+    write_result(path.parent, sensor_files(spec, path.stem, comment, notes))
     return path
 
 

@@ -6,6 +6,7 @@ during one decoder call.
 
 import contextlib
 import os
+import re
 import threading
 import zlib
 from collections.abc import Iterator
@@ -26,12 +27,22 @@ LARGEST_BYTES = 500_000_000
 """Bytes of a picture's file: ten times those of an uncompressed 16-bit colour picture of a 8-megapixel camera."""
 SEVERAL_FROM_START = (b"II*\0", b"MM\0*", b"RIFF")
 """First bytes of TIFF and WebP files, which may hold several pictures."""
+ADDED_BYTES = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
+"""What the JPEG decoder says of bytes behind a picture that is complete: some cameras add them."""
+DAMAGE = re.compile(
+    r"(?!.*before marker 0xd9)Corrupt JPEG data: (?!bad ICC)[\w ]+|Premature end of JPEG file|Inconsistent progression sequence"
+    r"|Invalid SOS parameters|(?<=TIFF_Error )[^\n]+"
+)
+"""What decoders say of pictures of which they could read a part only, and give the rest all the same."""
 DEPTHS = (8, 10, 12, 14, 16)
 """Bit depths that cameras deliver in 16-bit files."""
+MOST_HEARD = 10_000
+"""Bytes of a decoder's messages that are kept: the first of them tells what is wrong."""
 STDERR = 2
 """File descriptor of the process's stderr."""
 
 _lock = threading.Lock()
+_hearing = threading.Lock()  # one call at a time, so that what is heard is its own
 _inside = 0  # number of calls that currently need stderr redirected
 _kept: int | None = None  # the original stderr while it is redirected
 
@@ -39,7 +50,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET; OpenCV re
 
 
 def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
-    """A picture as (H, W) or (H, W, 3) uint8 RGB, and a note on what was converted ("" if nothing).
+    """A picture as (H, W) or (H, W, 3) uint8 RGB, and a note on what was converted or odd ("" if nothing).
 
     Parameters
     ----------
@@ -49,11 +60,25 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
     Raises
     ------
     FrameError
-        The file cannot be read: it is missing, empty, truncated or no picture.
+        The file cannot be read: it is missing, empty, truncated, damaged or no picture.
     """
-    stored, several = _stored(path)
+    return _as_levels(*_stored(path), bits)
+
+
+def picture_of(data: bytes) -> tuple[np.ndarray, str]:
+    """A picture from a file's bytes, as of ``read_image``.
+
+    Raises
+    ------
+    FrameError
+        They are cut, damaged or no picture; the message names no file.
+    """
+    return _as_levels(*_decoded(data), 0)
+
+
+def _as_levels(stored: np.ndarray, odd: str, bits: int) -> tuple[np.ndarray, str]:
     image, note = to_eight_bits(stored, bits)
-    note = "; ".join(filter(None, [several, note]))
+    note = "; ".join(filter(None, [odd, note]))
     if image.ndim == 3:
         image = image[..., 0] if image.shape[2] < 3 else cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2RGB)
     return np.ascontiguousarray(image), note
@@ -76,31 +101,45 @@ def decode(path: Path) -> np.ndarray:
     Raises
     ------
     FrameError
-        The file cannot be read: it is missing, empty, truncated or no picture.
+        The file cannot be read: it is missing, empty, truncated, damaged or no picture.
     """
     return _stored(path)[0]
 
 
 def _stored(path: Path) -> tuple[np.ndarray, str]:
-    """Levels as of ``decode``, and a note if the file holds further pictures ("" if not)."""
+    """Levels as of ``decode``, and what is odd in the file ("" if nothing)."""
     try:
         data = read_regular(path, LARGEST_BYTES)
     except OSError as error:
         raise FrameError(f"{path.name}: can't be read ({error.strerror})") from error
     if not data:
         raise FrameError(f"{path.name}: the file is empty; copy it again")
-    if data.startswith(PNG_START) and (fault := _png_fault(data)):
-        raise FrameError(f"{path.name}: {fault}; copy it again")
     try:
-        with quiet():
+        image, odd = _decoded(data)
+    except FrameError as error:
+        raise FrameError(f"{path.name}: {error}") from None
+    several = "holds several pictures; only the first is read" if _holds_several(path, data) else ""
+    return image, "; ".join(filter(None, [several, odd]))
+
+
+def _decoded(data: bytes) -> tuple[np.ndarray, str]:
+    """Levels as of ``decode`` from a picture's bytes, and what its decoder found odd ("" if nothing)."""
+    if data.startswith(PNG_START) and (torn := _png_fault(data)):
+        raise FrameError(f"{torn}; copy it again")
+    try:
+        with overheard() as said:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
-        raise FrameError(f"{path.name}: not a readable picture (broken or unknown format); copy or convert it again")
+        raise FrameError("not a readable picture (broken or unknown format); copy or convert it again")
     if image.dtype not in (np.uint8, np.uint16):
-        raise FrameError(f"{path.name}: expected 8-bit levels, got {image.dtype}; convert it to 8 bits")
-    return image, "holds several pictures; only the first is read" if _holds_several(path, data) else ""
+        raise FrameError(f"expected 8-bit levels, got {image.dtype}; convert it to 8 bits")
+    if fault := DAMAGE.search(said[0]):
+        raise FrameError(f"damaged ({fault[0]}); copy it again, or leave it out")
+    if extra := ADDED_BYTES.search(said[0]):
+        return image, f"holds {extra[1]} bytes that belong to no part of it: damaged, or of a camera that adds some; look at its pins"
+    return image, ""
 
 
 def _holds_several(path: Path, data: bytes) -> bool:
@@ -186,3 +225,27 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         _turn_back()
+
+
+@contextlib.contextmanager
+def overheard() -> Iterator[list[str]]:
+    """Context as ``quiet`` that gives a list; what was printed to stderr meanwhile is its one text, once the context has ended."""
+    said = [""]
+    with _hearing, quiet():  # stderr is the null device, and stays it until this context ends
+        if _kept is None:
+            yield said
+            return
+        heard, ear = os.pipe()
+        os.set_blocking(ear, False)  # what is longer than a pipe takes is dropped
+        os.set_blocking(heard, False)
+        nowhere = os.dup(STDERR)
+        os.dup2(ear, STDERR)
+        os.close(ear)
+        try:
+            yield said
+        finally:
+            os.dup2(nowhere, STDERR)
+            os.close(nowhere)
+            with contextlib.suppress(BlockingIOError):
+                said[0] = os.read(heard, MOST_HEARD).decode("utf-8", "replace")
+            os.close(heard)

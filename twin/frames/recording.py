@@ -1,21 +1,21 @@
 """A recording, opened from whatever the user gives and read frame by frame."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
 
-import cv2
 import numpy as np
 
-from scenes.files import LONGEST_PATH, require_regular, shown
+from scenes.files import LONGEST_PATH, shown
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
 from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_of, known_frames, times
-from twin.frames.images import quiet, read_image
+from twin.frames.images import read_image
 from twin.frames.tables import TABLES, order_by_table, read_metadata
+from twin.frames.videos import Video, open_video
 from twin.types import Form, Frame
 
 MOST_NAMED = 20  # columns that a message names; the widest tables in use have about 40
@@ -90,6 +90,7 @@ class Recording:
     problems: list[str] = field(default_factory=list)
     failed: list[BadFrame] = field(default_factory=list)
     _files: list[Path] = field(default_factory=list, repr=False)
+    _video: Video | None = field(default=None, repr=False)
     _bits: int = field(default=0, repr=False)
     _noted: set[str] = field(default_factory=set, repr=False)
 
@@ -97,30 +98,36 @@ class Recording:
         return len(self.names)
 
     def __iter__(self) -> Iterator[Frame]:
+        yield from self.some(range(len(self)))
+
+    def some(self, chosen: Collection[int]) -> Iterator[Frame]:
+        """The readable frames of some indices of ``names``, in order; the others of these are added to ``failed``."""
         self.failed.clear()
-        if not self._files:
-            yield from self._video_frames()
-            return
-        for index, name in enumerate(self.names):
-            try:
-                yield self.read(index)
-            except FrameError as error:
-                self.failed.append({"image_name": name, "reason": str(error).removeprefix(f"{name}: ")})
+        for index, frame in self._video_frames(self._video, chosen) if self._video is not None else self._pictures(chosen):
+            if isinstance(frame, str):
+                self.failed.append({"image_name": self.names[index], "reason": frame.removeprefix(f"{self.names[index]}: ")})
+            else:
+                yield frame
 
     def read(self, index: int) -> Frame:
-        """Read frame ``index`` of ``names``. In a video this is done by seeking.
+        """Read frame ``index`` of ``names``. A video is read from its beginning for it.
 
         Raises
         ------
         FrameError
             The frame can't be read, or its size differs from the recording's.
         """
-        if not self._files:
-            for frame in self._video_frames():
-                if frame.sequence == index:
-                    return frame
+        if self._video is not None:
+            for _, frame in self._video_frames(self._video, {index}):
+                if isinstance(frame, str):
+                    raise FrameError(f"{self.names[index]}: {frame}")
+                return frame
             raise FrameError(f"{self.path.name}: has no frame {index}; it ends after {len(self)}")
         return self._frame(self._image(self._files[index]), index)
+
+    def notes(self) -> list[str]:
+        """What is odd in the recording, and the frames that could not be read so far, one line each."""
+        return [*self.problems, *(f"skipped {bad['image_name']}: {bad['reason']}" for bad in self.failed)]
 
     def labels_found(self) -> str:
         """What there is of labels, for a message: the table's columns, or why no table serves."""
@@ -143,18 +150,23 @@ class Recording:
             raise FrameError(f"{name}: expected {expected} as the recording's other frames, got {got}; leave it out or record it again")
         return Frame(image, self.form, name, time_s, index)
 
-    def _video_frames(self) -> Iterator[Frame]:
-        with quiet():
-            capture = cv2.VideoCapture(str(self.path))
-        try:
-            for index in range(len(self.names)):
-                time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-                image = _next_image(capture)
-                if image is None:
-                    break
-                yield self._frame(image, index, time_s)
-        finally:
-            capture.release()
+    def _pictures(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
+        """Index and frame, or why it can't be read, of chosen pictures."""
+        for index in sorted(chosen):
+            try:
+                yield index, self.read(index)
+            except FrameError as error:
+                yield index, str(error)
+
+    def _video_frames(self, video: Video, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
+        """Index and frame, or why it can't be read, of chosen frames of a video."""
+        for index, time_s, image in video.frames():
+            if index not in chosen:
+                continue
+            try:
+                yield index, image if isinstance(image, str) else self._frame(image, index, time_s)
+            except FrameError as error:
+                yield index, str(error)
 
     def take_reference(self, candidates: list[Path]) -> None:
         """Use the first readable picture of the frames' size as the no-contact frame."""
@@ -193,73 +205,11 @@ class Recording:
                 self.metadata[file.name] = content
 
 
-def _video_image(image: np.ndarray) -> np.ndarray:
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def _next_image(capture: cv2.VideoCapture) -> np.ndarray | None:
-    with quiet():
-        good, image = capture.read()
-    return _video_image(image) if good else None
-
-
-def _count_frames(path: Path) -> tuple[int, int, np.ndarray]:
-    """Number of frames that can be decoded, number of frames that the file states, and the first frame (RGB)."""
-    with quiet():
-        capture = cv2.VideoCapture(str(path))
-    try:
-        promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
-        first = _next_image(capture)
-        if first is None:
-            raise FrameError(f"{path}: no frame can be decoded; check that it is a video, or record it again")
-        count = 1
-        while _next_image(capture) is not None:
-            count += 1
-    finally:
-        capture.release()
-    return count, promised, first
-
-
 def _open_video(path: Path, known: KnownFrames | None, form: Form | None) -> Recording:
-    try:
-        require_regular(path)
-    except OSError as error:
-        raise FrameError(f"{path}: can't be read ({error.strerror}); give a video") from error
-    count, promised, first = _count_frames(path)
-    problems: list[str] = []
-    if promised > count or _is_cut(path):
-        # The decoder makes up what is missing of a frame that was cut, and does not say so.
-        decoded = f"{count} of {max(promised, count)} frames can be decoded"
-        problems.append(f"{path.name}: cut, {decoded}; the last of them may lack a part and is left out")
-        count -= 1
-    if not count:
-        raise FrameError(f"{path}: cut within its first frame; copy it again, or record it again")
-    names = [f"{path.stem}_{k:06d}" for k in range(count)]
-    return Recording(path, form_of(first, path.name, known, form), names, (first.shape[1], first.shape[0]), problems=problems)
-
-
-def _is_cut(path: Path) -> bool:
-    """Whether an AVI or MP4 file is shorter than its own chunks say."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(8)
-        if head[:4] == b"RIFF":
-            return size < len(head) + int.from_bytes(head[4:], "little")
-        if head[4:] != b"ftyp":
-            return False
-        start = 0
-        while start < size:
-            file.seek(start)
-            head = file.read(16)
-            length = int.from_bytes(head[:4], "big")
-            if length == 1:  # the length follows, in 8 bytes
-                length = int.from_bytes(head[8:], "big")
-            elif length == 0:  # up to the file's end
-                return False
-            if length < 8:  # no box
-                return True
-            start += length
-        return start > size
+    video = open_video(path)
+    names = [f"{path.stem}_{k:06d}" for k in range(video.count)]
+    size_px = (video.first.shape[1], video.first.shape[0])
+    return Recording(path, form_of(video.first, path.name, known, form), names, size_px, problems=video.problems, _video=video)
 
 
 def _choose_folder(
@@ -358,6 +308,17 @@ def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Pat
 
 
 def evenly_read(recording: Recording, limit: int) -> list[Frame]:
-    """At most ``limit`` frames of a recording, evenly spread from its first to its last."""
-    chosen = np.linspace(0, len(recording) - 1, min(limit, len(recording))).round()
-    return [recording.read(int(index)) for index in np.unique(chosen)]
+    """At most ``limit`` frames of a recording, evenly spread from its first to its last.
+
+    Of these, a frame that can't be read is left out and added to ``failed``.
+
+    Raises
+    ------
+    FrameError
+        None of them can be read.
+    """
+    chosen = set(np.linspace(0, len(recording) - 1, min(limit, len(recording))).round().astype(int).tolist())
+    frames = list(recording.some(chosen))
+    if not frames:
+        raise FrameError(f"{recording.failed[0]['image_name']}: {recording.failed[0]['reason']}")
+    return frames

@@ -1,1 +1,0 @@
-"""The undeformed sensor: skin, gel, window and pins as meshes and places."""

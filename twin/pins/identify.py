@@ -152,7 +152,6 @@ class Identified:
 
     @property
     def best(self) -> Candidate:
-        """The likeliest layout."""
         return self.candidates[0]
 
 

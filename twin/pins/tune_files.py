@@ -5,7 +5,8 @@ from pathlib import Path
 
 from scenes import SensorSpec
 from twin.errors import OptionError
-from twin.frames import evenly_read, open_recording
+from twin.frames import Recording, evenly_read, open_recording
+from twin.frames.forms import known_frames, times
 from twin.pins.detector_spec import Evidence, Method, write_detector
 from twin.pins.tune import Tuned, tune
 from twin.progress import Progress, silent, stage
@@ -87,10 +88,23 @@ def tune_on_frames(
         raise OptionError(f"--out {out}: give the name of a .toml file")
     recording = open_recording(path, None, form)
     frames = evenly_read(recording, limit)
+    odd = recording.notes() + _of_another_size(recording, sensor)
     with stage(progress, "tuning") as step:
         found = tune(frames, sensor, method, progress=step)
     evidence = found.detector.evidence
     assert evidence is not None  # ``tune`` always gives evidence
     if out is not None:
         write_detector(out, found.detector, f"Found by 'twin tune' from {len(frames)} frames of {path.name}; {evidence.sure}.")
-    return TunedOnFrames(found, evidence, sensor.pins.count, [] if out is None else [out], recording.problems)
+    return TunedOnFrames(found, evidence, sensor.pins.count, [] if out is None else [out], odd)
+
+
+def _of_another_size(recording: Recording, sensor: SensorSpec) -> list[str]:
+    """A note if the frames have the size of none of the sensor's forms."""
+    sizes = known_frames(sensor).size_px.values()
+    if recording.size_px in sizes:
+        return []
+    own = " or ".join(times(size) for size in sizes)
+    return [
+        f"{recording.names[0]}: {times(recording.size_px)}, {sensor.name} has frames of {own}; these parameters are for frames of "
+        f"{times(recording.size_px)} only"
+    ]

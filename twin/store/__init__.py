@@ -9,6 +9,7 @@ from twin.store.atomic import (
     write_bytes,
     write_json,
     write_npz,
+    write_result,
     write_text,
     write_with,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "write_bytes",
     "write_json",
     "write_npz",
+    "write_result",
     "write_text",
     "write_with",
     "writes",

@@ -80,6 +80,23 @@ def write_text(path: Path, text: str) -> Path:
     return write_bytes(path, text.encode(errors="surrogateescape"))
 
 
+def write_result(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write texts by the names of their files, each whole or not at all: a result that took long and is not lost if this fails.
+
+    Raises
+    ------
+    StoreError
+        A file cannot be written. ``unsaved`` of the error has all the texts.
+    """
+    try:
+        for name, text in texts.items():
+            write_text(folder / name, text)
+    except StoreError as error:
+        told = StoreError(f"{error}; the result is printed, so that it can be saved elsewhere")
+        told.unsaved = dict(texts)
+        raise told from error
+
+
 @contextmanager
 def text_file(path: Path) -> Iterator[io.StringIO]:
     """Context that gives a text to write to. If the context ends without an error, the text is written; raises as ``write_with``."""

@@ -13,7 +13,7 @@ from training.dataset import Dataset, joined, split_rows
 from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_check
 from training.gaussian_process import fit_two_fidelities
-from training.identity import identity_of
+from training.identity import frame_marks, identity_of
 from training.loop import epoch_step
 from training.models import model_named, recipe_of
 from training.pins import voronoi_areas
@@ -225,6 +225,8 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     missed = [intervals(made, truth, raw, scale, executed) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
     content |= intervals((mean + alone) / 2, truth, raw, scale, executed) | {"beside": process.arrays()}
+    if "learnt_from" in content:
+        content["learnt_from"] = np.concatenate([content["learnt_from"].numpy(), frame_marks(labelled)])
     write_tensors(out / TENSORS, content)
     about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}
     write_text(out / CONFIG, json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")

@@ -79,6 +79,7 @@ def real_study(
         detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
         judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
     source, notes = consensus(spec, frames, list(dict.fromkeys((*detectors, *judges))))
+    notes += recording.notes()
     usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
     if not usable:
         raise TwinError("none of the conditions can be applied to frames that are already there; without --frames they are rendered")

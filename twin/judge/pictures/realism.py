@@ -28,16 +28,13 @@ class TwoSample(Protocol):
     """Result of a two-sample test: share of rightly assigned patches, and its interval."""
 
     @property
-    def accuracy(self) -> float:
-        """Share of the pictures that were told right."""
+    def accuracy(self) -> float: ...
 
     @property
-    def low(self) -> float:
-        """Lower end of its 90 % interval."""
+    def low(self) -> float: ...
 
     @property
-    def high(self) -> float:
-        """Upper end of its 90 % interval."""
+    def high(self) -> float: ...
 
 
 # A two-sample test: ``test(real images, rendered images, inside, progress)``.

@@ -416,7 +416,7 @@ class ResponseSpec(Section):
 
 
 class RecordingSpec(Section):
-    """The capture side of the sensor's recordings: crop, adaptive threshold, resize.
+    """The capture side of the sensor's recordings: crop, gray, median, adaptive threshold, resize.
 
     Attributes
     ----------
@@ -424,13 +424,23 @@ class RecordingSpec(Section):
         End exclusive.
     width_px, height_px : int
         Size of the stored image.
+    resized : {"after", "before"}
+        Whether the picture is resized after its threshold, as the MG400's recorder does, or before it, as the UR5's does. Resized after
+        it, a picture has gray edges.
+    median_px : {0, 3, 5}
+        Width of the median filter before the threshold; 0: none.
+    threshold_weights : {"gaussian", "mean"}
+        How the threshold's block is averaged.
     threshold_block_px, threshold_offset : int, float
-        As OpenCV's ``adaptiveThreshold`` takes them.
+        As OpenCV's ``adaptiveThreshold`` takes them; the block is one of the picture that the threshold sees.
     """
 
     crop_px: tuple[int, int, int, int]
     width_px: Annotated[int, Field(ge=16, le=8192)]
     height_px: Annotated[int, Field(ge=16, le=8192)]
+    resized: Literal["after", "before"] = "after"
+    median_px: Annotated[Literal[0, 3, 5], NotTruth] = 5
+    threshold_weights: Literal["gaussian", "mean"] = "gaussian"
     threshold_block_px: Annotated[int, Field(ge=3, le=8192)]
     threshold_offset: float
 

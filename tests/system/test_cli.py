@@ -1,6 +1,7 @@
 """The program as a user starts it: files, messages, exit codes."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -150,8 +151,11 @@ def test_no_good_frame_is_a_failure_that_still_leaves_its_summary(tmp_path):
 
 
 def test_a_sensor_without_recording_form_says_so_before_it_presses(tmp_path):
-    asked = ("--sensor", "ur5-331", "--object", "plane", "--indent-mm", 2, "--form", "recording", "--out", tmp_path)
-    one_line_error(twin("render", *asked), "ur5-331", "raw form")
+    text = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
+    own = re.sub(r"\n\[(pipeline\.)?recording\].*?(?=\n\[)", "", text, flags=re.DOTALL)
+    (tmp_path / "own.toml").write_text(own)
+    asked = ("--sensor", tmp_path / "own.toml", "--object", "plane", "--indent-mm", 2, "--form", "recording", "--out", tmp_path)
+    one_line_error(twin("render", *asked), "own", "raw form")
 
 
 def test_unusable_meshes_are_named(tmp_path):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from plain_sensor import changed, plain
 
+from scenes import load_sensor
 from scenes.sensor import RecordingSpec
 from twin.camera.capture import (
     amplified,
@@ -22,6 +23,8 @@ from twin.camera.capture import (
     vignetted,
 )
 from twin.errors import FrameError
+from twin.frames import open_recording
+from twin.frames.forms import gray_levels
 
 RECORDING = RecordingSpec(crop_px=(20, 10, 140, 110), width_px=120, height_px=100, threshold_block_px=61, threshold_offset=-5.0)
 WIDTH, HEIGHT = 160, 120
@@ -312,6 +315,30 @@ def test_a_recording_is_binary_and_shows_the_dots():
 def test_a_resized_recording_has_gray_edges():
     image = record(dots(), RECORDING.model_copy(update={"width_px": 90, "height_px": 80}))
     assert image.shape == (80, 90) and 0 < np.mean((image > 0) & (image < 255)) < 0.108
+
+
+def test_resized_before_its_threshold_a_recording_is_black_and_white():
+    small = RECORDING.model_copy(update={"width_px": 90, "height_px": 80, "resized": "before", "threshold_block_px": 45})
+    image = record(dots(), small)
+    assert image.shape == (80, 90) and set(np.unique(image)) == {0, 255}
+    assert (record(dots(), RECORDING) == record(dots(), RECORDING.model_copy(update={"resized": "before"}))).all(), "the crop's own size"
+
+
+def test_without_a_median_single_bright_pixels_stay_in_the_recording():
+    raw = dots()
+    raw[12:108:16, 38:138:16] = 255
+    bare = RECORDING.model_copy(update={"median_px": 0})
+    assert (record(raw, bare)[12 - 10 : 98 : 16, 38 - 20 : 118 : 16] == 255).all()
+
+
+@pytest.mark.real
+def test_the_ur5s_raw_frames_recorded_are_the_makers_pictures_bit_for_bit(real_dir):
+    spec = load_sensor("ur5-331")
+    assert spec.recording is not None
+    raws, theirs = open_recording(real_dir / "ur5-331-raw", spec), open_recording(real_dir / "ur5-331-surface-3d-tap", spec)
+    assert len(raws) == 30
+    for raw in raws:
+        assert np.array_equal(record(raw.image, spec.recording), gray_levels(theirs.read(theirs.names.index(raw.name)).image)), raw.name
 
 
 def test_a_part_of_the_frame_records_as_the_whole_does():

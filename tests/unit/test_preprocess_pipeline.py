@@ -272,8 +272,9 @@ def test_exchanged_pins_fold_the_layout():
     assert folded_fraction(rest, rest.pins_px) == 0.0 < folded_fraction(rest, exchanged)
 
 
-def test_a_raw_frame_and_its_recording_show_the_same_pins():
-    spec = load_sensor("mg400-127")
+@pytest.mark.parametrize("name", ["mg400-127", "ur5-331"])
+def test_a_raw_frame_and_its_recording_show_the_same_pins(name):
+    spec = load_sensor(name)
     rest = nominal_reference(spec, Form.RAW).pins_px
     truth = smooth_warp(rest, 8.0, np.random.default_rng(0))
     raw = drawn_frame(spec, Form.RAW, truth, noise_sd=1.0, rng=np.random.default_rng(1))
@@ -379,6 +380,20 @@ def test_drawn_discs_have_their_centroid():
 
 
 EVERY = {"tac-vgnn-331": 25, "tac-vgnn-127": 25, "ur5-331-raw": 3}
+UR5_SETS = ("surface-3d-tap", "surface-3d-shear", "edge-2d-tap", "edge-2d-shear")
+UR5_EVERY = 250  # one frame in so many: 20 of each set
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("kind", UR5_SETS)
+def test_nearly_every_picture_of_the_ur5_shows_every_pin(real_dir, kind):
+    spec = load_sensor("ur5-331")
+    recording = open_recording(real_dir / f"ur5-331-{kind}", spec)
+    assert recording.form == Form.RECORDING
+    pipeline = Pipeline(spec, recording.form)
+    observations = [pipeline(recording.read(k)) for k in range(0, len(recording), UR5_EVERY)]
+    assert all(o.valid for o in observations)
+    assert np.mean([o.found == spec.pins.count for o in observations]) >= 0.85  # deep sheared pictures merge some at the rim
 
 
 @pytest.mark.real

@@ -32,8 +32,8 @@ MOST_PIXELS = 20_000
 """Most pixels that are used to recognise a stream."""
 JPEG_BLOCK_PX = 16
 """Side of the blocks of a JPEG whose chroma has half the resolution."""
-MEDIAN_PX = 5
-"""Width of the median filter with which the recorder removes specks before its threshold."""
+WEIGHTS = {"gaussian": cv2.ADAPTIVE_THRESH_GAUSSIAN_C, "mean": cv2.ADAPTIVE_THRESH_MEAN_C}
+"""OpenCV's names of the averages that a recorder's threshold may take."""
 
 
 def expose(
@@ -185,10 +185,10 @@ def compressed(frame: ImageArray, quality: int, origin_px: tuple[int, int] = (0,
 
 
 def record(raw: ImageArray, recording: RecordingSpec, *, origin_px: tuple[int, int] = (0, 0)) -> ImageArray:
-    """A raw frame as the recorder stores it: crop, gray, median, adaptive Gaussian threshold, area resize.
+    """A raw frame as the recorder stores it: crop, gray, median, adaptive threshold, and an area resize before or after the threshold.
 
-    This is the preprocessing of the sensor group's capture software (``CvPreprocVideoCamera``). If the stored size differs from the
-    crop's, resizing gives the binary image gray edges.
+    This is the preprocessing of the sensor group's capture software (``CvPreprocVideoCamera``; the UR5's recordings were resized first
+    and not filtered). If a picture is resized after its threshold, and the stored size differs from the crop's, it has gray edges.
 
     Parameters
     ----------
@@ -208,11 +208,21 @@ def record(raw: ImageArray, recording: RecordingSpec, *, origin_px: tuple[int, i
     if x0 < 0 or y0 < 0 or x1 > width or y1 > height:
         raise FrameError(f"recording.crop_px {recording.crop_px} does not fit a {width} x {height} px frame that starts at {origin_px}")
     gray = cv2.cvtColor(raw, cv2.COLOR_RGB2GRAY) if raw.ndim == 3 else raw
-    calm = cv2.medianBlur(np.ascontiguousarray(gray[y0:y1, x0:x1]), MEDIAN_PX)
-    block, offset = recording.threshold_block_px, recording.threshold_offset
-    binary = cv2.adaptiveThreshold(calm, 255, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, block, offset)
+    seen = np.ascontiguousarray(gray[y0:y1, x0:x1])
+    if recording.resized == "before":
+        return _black_and_white(_of_size(seen, recording), recording)
+    return _of_size(_black_and_white(seen, recording), recording)
+
+
+def _black_and_white(gray: ImageArray, recording: RecordingSpec) -> ImageArray:
+    calm = cv2.medianBlur(gray, recording.median_px) if recording.median_px else gray
+    average, block = WEIGHTS[recording.threshold_weights], recording.threshold_block_px
+    return cv2.adaptiveThreshold(calm, 255, average, cv2.THRESH_BINARY, block, recording.threshold_offset).astype(np.uint8, copy=False)
+
+
+def _of_size(picture: ImageArray, recording: RecordingSpec) -> ImageArray:
     size = (recording.width_px, recording.height_px)
-    stored = binary if binary.shape[::-1] == size else cv2.resize(binary, size, interpolation=cv2.INTER_AREA)
+    stored = picture if picture.shape[::-1] == size else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     return stored.astype(np.uint8, copy=False)
 
 

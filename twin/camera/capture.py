@@ -208,7 +208,7 @@ def record(raw: ImageArray, recording: RecordingSpec, *, origin_px: tuple[int, i
     if x0 < 0 or y0 < 0 or x1 > width or y1 > height:
         raise FrameError(f"recording.crop_px {recording.crop_px} does not fit a {width} x {height} px frame that starts at {origin_px}")
     gray = cv2.cvtColor(raw, cv2.COLOR_RGB2GRAY) if raw.ndim == 3 else raw
-    seen = np.ascontiguousarray(gray[y0:y1, x0:x1])
+    seen = np.ascontiguousarray(gray[y0:y1, x0:x1]).astype(np.uint8, copy=False)
     if recording.resized == "before":
         return _black_and_white(_of_size(seen, recording), recording)
     return _of_size(_black_and_white(seen, recording), recording)

@@ -34,9 +34,9 @@ class Resolution:
         Elements through the skin and from the skin to the lens.
     """
 
-    across: int = 16
+    across: int = 18
     skin_layers: int = 1
-    gel_layers: int = 3
+    gel_layers: int = 2
 
     def __post_init__(self) -> None:
         if self.across < 4 or self.across % 2 or self.skin_layers < 1 or self.gel_layers < 1:

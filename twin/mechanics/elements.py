@@ -9,8 +9,11 @@ a level's four points), their mean (over both) and half their difference. One vo
 the element from volumetric locking (mean dilatation, Simo & Taylor 1985). ``S`` is a given stress, what
 is left of the past in a viscoelastic body, zero in an elastic one.
 
-Gel: quadratic splines in all directions, kappa_d = kappa. Skin: quadratic splines along it, linear
-through it. A bent linear layer can't thin where it is stretched and thicken where it is compressed,
+Gel: quadratic splines in all directions. With one coefficient in each direction for each element, a C1
+spline has three unknowns for an element; two volume ratios that are both nearly fixed would be too many for
+them. Therefore the difference is held less: 1 / kappa_d = 1 / kappa + 1 / (9 mu), which is kappa for a
+compressible gel, and bounded for an incompressible one. On finer meshes the difference vanishes, and with it
+the choice. Skin: quadratic splines along it, linear through it. A bent linear layer can't thin where it is stretched and thicken where it is compressed,
 which would make it too stiff; with that thickness strain eliminated by zero thickness stress (as in a
 plate), its bending energy is the plane-stress one, which fixes the modulus of the difference:
 kappa_d = 2 mu nu / (1 - nu) + 2 mu / 3. A homogeneous state has no difference and is exact.
@@ -43,15 +46,12 @@ class Elements:
         m elements with b controls each.
     law : (6,) float
         See ``law_coefficients``.
-    layer : bool
-        Whether they are linear through a skin, so that kappa_d is a matter of shear.
     difference_mpa : (m,) or (0,) float
         Given stress that works on half the difference of the two levels' volume strains; none in an elastic body.
     """
 
     cells: Cells
     law: FloatArray
-    layer: bool = False
     difference_mpa: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def add_forces(self, control_mm: FloatArray, stress: FloatArray, out: FloatArray, pressure_mpa: float = 0.0) -> float:

@@ -16,6 +16,11 @@ from twin.compiled import compiled
 from twin.types import FloatArray
 
 
+_LARGEST_DIFFERENCE = 9.0
+"""Limit of kappa_d of an element that is quadratic through its depth, in shear moduli. Measured on planes, balls and edges pressed by a gel
+of Poisson's ratio 0.486: with 20, two layers of gel are 2 to 3 % too stiff, with 4 they are 1 to 2 % too soft."""
+
+
 def law_coefficients(spec: MaterialSpec, *, layer: bool) -> FloatArray:
     """(6,) c10, c01, c20, c30, kappa and kappa_d of a material, MPa.
 
@@ -23,7 +28,8 @@ def law_coefficients(spec: MaterialSpec, *, layer: bool) -> FloatArray:
     """
     mu = spec.young_modulus_mpa / (2 * (1 + spec.poisson_ratio))
     kappa = spec.young_modulus_mpa / (3 * (1 - 2 * spec.poisson_ratio))
-    difference = 2 * mu * (spec.poisson_ratio / (1 - spec.poisson_ratio) + 1 / 3) if layer else kappa
+    limit = _LARGEST_DIFFERENCE * mu
+    difference = 2 * mu * (spec.poisson_ratio / (1 - spec.poisson_ratio) + 1 / 3) if layer else kappa * limit / (kappa + limit)
     half = mu / 2
     share = spec.second_invariant_share
     return np.array([half * (1 - share), half * share, half * spec.c20_c10, half * spec.c30_c10, kappa, difference])

@@ -27,8 +27,7 @@ class History:
     stress : (m, 8, 3, 3) float
         S at the last state, and ``branches`` H (terms, m, 8, 3, 3).
     difference : (m,) float
-        The same of the skin's kappa_d part (see ``Elements.difference_stress``), and ``difference_branches`` (terms, m); zero in
-        the gel.
+        The same of the kappa_d part (see ``Elements.difference_stress``), and ``difference_branches`` (terms, m).
     """
 
     stress: FloatArray
@@ -50,11 +49,8 @@ class History:
         share, fade, late = _decay(terms, step_s)
         kept = (share * late).sum()
         law = kind.law.copy()
-        law[:4] *= 1 - share.sum() + kept
-        changed = replace(kind, law=law)
-        if kind.layer:
-            law[5] *= 1 - share.sum() + kept
-            changed = replace(changed, difference_mpa=fade @ self.difference_branches - kept * self.difference)
+        law[[0, 1, 2, 3, 5]] *= 1 - share.sum() + kept
+        changed = replace(kind, law=law, difference_mpa=fade @ self.difference_branches - kept * self.difference)
         return changed, np.einsum("t,tmqij->mqij", fade, self.branches) - kept * self.stress
 
     def after(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float, control_mm: FloatArray) -> "History":
@@ -63,7 +59,7 @@ class History:
             return self
         share, fade, late = _decay(terms, step_s)
         stress = kind.distortion_stress(control_mm)
-        difference = kind.difference_stress(control_mm) if kind.layer else self.difference
+        difference = kind.difference_stress(control_mm)
         grown = share * late
         return History(
             stress,

@@ -238,7 +238,7 @@ class SoftBody:
     def __init__(self, geometry: GeometrySpec, gel: GelSpec) -> None:
         solid = self.solid = build_solid(geometry)
         soft = law_coefficients(gel, layer=False)
-        skin = Elements(solid.skin, law_coefficients(geometry.skin, layer=True), layer=True)
+        skin = Elements(solid.skin, law_coefficients(geometry.skin, layer=True))
         self._kinds = skin, Elements(solid.gel_top, soft), Elements(solid.gel_deep, soft)
         self.free = np.flatnonzero(~solid.fixed)
         self.unknown = np.full((len(solid.fixed), 3), -1)

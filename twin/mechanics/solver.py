@@ -171,7 +171,7 @@ class SkinSolver:
         solid = build_solid(spec.geometry, resolution=self.resolution, focus=focus)
         gel = law_coefficients(spec.gel, layer=False)
         kinds = (
-            Elements(solid.skin, law_coefficients(spec.skin, layer=True), layer=True),
+            Elements(solid.skin, law_coefficients(spec.skin, layer=True)),
             Elements(solid.gel_top, gel),
             Elements(solid.gel_deep, gel),
         )

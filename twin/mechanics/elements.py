@@ -10,13 +10,14 @@ the element from volumetric locking (mean dilatation, Simo & Taylor 1985). ``S``
 is left of the past in a viscoelastic body, zero in an elastic one.
 
 Gel: quadratic splines in all directions. With one coefficient in each direction for each element, a C1
-spline has three unknowns for an element; two volume ratios that are both nearly fixed would be too many for
-them. Therefore the difference is held less: 1 / kappa_d = 1 / kappa + 1 / (9 mu), which is kappa for a
-compressible gel, and bounded for an incompressible one. On finer meshes the difference vanishes, and with it
-the choice. Skin: quadratic splines along it, linear through it. A bent linear layer can't thin where it is stretched and thicken where it is compressed,
-which would make it too stiff; with that thickness strain eliminated by zero thickness stress (as in a
-plate), its bending energy is the plane-stress one, which fixes the modulus of the difference:
-kappa_d = 2 mu nu / (1 - nu) + 2 mu / 3. A homogeneous state has no difference and is exact.
+spline has three unknowns for an element; two volume ratios that are both nearly fixed would be too many
+for them. Therefore the difference is held less: 1 / kappa_d = 1 / kappa + 1 / (9 mu), which is kappa for
+a compressible gel, and bounded for an incompressible one. On finer meshes the difference vanishes, and
+with it the choice. Skin: quadratic splines along it, linear through it. A bent linear layer can't thin
+where it is stretched and thicken where it is compressed, which would make it too stiff; with that
+thickness strain eliminated by zero thickness stress (as in a plate), its bending energy is the plane-
+stress one, which fixes the modulus of the difference: kappa_d = 2 mu nu / (1 - nu) + 2 mu / 3. A
+homogeneous state has no difference and is exact.
 
 Two Gauss points per direction under-integrate the quadratic splines just enough to free them from
 membrane and shear locking, and leave no mode without stiffness, since the splines are C1.

@@ -183,6 +183,7 @@ class LeRobotArm:
 
     @property
     def action_features(self) -> dict[str, type]:
+        """Names and types of an action's values."""
         return {key: float for key in self._keys}
 
     @property

@@ -116,6 +116,7 @@ class Rig:
 
     @property
     def mounting(self) -> Mounting:
+        """How the arm holds the sensor."""
         return self.placed.mounting
 
     @property

@@ -30,20 +30,49 @@ Range = Annotated[tuple[float, float], AfterValidator(_rising)]
 
 
 class SafetyLimits(Section):
-    """Limits of an arm's moves in a loop. None means no limit."""
+    """Limits of an arm's moves in a loop.
 
-    box_mm: tuple[Range, Range, Range]  # range of the tool's x, y and z in the base frame
-    annulus_mm: tuple[NonNegative, Positive] | None = None  # distance from the base's axis
+    An optional limit that is left out does not exist. The defaults are cautious numbers for a desktop arm with a soft sensor; nothing in
+    the arms' manuals asks for them.
+
+    Attributes
+    ----------
+    box_mm : three pairs
+        Range of the tool's x, y and z in the base frame.
+    annulus_mm : (nearest, farthest), optional
+        Range of the tool's distance from the base's axis.
+    joints_deg : pairs, optional
+        Range of each joint.
+    linkage_deg : float, optional
+        Largest J3 - J2 of an arm with a parallel linkage.
+    step_mm, step_deg : float, optional
+        Longest move and largest turn of one step; a longer one is shortened.
+    linear_mm_s, angular_deg_s : float
+        Largest speeds.
+    contact_mm : float
+        Deepest contact that the sensor may report.
+    frame_age_s : float
+        Largest age of the frame that a move is decided on.
+    feedback_age_s : float
+        Largest age of the arm's own feedback.
+    retreat_mm : float
+        Distance of the tool from the object at the end and after a failure.
+    retreat_mm_s : float
+        Speed of that retreat.
+    """
+
+    box_mm: tuple[Range, Range, Range]
+    annulus_mm: tuple[NonNegative, Positive] | None = None
     joints_deg: tuple[Range, ...] | None = None
-    linkage_deg: Positive | None = None  # largest J3 - J2
-    step_mm: Positive | None = None  # longest move; a longer one is shortened
+    linkage_deg: Positive | None = None
+    step_mm: Positive | None = None
     step_deg: Positive | None = None
     linear_mm_s: Positive = 100.0
     angular_deg_s: Positive = 90.0
-    contact_mm: Positive = 6.0  # deepest contact that the sensor may report
+    contact_mm: Positive = 6.0
     frame_age_s: Positive = 0.5
     feedback_age_s: Positive = FEEDBACK_AGE_S
-    retreat_mm: Positive = 50.0  # distance of the tool from the object at the end and after a failure
+    retreat_mm: Positive = 50.0
     retreat_mm_s: Positive = 50.0
 
 

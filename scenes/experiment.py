@@ -19,7 +19,15 @@ Six = tuple[float, float, float, float, float, float]
 
 
 class PoseRanges(Section):
-    """Lowest and highest value of each coordinate of the pose. If both are equal, the coordinate is fixed."""
+    """Lowest and highest value of each coordinate of the pose. If both are equal, the coordinate is fixed.
+
+    Attributes
+    ----------
+    pose_1, pose_2, pose_3 : (lowest, highest)
+        x, y and z of the tool in the work frame, mm.
+    pose_4, pose_5, pose_6 : (lowest, highest)
+        Rx, Ry and Rz, deg.
+    """
 
     pose_1: Range = (0.0, 0.0)
     pose_2: Range = (0.0, 0.0)
@@ -30,7 +38,15 @@ class PoseRanges(Section):
 
 
 class MoveRanges(Section):
-    """Lowest and highest value of each coordinate of the move that follows the tap. If both are equal, the coordinate is fixed."""
+    """Lowest and highest value of each coordinate of the move that follows the tap. If both are equal, the coordinate is fixed.
+
+    Attributes
+    ----------
+    move_1, move_2, move_3 : (lowest, highest)
+        Along x, y and z of the work frame, mm.
+    move_4, move_5, move_6 : (lowest, highest)
+        Turn about x, y and z, deg.
+    """
 
     move_1: Range = (0.0, 0.0)
     move_2: Range = (0.0, 0.0)
@@ -41,10 +57,16 @@ class MoveRanges(Section):
 
 
 class ExperimentSpec(Section):
-    """An experiment, complete. ``name`` is the file's stem.
+    """An experiment, complete.
 
     Attributes
     ----------
+    name : str
+        The file's stem; not a key of the file.
+    description : str
+        One line for ``twin experiments``.
+    source : str
+        Where the ranges come from.
     object : str
         The object that is touched by default: a name of ``twin objects`` or a file.
     approach : {"x", "y", "z"}
@@ -59,6 +81,10 @@ class ExperimentSpec(Section):
         Seed of the random draws.
     wider : str
         Name of an experiment with slightly larger ranges. In the twin, models for this experiment are trained on that one.
+    pose : PoseRanges
+        Where the contacts are.
+    move : MoveRanges
+        How the sensor is dragged after the tap; none by default.
     """
 
     name: Name

@@ -12,36 +12,77 @@ from scenes.base import Name, NonNegative, Positive, Section
 
 
 class PlaneShape(Section):
-    """Half space z >= 0."""
+    """Half space z >= 0.
+
+    Attributes
+    ----------
+    kind : {"plane"}
+        Names this shape.
+    """
 
     kind: Literal["plane"]
 
 
 class SphereShape(Section):
-    """Ball behind its pole at the origin."""
+    """Ball behind its pole at the origin.
+
+    Attributes
+    ----------
+    kind : {"sphere"}
+        Names this shape.
+    radius_mm : float
+        Of the ball.
+    """
 
     kind: Literal["sphere"]
     radius_mm: Positive
 
 
 class CylinderShape(Section):
-    """Cylinder along y, infinitely long, touching the origin from z > 0."""
+    """Cylinder along y, infinitely long, touching the origin from z > 0.
+
+    Attributes
+    ----------
+    kind : {"cylinder"}
+        Names this shape.
+    radius_mm : float
+        Of the cylinder.
+    """
 
     kind: Literal["cylinder"]
     radius_mm: Positive
 
 
 class EdgeShape(Section):
-    """Quarter space x >= 0, z >= 0. Its edge along y would pass through the origin, but it is rounded and so lies a little behind it."""
+    """Quarter space x >= 0, z >= 0. Its edge along y would pass through the origin, but it is rounded and so lies a little behind it.
+
+    Attributes
+    ----------
+    kind : {"edge"}
+        Names this shape.
+    fillet_mm : float
+        Radius by which the edge is rounded.
+    """
 
     kind: Literal["edge"]
     fillet_mm: NonNegative = 0.0
 
 
 class PrismShape(Section):
-    """Upright prism: regular polygon section in the x-z plane, extruded along y.
+    """Upright prism: regular polygon section in the x-z plane, extruded along y. Face ``0`` is centred on the origin.
 
-    Face ``0`` is centred on the origin. ``taper_deg`` tilts the side faces about x (a bevelled prism).
+    Attributes
+    ----------
+    kind : {"prism"}
+        Names this shape.
+    sides : int
+        Number of sides of the polygon.
+    inradius_mm : float
+        Distance from the axis to each side face.
+    fillet_mm : float
+        Radius by which the edges along y are rounded.
+    taper_deg : float
+        Tilt of the side faces about x (a bevelled prism).
     """
 
     kind: Literal["prism"]
@@ -52,13 +93,23 @@ class PrismShape(Section):
 
 
 class MeshShape(Section):
-    """Closed triangle mesh (STL, OBJ, PLY). ``file`` is relative to the specification.
+    """Closed triangle mesh (STL, OBJ, PLY).
 
-    The mesh is turned by ``rotation_deg`` (intrinsic x, y, z), then moved so that the line through its bounding box's
-    centre along z first meets it at the origin (where the mesh has a hole there: its lowest vertex has z = 0).
+    The mesh is turned, then moved so that the line through its bounding box's centre along z first meets it at the origin (where the mesh
+    has a hole there: its lowest vertex has z = 0).
 
-    ``sha256`` is the digest of the file's content. It is found when the object is loaded; a specification that gives it takes no other
-    content.
+    Attributes
+    ----------
+    kind : {"mesh"}
+        Names this shape.
+    file : str
+        Path of the mesh, relative to the specification.
+    unit : {"mm", "cm", "m", "inch"}
+        Unit of the lengths in the file.
+    rotation_deg : three numbers
+        Turn of the mesh, intrinsic about x, y, z.
+    sha256 : str
+        Digest of the file's content. It is found when the object is loaded; a specification that gives it takes no other content.
     """
 
     kind: Literal["mesh"]
@@ -75,7 +126,17 @@ Shape = Annotated[
 
 
 class TextureSpec(Section):
-    """A wire mesh lying on the surface, raised by one wire diameter: round wires crossing at a pitch."""
+    """A wire mesh lying on the surface, raised by one wire diameter: round wires crossing at a pitch.
+
+    Attributes
+    ----------
+    kind : {"wire-mesh"}
+        Names this texture.
+    pitch_mm : float
+        Distance between the axes of neighbouring wires.
+    wire_diameter_mm : float
+        Of each wire.
+    """
 
     kind: Literal["wire-mesh"]
     pitch_mm: Positive
@@ -83,13 +144,33 @@ class TextureSpec(Section):
 
 
 class ObjectSpec(Section):
-    """An object, complete. ``name`` is the file's stem.
+    """An object, complete.
 
-    ``friction`` is the static coefficient of friction. When a point has slid by about ``slip_weakening_mm``, the coefficient has fallen
-    to ``kinetic_friction`` (default: the static one). ``shear_strength_mpa`` is the largest friction stress (default: no bound).
-    These four apply to contacts that no arm makes and to sensors without a rig. If a sensor has a rig, the rig's friction applies
-    instead (see ``RigSpec``). ``compliance_mm_per_n`` is the object's displacement along the sensor's axis for each N; it is added to
-    the rig's.
+    The four keys of friction apply to contacts that no arm makes and to sensors without a rig. If a sensor has a rig, the rig's friction
+    applies instead (see ``RigSpec``).
+
+    Attributes
+    ----------
+    name : str
+        The file's stem; not a key of the file.
+    description : str
+        One line for ``twin objects``.
+    source : str
+        Where the numbers come from.
+    shape : PlaneShape, SphereShape, CylinderShape, EdgeShape, PrismShape or MeshShape
+        The surface; its ``kind`` decides which.
+    texture : TextureSpec, optional
+        What lies on the surface.
+    friction : float
+        Static coefficient of friction. The default is a plausible one for rubber on a smooth solid.
+    kinetic_friction : float, optional
+        Coefficient of friction of a point that slides. Without it: the static one.
+    slip_weakening_mm : float
+        Slid length over which the coefficient falls from the static to the kinetic one.
+    shear_strength_mpa : float, optional
+        Largest friction stress. Without it there is no bound.
+    compliance_mm_per_n : float
+        Displacement of the object along the sensor's axis for each N; it is added to the rig's.
     """
 
     name: Name

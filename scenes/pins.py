@@ -52,6 +52,7 @@ class PinsSpec(Section):
     length_mm, diameter_mm : float
         Of the stem. The defaults of these and of the cap are those found for a printed TacTip of 331 pins.
     cap_diameter_mm, cap_height_mm : float
+        Of the white cap at the pin's end.
     """
 
     layout: Layout = "rings"

@@ -13,9 +13,14 @@ Ends = tuple[float, float]
 class Spread(Section):
     """How a number of a specification is drawn; exactly one of three ways.
 
-    ``scale``: the specification's number is multiplied by a factor whose logarithm is uniform between those of the two ends. ``add``: a
-    number that is uniform between the ends is added. ``value``: a number that is uniform between the ends replaces it (rounded if the
-    specification needs an integer).
+    Attributes
+    ----------
+    scale : (lowest, highest)
+        The specification's number is multiplied by a factor whose logarithm is uniform between those of the two ends.
+    add : (lowest, highest)
+        A number that is uniform between the ends is added.
+    value : (lowest, highest)
+        A number that is uniform between the ends replaces it (rounded if the specification needs an integer).
     """
 
     scale: tuple[Positive, Positive] | None = None
@@ -38,7 +43,19 @@ class Spread(Section):
 
 
 class FrictionSpread(Section):
-    """Friction of a contact: 0 in ``free_share`` of the contacts, ``stick`` in ``stick_share``, else uniform in its logarithm."""
+    """Friction of a contact, drawn for each contact.
+
+    Attributes
+    ----------
+    low, high : float
+        Ends of the coefficient, which is uniform in its logarithm between them.
+    free_share : float
+        Share of the contacts without friction.
+    stick_share : float
+        Share of the contacts that have the coefficient ``stick`` instead.
+    stick : float
+        Coefficient of friction; the default is so large that nothing slides.
+    """
 
     low: Positive
     high: Positive
@@ -56,10 +73,14 @@ class FrictionSpread(Section):
 
 
 class RandomisationSpec(Section):
-    """What is drawn anew for each contact. ``name`` is the file's stem.
+    """What is drawn anew for each contact.
 
     Attributes
     ----------
+    name : str
+        The file's stem; not a key of the file.
+    description : str
+        One line for ``twin randomisations``.
     executed_share : float
         Share of the contacts in which the move is executed before the frame is taken.
     pin_noise_px : float

@@ -45,8 +45,8 @@ class RigSpec(Section):
         Azimuth of the direction across in the sensor frame, from image x towards image y.
     friction : float
         Coefficient of static and kinetic friction of all contacts that this rig's arm makes, with any object: it was fitted to frames of
-        this sensor's skin. An object's own friction applies to sensors without a rig and to contacts that no arm makes (``twin render``,
-        ``SkinSolver.press``). A friction that a user gives takes precedence over both.
+        this sensor's skin. The default is that of an object. An object's own friction applies to sensors without a rig and to contacts
+        that no arm makes (``twin render``, ``SkinSolver.press``). A friction that a user gives takes precedence over both.
     compliance_mm_per_n : float
         Displacement of the arm and its mount along the sensor's axis for each N. It is needed because labels are the poses that the arm
         was sent to, not those that it reached. An object's own compliance is added to it.

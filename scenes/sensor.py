@@ -20,7 +20,15 @@ ELSEWHERE = "leave it out if it was measured on another layout"
 
 
 class RelaxationTerm(Section):
-    """A part of the shear stiffness that relaxes (one Maxwell element): ``fraction`` of it, with time constant ``time_s``."""
+    """A part of the shear stiffness that relaxes (one Maxwell element).
+
+    Attributes
+    ----------
+    fraction : float
+        Share of the instantaneous stiffness.
+    time_s : float
+        Time constant.
+    """
 
     fraction: Annotated[float, Field(gt=0, lt=1)]
     time_s: Positive
@@ -75,10 +83,19 @@ class MaterialSpec(Section):
 
 
 class SkinSpec(MaterialSpec):
-    """Hemispherical skin, clamped in the rim plane ``z = rim_z_mm``.
+    """Hemispherical skin, clamped in its rim plane.
 
     The defaults are those of the printed TacTip: the radius of its makers' simulation CAD, about 1 mm of Agilus30 of Shore A 26 to 30
     (0.4 to 1 MPa).
+
+    Attributes
+    ----------
+    outer_radius_mm : float
+        Of the dome.
+    thickness_mm : float
+        Of the skin.
+    rim_z_mm : float
+        Plane in which the skin is clamped.
     """
 
     young_modulus_mpa: Positive = 0.7
@@ -96,6 +113,7 @@ class GelSpec(MaterialSpec):
     sealed : bool
         Whether the gel's volume as a whole stays exactly constant, whatever its Poisson's ratio.
     refractive_index : float
+        The default is that of the silicone gel.
     absorption_per_mm : three numbers
         Beer-Lambert coefficients for red, green and blue.
     haze : float
@@ -118,9 +136,18 @@ class GelSpec(MaterialSpec):
 
 
 class LensSpec(Section):
-    """Rigid flat window (acrylic) that closes the gel; ``z_mm`` is its gel-side face. Behind it is air.
+    """Rigid flat window (acrylic) that closes the gel. Behind it is air.
 
-    The default radius is measured from public CAD of the TacTip.
+    Attributes
+    ----------
+    z_mm : float
+        Plane of its gel-side face.
+    radius_mm : float
+        Of the window. The default is measured from public CAD of the TacTip.
+    thickness_mm : float
+        From face to face.
+    refractive_index : float
+        The default is that of acrylic.
     """
 
     z_mm: float = -2.0
@@ -140,7 +167,9 @@ class CameraSpec(Section):
     Attributes
     ----------
     width_px, height_px : int
+        Size of a frame.
     channels : {"color", "mono"}
+        Whether frames are in colour or gray.
     projection : {"perspective", "fisheye"}
         Perspective: Brown-Conrady distortion k1, k2, p1, p2 of the tangents. Fisheye: theta (1 + k1 theta^2 + k2 theta^4)
         (Kannala and Brandt 2006).
@@ -151,10 +180,11 @@ class CameraSpec(Section):
     tilt_x_deg, tilt_y_deg : float
         The camera is turned about its pupil.
     k1, k2, p1, p2 : float
+        Distortion: radial (k) and tangential (p), as ``projection`` says.
     aperture_mm : float
         The pupil's diameter; 0: everything is sharp.
     focus_mm : float
-        Distance in air, from the pupil, of what is sharp.
+        Distance in air, from the pupil, of what is sharp, where ``aperture_mm`` is above 0. The default is near a TacTip's caps.
     vignetting : float
         Share of light that is lost at the corners; it rises with the square of the distance from the image's middle.
     red_scale, blue_scale : float
@@ -282,13 +312,15 @@ class HousingSpec(Section):
     albedo : three numbers
         Linear RGB.
     ambient : float
-        Light at the inner edge, which falls off outwards over ``ambient_falloff_mm``.
-    glow : float
+        Light at the inner edge.
+    ambient_falloff_mm : float
+        Length over which that light falls off outwards.
+    glow, glow_radius_mm, glow_height_mm, glow_exponent : float
         Each LED adds ``glow (1 + d^2 / h^2)^-n`` at the distance d from its place at ``glow_radius_mm``, with h the
         ``glow_height_mm`` and n the ``glow_exponent``. n = 1.5: a small source at the height h above matt material; higher: glossy.
     lip_width_mm, wall_fraction : float
         Farther out than the lip's width the wall shows only this share of the light.
-    fill : float
+    fill, fill_width_mm : float
         Radiance with which the innermost ``fill_width_mm`` of the ring light the gel.
     rim : RimSpec, optional
         Light measured on top of all that.
@@ -319,7 +351,19 @@ class HousingSpec(Section):
 
 
 class SpeckSpec(Section):
-    """A bubble or grain on the window's gel side: a soft disc that hides ``opacity`` of what is behind it and sends ``light``."""
+    """A bubble or grain on the window's gel side: a soft disc.
+
+    Attributes
+    ----------
+    x_mm, y_mm : float
+        Its middle in the sensor frame.
+    radius_mm : float
+        Of the disc.
+    opacity : float
+        Share of the light from behind it that it hides.
+    light : float
+        Radiance that it sends itself, as a share of saturation.
+    """
 
     x_mm: float
     y_mm: float
@@ -336,8 +380,11 @@ class AppearanceSpec(Section):
     Attributes
     ----------
     skin_albedo, pin_albedo, cap_albedo : three numbers
+        Diffuse reflectance: red, green, blue.
     skin_gloss, cap_gloss : float
-        Weight of a rough specular lobe; ``skin_roughness`` and ``cap_roughness`` are its roughness.
+        Weight of a rough specular lobe.
+    skin_roughness, cap_roughness : float
+        Roughness of that lobe.
     cap_bump : float
         Share of the light that a cap takes as a small ball does, from any direction, and not as a flat disc: printed caps are
         round and translucent.
@@ -351,6 +398,7 @@ class AppearanceSpec(Section):
     cap_offsets : (N, 2) float
         a_1 and b_1: how far the outline's middle lies beside the pin's, in cap radii.
     specks : tuple of SpeckSpec
+        Bubbles and grains on the window.
     """
 
     skin_albedo: Rgb = (0.0006, 0.00048, 0.0055)
@@ -371,6 +419,8 @@ class AppearanceSpec(Section):
 
 class ResponseSpec(Section):
     """From linear light to 8-bit gray levels. The steps follow one another in this order.
+
+    The defaults are plausible numbers for a USB camera; 'twin calibrate optics' finds a sensor's own.
 
     Attributes
     ----------
@@ -462,6 +512,7 @@ class BlobSpec(Section):
     threshold : float
         A fixed gray level (0 to 255) if ``threshold_block_px`` is 0, else the offset of an adaptive mean threshold over that block.
     threshold_block_px : int
+        Side of the square over which the mean is taken; 0: one fixed threshold.
     erosion_px : int
         Size of the square erosion kernel; 1: no erosion.
     mask_center_px, mask_radius_px : (x, y), float
@@ -486,14 +537,28 @@ class BlobSpec(Section):
 
 
 class PipelineSpec(Section):
-    """Pin detection for the camera's own frames and for the recordings' form."""
+    """Pin detection for each form of the sensor's frames.
+
+    Attributes
+    ----------
+    raw : BlobSpec
+        For the camera's own frames.
+    recording : BlobSpec, optional
+        For the recordings' cropped and thresholded form.
+    """
 
     raw: BlobSpec
     recording: BlobSpec | None = None
 
 
 class GeometrySpec(Section):
-    """Where skin, window and pins are: what the meshes of a sensor are made from (``SensorSpec.geometry``)."""
+    """Where skin, window and pins are: what the meshes of a sensor are made from (``SensorSpec.geometry``).
+
+    Attributes
+    ----------
+    skin, lens, pins : SkinSpec, LensSpec, PinsSpec
+        The sensor's own sections.
+    """
 
     skin: SkinSpec
     lens: LensSpec
@@ -501,7 +566,15 @@ class GeometrySpec(Section):
 
 
 class ViewSpec(Section):
-    """What decides where the camera sees a place in the gel: the camera, the window and the gel's index (``SensorSpec.view``)."""
+    """What decides where the camera sees a place in the gel: the camera, the window and the gel's index (``SensorSpec.view``).
+
+    Attributes
+    ----------
+    camera, lens : CameraSpec, LensSpec
+        The sensor's own sections.
+    gel_index : float
+        The gel's refractive index.
+    """
 
     camera: CameraSpec
     lens: LensSpec
@@ -509,7 +582,13 @@ class ViewSpec(Section):
 
 
 class CaptureSpec(Section):
-    """What makes a frame from the light on the film: the gel's haze, the camera's optics and its response (``SensorSpec.capture``)."""
+    """What makes a frame from the light on the film: the gel's haze, the camera's optics and its response (``SensorSpec.capture``).
+
+    Attributes
+    ----------
+    gel, camera, response : GelSpec, CameraSpec, ResponseSpec
+        The sensor's own sections.
+    """
 
     gel: GelSpec
     camera: CameraSpec
@@ -517,9 +596,42 @@ class CaptureSpec(Section):
 
 
 class SensorSpec(Section):
-    """A TacTip, complete. ``name`` is the file's stem; ``rig`` is there where contacts of this sensor on a robot were calibrated.
+    """A TacTip, complete.
 
     A file needs only [pins], [camera] and [pipeline.raw]; all other sections have defaults, those of a printed TacTip.
+
+    Attributes
+    ----------
+    name : str
+        The file's stem; not a key of the file.
+    description : str
+        One line for ``twin sensors``.
+    source : str
+        Where the numbers come from.
+    skin : SkinSpec
+        The soft skin.
+    gel : GelSpec
+        What fills it.
+    lens : LensSpec
+        The window behind the gel.
+    pins : PinsSpec
+        The pins' layout and size.
+    camera : CameraSpec
+        Where the camera is, and how it projects.
+    leds : LedRingSpec
+        The light.
+    housing : HousingSpec
+        What the camera sees around the window.
+    appearance : AppearanceSpec
+        Reflectances of skin, pins and caps.
+    response : ResponseSpec
+        From light to gray levels.
+    recording : RecordingSpec, optional
+        How the sensor's recordings were made from raw frames.
+    pipeline : PipelineSpec
+        How pins are found.
+    rig : RigSpec, optional
+        The robot that holds the sensor, where its contacts were calibrated.
     """
 
     name: Name

@@ -13,6 +13,13 @@ class PlacementSpec(Section):
     """An object's place in the arm's base frame: its origin, and its turn about the base's z.
 
     Without a turn the object's outward side looks to -y of the base, its section lies level and its y axis points down.
+
+    Attributes
+    ----------
+    position_mm : three numbers
+        The object's origin in the base frame.
+    turn_deg : float
+        Turn about the base's z, from x towards y.
     """
 
     position_mm: Three = (300.0, 60.0, 0.0)
@@ -20,17 +27,25 @@ class PlacementSpec(Section):
 
 
 class ServoSpec(Section):
-    """Following a surface: a proportional and integral law on depth and angle with a feed along the surface. ``name`` is the file's stem.
+    """Following a surface: a proportional and integral law on depth and angle with a feed along the surface.
+
+    The default gains and bounds of the integrals are those of the sensor group's public servo code.
 
     Attributes
     ----------
+    name : str
+        The file's stem; not a key of the file.
+    description : str
+        What the file is for.
+    source : str
+        Where the numbers come from.
     experiment : str
         Experiment whose labels the model estimates: it gives the approach and the zero of the depth.
     indent_mm, angle_deg : float
         Reference of the control: indentation, and angle from the surface's normal.
     feed_mm : float
         Way along the surface in each step.
-    kp_*, ki_* : float
+    kp_depth, ki_depth, kp_angle, ki_angle : float
         Gains: shares of the error (p) and of its sum over the steps (i) that a step corrects.
     integral_mm, integral_deg : float
         Bounds of the sums.

@@ -20,16 +20,20 @@ class Estimate(Protocol):
     def value(self) -> np.ndarray: ...
 
     @property
-    def low(self) -> np.ndarray: ...
+    def low(self) -> np.ndarray:
+        """Lower ends of the 90 % intervals."""
 
     @property
-    def high(self) -> np.ndarray: ...
+    def high(self) -> np.ndarray:
+        """Upper ends of the 90 % intervals."""
 
     @property
-    def valid(self) -> bool: ...
+    def valid(self) -> bool:
+        """Whether the pins allow an estimate."""
 
     @property
-    def reason(self) -> str: ...
+    def reason(self) -> str:
+        """Why it is not valid; "" if it is."""
 
 
 Estimator = Callable[[Frame], Estimate]

@@ -68,11 +68,14 @@ class PinState(Protocol):
     """
 
     @property
-    def base_mm(self) -> FloatArray: ...
+    def base_mm(self) -> FloatArray:
+        """Where the pins stand on the skin (N, 3)."""
+
     @property
     def axis(self) -> FloatArray: ...
     @property
-    def caps_mm(self) -> FloatArray: ...
+    def caps_mm(self) -> FloatArray:
+        """Middles of the caps (N, 3)."""
 
 
 @dataclass(frozen=True)

@@ -65,9 +65,11 @@ class Arm(Protocol):
     axes: int  # 4 for the Dobots, 6 where tilt can be commanded
 
     @property
-    def is_connected(self) -> bool: ...
+    def is_connected(self) -> bool:
+        """Whether the connection is open."""
 
-    def connect(self) -> None: ...
+    def connect(self) -> None:
+        """Open the connection; nothing moves."""
 
     def disconnect(self) -> None:
         """Stop the arm and close the connection. It has no effect when the arm is not connected.
@@ -82,11 +84,14 @@ class Arm(Protocol):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None: ...
 
-    def enable(self) -> None: ...
+    def enable(self) -> None:
+        """Switch the motors on. Nothing moves before."""
 
-    def disable(self) -> None: ...
+    def disable(self) -> None:
+        """Switch the motors off."""
 
-    def clear_error(self) -> None: ...
+    def clear_error(self) -> None:
+        """Acknowledge alarms, so that the arm can be enabled again."""
 
     def stop(self) -> None:
         """End the motion at once and forget what is queued."""
@@ -97,7 +102,8 @@ class Arm(Protocol):
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         """The newest state; ``StaleDataError`` if it is older than ``max_age_s``."""
 
-    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None: ...
+    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
+        """Set the speeds of the moves that follow."""
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         """Move the tool straight to ``pose`` (6,); returns the pose really commanded (clamped to what the arm can do).
@@ -106,7 +112,8 @@ class Arm(Protocol):
         Without, it returns when the arm has accepted it.
         """
 
-    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray: ...
+    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
+        """Go to joints (J,), deg; otherwise as `move_linear`. Returns the pose that was commanded."""
 
     def wait_settled(self, pose: np.ndarray, *, tolerance_mm: float = 0.1, tolerance_deg: float = 0.1, timeout_s: float = 10.0) -> ArmState:
         """Wait for feedback of the arm at rest at ``pose``: the state that confirms it.
@@ -127,7 +134,8 @@ class BaseArm(Connection):
 
     @property
     @abstractmethod
-    def is_connected(self) -> bool: ...
+    def is_connected(self) -> bool:
+        """Whether the connection is open."""
 
     @abstractmethod
     def stop(self) -> None: ...

@@ -76,10 +76,12 @@ class Message:
 
     @property
     def is_write(self) -> bool:
+        """Whether the message sets something."""
         return bool(self.ctrl & WRITE)
 
     @property
     def is_queued(self) -> bool:
+        """Whether the command goes through the arm's queue."""
         return bool(self.ctrl & QUEUED)
 
     def to_bytes(self) -> bytes:

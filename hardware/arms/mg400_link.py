@@ -39,6 +39,7 @@ class CommandPort:
 
     @property
     def is_open(self) -> bool:
+        """Whether the connection is open."""
         return self._socket is not None
 
     def open(self, *, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
@@ -86,6 +87,7 @@ class CommandPort:
         )
 
     def send(self, text: str) -> None:
+        """Send one command and return the arm's reply."""
         with self._lock:
             if self._socket is None:
                 raise DeviceNotConnectedError(f"{self._name}: the connection was lost; disconnect() and connect() again")

@@ -67,6 +67,7 @@ class Reply:
         return self.echo.split("(")[0].strip().lower()
 
     def numbers(self) -> list[float]:
+        """The reply's values as numbers."""
         return [float(text) for text in re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", self.values)]
 
     def alarms(self) -> list[int]:

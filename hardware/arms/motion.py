@@ -78,6 +78,7 @@ class Piece:
         return value if self.linear else self.kinematics.forward(value)
 
     def joints_deg(self, time_s: float) -> np.ndarray:
+        """Joints (J,) at a time."""
         value = self._value(time_s)
         return self.kinematics.inverse(value) if self.linear else value
 
@@ -141,12 +142,15 @@ class MotionTrack:
         return self._at(time_s).pose(time_s)
 
     def joints_deg(self, time_s: float) -> np.ndarray:
+        """Joints (J,) at a time."""
         return self._at(time_s).joints_deg(time_s)
 
     def moving(self, time_s: float) -> bool:
+        """Whether a piece lasts at that time."""
         return bool(self.end_s > time_s)
 
     def target(self) -> Piece:
+        """The last piece."""
         return self._pieces[-1]
 
     def move(self, end: np.ndarray, speeds: Speeds, *, linear: bool, now_s: float) -> Piece | Violation:

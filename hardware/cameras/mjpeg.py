@@ -61,9 +61,11 @@ def hold_little(connection: socket.socket) -> None:
 class Readable(Protocol):
     """A stream of bytes."""
 
-    def readline(self, limit: int, /) -> bytes: ...
+    def readline(self, limit: int, /) -> bytes:
+        """The next line, of at most ``limit`` bytes."""
 
-    def read(self, amount: int, /) -> bytes: ...
+    def read(self, amount: int, /) -> bytes:
+        """The next ``amount`` bytes."""
 
 
 class MjpegCamera(LiveSource):

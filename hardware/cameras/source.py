@@ -25,7 +25,8 @@ class FrameSource(Protocol):
         """Longest time from ``connect`` to the first frame."""
 
     @property
-    def is_connected(self) -> bool: ...
+    def is_connected(self) -> bool:
+        """Whether frames can be read."""
 
     @property
     def dropped(self) -> int:

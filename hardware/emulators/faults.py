@@ -39,6 +39,7 @@ class Faults:
             raise TwinError(f"fault '{text}': '{value}' is not a number; for example {name}={default or 1:g}") from error
 
     def clear(self) -> None:
+        """Switch all faults off."""
         self._on.clear()
 
     def __contains__(self, name: str) -> bool:

@@ -44,6 +44,7 @@ class PlanarFrame:
 
     @classmethod
     def of_pose(cls, pose: np.ndarray) -> "PlanarFrame":
+        """The frame whose origin and turn are those of a pose."""
         return cls(*(float(value) for value in np.asarray(pose)[[0, 1, 2, 5]]))
 
     @property
@@ -146,6 +147,7 @@ class Mg400Controller:
 
     @property
     def queue_runs(self) -> bool:
+        """Whether queued moves are carried out."""
         return not (self.alarms or self._held)
 
     def enable(self) -> None:
@@ -208,6 +210,7 @@ class Mg400Controller:
             self.reset()
 
     def pause(self) -> None:
+        """Hold the queue until ``Continue``."""
         with self.lock:
             self._hold(time.monotonic())
             self.paused = True

@@ -242,9 +242,10 @@ def test_every_command_has_entries(laboratory: Laboratory) -> None:
 def commands_below(laboratory: Laboratory, words: list[str]) -> list[str]:
     """Every command, by what the help lists."""
     text = laboratory.program.call(*words, "--help", folder=laboratory.folder).stdout
-    if "\nCommands:" not in text:
+    if " COMMAND [ARGS]" not in text.partition("\n")[0]:
         return [" ".join(words)]
-    listed = re.findall(r"^  (\w[\w-]*)", text.split("\nCommands:")[1], re.MULTILINE)
+    titled = text.split("Show this message and exit.")[1]  # commands stand below the options, under one title or several
+    listed = re.findall(r"^  (\w[\w-]*)", titled, re.MULTILINE)
     return [name for word in listed for name in commands_below(laboratory, [*words, word])]
 
 

@@ -229,7 +229,12 @@ def declared(*extras: str) -> set[str]:
 def test_what_is_imported_is_asked_for(folders, extras):
     """A library that only happens to be installed is missing on the next machine."""
     of_import = metadata.packages_distributions()
-    own = BY_HAND | set(MAY_IMPORT) | set(sys.stdlib_module_names) | {path.stem for path in (ROOT / "tests").rglob("*")}
+    own = (
+        BY_HAND
+        | set(MAY_IMPORT)
+        | set(sys.stdlib_module_names)
+        | {path.stem for folder in ("tests", "docs") for path in (ROOT / folder).rglob("*")}
+    )
     for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
         for name in sorted({name.split(".")[0] for name in imports_of(path)} - own):
             distributions = {name.lower() for name in of_import.get(name, [NAMED_OTHERWISE.get(name, name)])}

@@ -19,15 +19,45 @@ from typer.core import TyperGroup
 
 from twin.errors import OptionError, StoreError, TwinError
 
-# Modules of commands, in the order in which 'twin --help' lists them.
-COMMANDS = ("start", "studio", "frames", "calibration", "learning", "studies", "live")
+# Modules of commands, in the order in which 'twin --help' lists them, and the title that their commands stand under there.
+COMMANDS = {
+    "start": "Begin",
+    "studio": "Begin",
+    "frames": "Frames and pins",
+    "calibration": "Your own sensor, and how true its twin is",
+    "learning": "Data sets and models",
+    "studies": "Studies",
+    "live": "Cameras and arms",
+}
 
 # Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as shells count).
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130
 
 
 class _Commands(TyperGroup):
-    """All commands. After Ctrl-C typer alone would end the program without a word."""
+    """All commands, listed by the kind of work. After Ctrl-C typer alone would end the program without a word."""
+
+    def titled(self, ctx: Any) -> dict[str, list[str]]:
+        """Names of the commands under each title of ``COMMANDS``."""
+        found: dict[str, list[str]] = {title: [] for title in COMMANDS.values()}
+        for name in self.list_commands(ctx):
+            command: Any = self.get_command(ctx, name)
+            while hasattr(command, "commands"):  # a group of commands stands where its own stand
+                command = next(iter(command.commands.values()))
+            found[COMMANDS[command.callback.__module__.rpartition(".")[2]]].append(name)
+        return {title: names for title, names in found.items() if names}
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        width = max(map(len, self.list_commands(ctx)))
+        for title, names in self.titled(ctx).items():
+            commands = [self.get_command(ctx, name) for name in names]
+            rows = [
+                (f"{name:{width}}", command.get_short_help_str(formatter.width - width - 6))
+                for name, command in zip(names, commands, strict=True)
+                if command
+            ]
+            with formatter.section(title):
+                formatter.write_dl(rows)
 
     def invoke(self, ctx: Any) -> Any:
         try:

@@ -433,6 +433,10 @@ Writes:
   audit.json, audit.png, audit.html
 
 Copy labels_corrected.csv beside targets.csv, and 'twin train' corrects the labels with it.
+
+\b
+Example:
+  twin audit recordings/mine --sensor mg400-331 --out out/audit
 """
 
 

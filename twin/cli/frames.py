@@ -34,6 +34,10 @@ Writes pins.npz:
   found (M,), valid (M,)
 and summary.json (frames, exact_fraction, ms.<stage>.p50|p95|p99, parameters,
 failed).
+
+\b
+Example:
+  twin preprocess recordings/mine --sensor mg400-331 --out out/pins
 """
 
 
@@ -95,6 +99,10 @@ Writes:
 With --legacy (for frames in the recordings' form) pins, edges and areas are computed as by the published release: the nodes are in
 its detector's order, in px of its resized image, relative to its scalar median. A frame in which not exactly all pins are found is
 left out.
+
+\b
+Example:
+  twin graph frame.png --sensor mg400-331 --kind voronoi --out out/graph
 """
 
 

@@ -174,6 +174,11 @@ Writes to --out: config.json (resolved, with the sensor and the parameters of
 the pipeline), curves.csv, weights.pt, and checkpoint.pt while it runs. The
 same command continues a run that was interrupted, if frames and labels are
 still the same.
+
+\b
+Example:
+  twin train --model vgnn --sensor mg400-331 --data recordings/mine \\
+      --target surface-2d --out runs/mine
 """
 
 
@@ -251,6 +256,10 @@ Writes:
 
 With --robustness it also writes robustness.csv: errors on frames whose image is changed (1 % scale, 2 px shift, 1 deg turn, 5 pins
 erased, each in a random direction), and how much larger they are than the errors on the unchanged frames.
+
+\b
+Example:
+  twin evaluate runs/mine --data recordings/mine --out out/errors
 """
 
 
@@ -280,6 +289,10 @@ HELP_PREDICT = """Tell the pose in every frame, with its 90 % interval.
 
 The model contains its sensor and pipeline, and a frame of another sensor is refused. If a recording has a frame without contact
 (init_0.png), the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
+
+\b
+Example:
+  twin predict runs/mine frame.png
 """
 
 
@@ -302,6 +315,7 @@ Its numbers have half the precision, and its size is less than a tenth. It can b
 weights below training/weights were made with these commands:
 
 \b
+Example:
   twin study sim-to-real --sensor mg400-331 --frames DIR \\
       --contacts surface-2d-wide --draws 2 --epochs 60 --out study
   twin pack study/sim_only --out training/weights/mg400-331 --force

@@ -42,6 +42,7 @@ DIR runs the model on the same frames again, and says whether the estimates are 
 contact at the start; the first frame is then kept with the session.
 
 \b
+Example:
   twin live --camera /dev/video0 --model RUN
   twin live --camera http://127.0.0.1:8081/stream.mjpg --model RUN \\
       --record out/session --headless --seconds 60
@@ -102,6 +103,7 @@ The folder has the recordings' own format (targets.csv, frames_bw/ or images/, i
 contacts.jsonl. The same command continues an interrupted collection.
 
 \b
+Example:
   twin collect --camera twin --arm simulated --sensor mg400-331 \\
       --experiment surface-2d --count 200 --out data/first
   twin collect --camera /dev/video0 --arm mg400 --sensor mg400-331 \\
@@ -168,6 +170,7 @@ Before the arm touches anything, a frame is taken from which the model counts pi
 specification's layout, as models on graphs always do.
 
 \b
+Example:
   twin servo --object can --model RUN --out out/servo
   twin emulate mg400 &  twin emulate camera --arm mg400:127.0.0.1 \\
       --sensor mg400-331 --object can --port 8081 &
@@ -269,7 +272,11 @@ def mg400(
 
     The ports are 29999 (dashboard), 30003 (motion), and 30004 (every 8 ms), 30005 (200 ms) and 30006 (50 ms) for feedback.
 
-    Try it: twin emulate mg400 &  then in Python: open_arm("mg400:127.0.0.1").
+    In Python: open_arm("mg400:127.0.0.1").
+
+    \b
+    Example:
+      twin emulate mg400
     """
     from hardware.emulators.mg400 import FAULTS
     from hardware.emulators.running import emulate_mg400
@@ -288,7 +295,11 @@ def magician(
 
     The name of its device is printed.
 
-    Try it: twin emulate magician --link /tmp/magician &  then in Python: open_arm("magician:/tmp/magician").
+    In Python: open_arm("magician:/tmp/magician").
+
+    \b
+    Example:
+      twin emulate magician --link /tmp/magician
     """
     from hardware.emulators.magician import FAULTS
     from hardware.emulators.running import emulate_magician
@@ -303,6 +314,7 @@ The stream of JPEGs shows the contact at the pose of an emulated arm. The pose c
 may run in different processes.
 
 \b
+Example:
   twin emulate mg400 &
   twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can \\
       --port 8081

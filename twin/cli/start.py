@@ -18,7 +18,12 @@ from twin.types import Form
 
 @app.command("sensors")
 def sensors() -> None:
-    """List the sensors, and where to put one's own."""
+    """List the sensors, and where to put one's own.
+
+    \b
+    Example:
+      twin sensors
+    """
     from scenes import catalog
 
     say(catalog.sensors().lines())
@@ -26,7 +31,12 @@ def sensors() -> None:
 
 @app.command("objects")
 def objects() -> None:
-    """List the objects, and where to put one's own."""
+    """List the objects, and where to put one's own.
+
+    \b
+    Example:
+      twin objects
+    """
     from scenes import catalog
 
     say([*catalog.objects().lines(), "Any STL, OBJ or PLY file (in mm) is an object too: --object part.stl"])
@@ -37,6 +47,10 @@ def experiments() -> None:
     """List the experiments, and where to put one's own.
 
     An experiment says which contacts are made, in the robot's coordinates.
+
+    \b
+    Example:
+      twin experiments
     """
     from scenes import catalog
 
@@ -48,6 +62,10 @@ def randomisations() -> None:
     """List the randomisations, and where to put one's own.
 
     A randomisation says what differs from one simulated frame to the next.
+
+    \b
+    Example:
+      twin randomisations
     """
     from scenes import catalog
 
@@ -60,6 +78,10 @@ def doctor() -> None:
 
     It looks at packages, Mitsuba's variants (and which one is used, and why), LLVM, GPU, offscreen 3D, cameras and serial ports. The
     exit code is 1 if nothing can be rendered on this machine.
+
+    \b
+    Example:
+      twin doctor
     """
     from hardware.doctor import examine_machine
 
@@ -74,6 +96,10 @@ def demo(out: Out = Path("out/demo"), force: Force = False) -> None:
     """Run the whole chain on shipped sensors, as one page.
 
     It presses, renders, finds pins and builds graphs for several sensors and objects. It writes pictures and a page (index.html).
+
+    \b
+    Example:
+      twin demo --out out/demo
     """
     from twin.cli.progress import shown
     from twin.demo.make_demo import run_demo

@@ -45,6 +45,7 @@ HELP_STUDY_SERVO = """Follow the Tac-VGNN paper's five objects with each model.
 It runs in the twin, and compares how well the models follow.
 
 \b
+Example:
   twin study servo --model out/gnn --model out/tac-vgnn --out out/study
 
 Writes to --out: a folder for each model and object as 'twin servo' writes it, study.csv, study.png.
@@ -86,6 +87,7 @@ UNSEEN = "cylinder,edge"
 HELP_STUDY_OBJECTS = """Train on several objects, and judge on others.
 
 \b
+Example:
   twin study objects --sensor mg400-331 --train plane,sphere,hexagon-rod \\
       --unseen cylinder,edge --out out/objects
 
@@ -100,6 +102,7 @@ models are judged; they are trained on the experiment that it names as wider.
 The same command continues an interrupted study. The run that learnt several objects can be given wherever a RUN is asked for:
 
 \b
+Example:
   twin servo --object can --model out/objects/mixed --out out/can
 
 \b
@@ -151,6 +154,7 @@ def study_objects(
 HELP_STUDY_SIM_TO_REAL = """Train in the twin or on real frames, test on real ones.
 
 \b
+Example:
   twin study sim-to-real --sensor mg400-331 --frames DIR --labels 40 \\
       --seed 0 --out out/sim-to-real
 
@@ -242,6 +246,7 @@ HELP_STUDY_TAC_VGNN = """Repeat the Tac-VGNN paper's comparison on a recording.
 It compares graphs, models and training efficiency, and shows how the Voronoi areas tell the depth of a contact.
 
 \b
+Example:
   twin study tac-vgnn --data DIR --sensor mg400-331 --out out/study \\
       --max-minutes 120
 

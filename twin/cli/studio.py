@@ -25,6 +25,7 @@ page says why.
 The page is served for this machine alone, loads nothing from elsewhere, and several browsers see the same state. Ctrl-C ends it.
 
 \b
+Example:
   twin studio
   twin studio --sensor ur5-331 --object edge
   twin studio --state out/studio/state-1.json

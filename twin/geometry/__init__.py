@@ -1,0 +1,1 @@
+"""The undeformed sensor: skin, gel, window and pins as meshes and places."""

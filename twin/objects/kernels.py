@@ -35,6 +35,7 @@ def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple
 
 @compiled(error_model="numpy")
 def plane(points: FloatArray) -> Probe:
+    """Half space behind the origin."""
     distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
         distance[k] = -points[k, 2]
@@ -57,6 +58,7 @@ def round_solid(points: FloatArray, radius: float, along_y: float) -> Probe:
 
 @compiled(error_model="numpy")
 def edge(points: FloatArray, fillet: float) -> Probe:
+    """Quarter space with a rounded edge along y."""
     distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
         # distances of the point in front of the faces, which are moved inwards by the fillet
@@ -117,6 +119,7 @@ def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper:
 
 @compiled(error_model="numpy")
 def unroll_cylinder(points: FloatArray, radius: float) -> Probe:
+    """Lengths along the surface of a cylinder instead of across it."""
     along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
     for k in range(len(points)):
         x, z = points[k, 0], points[k, 2] - radius
@@ -132,6 +135,7 @@ def unroll_cylinder(points: FloatArray, radius: float) -> Probe:
 
 @compiled(error_model="numpy")
 def unroll_prism(points: FloatArray, sides: int, inradius: float) -> Probe:
+    """Lengths along the surface of a prism instead of across it."""
     along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
     width = 2 * inradius * np.tan(np.pi / sides)
     for k in range(len(points)):

@@ -37,9 +37,20 @@ LEAST_LEVEL = 0.5  # gray levels: no threshold goes below
 class Evidence(Section):
     """How sure a tuning is: what it saw.
 
-    ``exact_rate``: share of the frames in which all pins were found. ``low_rate``: lower end of its 90 % interval.
-    ``threshold_slack``: gray levels by which the threshold may move either way at nearly the same rate.
-    ``mask_slack_px``: between the outermost pins seen and the mask.
+    Attributes
+    ----------
+    frames : int
+        Number of frames that were looked at.
+    exact_rate : float
+        Share of the frames in which all pins were found.
+    low_rate : float
+        Lower end of the 90 % interval of that share.
+    threshold_slack : float
+        Gray levels by which the threshold may move either way at nearly the same rate.
+    mask_slack_px : float
+        Distance between the outermost pins seen and the mask.
+    sure : {"sure", "fairly sure", "unsure"}
+        These numbers in words.
     """
 
     frames: int
@@ -53,11 +64,27 @@ class Evidence(Section):
 class DetectorSpec(Section):
     """One way to find the pins of one sensor in frames of one form.
 
-    ``blob`` as in a sensor's ``[pipeline.raw]``; its ``threshold`` is the contrast in gray levels that ``log``, ``dog`` and
-    ``doh`` ask of a blob, and the lowest level that ``simple`` looks at. ``radius_px``: of the caps, from the smallest to the largest.
-    ``size_px``: width and height of the frames; without it those of the sensor's specification. ``recording``: what the published
-    method's recorder does to a raw frame. ``pins_px``: where the tuning saw the pins at rest, in the specification's order (without
-    them: the specification's own layout).
+    Attributes
+    ----------
+    name : str
+        The file's stem; not a key of the file.
+    method : str
+        A key of ``METHODS``, which says what each does.
+    form : {"raw", "recording"}
+        Form of the frames.
+    size_px : (width, height), optional
+        Of the frames; without it those of the sensor's specification.
+    blob : BlobSpec
+        As in a sensor's ``[pipeline.raw]``. Its ``threshold`` is the contrast in gray levels that ``log``, ``dog`` and ``doh`` ask of a
+        blob, and the lowest level that ``simple`` looks at.
+    radius_px : (smallest, largest)
+        Radii of the caps.
+    recording : RecordingSpec, optional
+        What the published method's recorder does to a raw frame.
+    pins_px : (N, 2) float
+        Where the tuning saw the pins at rest, in the specification's order; empty: the specification's own layout.
+    evidence : Evidence, optional
+        How sure the tuning is.
     """
 
     name: Name

@@ -152,6 +152,7 @@ class Identified:
 
     @property
     def best(self) -> Candidate:
+        """The likeliest layout."""
         return self.candidates[0]
 
 

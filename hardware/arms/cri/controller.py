@@ -133,6 +133,7 @@ class RobotController(Closing):
 
     @property
     def servo_delay(self) -> tuple[float, float] | None:
+        """Delay after each move that does not wait for its end, s, and its bound; None: moves wait."""
         return self._servo_delay
 
     @servo_delay.setter
@@ -167,6 +168,7 @@ class RobotController(Closing):
 
     @property
     def joint_angles(self) -> np.ndarray:
+        """Present joints (J,), deg."""
         return self.arm.state().joints_deg
 
     def move_joints(self, joint_angles: Numbers) -> None:

@@ -86,6 +86,7 @@ class SyncRobot(Closing):
 
     @property
     def coord_frame(self) -> np.ndarray:
+        """The work frame in the base frame (6,)."""
         return mat2euler(self._T_base_work, self._axes)
 
     @coord_frame.setter
@@ -136,10 +137,12 @@ class SyncRobot(Closing):
 
     @property
     def joint_angles(self) -> np.ndarray:
+        """Present joints (J,), deg."""
         return self.controller.joint_angles
 
     @property
     def target_joint_angles(self) -> np.ndarray | None:
+        """Joints that were commanded last (J,), deg; None before the first move."""
         return self.controller.commanded_joint_angles
 
     @property
@@ -191,12 +194,15 @@ class AsyncRobot(SyncRobot):
         self._error: BaseException | None = None
 
     def async_move_joints(self, joint_angles: Numbers) -> None:
+        """As `move_joints`, without waiting for the end."""
         self._begin(lambda: self.move_joints(joint_angles))
 
     def async_move_linear(self, pose: Numbers, elbow: float | None = None) -> None:
+        """As `move_linear`, without waiting for the end."""
         self._begin(lambda: self.move_linear(pose, elbow))
 
     def async_move_circular(self, via_pose: Numbers, end_pose: Numbers, elbow: float | None = None) -> None:
+        """As `move_circular`, without waiting for the end."""
         self._begin(lambda: self.move_circular(via_pose, end_pose, elbow))
 
     def async_result(self) -> None:

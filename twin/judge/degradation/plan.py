@@ -16,7 +16,15 @@ from twin.judge.degradation.sweep import SEVERITIES
 
 
 class ConditionPlan(Section):
-    """``severe``: value at severity 1, in the unit of the parameter. The default is the condition's own value, which is the largest."""
+    """One condition of a sweep.
+
+    Attributes
+    ----------
+    name : str
+        Of a condition; ``twin robustness --list`` names all.
+    severe : float, optional
+        Value at severity 1, in the unit of the condition's parameter. The default is the condition's own value, which is the largest.
+    """
 
     name: str
     severe: float | None = None
@@ -43,8 +51,14 @@ class ConditionPlan(Section):
 class SweepPlan(Section):
     """A user's sweep.
 
-    ``steps``: increasing severities between 0 and 1 (0 is always included). ``condition``: the conditions to sweep (none: all).
-    ``pairs``: two names each; both conditions have the same severity.
+    Attributes
+    ----------
+    steps : tuple of float
+        Increasing severities between 0 and 1 (0 is always included). The defaults lie closer together where they are small.
+    condition : tuple of ConditionPlan
+        The conditions to sweep; empty: all.
+    pairs : tuple of (str, str)
+        Two names each; both conditions have the same severity.
     """
 
     steps: Annotated[tuple[Annotated[float, Field(gt=0, le=1)], ...], Field(min_length=1)] = SEVERITIES[1:]

@@ -28,13 +28,16 @@ class TwoSample(Protocol):
     """Result of a two-sample test: share of rightly assigned patches, and its interval."""
 
     @property
-    def accuracy(self) -> float: ...
+    def accuracy(self) -> float:
+        """Share of the pictures that were told right."""
 
     @property
-    def low(self) -> float: ...
+    def low(self) -> float:
+        """Lower end of its 90 % interval."""
 
     @property
-    def high(self) -> float: ...
+    def high(self) -> float:
+        """Upper end of its 90 % interval."""
 
 
 # A two-sample test: ``test(real images, rendered images, inside, progress)``.

@@ -9,18 +9,22 @@ from twin.judge.degradation.condition import Condition, OnSection, View, chosen
 
 
 def darker(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    """Less exposure."""
     return response.model_copy(update={"exposure": response.exposure * 2.0**-value})
 
 
 def brighter(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    """More exposure."""
     return response.model_copy(update={"exposure": response.exposure * 2.0**value})
 
 
 def noisier(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
+    """More read and shot noise."""
     return response.model_copy(update={"read_noise": float(np.hypot(response.read_noise, value))}) if value else response
 
 
 def jpeg(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """Stronger JPEG compression."""
     return compressed(image, max(100 - round(value), 1)) if value else image
 
 
@@ -41,6 +45,7 @@ def rows_lost(image: np.ndarray, value: float, view: View, rng: np.random.Genera
 
 
 def hot(image: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """Pixels that are stuck at white."""
     if not value:
         return image
     image = image.copy()

@@ -40,15 +40,18 @@ def bubbles(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorS
 
 
 def hazy(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
+    """Gel that scatters more light."""
     return gel.model_copy(update={"haze": gel.haze + value * (MOST_HAZE - gel.haze)}) if value else gel
 
 
 def yellowed(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
+    """Gel that absorbs blue."""
     old = gel.absorption_per_mm
     return gel.model_copy(update={"absorption_per_mm": tuple(a + value * share for a, share in zip(old, YELLOW, strict=True))})
 
 
 def softened(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
+    """Gel that has lost stiffness."""
     return gel.model_copy(update={"young_modulus_mpa": gel.young_modulus_mpa * (1 - value)})
 
 

@@ -12,6 +12,7 @@ GLARE_AT = (0.35, -0.25)
 
 
 def dimmed(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
+    """All LEDs weaker."""
     return leds.model_copy(update={"power": leds.power * (1 - value)}) if value else leds
 
 
@@ -26,6 +27,7 @@ def dead(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSp
 
 
 def reddened(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
+    """LEDs that have changed their colour."""
     red, green, blue = leds.color
     return leds.model_copy(update={"color": (red, green * (1 - value), blue * (1 - value))})
 

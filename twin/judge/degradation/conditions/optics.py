@@ -53,10 +53,12 @@ def line_kernel(length_px: float, degrees: float) -> np.ndarray:
 
 
 def defocus(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """A focus that has moved."""
     return blurred_by(light, disc_kernel(value * view.px_per_mm)) if value else light
 
 
 def motion(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """A camera that moves during the exposure."""
     return blurred_by(light, line_kernel(value * view.px_per_mm, MOTION_DEG)) if value else light
 
 

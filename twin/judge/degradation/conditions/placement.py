@@ -20,10 +20,12 @@ def shifted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorS
 
 
 def tilted(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
+    """A camera turned about x."""
     return camera.model_copy(update={"tilt_x_deg": camera.tilt_x_deg + value})
 
 
 def zoomed(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
+    """Another focal length."""
     return camera.model_copy(update={"fx_px": camera.fx_px * (1 + value), "fy_px": camera.fy_px * (1 + value)})
 
 
@@ -36,6 +38,7 @@ def distorted(spec: SensorSpec, value: float, rng: np.random.Generator) -> Senso
 
 
 def vignetted(camera: CameraSpec, value: float, rng: np.random.Generator) -> CameraSpec:
+    """Darker corners."""
     return camera.model_copy(update={"vignetting": camera.vignetting + value * (1 - camera.vignetting)})
 
 
@@ -57,19 +60,23 @@ def warped(light: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def rolled(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """A camera turned about its axis."""
     return warped(light, roll(value, view)) if value else light
 
 
 def rolled_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
+    """Places in the picture of a rolled camera."""
     matrix = roll(value, view)
     return px @ matrix[:, :2].T + matrix[:, 2] if value else px
 
 
 def sheared(light: np.ndarray, value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """Rows that are exposed one after the other while the camera moves."""
     return warped(light, skew(0.5 * value * view.px_per_mm / view.radius_px, view)) if value else light
 
 
 def sheared_points(px: np.ndarray, value: float, view: View) -> np.ndarray:
+    """Places in that picture."""
     matrix = skew(0.5 * value * view.px_per_mm / view.radius_px, view)
     return px @ matrix[:, :2].T + matrix[:, 2] if value else px
 

@@ -26,14 +26,17 @@ def wrong_crop(image: np.ndarray, value: float, view: View, rng: np.random.Gener
 
 
 def displaced(px: np.ndarray, value: float, view: View) -> np.ndarray:
+    """Places in a wrongly cropped picture."""
     return px + np.array(offset_px(value, view))
 
 
 def too_strict(detector: DetectorSpec, value: float) -> DetectorSpec:
+    """A threshold that misses pins."""
     return detector.stricter(value)
 
 
 def too_lax(detector: DetectorSpec, value: float) -> DetectorSpec:
+    """A threshold that takes other things for pins."""
     return detector.stricter(-value)
 
 

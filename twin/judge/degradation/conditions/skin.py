@@ -33,6 +33,7 @@ def cap_levels(appearance: AppearanceSpec, count: int) -> np.ndarray:
 
 
 def missing(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
+    """Caps that have come off."""
     if not value:
         return spec
     levels = np.where(chosen(spec.pins.count, value, rng), GONE, cap_levels(spec.appearance, spec.pins.count))
@@ -40,10 +41,12 @@ def missing(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorS
 
 
 def those_missing(value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """Which caps (N,) have come off."""
     return chosen(len(view.caps_px), value, rng)
 
 
 def broken(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
+    """Caps of which a part has broken off."""
     if not value:
         return spec
     old = np.array(spec.appearance.cap_shapes or np.zeros((spec.pins.count, len(BROKEN))))
@@ -58,10 +61,12 @@ def broken(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSp
 
 
 def faded(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> AppearanceSpec:
+    """Caps that have darkened."""
     return appearance.model_copy(update={"cap_albedo": tuple(a * (1 - value) for a in appearance.cap_albedo)}) if value else appearance
 
 
 def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
+    """Caps of different brightness."""
     if not value:
         return spec
     levels = cap_levels(spec.appearance, spec.pins.count) * np.exp(-value * np.abs(rng.standard_normal(spec.pins.count)))
@@ -69,6 +74,7 @@ def uneven(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSp
 
 
 def pale(appearance: AppearanceSpec, value: float, rng: np.random.Generator) -> AppearanceSpec:
+    """A skin that has lost its black."""
     old = appearance.skin_albedo
     return appearance.model_copy(update={"skin_albedo": tuple(a + value * (1 - a) for a in old)}) if value else appearance
 
@@ -93,6 +99,7 @@ def torn(light: np.ndarray, value: float, view: View, rng: np.random.Generator) 
 
 
 def those_torn_off(value: float, view: View, rng: np.random.Generator) -> np.ndarray:
+    """Which caps (N,) lie in the hole."""
     at = view.center_px + np.array(TEAR_AT) * view.radius_px
     return np.linalg.norm(view.caps_px - at, axis=1) < 0.5 * value * view.px_per_mm if value else np.zeros(len(view.caps_px), bool)
 

@@ -34,7 +34,7 @@ def way_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> li
         return [clear]
     surface = outline @ placed.T_base_object[:2, [0, 2]].T + placed.T_base_object[:2, 3]
     middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
-    radius_mm = np.linalg.norm(surface - middle, axis=1).max() + placed.mounting.radius_mm + MARGIN_MM
+    radius_mm = np.linalg.norm(surface - middle, axis=1).max() + placed.mounting.skin_reach_mm + MARGIN_MM
     T = matrix_of(clear)
     domes = [matrix_of(pose)[:2, :3] @ placed.mounting.centre_mm + pose[:2] - middle for pose in (start, clear)]
     if distance_to_axis(*domes) >= min(radius_mm, np.linalg.norm(domes[1])):

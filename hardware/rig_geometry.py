@@ -67,7 +67,7 @@ class PlacedObject:
         x, y, z = self.mounting.across, self.mounting.axis, self.mounting.out_of_plane
         T = np.eye(4)  # the tool's across, axis and plane's normal lie along the object's x, z and -y
         T[:3, :3] = self.T_base_object[:3, [0, 2, 1]] * [1, 1, -1] @ np.stack([x, y, z])
-        out_mm = self.mounting.radius_mm + self._surface.raised_mm - indent_mm
+        out_mm = self.mounting.skin_apex_mm + self._surface.raised_mm - indent_mm
         centre = self.T_base_object[:3, 3] - out_mm * self.T_base_object[:3, 2]
         T[:3, 3] = centre - T[:3, :3] @ self.mounting.centre_mm
         return pose_of(T, np.zeros(6))

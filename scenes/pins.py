@@ -1,5 +1,6 @@
 """The pins of a TacTip: their layout as data, and their size."""
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -46,7 +47,9 @@ class PinsSpec(Section):
         What is proportional to the distance from the middle of the layout: the polar angle, or its sine (the layout then keeps its shape
         seen along the axis).
     max_polar_deg : float
-        Polar angle of the outermost pins (of the corner pins of a hexagon or grid).
+        On a cap: polar angle of the outermost pins (of the corner pins of a hexagon or grid).
+    reach_mm : float, optional
+        Distance of the outermost pins' feet from the axis. A flat pad needs it; on a cap it takes the place of ``max_polar_deg``.
     phase_deg : float
         Turn of the layout from x towards y. At 0 the first pin of each ring lies on x.
     length_mm, diameter_mm : float
@@ -64,6 +67,7 @@ class PinsSpec(Section):
     missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
     spacing: Literal["polar", "plan"] = "polar"
     max_polar_deg: Annotated[float, Field(gt=0, lt=90)] = 64.0
+    reach_mm: Positive | None = None
     phase_deg: float = 0.0
     length_mm: Positive = 1.1
     diameter_mm: Positive = 0.8
@@ -84,6 +88,12 @@ class PinsSpec(Section):
     def count(self) -> int:
         """Number of pins N."""
         return self.complete_count - len(self.missing)
+
+    def largest_polar_rad(self, radius_mm: float) -> float | None:
+        """Polar angle of the outermost pins on the inside of a cap of this radius; None where they reach beyond it."""
+        if self.reach_mm is None:
+            return math.radians(self.max_polar_deg)
+        return math.asin(self.reach_mm / radius_mm) if self.reach_mm < radius_mm else None
 
     def in_words(self) -> str:
         """The layout for people: '331 pins in 10 rings'."""

@@ -1,7 +1,7 @@
 """The specification of a TacTip: geometry, material, optics, camera, recording, pipeline, rig.
 
-Sensor frame: origin at the centre of the dome's sphere, z out of the tip (apex at
-``z = skin.outer_radius_mm``), x and y along the image's x (right) and y (down) of an
+Sensor frame: origin at the centre of a cap's sphere or in the middle of a flat pad's outside, z out of the tip
+(apex at ``z = skin.apex_mm``), x and y along the image's x (right) and y (down) of an
 untilted camera. Lengths mm, stiffness MPa (N/mm^2), angles deg (files only), pixels px
 with (0, 0) at the centre of the first pixel of the *raw* camera frame.
 """
@@ -9,130 +9,15 @@ with (0, 0) at the centre of the first pixel of the *raw* camera frame.
 import math
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from scenes.base import Fraction, Index, Name, NearOne, NonNegative, NotTruth, Positive, Rgb, Section
+from scenes.body import GelSpec, SkinSpec
 from scenes.pins import PinsSpec
 from scenes.rig import RigSpec
 
 ELSEWHERE = "leave it out if it was measured on another layout"
 """What to do with caps that were measured and do not fit."""
-
-
-class RelaxationTerm(Section):
-    """A part of the shear stiffness that relaxes (one Maxwell element).
-
-    Attributes
-    ----------
-    fraction : float
-        Share of the instantaneous stiffness.
-    time_s : float
-        Time constant.
-    """
-
-    fraction: Annotated[float, Field(gt=0, lt=1)]
-    time_s: Positive
-
-
-MOST_POISSON = 0.49999  # measured: contacts converge up to it; closer to 0.5 rounding alone is above the solver's tolerance
-
-
-def _compressible(poisson_ratio: float) -> float:
-    if poisson_ratio > MOST_POISSON:
-        raise ValueError(f"a contact does not converge above {MOST_POISSON}; rubber that hardly changes its volume has 0.49 to 0.4999")
-    return poisson_ratio
-
-
-Poisson = Annotated[float, Field(ge=0), AfterValidator(_compressible)]
-
-
-class MaterialSpec(Section):
-    """A nearly incompressible rubber: its stiffness, and how it stiffens and relaxes.
-
-    Attributes
-    ----------
-    young_modulus_mpa, poisson_ratio : float
-        At small strain. In a rubber that relaxes: before anything has relaxed.
-    law : {"neo-hookean", "mooney-rivlin", "yeoh"}
-        See ``twin.mechanics.material``.
-    second_invariant_share : float
-        For Mooney-Rivlin: c01 / (c10 + c01).
-    c20_c10, c30_c10 : float
-        For Yeoh: c20 and c30 relative to c10.
-    relaxation : tuple of RelaxationTerm
-        A Prony series; empty: elastic.
-    """
-
-    young_modulus_mpa: Positive
-    poisson_ratio: Poisson
-    law: Literal["neo-hookean", "mooney-rivlin", "yeoh"] = "neo-hookean"
-    second_invariant_share: Fraction = 0.0
-    c20_c10: NonNegative = 0.0
-    c30_c10: NonNegative = 0.0
-    relaxation: tuple[RelaxationTerm, ...] = ()
-
-    @model_validator(mode="after")
-    def _check_law(self) -> Self:
-        if self.law != "mooney-rivlin" and self.second_invariant_share:
-            raise ValueError("second_invariant_share belongs to law = 'mooney-rivlin'")
-        if self.law != "yeoh" and (self.c20_c10 or self.c30_c10):
-            raise ValueError("c20_c10 and c30_c10 belong to law = 'yeoh'")
-        if sum(term.fraction for term in self.relaxation) >= 1:
-            raise ValueError("the fractions of relaxation must sum to less than 1: some stiffness must stay")
-        return self
-
-
-class SkinSpec(MaterialSpec):
-    """Hemispherical skin, clamped in its rim plane.
-
-    The defaults are those of the printed TacTip: the radius of its makers' simulation CAD, about 1 mm of Agilus30 of Shore A 26 to 30
-    (0.4 to 1 MPa).
-
-    Attributes
-    ----------
-    outer_radius_mm : float
-        Of the dome.
-    thickness_mm : float
-        Of the skin.
-    rim_z_mm : float
-        Plane in which the skin is clamped.
-    """
-
-    young_modulus_mpa: Positive = 0.7
-    poisson_ratio: Poisson = 0.47
-    outer_radius_mm: Positive = 20.0
-    thickness_mm: Positive = 1.0
-    rim_z_mm: float = 0.0
-
-
-class GelSpec(MaterialSpec):
-    """Gel between skin and window.
-
-    Attributes
-    ----------
-    sealed : bool
-        Whether the gel's volume as a whole stays exactly constant, whatever its Poisson's ratio.
-    refractive_index : float
-        The default is that of the silicone gel.
-    absorption_per_mm : three numbers
-        Beer-Lambert coefficients for red, green and blue.
-    haze : float
-        Share of the light towards the camera that the gel scatters forward.
-    haze_sigma_px : float
-        Sd of the Gaussian over which it is scattered.
-
-    Notes
-    -----
-    The default modulus is that of the gel RTV27905 (0.01 to 0.03 MPa).
-    """
-
-    young_modulus_mpa: Positive = 0.02
-    poisson_ratio: Poisson = 0.47
-    sealed: bool = False
-    refractive_index: Index = 1.41
-    absorption_per_mm: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
-    haze: Fraction = 0.0
-    haze_sigma_px: Positive = 20.0
 
 
 class LensSpec(Section):
@@ -176,7 +61,8 @@ class CameraSpec(Section):
     fx_px, fy_px, cx_px, cy_px : float
         Focal lengths and principal point.
     distance_mm : float
-        From the entrance pupil to the dome's centre: the pupil is at z = -distance.
+        From the entrance pupil to the origin (a cap's centre, a pad's outside): the pupil is at z = -distance. Negative where a shallow
+        cap's centre lies behind the pupil.
     tilt_x_deg, tilt_y_deg : float
         The camera is turned about its pupil.
     k1, k2, p1, p2 : float
@@ -201,7 +87,7 @@ class CameraSpec(Section):
     fy_px: Positive
     cx_px: float
     cy_px: float
-    distance_mm: Positive
+    distance_mm: float
     tilt_x_deg: Annotated[float, Field(ge=-30, le=30)] = 0.0
     tilt_y_deg: Annotated[float, Field(ge=-30, le=30)] = 0.0
     k1: float = 0.0
@@ -307,6 +193,8 @@ class HousingSpec(Section):
     ----------
     aperture_radius_mm, outer_radius_mm : float
         Of the annulus.
+    aperture_mm : (width, height), optional
+        Of a rectangular opening, along x and y, instead of the round one.
     z_mm, center_mm : float, (x, y)
         Its plane and its centre.
     albedo : three numbers
@@ -327,6 +215,7 @@ class HousingSpec(Section):
     """
 
     aperture_radius_mm: Positive = 16.6
+    aperture_mm: tuple[Positive, Positive] | None = None
     outer_radius_mm: Positive = 60.0
     z_mm: float = -4.0
     center_mm: tuple[float, float] = (0.0, 0.0)
@@ -668,15 +557,15 @@ class SensorSpec(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         skin, pins = self.skin, self.pins
-        inner_mm = skin.outer_radius_mm - skin.thickness_mm
-        if inner_mm <= 0:
-            raise ValueError("skin.thickness_mm must be smaller than skin.outer_radius_mm")
-        if pins.length_mm + pins.cap_height_mm >= inner_mm:
-            raise ValueError("pins.length_mm + pins.cap_height_mm must be smaller than the inner radius of the skin")
+        inside_mm = skin.apex_mm - skin.thickness_mm
         if self.lens.z_mm > skin.rim_z_mm:
             raise ValueError("lens.z_mm must not lie in front of skin.rim_z_mm")
-        if self.skin.rim_z_mm >= inner_mm * math.cos(math.radians(pins.max_polar_deg)):
-            raise ValueError("pins.max_polar_deg puts pins behind skin.rim_z_mm")
+        if self.lens.z_mm >= inside_mm:
+            raise ValueError("lens.z_mm must lie behind the skin: below -skin.thickness_mm for a flat pad")
+        room_mm = inside_mm if skin.shape == "cap" else inside_mm - self.lens.z_mm
+        if pins.length_mm + pins.cap_height_mm >= room_mm:
+            raise ValueError("pins.length_mm + pins.cap_height_mm must be smaller than a cap's inner radius, or a pad's gel is deep")
+        self._check_reach()
         if self.camera.distance_mm <= -self.lens.back_mm:
             raise ValueError("camera.distance_mm must put the pupil behind the window (greater than lens.thickness_mm - lens.z_mm)")
         if self.leds.z_mm > self.lens.back_mm:
@@ -695,3 +584,18 @@ class SensorSpec(Section):
         if (self.recording is None) != (self.pipeline.recording is None):
             raise ValueError("recording and pipeline.recording go together: give both or neither")
         return self
+
+    def _check_reach(self) -> None:
+        """The outermost pins must stand on the skin: before a cap's rim, on a pad's flat part."""
+        skin, reach_mm = self.skin, self.pins.reach_mm
+        if skin.shape == "cap":
+            polar_rad = self.pins.largest_polar_rad(skin.apex_mm - skin.thickness_mm)
+            if polar_rad is None or skin.rim_z_mm >= (skin.apex_mm - skin.thickness_mm) * math.cos(polar_rad):
+                raise ValueError(f"pins.{'max_polar_deg' if reach_mm is None else 'reach_mm'} puts pins behind skin.rim_z_mm")
+            return
+        if reach_mm is None:
+            raise ValueError("pins.reach_mm is missing: on a flat pad it is the distance of the outermost pin from the axis")
+        if reach_mm > math.hypot(*(half + skin.rim_z_mm for half in skin.half_size_mm)) or (
+            skin.shape == "round-pad" and reach_mm > skin.outer_radius_mm + skin.rim_z_mm
+        ):
+            raise ValueError("pins.reach_mm puts pins beyond the flat part of the pad")

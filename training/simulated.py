@@ -118,7 +118,7 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     for path_id in np.unique(contact[rows >= 0]):
         mine = contact == path_id
         sensor = _rigged(config.sensor, draws[int(path_id)])
-        sent = np.stack([object_pose(rig_of(sensor), config.experiment, each, sensor.skin.outer_radius_mm) for each in pose[mine]])
+        sent = np.stack([object_pose(rig_of(sensor), config.experiment, each, sensor.skin.apex_mm) for each in pose[mine]])
         sent[:, 2, 3] += config.object.compliance_mm_per_n * force_n[mine, 2]
         for label, values in surface_labels(config.experiment, Mounting.of(sensor, config.experiment), surface, sent).items():
             found.setdefault(label, np.full(len(rows), np.nan))[mine] = values

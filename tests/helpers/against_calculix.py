@@ -7,7 +7,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from scenes import load_sensor
-from scenes.sensor import GelSpec, SensorSpec, SkinSpec
+from scenes.body import GelSpec, SkinSpec
+from scenes.sensor import SensorSpec
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver

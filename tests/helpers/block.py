@@ -6,8 +6,8 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
+from scenes.body import MaterialSpec
 from scenes.load import load_sensor
-from scenes.sensor import MaterialSpec
 from twin.geometry.bspline import Basis
 from twin.geometry.solid import Cells, _local, joined_cells, spline_cells
 from twin.mechanics import SkinSolver

@@ -88,7 +88,7 @@ def test_it_may_begin_in_contact(solver):
 def test_too_deep_is_an_error_and_coming_back_is_not(solver):
     follower = Follower(solver, load_object("plane"), OWN)
     follower.move(plate(-1.0), 0.0)
-    with pytest.raises(ContactError, match="inside the dome"):
+    with pytest.raises(ContactError, match="inside the skin"):
         follower.move(plate(15.0), 1.0)
     assert follower.move(plate(1.0), 2.0).force_n[2] > 0
 

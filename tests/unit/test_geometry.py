@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 from block import rotation
+from scipy.spatial import cKDTree
 
+from scenes.body import SkinSpec
 from scenes.load import list_sensors, load_sensor
 from twin.geometry.bspline import Basis
-from twin.geometry.chart import Chart, Focus, disc_points, dome_points
+from twin.geometry.chart import Chart, Focus
 from twin.geometry.mesh import GEL, SKIN, NodeView, build_mesh, skin_surface, to_pyvista
 from twin.geometry.pins import rest_pins
+from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Resolution, body_points, build_solid, pin_pose, surface_operators
 
 ROUNDING_MM = 1e-9
@@ -128,12 +131,12 @@ def test_lines_gather_around_the_focus(focus):
     """The fine part, 3/4 of the square's side, reaches about as far as asked, and its elements are smaller than an even grid's."""
     chart = chart_of(focus)
     here = focus.polar_rad / (np.pi / 2) * np.exp(1j * focus.azimuth_rad)
-    centre = dome_points(np.array([here]), 1.0, 0.0)[0]
+    centre = DOME.directions(np.array([here]))[0]
     grid = np.linspace(-1, 1, 201)
     v, u = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
     disc = chart.disc(np.column_stack([u, v]))
     assert abs(chart.disc(np.zeros((1, 2)))[0] - here) < 1e-12
-    away = np.arccos(np.clip(dome_points(disc, 1.0, 0.0) @ centre, -1, 1))
+    away = np.arccos(np.clip(DOME.directions(disc) @ centre, -1, 1))
     inside = np.mean(away < focus.radius_rad)
     cap = 1 - np.cos(focus.radius_rad)  # its share of the half sphere
     assert inside > 1.2 * cap
@@ -145,14 +148,89 @@ def test_a_focus_turned_about_the_axis_turns_the_chart():
     assert np.abs(turned - chart_of(Focus(0.6, 0.3, turn_rad=0.2)).disc(at) * np.exp(1.1j)).max() < 1e-14
 
 
-def test_disc_points_undo_dome_points():
-    disc = chart_of(FOCI[2]).disc(square_points())
-    points = dome_points(disc, 19.0, 3.0)
-    assert np.abs(np.linalg.norm(points, axis=1) - 19).max() < ROUNDING_MM
-    assert points[:, 2].min() > 3
-    assert np.abs(disc_points(points, 19.0, 3.0) - disc).max() < 1e-12
-    rim = dome_points(np.exp(1j * np.linspace(0, 6, 20)), 19.0, 3.0)
-    assert np.abs(rim[:, 2] - 3).max() < ROUNDING_MM
+SKINS = {
+    "dome": SkinSpec(),
+    "shallow cap": SkinSpec(outer_radius_mm=40.0, rim_z_mm=35.0),
+    "more than a hemisphere": SkinSpec(outer_radius_mm=12.0, rim_z_mm=-4.0),
+    "round pad": SkinSpec(shape="round-pad", outer_radius_mm=15.0),
+    "round pad with a rounded edge": SkinSpec(shape="round-pad", outer_radius_mm=15.0, rim_z_mm=-3.0),
+    "rectangular pad": SkinSpec(shape="rectangular-pad", width_mm=40.0, height_mm=26.0, thickness_mm=1.5),
+    "rectangular pad with a rounded edge": SkinSpec(shape="rectangular-pad", width_mm=40.0, height_mm=26.0, rim_z_mm=-4.0),
+}
+DOME = shape_of(SkinSpec())
+
+
+@pytest.fixture(params=SKINS.values(), ids=SKINS)
+def shape(request):
+    return shape_of(request.param)
+
+
+def places_of(shape):
+    return shape.chart(FOCI[2]).disc(square_points() * 0.999)
+
+
+def test_the_place_of_a_point_undoes_the_point_of_a_place(shape):
+    place = places_of(shape)
+    assert np.abs(shape.place(shape.inside(place)) - place).max() < 1e-9
+    assert np.abs(shape.of_disc(shape.disc(place)) - place).max() < 1e-9
+
+
+def test_the_rim_lies_in_its_plane_and_all_else_in_front_of_it(shape):
+    rim, within = shape.rim(200), places_of(shape)
+    assert shape.rim_share(rim) == pytest.approx(1) and shape.rim_share(within).max() < 1
+    assert np.abs(shape.outside(rim)[:, 2] - shape.skin.rim_z_mm).max() < ROUNDING_MM
+    assert shape.outside(within)[:, 2].min() >= shape.skin.rim_z_mm - ROUNDING_MM
+    assert shape.outside(np.zeros(1, complex))[0] == pytest.approx([0, 0, shape.skin.apex_mm])
+    reach = np.abs(shape.outside(np.concatenate([rim, within])))[:, :2].max(axis=0)
+    assert reach == pytest.approx(shape.skin.half_size_mm, rel=0.01) or shape.skin.rim_z_mm < 0
+
+
+def test_the_inside_lies_a_thickness_beneath_the_outside(shape):
+    place = places_of(shape)
+    flat = shape.rim_share(place) < 0.1
+    apart = np.linalg.norm(shape.outside(place) - shape.inside(place), axis=1)
+    thickness = shape.skin.thickness_mm
+    assert apart[flat] == pytest.approx(thickness, rel=0.02) and thickness * 0.99 < apart.min() and apart.max() < 2 * thickness
+
+
+def test_the_normals_are_square_to_the_inside(shape):
+    place = places_of(shape)
+    normal = shape.normals(shape.inside(place))
+    assert np.linalg.norm(normal, axis=1) == pytest.approx(1) and (normal[shape.rim_share(place) < 0.5, 2] > 0).all()
+    for step in (1e-6, 1e-6j):
+        along = shape.inside(place + step) - shape.inside(place - step)
+        assert np.abs(np.sum(normal * along, axis=1) / np.linalg.norm(along, axis=1)).max() < 1e-3
+
+
+def test_a_point_lifted_off_the_outside_comes_back_to_it(shape):
+    place = places_of(shape)
+    outside = shape.outside(place)
+    assert np.abs(shape.on_outside(outside) - outside).max() < 1e-6
+    lifted = shape.on_outside(outside + 0.05 * np.random.default_rng(0).standard_normal(outside.shape))
+    assert np.abs(shape.on_outside(lifted) - lifted).max() < 1e-6  # it lies on it
+
+
+def test_even_places_cover_the_outside_evenly(shape):
+    outside = shape.outside(shape.even(2000))
+    neighbour = cKDTree(outside).query(outside, k=2)[0][:, 1]
+    assert neighbour.max() < 2.5 * np.median(neighbour)
+    turned = shape.even(2000, turn_rad=0.3)
+    assert len(turned) == len(outside) and shape.rim_share(turned).max() <= 1
+
+
+def test_directions_of_a_dome_are_those_of_its_points_and_of_others_cover_a_hemisphere(shape):
+    assert DOME.directions(places_of(DOME)) == pytest.approx(DOME.outside(places_of(DOME)) / 20)
+    rim = shape.directions(shape.rim(100))
+    assert rim[:, 2] == pytest.approx(np.cos(shape.largest_rad), abs=1e-12) and shape.largest_rad >= np.pi / 2
+
+
+@pytest.mark.parametrize("focus", FOCI)
+def test_the_chart_of_a_rectangle_keeps_its_sides_and_has_an_inverse(focus):
+    chart, at = shape_of(SKINS["rectangular pad"]).chart(focus), square_points()
+    assert np.abs(chart.square(chart.disc(at)) - at).max() < 1e-9
+    for side in (np.column_stack([np.ones(20), np.linspace(-1, 1, 20)]), np.column_stack([np.linspace(-1, 1, 20), -np.ones(20)])):
+        fixed = 0 if side[0, 0] == side[1, 0] else 1
+        assert chart.square(chart.disc(side))[:, fixed] == pytest.approx(side[:, fixed])
 
 
 # --- the solid

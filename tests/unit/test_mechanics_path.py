@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from block import Watched, last, rotation, usual_sensor
 
+from scenes.body import MaterialSpec
 from scenes.load import load_object
 from scenes.object import ObjectSpec
-from scenes.sensor import MaterialSpec
 from twin.errors import ContactError
 from twin.geometry.solid import Resolution
 from twin.mechanics import ContactPath, ContactPose, Friction, SkinSolver
@@ -300,7 +300,7 @@ def test_a_nonsense_pose_is_refused(solver, pose_, wanted):
 def test_a_path_that_starts_inside_the_skin_or_goes_too_deep_is_refused(solver):
     with pytest.raises(ContactError, match="starts 0.99 mm inside the skin"):
         solver.press(load_object("plane"), through(pose(height=-1), pose(height=-2)))
-    with pytest.raises(ContactError, match="the path goes 1[0-4].. mm into the dome"):
+    with pytest.raises(ContactError, match="the path goes 1[0-4].. mm into the skin"):
         solver.press(load_object("plane"), through(pose(), pose(height=-14)))
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from block import Watched, build_block, forces, material, soft_sensor, usual_sensor
 
+from scenes.body import RelaxationTerm
 from scenes.load import load_object
-from scenes.sensor import RelaxationTerm
 from twin.geometry.solid import Resolution
 from twin.mechanics import ContactPath
 from twin.mechanics.elements import Elements

@@ -8,7 +8,8 @@ about 18 % of all 8-bit colours can be the result.
 import cv2
 import numpy as np
 
-from scenes.sensor import CameraSpec, CaptureSpec, GelSpec, RecordingSpec, ResponseSpec
+from scenes.body import GelSpec
+from scenes.sensor import CameraSpec, CaptureSpec, RecordingSpec, ResponseSpec
 from twin.errors import FrameError
 from twin.types import BoolArray, FloatArray, ImageArray, IntArray
 

@@ -16,8 +16,9 @@ or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 
 `lens_disc` gives the part of the raw frame that shows the gel: the housing's aperture.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from scenes.sensor import CameraSpec, HousingSpec, ViewSpec
@@ -148,7 +149,7 @@ class Disc:
     center_px : (2,) float
     radius_px : float
     inside : (H, W) bool
-        Pixels whose centre lies in the disc.
+        Pixels whose centre lies in the disc, or in a rectangular opening.
     """
 
     center_px: np.ndarray
@@ -168,13 +169,23 @@ def round_disc(size_px: tuple[int, int], center_px: np.ndarray, radius_px: float
 
 
 def lens_disc(view: ViewSpec, housing: HousingSpec) -> Disc:
-    """The housing's aperture as the camera sees it: centre and mean radius of its projected rim."""
+    """The housing's aperture as the camera sees it: centre and mean radius of its projected rim, and the pixels within it."""
     turn = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
-    rim = np.column_stack([housing.aperture_radius_mm * np.cos(turn), housing.aperture_radius_mm * np.sin(turn), np.zeros(CORNERS)])
+    out = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(CORNERS)])
+    if housing.aperture_mm is None:
+        rim = housing.aperture_radius_mm * out
+    else:
+        half = np.array(housing.aperture_mm) / 2
+        rim = out / np.abs(out[:, :2] / half).max(axis=1, keepdims=True)
     rim_px = project(view, rim + [*housing.center_mm, housing.z_mm])
     center = rim_px.mean(axis=0)
     radius = float(np.linalg.norm(rim_px - center, axis=1).mean())
-    return round_disc((view.camera.width_px, view.camera.height_px), center, radius)
+    disc = round_disc((view.camera.width_px, view.camera.height_px), center, radius)
+    if housing.aperture_mm is None:
+        return disc
+    inside = np.zeros(disc.inside.shape, np.uint8)
+    cv2.fillConvexPoly(inside, np.round(rim_px).astype(np.int32), 1)
+    return replace(disc, inside=inside.astype(bool))
 
 
 def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:

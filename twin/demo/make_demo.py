@@ -112,7 +112,7 @@ def _contact_content(simulator: Simulator, result: ContactResult, skin: Path, pi
     spec = simulator.spec
     written = contact_pictures(pictures, result)
     touched = result.state.contact_mm
-    contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.outer_radius_mm])
+    contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.apex_mm])
     contact_px = from_raw(spec.recording, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
     height, width = result.raw.frame.image.shape[:2]
     return ContactContent(

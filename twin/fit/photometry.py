@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from scenes.sensor import BlobSpec, GelSpec, ResponseSpec, SensorSpec
+from scenes.body import GelSpec
+from scenes.sensor import BlobSpec, ResponseSpec, SensorSpec
 from twin.camera.capture import blurred
 from twin.judge.pictures.aligned import SATURATED, Aligned, levels_slope, require_cameras_own, revised, to_levels, to_light
 from twin.judge.pictures.spots import clear_of_pins, pin_spacing_px

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from scenes.sensor import GelSpec, HousingSpec, SensorSpec
+from scenes.body import GelSpec
+from scenes.sensor import HousingSpec, SensorSpec
 from twin.camera.capture import hazed, vignetted
 from twin.camera.projection import lens_disc, round_disc
 from twin.errors import FrameError

@@ -1,7 +1,7 @@
 """The sensor's body as hexahedra, for views, files and the renderer. The mesh is the same for every contact.
 
-A square grid is bent over the dome (``chart``). At each of its points a straight column of nodes runs through the skin and the gel to
-the lens. The mechanics are computed with the spline solid (``solid``); `NodeView` gives the nodes' places from it.
+A square grid is bent over the skin (``chart``, ``shapes``). At each of its points a straight column of nodes runs through the skin and
+the gel to the lens. The mechanics are computed with the spline solid (``solid``); `NodeView` gives the nodes' places from it.
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,8 @@ import numpy as np
 import pyvista as pv
 
 from scenes.sensor import GeometrySpec
-from twin.geometry.chart import Chart, Focus
+from twin.geometry.chart import Focus
+from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Solid, body_points, surface_operators
 from twin.types import ComplexArray, FloatArray, IntArray
 
@@ -39,7 +40,7 @@ class SensorMesh:
     Attributes
     ----------
     nodes_mm : (n, 3) float
-        Outer and inner surface nodes lie exactly on their spheres.
+        Outer and inner surface nodes lie exactly on the skin's surfaces.
     hexes : (m, 8) int
         VTK order, positive volumes.
     material : (m,) int
@@ -67,8 +68,8 @@ def build_mesh(geometry: GeometrySpec) -> SensorMesh:
     """Mesh a sensor at rest: 21x21 columns, one layer of skin, four of gel."""
     side, layers = _ACROSS, _SKIN_LAYERS + _GEL_LAYERS
     v, u = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side), indexing="ij")
-    largest = float(np.arccos(geometry.skin.rim_z_mm / (geometry.skin.outer_radius_mm - geometry.skin.thickness_mm)))
-    disc = Chart(Focus(radius_rad=_FOCUS_SHARE * largest), largest).disc(np.stack([u.ravel(), v.ravel()], axis=1))
+    shape = shape_of(geometry.skin)
+    disc = shape.chart(Focus(radius_rad=_FOCUS_SHARE * shape.largest_rad)).disc(np.stack([u.ravel(), v.ravel()], axis=1))
     depths = np.concatenate([np.linspace(0, 1, _SKIN_LAYERS + 1), 1 + np.linspace(0, 1, _GEL_LAYERS + 1)[1:]])
     grid = (layers + 1, side, side)
     index = np.arange(np.prod(grid)).reshape(grid)

@@ -11,6 +11,7 @@ from scipy.spatial import Delaunay, cKDTree
 
 from scenes.pins import PinsSpec
 from scenes.sensor import GeometrySpec
+from twin.geometry.shapes import shape_of
 from twin.types import FloatArray, IntArray
 
 LEAST_BORDER = 3
@@ -163,12 +164,7 @@ def border_of(places: FloatArray) -> IntArray:
 
 
 def rest_pins(geometry: GeometrySpec) -> PinRest:
-    """Pins at rest of a sensor: the layout wrapped onto the inside of the dome as ``PinsSpec.spacing`` says."""
-    pins, skin = geometry.pins, geometry.skin
-    place = pin_lattice(pins).places @ [1, 1j]
-    largest = np.radians(pins.max_polar_deg)
-    polar = largest * np.abs(place) if pins.spacing == "polar" else np.arcsin(np.sin(largest) * np.abs(place))
-    azimuth = np.angle(place) + np.radians(pins.phase_deg)
-    outward = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=1)
-    base = (skin.outer_radius_mm - skin.thickness_mm) * outward
+    """Pins at rest of a sensor: the layout on the inside of its skin, as the skin's shape and ``PinsSpec.spacing`` say."""
+    pins = geometry.pins
+    base, outward = shape_of(geometry.skin).pins(pin_lattice(pins).places, pins)
     return PinRest(base, -outward, base - (pins.length_mm + pins.cap_height_mm / 2) * outward)

@@ -1,6 +1,6 @@
 """The sensor's body as a spline solid, with which the mechanics are computed.
 
-A square grid of columns is bent over the dome (``chart``). Each column runs through the skin and the gel to the lens. Shape and
+A square grid of columns is bent over the skin (``chart``, ``shapes``). Each column runs through the skin and the gel to the lens. Shape and
 displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell & Bazilevs 2005): quadratic and C1 over the dome,
 linear through the skin, quadratic through the gel. Because a skin bent by contact is smooth, splines need fewer unknowns than trilinear
 elements. The displacement inside the gel is even smoother: below the gel's surface its grid has half as many lines as the skin's, and is
@@ -14,8 +14,9 @@ import numpy as np
 
 from scenes.sensor import GeometrySpec
 from twin.geometry.bspline import Basis
-from twin.geometry.chart import Chart, Focus, disc_points, dome_points
+from twin.geometry.chart import Chart, Focus, RectangleChart
 from twin.geometry.pins import rest_pins
+from twin.geometry.shapes import shape_of
 from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _GEL_GRADING = 1.5
@@ -79,7 +80,7 @@ class Solid:
         and whose inner side has the coarse one; the other elements of the gel.
     boxes : tuple of (m, 4) int
         For each kind of cells: first and last row, first and last column (last: exclusive) on the skin's grid.
-    chart : Chart
+    chart : Chart or RectangleChart
     basis, coarse, through : Basis
         Splines along the square's sides in the skin and in the gel, and through the gel (depth 1 at the skin, 2 at the lens).
     inner : slice
@@ -98,7 +99,7 @@ class Solid:
     gel_top: Cells
     gel_deep: Cells
     boxes: tuple[IntArray, IntArray, IntArray]
-    chart: Chart
+    chart: Chart | RectangleChart
     basis: Basis
     coarse: Basis
     through: Basis
@@ -120,9 +121,9 @@ class Solid:
 def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None, focus: Focus | None = None) -> Solid:
     """Build the body of a sensor. Its grid is fine around a focus (default: around the apex)."""
     resolution, focus = resolution or Resolution(), focus or Focus()
-    inner_mm = geometry.skin.outer_radius_mm - geometry.skin.thickness_mm
+    shape = shape_of(geometry.skin)
     basis = Basis(np.linspace(-1, 1, resolution.across + 1))
-    chart = Chart(focus, float(np.arccos(geometry.skin.rim_z_mm / inner_mm)))
+    chart = shape.chart(focus)
     coarse = Basis(basis.breaks[::2])
     through = Basis(1 + np.linspace(0, 1, resolution.gel_layers + 1) ** _GEL_GRADING)
     layers, side, coarse_side = resolution.skin_layers, basis.count, coarse.count
@@ -142,7 +143,7 @@ def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None,
     top = [(index[-1], basis, _local(through, 0, 0))] + [(below[d - 1], coarse, _local(through, 0, d)) for d in (1, 2)]
     deep_parts = [[(below[e + d - 1], coarse, _local(through, e, d)) for d in range(3)] for e in range(1, resolution.gel_layers)]
     pins = rest_pins(geometry)
-    value, slope_u, slope_v = surface_operators(basis, chart.square(disc_points(pins.base_mm, inner_mm, geometry.skin.rim_z_mm)))
+    value, slope_u, slope_v = surface_operators(basis, chart.square(shape.place(pins.base_mm)))
     return Solid(
         control_mm=control,
         fixed=np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
@@ -206,18 +207,10 @@ def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
 
 def body_points(geometry: GeometrySpec, disc: ComplexArray, depth: float) -> FloatArray:
     """Places (k, 3) of the body at rest: depth 0 is the skin's outside, 1 its inside, 2 the lens, with straight lines between them."""
-    skin = geometry.skin
-    inner_mm = skin.outer_radius_mm - skin.thickness_mm
-    inner = dome_points(disc, inner_mm, skin.rim_z_mm)
-    if depth <= 1:
-        outer = dome_points(disc, skin.outer_radius_mm, skin.rim_z_mm)
-        return outer + depth * (inner - outer)
-    flat = np.sqrt(inner_mm**2 - skin.rim_z_mm**2) * disc
-    lens = np.column_stack([flat.real, flat.imag, np.full(len(disc), geometry.lens.z_mm)])
-    return inner + (depth - 1) * (lens - inner)
+    return shape_of(geometry.skin).body(disc, depth, geometry.lens.z_mm)
 
 
-def _fit(basis: Basis, chart: Chart, geometry: GeometrySpec, depth: float) -> FloatArray:
+def _fit(basis: Basis, chart: Chart | RectangleChart, geometry: GeometrySpec, depth: float) -> FloatArray:
     """Controls (side^2, 3) of the spline surface through the body's places at one depth."""
     v, u = np.meshgrid(basis.greville, basis.greville, indexing="ij")
     places = body_points(geometry, chart.disc(np.column_stack([u.ravel(), v.ravel()])), depth)

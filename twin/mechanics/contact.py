@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.compiled import compiled
+from twin.geometry.shapes import SkinShape
 from twin.geometry.solid import Solid
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
@@ -33,7 +34,7 @@ POINTS_PER_ELEMENT = 4
 class ContactPoints:
     """Where the outer skin is tested for contact: 4x4 even points of each outer element.
 
-    A point lies on the true sphere at rest: it is its place on the spline surface plus a fixed ``lift_mm``.
+    A point lies on the true outside at rest: it is its place on the spline surface plus a fixed ``lift_mm``.
 
     Attributes
     ----------
@@ -56,8 +57,8 @@ class ContactPoints:
         return positions(self.controls, self.weights, self.lift_mm, control_mm)
 
 
-def contact_points(solid: Solid, radius_mm: float) -> ContactPoints:
-    """Contact points of a solid whose outer surface is a sphere of a radius."""
+def contact_points(solid: Solid, shape: SkinShape) -> ContactPoints:
+    """Contact points of the solid of a skin of a shape."""
     basis = solid.basis
     count = basis.elements * POINTS_PER_ELEMENT
     step = (basis.breaks[-1] - basis.breaks[0]) / count
@@ -76,7 +77,7 @@ def contact_points(solid: Solid, radius_mm: float) -> ContactPoints:
     return ContactPoints(
         controls=solid.skin.controls[element, :9],
         weights=np.einsum("ri,cj->rcij", local, local).reshape(-1, 9),
-        lift_mm=flat * (radius_mm / np.linalg.norm(flat, axis=1, keepdims=True) - 1),
+        lift_mm=shape.on_outside(flat) - flat,
         area_mm2=np.linalg.norm(growth, axis=1) * step**2,
         element=element,
     )

@@ -8,7 +8,7 @@ from scenes.object import ObjectSpec
 from twin.errors import ContactError
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.ongoing import OngoingContact
-from twin.mechanics.path import ContactPath, carried, deepest_mm, dome_directions
+from twin.mechanics.path import ContactPath, carried, deepest_mm
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
 from twin.types import ContactState
@@ -16,9 +16,9 @@ from twin.types import ContactState
 STEP_MM = 1.2  # largest motion across the contact in one load step
 FINE_STEP_MM = 0.6  # the same beside wires: a longer step carries skin past a wire's middle, where it then hooks
 LARGEST_MOVE_MM = 30.0  # largest motion between two poses in contact; beyond it the way between them is unknown
-SETTLED_MM = 0.005  # most that the dome still has to move where the arm has given way: 0.02 px in the shipped cameras
+SETTLED_MM = 0.005  # most that the object still has to move where the arm has given way: 0.02 px in the shipped cameras
 _MOST_SETTLING = 8  # load steps until an arm that gives way stands; one or two are usual
-_DIRECTIONS = 2000  # directions on the whole sphere, in which the object is looked for
+_PLACES = 2000  # places on a whole sphere, at which the object is looked for
 _BACK_MM = 1.0  # stride of the search for a free pose
 _WHERE = "following the object"  # what an error names
 
@@ -27,7 +27,7 @@ class Follower:
     """Follows one object with one sensor.
 
     A contact begins where the object comes to press the skin. It goes on, with all that friction remembers, until the object has
-    left the undeformed dome. A contact that cannot be carried on is begun anew from the object's retreat along the sensor's axis
+    left the undeformed skin. A contact that cannot be carried on is begun anew from the object's retreat along the sensor's axis
     (``restarts`` counts these).
 
     Poses are those commanded. Where the law lets the arm give way, each move ends where force and giving way balance.
@@ -45,8 +45,7 @@ class Follower:
     def __init__(self, solver: SkinSolver, touched: ObjectSpec, law: ContactLaw, *, step_mm: float | None = None) -> None:
         self._solver, self._law, self._step_mm = solver, law, step_mm or _step_of(touched)
         self._field = build_field(touched)
-        self._radius_mm = solver.spec.skin.outer_radius_mm
-        self._dome_mm = self._radius_mm * dome_directions(solver.spec.skin, _DIRECTIONS)
+        self._skin_mm = solver.shape.outside(solver.shape.even(_PLACES))
         self._rest = solver.rest()
         self._contact: OngoingContact | None = None
         self._T: np.ndarray | None = None
@@ -78,30 +77,30 @@ class Follower:
         """Press once, shallowly, and forget it: compiled code is loaded, so that a first contact takes no longer than others."""
         T = np.eye(4)
         for depth_mm in (-_BACK_MM, _BACK_MM / 2):
-            T[2, 3] = self._radius_mm - depth_mm
+            T[2, 3] = self._solver.spec.skin.apex_mm - depth_mm
             self.move(T, self._time_s)
         self._contact = self._T = None
 
     def gap_mm(self, T: np.ndarray) -> float:
-        """Smallest distance of the object at ``T`` to the undeformed dome, negative inside."""
+        """Smallest distance of the object at ``T`` to the undeformed skin, negative inside."""
         return self.nearest(T)[0]
 
     def nearest(self, T: np.ndarray) -> tuple[float, np.ndarray]:
-        """Smallest distance of the object at ``T`` to the undeformed dome (negative inside), and the dome's place (3,) of it."""
+        """Smallest distance of the object at ``T`` to the undeformed skin (negative inside), and the skin's place (3,) of it."""
         gaps = self._gaps(T)
         place = int(gaps.argmin())
-        return float(gaps[place]), self._dome_mm[place]
+        return float(gaps[place]), self._skin_mm[place]
 
     def pressed_mm(self, T: np.ndarray) -> np.ndarray:
-        """Places (k, 3) of the undeformed dome that lie inside the object at ``T``."""
-        return self._dome_mm[self._gaps(T) < 0]
+        """Places (k, 3) of the undeformed skin that lie inside the object at ``T``."""
+        return self._skin_mm[self._gaps(T) < 0]
 
     @property
     def _relaxes(self) -> bool:
         return bool(self._solver.spec.skin.relaxation or self._solver.spec.gel.relaxation)
 
     def _gaps(self, T: np.ndarray) -> np.ndarray:
-        return self._field.distance((self._dome_mm - T[:3, 3]) @ T[:3, :3])
+        return self._field.distance((self._skin_mm - T[:3, 3]) @ T[:3, :3])
 
     def _free(self, T: np.ndarray) -> ContactState:
         rest = self._rest
@@ -110,9 +109,9 @@ class Follower:
     def _press(self, T: np.ndarray, time_s: float) -> None:
         limit = deepest_mm(self._solver.spec.geometry)
         if (deep := -self.gap_mm(T)) > limit:
-            raise ContactError(f"the object is {deep:.1f} mm inside the dome, more than {limit:.1f} (half the gel's depth); move away")
+            raise ContactError(f"the object is {deep:.1f} mm inside the skin, more than {limit:.1f} (half the gel's depth); move away")
         last = self._T
-        near = last is not None and np.linalg.norm(carried(self._dome_mm, last, T), axis=1).max() < LARGEST_MOVE_MM
+        near = last is not None and np.linalg.norm(carried(self._skin_mm, last, T), axis=1).max() < LARGEST_MOVE_MM
         if last is not None and near and (self._contact is not None or self.gap_mm(last) >= 0):
             try:
                 self._go(last, T, self._time_s, time_s)
@@ -125,18 +124,18 @@ class Follower:
     def _retreat(self, T: np.ndarray) -> np.ndarray:
         """The object moved away along the sensor's axis until it is free."""
         free = T.copy()
-        for _ in range(int(4 * self._radius_mm / _BACK_MM)):
+        for _ in range(int(4 * max(self._solver.spec.skin.half_size_mm) / _BACK_MM)):
             free[2, 3] += _BACK_MM
             if self.gap_mm(free) > 0:
                 return free
-        raise ContactError("the object reaches around the dome: no way out along the sensor's axis; move away sideways")
+        raise ContactError("the object reaches around the skin: no way out along the sensor's axis; move away sideways")
 
     def _go(self, start: np.ndarray, stop: np.ndarray, start_s: float, stop_s: float) -> None:
         way = ContactPath(np.stack([start, stop]), np.array([start_s, max(stop_s, start_s + 1e-3)]))
         pressed = self._gaps(stop) < 0
         if self._contact is None:
             self._contact = self._solver.begin(self._field, self._law, start, focus=self._solver.focus(self._field, way))
-        moved = np.linalg.norm(carried(self._dome_mm[pressed], start, stop), axis=1).max()
+        moved = np.linalg.norm(carried(self._skin_mm[pressed], start, stop), axis=1).max()
         count = max(1, int(np.ceil(moved / self._step_mm)))
 
         def pose_at(progress: float) -> np.ndarray:
@@ -151,7 +150,7 @@ class Follower:
         """Take the pose that the last force gives, until that force no longer changes it; ``T`` (4, 4) is the commanded pose."""
         for _ in range(_MOST_SETTLING):
             there = self._law.pose(T, self._state.force_n)
-            if np.linalg.norm(carried(self._dome_mm, contact.load.T, there), axis=1).max() <= SETTLED_MM:
+            if np.linalg.norm(carried(self._skin_mm, contact.load.T, there), axis=1).max() <= SETTLED_MM:
                 return
             way = ContactPath(np.stack([contact.load.T, there]))
             for _, state in contact.advance(way.at, 0.0, 1.0, lambda progress: 0.0, _WHERE):

@@ -11,7 +11,7 @@ modulus kappa.
 
 import numpy as np
 
-from scenes.sensor import MaterialSpec
+from scenes.body import MaterialSpec
 from twin.compiled import compiled
 from twin.types import FloatArray
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.sensor import RelaxationTerm
+from scenes.body import RelaxationTerm
 from twin.errors import ContactError
 from twin.geometry.mesh import NodeView
 from twin.geometry.solid import Solid, pin_pose

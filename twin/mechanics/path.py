@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.sensor import GeometrySpec, SkinSpec
+from scenes.sensor import GeometrySpec
 from twin.errors import ContactError
+from twin.geometry.shapes import shape_of
 from twin.objects import ObjectField
 from twin.types import FloatArray
 
@@ -16,8 +17,8 @@ _LARGEST_TWIST_DEG = 90.0
 """Largest twist of a contact pose: a quarter turn."""
 _TOUCH_TOLERANCE_MM = 1e-6
 """The object is at first touch when its distance to the dome is at most this."""
-_DOME_POINTS = 20_000
-"""Points on the whole sphere at which the distance of the object is looked for: 0.5 mm apart on a dome of 20 mm."""
+_SKIN_POINTS = 20_000
+"""Points on a whole sphere at which the distance of the object is looked for: 0.5 mm apart on a dome of 20 mm."""
 _NEAR_POINTS = 2000
 """Points around the nearest of them, 30 times finer, for the second search."""
 _START_MM = 60.0
@@ -119,7 +120,7 @@ def carried(points_mm: FloatArray, start: FloatArray, stop: FloatArray) -> Float
 
 def deepest_mm(geometry: GeometrySpec) -> float:
     """Half the gel's depth: no contact goes deeper."""
-    return 0.5 * (geometry.skin.outer_radius_mm - geometry.skin.thickness_mm - geometry.lens.z_mm)
+    return 0.5 * (geometry.skin.apex_mm - geometry.skin.thickness_mm - geometry.lens.z_mm)
 
 
 def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> ContactPath:
@@ -132,26 +133,23 @@ def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> 
     Raises
     ------
     ContactError
-        If a value is out of range, or the object misses the dome or starts inside it.
+        If a value is out of range, or the object misses the skin or starts inside it.
     """
     _check(geometry, pose)
     rx, ry = np.radians(pose.tilt_deg)
     turn_x = np.array([[1, 0, 0], [0, np.cos(rx), -np.sin(rx)], [0, np.sin(rx), np.cos(rx)]])
     turn_y = np.array([[np.cos(ry), 0, np.sin(ry)], [0, 1, 0], [-np.sin(ry), 0, np.cos(ry)]])
-    skin = geometry.skin
-    radius = skin.outer_radius_mm
+    skin, shape = geometry.skin, shape_of(geometry.skin)
     T = np.eye(4)
     T[:3, :3] = turn_y @ turn_x
-    T[:3, 3] = [*pose.offset_mm, radius]
-    lowest_z = skin.rim_z_mm / radius
-    directions = dome_directions(skin, _DOME_POINTS)
-    height, nearest = _bring_down(field, T, radius * directions, _START_MM, radius - skin.rim_z_mm)
+    T[:3, 3] = [*pose.offset_mm, skin.apex_mm]
+    size_mm = max(skin.half_size_mm)
+    places = shape.even(_SKIN_POINTS)
+    height, nearest = _bring_down(field, T, shape.outside(places), _START_MM, size_mm)
     # around the nearest point the sampling is refined 30 times
-    spread = 3 / np.sqrt(_DOME_POINTS)
-    near = directions[nearest] + spread * _sphere_points(_NEAR_POINTS)
-    near /= np.linalg.norm(near, axis=1, keepdims=True)
-    near = near[near[:, 2] >= lowest_z]
-    height, _ = _bring_down(field, T, radius * near, height + spread * radius, radius - skin.rim_z_mm)
+    spread = 3 / np.sqrt(_SKIN_POINTS)
+    near = shape.outside(shape.near(complex(places[nearest]), spread, _NEAR_POINTS))
+    height, _ = _bring_down(field, T, near, height + spread * size_mm, size_mm)
     T[2, 3] += height
     pressed = T.copy()
     pressed[2, 3] -= max(pose.indent_mm, 0.0)
@@ -165,23 +163,17 @@ def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> 
     return ContactPath(np.stack(poses))
 
 
-def dome_directions(skin: SkinSpec, count: int) -> FloatArray:
-    """(k, 3) unit vectors evenly over the dome, about ``count`` on the whole sphere."""
-    directions = _sphere_points(count)
-    return directions[directions[:, 2] >= skin.rim_z_mm / skin.outer_radius_mm]
-
-
 def _check(geometry: GeometrySpec, pose: ContactPose) -> None:
     values = np.concatenate([[pose.indent_mm, pose.twist_deg], pose.tilt_deg, pose.shear_mm, pose.offset_mm])
     if values.shape != (8,) or not np.isfinite(values).all():
         raise ContactError(f"a contact pose needs finite numbers, got {values}; give numbers in mm and deg")
-    radius = geometry.skin.outer_radius_mm
+    size = max(geometry.skin.half_size_mm)
     limits = [
         ("indent_mm", pose.indent_mm, deepest_mm(geometry), "half the gel's depth"),
         ("tilt_deg", max(map(abs, pose.tilt_deg)), _LARGEST_TILT_DEG, "the dome's reach"),
-        ("shear_mm", float(np.hypot(*pose.shear_mm)), radius / 2, "half the dome's radius"),
+        ("shear_mm", float(np.hypot(*pose.shear_mm)), size / 2, "half the skin's radius"),
         ("twist_deg", abs(pose.twist_deg), _LARGEST_TWIST_DEG, "a quarter turn"),
-        ("offset_mm", max(map(abs, pose.offset_mm)), 50 * radius, "fifty radii"),
+        ("offset_mm", max(map(abs, pose.offset_mm)), 50 * size, "fifty radii"),
     ]
     for name, value, limit, reason in limits:
         if value > limit:
@@ -206,7 +198,7 @@ def _bring_down(field: ObjectField, T: FloatArray, points_mm: FloatArray, height
             height_mm = (height_mm + free_mm) / 2
         if height_mm < -depth_mm:
             break
-    raise ContactError("the object misses the dome; use a smaller offset or tilt")
+    raise ContactError("the object misses the skin; use a smaller offset or tilt")
 
 
 def _sphere_points(count: int) -> FloatArray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.sensor import RelaxationTerm
+from scenes.body import RelaxationTerm
 from twin.mechanics.elements import Elements
 from twin.types import FloatArray
 

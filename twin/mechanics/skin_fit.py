@@ -21,7 +21,8 @@ from scipy import sparse
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from threadpoolctl import ThreadpoolController
 
-from scenes.sensor import GelSpec, GeometrySpec, SensorSpec, ViewSpec
+from scenes.body import GelSpec
+from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
 from twin.camera.projection import pixel_rays, project
 from twin.geometry.solid import build_solid, pin_pose, surface_operators
 from twin.mechanics.elements import PAIRS, Elements

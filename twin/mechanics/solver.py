@@ -13,6 +13,7 @@ from scenes.sensor import SensorSpec
 from twin.errors import ContactError
 from twin.geometry.chart import Focus
 from twin.geometry.mesh import NodeView, build_mesh
+from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Resolution, build_solid, pin_pose
 from twin.mechanics.balance import Body, Friction
 from twin.mechanics.contact import contact_points
@@ -21,16 +22,16 @@ from twin.mechanics.law import ContactLaw
 from twin.mechanics.material import law_coefficients
 from twin.mechanics.newton import LoadStepper
 from twin.mechanics.ongoing import OngoingContact, Setting
-from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, dome_directions, plan_path
+from twin.mechanics.path import ContactPath, ContactPose, carried, deepest_mm, plan_path
 from twin.objects import ObjectField, build_field
 from twin.types import ContactState, FloatArray
 
 _STEP_MM = 0.4
-"""Largest motion of the object, seen from any pressed place of the dome, in one load step."""
+"""Largest motion of the object, seen from any pressed place of the skin, in one load step."""
 _LOOK_MM = 2.0
 """Largest motion between two poses of the path at which the solver looks where the object will press."""
 _FOCUS_POINTS = 2000
-"""Directions on the whole sphere in which the solver looks where the object will press."""
+"""Places on a whole sphere at which the solver looks where the object will press."""
 _FOCUS_GAP_MM = 0.5
 """At a first touch a direction counts for the focus with exp(-gap / this): the object's local shape decides, not how deep it will press."""
 
@@ -62,11 +63,18 @@ class SkinSolver:
     ----------
     spec : SensorSpec
     resolution : Resolution, optional
+
+    Attributes
+    ----------
+    mesh : SensorMesh
+    shape : SkinShape
+        Where the skin is at rest.
     """
 
     def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None) -> None:
         self.spec, self.resolution = spec, resolution or Resolution()
         self.mesh = build_mesh(spec.geometry)
+        self.shape = shape_of(spec.skin)
         self._blas = ThreadpoolController()
         self._setting = lru_cache(maxsize=_KEPT_SOLIDS)(self._set_up)
 
@@ -143,7 +151,7 @@ class SkinSolver:
             return
         reached = self._reached(field, plan)
         contact = self.begin(field, law, plan.at(0.0), focus=self.focus(field, plan))
-        stops = _stops(plan, reached, self.spec.skin.outer_radius_mm, step_mm)
+        stops = _stops(plan, reached, step_mm)
         force_n: FloatArray = np.zeros(3)
 
         def pose_at(progress: float) -> FloatArray:
@@ -175,29 +183,28 @@ class SkinSolver:
             Elements(solid.gel_top, gel),
             Elements(solid.gel_deep, gel),
         )
-        points = contact_points(solid, spec.skin.outer_radius_mm)
+        points = contact_points(solid, self.shape)
         body = Body(kinds, points, ~solid.fixed, spec.gel.sealed)
         relaxation = spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation
         return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
 
     def _reached(self, field: ObjectField, plan: ContactPath) -> FloatArray:
-        """Directions (k, 3) of the dome that the object would pass through on its path; ContactError if the path makes no sense."""
-        radius = self.spec.skin.outer_radius_mm
-        directions = dome_directions(self.spec.skin, _FOCUS_POINTS)
-        deepest = np.full(len(directions), np.inf)
+        """Points (k, 3) of the skin that the object would pass through on its path; ContactError if the path makes no sense."""
+        skin_mm = self.shape.outside(self.shape.even(_FOCUS_POINTS))
+        deepest = np.full(len(skin_mm), np.inf)
         limit = deepest_mm(self.spec.geometry)
-        for at in _stops(plan, directions, radius, _LOOK_MM):
+        for at in _stops(plan, skin_mm, _LOOK_MM):
             T = plan.at(at)
-            gap = field.distance((radius * directions - T[:3, 3]) @ T[:3, :3])
+            gap = field.distance((skin_mm - T[:3, 3]) @ T[:3, :3])
             if at == 0 and gap.min() < -_START_INSIDE_MM:
                 raise ContactError(f"the object starts {-gap.min():.2f} mm inside the skin; begin the path clear of it")
             if -gap.min() > limit:
                 raise ContactError(
-                    f"the path goes {-gap.min():.1f} mm into the dome about its pose {at:.2g}, more than {limit:.1f} (half the gel's depth)"
+                    f"the path goes {-gap.min():.1f} mm into the skin about its pose {at:.2g}, more than {limit:.1f} (half the gel's depth)"
                 )
             deepest = np.minimum(deepest, gap)
         pressed = deepest < 0
-        return directions[pressed] if pressed.any() else directions[[deepest.argmin()]]
+        return skin_mm[pressed] if pressed.any() else skin_mm[[deepest.argmin()]]
 
     def focus(self, field: ObjectField, plan: ContactPath) -> Focus:
         """Where the solid is fine for a path: around the places that the object touches first.
@@ -207,15 +214,13 @@ class SkinSolver:
         the grid turn with the object. So the focus is a continuous function of the poses, it turns with the scene, and it does not
         depend on how deep the object is pressed.
         """
-        radius = self.spec.skin.outer_radius_mm
-        directions = dome_directions(self.spec.skin, _FOCUS_POINTS)
         turn = plan.poses[0][:3, :3]
-        about_z = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])  # the directions turn with the object, too
-        cosine, sine = np.cos(about_z), np.sin(about_z)
-        directions = directions @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+        about_z = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+        places = self.shape.even(_FOCUS_POINTS, turn_rad=about_z)  # they turn with the object, too
+        skin_mm, directions = self.shape.outside(places), self.shape.directions(places)
         depths, gaps = [], []
-        for at in _stops(plan, directions, radius, _LOOK_MM):
-            depth, gap = _gaps_at_touch(field, plan.at(at), radius * directions)
+        for at in _stops(plan, skin_mm, _LOOK_MM):
+            depth, gap = _gaps_at_touch(field, plan.at(at), skin_mm)
             depths.append(depth)
             gaps.append(gap)
         deepest = max(depths)
@@ -251,12 +256,12 @@ def _turn(turn: FloatArray, polar: float, azimuth: float) -> float:
     return float(np.angle((along_x - 1j * along_y) * np.exp(1j * azimuth)))
 
 
-def _stops(plan: ContactPath, directions: FloatArray, radius_mm: float, step_mm: float) -> FloatArray:
-    """Progress at regular load steps: the poses, and between them no point of the dome in these directions sees the object move farther."""
+def _stops(plan: ContactPath, points_mm: FloatArray, step_mm: float) -> FloatArray:
+    """Progress at regular load steps: the poses, and between them none of the skin's points (k, 3) sees the object move farther."""
     out = [np.zeros(1)]
     for leg in range(len(plan.poses) - 1):
         start, stop = plan.poses[leg], plan.poses[leg + 1]
-        moved = carried(radius_mm * directions, start, stop)
+        moved = carried(points_mm, start, stop)
         count = max(1, int(np.ceil(np.linalg.norm(moved, axis=1).max() / step_mm)))
         out.append(leg + np.arange(1, count + 1) / count)
     return np.concatenate(out)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scenes.sensor import GelSpec, LensSpec
+from scenes.body import GelSpec
+from scenes.sensor import LensSpec
 from twin.compiled import compiled
 from twin.optics.lights import Patch
 from twin.optics.window import NEWTON_STEPS, fresnel

@@ -18,6 +18,7 @@ from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
 from twin.camera.projection import project, sensor_to_camera
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
+from twin.geometry.shapes import shape_of
 from twin.optics.direct_light import DirectLight
 from twin.optics.lens import ray_table
 from twin.optics.lights import lights
@@ -36,7 +37,7 @@ Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 SKIN, STEM, SIDE, FACE = range(4)
 """Indices of the materials: the skin, and a pin's stem, cap side and cap face."""
 BELT_STEP_RAD = np.radians(8.0)
-"""Largest step of polar angle between circles of corners of the skin, from the outermost pins to the rim."""
+"""Largest step of direction (`twin.geometry.shapes`) between circles of corners of the skin, from the outermost pins to the rim."""
 BELT_PLACES = 48
 """Number of corners of the skin on each of these circles."""
 DARK = 1e-3
@@ -131,7 +132,7 @@ class Preview:
         self._outlines = PinOutlines(spec.view, spec.pins, spec.appearance)
         self._belt_mm, self._faces = _belt(spec.geometry, self._rest.base_mm)
         self._belt_px = project(spec.view, self._belt_mm)
-        self._belt_light = self._light(self._belt_mm, -_unit(self._belt_mm))
+        self._belt_light = self._light(self._belt_mm, -shape_of(spec.skin).normals(self._belt_mm))
         self._mean_light = self._cap_light(self._rest.caps_mm, self._rest.axis).mean()
         look = spec.appearance
         self._albedo = (
@@ -279,16 +280,14 @@ def _fit(parts: FloatArray, target: FloatArray) -> FloatArray:
 
 def _belt(geometry: GeometrySpec, feet_mm: FloatArray) -> tuple[FloatArray, IntArray]:
     """Points (b, 3) of the skin at rest from the outermost pins to the rim, and triangles (t, 3) over the feet (N, 3) and these points."""
-    skin = geometry.skin
-    inner_mm = skin.outer_radius_mm - skin.thickness_mm
-    start, end = np.radians(geometry.pins.max_polar_deg), np.arccos(np.clip(skin.rim_z_mm / inner_mm, -1, 1))
-    steps = np.linspace(start, end, int(np.ceil((end - start) / BELT_STEP_RAD)) + 1)[1:]
-    polar, turn = (g.ravel() for g in np.meshgrid(steps, np.arange(BELT_PLACES) * 2 * np.pi / BELT_PLACES, indexing="ij"))
-    belt = inner_mm * np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
-    outward = _unit(np.concatenate([feet_mm, belt]))
-    from_axis = np.linalg.norm(outward[:, :2], axis=1, keepdims=True)
-    chart = outward[:, :2] * np.arccos(np.clip(outward[:, 2:], -1, 1)) / np.maximum(from_axis, 1e-9)
-    return belt, Delaunay(chart).simplices
+    shape = shape_of(geometry.skin)
+    feet = shape.place(feet_mm)
+    start = float(shape.rim_share(feet).max())
+    circles = max(int(np.ceil((1 - start) * shape.largest_rad / BELT_STEP_RAD)), 1)
+    shares = np.linspace(start, 1, circles + 1)[1:]
+    belt = (shares[:, None] * shape.rim(BELT_PLACES)).ravel()
+    places = np.concatenate([feet, belt])
+    return shape.inside(belt), Delaunay(np.column_stack([places.real, places.imag])).simplices
 
 
 def _transmittance(view: ViewSpec, window_px: tuple[int, int, int, int]) -> FloatArray:

@@ -56,7 +56,7 @@ def _seen(
     """Light (..., 3) and cover (...) along rays from the pupil, whose directions (..., 3) are in the sensor frame and of any length."""
     tangents = rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)
     at_ring = tangents * (ring.z_mm + view.camera.distance_mm)
-    wall = np.linalg.norm(at_ring - ring.center_mm, axis=-1) >= ring.aperture_radius_mm
+    wall = beyond_aperture(ring, at_ring) >= 0
     light = np.where(wall[..., None], housing_light(leds, ring, at_ring), reflections(view, leds, ring, tangents))
     hidden, shine = _specks(view, specks, tangents)
     light = np.where(wall[..., None], light, light + shine) + rim_light(ring, at_ring)
@@ -88,6 +88,15 @@ def rim_places(
     return turn, along
 
 
+def beyond_aperture(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
+    """Distance (...) of places (..., 2) of the housing's plane from its opening, mm; negative within it."""
+    place = at_mm - ring.center_mm
+    if ring.aperture_mm is None:
+        return np.linalg.norm(place, axis=-1) - ring.aperture_radius_mm
+    over = np.abs(place) - np.array(ring.aperture_mm) / 2
+    return np.linalg.norm(np.maximum(over, 0), axis=-1) + np.minimum(over.max(axis=-1), 0)
+
+
 def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
     """Radiance (..., 3) that the ring and wall send to the camera from places (..., 2) of their plane.
 
@@ -96,7 +105,7 @@ def housing_light(leds: LedRingSpec, ring: HousingSpec, at_mm: FloatArray) -> Fl
     """
     patches = led_patches(leds)
     place = at_mm - ring.center_mm
-    out = np.linalg.norm(place, axis=-1) - ring.aperture_radius_mm
+    out = beyond_aperture(ring, at_mm)
     full = max(p.radiance.max() for p in patches) or 1.0
     shares = [p.radiance.max() / full for p in patches]
     light = ring.ambient * np.mean(shares) * np.exp(-np.maximum(out, 0) / ring.ambient_falloff_mm)

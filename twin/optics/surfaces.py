@@ -9,13 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
-from scenes.sensor import AppearanceSpec, PinsSpec, SkinSpec
+from scenes.body import SkinSpec
+from scenes.sensor import AppearanceSpec, PinsSpec
+from twin.geometry.shapes import shape_of
 from twin.types import FloatArray, IntArray
 
-SKIN_POLAR_STEPS = 40
-"""Circles of the skin's grid between apex and rim."""
-SKIN_AZIMUTH_STEPS = 80
-"""Vertices on each circle."""
+SKIN_CIRCLES = 40
+"""Circles of the skin's grid between apex and rim (squares on a rectangular pad)."""
+SKIN_PLACES = 80
+"""Vertices on each circle; a multiple of 8, so that a rectangle's corners are among them."""
+RIM_APART_RAD = 0.02
+"""Points of the rim that are nearer to a control point than this are left out: two sites at one place have no spline."""
 STEM_SIDES = 8
 """Number of sides of a stem."""
 CAP_SIDES = 16
@@ -38,10 +42,10 @@ class Surface:
 
 
 class SkinSurface:
-    """The skin's inside as a fine grid over the dome, whose displacement is interpolated smoothly between control points.
+    """The skin's inside as a fine grid, whose displacement is interpolated smoothly between control points.
 
-    The displacement of the fine grid is the thin-plate spline (Duchon 1977) through the control points' displacements in the dome's
-    azimuthal equidistant chart. Because the control points' places at rest are fixed, it is one constant matrix.
+    The displacement of the fine grid is the thin-plate spline (Duchon 1977) through the control points' displacements over the
+    places of the skin (`twin.geometry.shapes`). Because the control points' places at rest are fixed, it is one constant matrix.
 
     Parameters
     ----------
@@ -51,23 +55,20 @@ class SkinSurface:
     """
 
     def __init__(self, skin: SkinSpec, control_mm: FloatArray) -> None:
-        inner_mm = skin.outer_radius_mm - skin.thickness_mm
-        rim_rad = np.arccos(np.clip(skin.rim_z_mm / inner_mm, -1, 1))
-        polar = np.linspace(0, rim_rad, SKIN_POLAR_STEPS + 1)[1:]
-        azimuth = np.arange(SKIN_AZIMUTH_STEPS) * 2 * np.pi / SKIN_AZIMUTH_STEPS
-        theta, phi = (a.ravel() for a in np.meshgrid(polar, azimuth, indexing="ij"))
-        apex = np.array([[0.0, 0.0, 1.0]])
-        outward = np.concatenate([apex, np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)])
-        self.rest_mm = inner_mm * outward
-        self.faces = _fan_grid(SKIN_POLAR_STEPS, SKIN_AZIMUTH_STEPS)
+        shape = shape_of(skin)
+        shares = np.linspace(0, 1, SKIN_CIRCLES + 1)[1:]
+        places = np.concatenate([[0j], (shares[:, None] * shape.rim(SKIN_PLACES)).ravel()])
+        self.rest_mm = shape.inside(places)
+        self.faces = _fan_grid(SKIN_CIRCLES, SKIN_PLACES)
         # The rim is clamped: fixed points on it keep the spline at rest there, because the rim has no control points.
         self._keep = np.unique(np.linspace(0, len(control_mm) - 1, min(len(control_mm), MOST_CONTROL_POINTS)).astype(int))
-        chart = _chart(control_mm[self._keep])
-        rim_chart = _chart(self.rest_mm[-SKIN_AZIMUTH_STEPS::4])
-        apart = np.min(np.linalg.norm(rim_chart[:, None] - chart[None], axis=2), axis=1) > 0.02
+        chart, grid = (shape.largest_rad * place for place in (shape.place(control_mm[self._keep]), places))
+        chart, grid = (np.column_stack([place.real, place.imag]) for place in (chart, grid))
+        rim_chart = grid[-SKIN_PLACES::4]
+        apart = np.min(np.linalg.norm(rim_chart[:, None] - chart[None], axis=2), axis=1) > RIM_APART_RAD
         sites = np.concatenate([chart, rim_chart[apart]])
         unit = np.eye(len(sites))[:, : len(chart)]
-        self._weights = RBFInterpolator(sites, unit, kernel="thin_plate_spline")(_chart(self.rest_mm)).astype(np.float32)
+        self._weights = RBFInterpolator(sites, unit, kernel="thin_plate_spline")(grid).astype(np.float32)
         self.control_mm = control_mm
 
     def vertices(self, control_mm: FloatArray) -> FloatArray:
@@ -111,14 +112,6 @@ def cap_outlines(look: AppearanceSpec, sides: int) -> FloatArray | None:
     orders = 2 + np.arange(shapes.shape[1] // 2)[:, None]
     beside = offsets @ np.stack([np.cos(turn), np.sin(turn)])
     return 1 + shapes[:, :1] + shapes[:, 1::2] @ np.cos(orders * turn) + shapes[:, 2::2] @ np.sin(orders * turn) + beside
-
-
-def _chart(points_mm: FloatArray) -> FloatArray:
-    """Azimuthal equidistant chart (n, 2), rad, of the directions of points from the dome's centre."""
-    unit = points_mm / np.linalg.norm(points_mm, axis=1, keepdims=True)
-    polar = np.arccos(np.clip(unit[:, 2], -1, 1))
-    rho = np.hypot(unit[:, 0], unit[:, 1])
-    return unit[:, :2] * np.divide(polar, rho, out=np.ones_like(rho), where=rho > 1e-9)[:, None]
 
 
 def _fan_grid(rings: int, around: int) -> IntArray:

@@ -107,7 +107,7 @@ class RigContact:
         self.solver, self.experiment = solver, experiment
         self.rig = rig or rig_of(solver.spec)
         self.field = build_field(touched)
-        mounting = Mounting.on(self.rig, experiment, solver.spec.skin.outer_radius_mm)
+        mounting = Mounting.on(self.rig, experiment, solver.spec.skin)
         self.law = contact_law(rig or solver.spec.rig, mounting, touched)
 
     def way(self, label: ArmLabel) -> ArmPath:

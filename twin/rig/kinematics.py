@@ -4,7 +4,7 @@ Work frame of the robot: x, y, z. The sensor, unturned, looks along the approach
 where the approach is x. It appears in the image at the azimuth ``image_turn``. c0 is a0 x b0. With R the static xyz rotation by
 ``turn_sign (pose_4..6 + turn_offset)`` and p = ``pose_1..3``,
 
-    centre of the dome = p + R (tcp_to_dome a0 + tcp_lateral b0 + tcp_aside c0)
+    origin of the sensor = p + R (tcp_to_dome a0 + tcp_lateral b0 + tcp_aside c0)
 
 The object's frame has z along the approach and leans by ``plate_tilt``. The object stands where an unturned sensor at the robot's
 origin indents it by ``zero + contact_offset``. An arm taps along a0, then makes the move in one straight line.
@@ -17,17 +17,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from scenes.body import SkinSpec
 from scenes.experiment import ExperimentSpec
 from scenes.rig import RigSpec
-from scenes.sensor import SensorSpec, SkinSpec
+from scenes.sensor import SensorSpec
 from twin.errors import ContactError
-from twin.mechanics.path import ContactPath, dome_directions
+from twin.geometry.shapes import shape_of
+from twin.mechanics.path import ContactPath
 from twin.objects import ObjectField
 from twin.rig.labels import ArmLabel
 
 MOST_TURN_DEG = 1.0  # largest turn between two poses of the path; straight pieces then miss the arm's arc by a few um
 TOUCH_TOLERANCE_MM = 1e-6  # gap that counts as a touch
-TOUCH_POINTS = 20_000  # directions on the whole sphere; the dome bulges by less than 2 um between them
+TOUCH_POINTS = 20_000  # places on a whole sphere; a dome bulges by less than 2 um between them
 MOST_MARCHES = 400  # strides of the search for the first touch; some ten are usual
 CLEAR_MM = 10.0  # how far before the tap the search begins; recorded taps of 5 mm begin up to 0.4 mm inside the object
 
@@ -66,17 +68,17 @@ class ArmPath:
 
 
 def rig_of(sensor: SensorSpec) -> RigSpec:
-    """The sensor's rig. A sensor without one gets the plainest: the tool point is the dome's tip, and nothing gives way."""
-    return sensor.rig or RigSpec(tcp_to_dome_mm=-sensor.skin.outer_radius_mm)
+    """The sensor's rig. A sensor without one gets the plainest: the tool point is the tip, and nothing gives way."""
+    return sensor.rig or RigSpec(tcp_to_dome_mm=-sensor.skin.apex_mm)
 
 
-def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, radius_mm: float) -> np.ndarray:
-    """``T_sensor_object`` (4, 4) with the arm at a pose (6,), mm and deg."""
+def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex_mm: float) -> np.ndarray:
+    """``T_sensor_object`` (4, 4) with the arm at a pose (6,), mm and deg; ``apex_mm`` is that of the skin."""
     unturned = _UNTURNED[experiment.approach]
     approach = unturned[:, 2]
     turn = Rotation.from_euler("xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True).as_matrix()
     centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm]
-    surface = (radius_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * approach
+    surface = (apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * approach
     sensor = turn @ unturned
     T = np.eye(4)
     T[:3, :3] = sensor.T @ unturned @ Rotation.from_euler("y", -rig.plate_tilt_deg, degrees=True).as_matrix()
@@ -99,14 +101,14 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: Ob
     ContactError
         The sensor is inside the object long before the tap.
     """
-    radius_mm = skin.outer_radius_mm
+    shape = shape_of(skin)
 
     def at(pose: np.ndarray) -> np.ndarray:
-        return object_pose(rig, experiment, pose, radius_mm)
+        return object_pose(rig, experiment, pose, skin.apex_mm)
 
     tap = np.asarray(experiment.tap) * (1 + CLEAR_MM / experiment.tap[experiment.axis])
     tapped = np.asarray(label.pose, float) - label.move
-    share, touches = _first_touch(field, at(tapped - tap), at(tapped), radius_mm * dome_directions(skin, TOUCH_POINTS))
+    share, touches = _first_touch(field, at(tapped - tap), at(tapped), shape.outside(shape.even(TOUCH_POINTS)))
     still = np.zeros(6)
     labels = [ArmLabel(tapped - (1 - share) * tap, still), ArmLabel(tapped, still)]
     if label.executed:
@@ -117,10 +119,10 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: Ob
     return ArmPath(ContactPath(np.stack([at(each.pose) for each in labels])), labels, touches)
 
 
-def _first_touch(field: ObjectField, start: np.ndarray, stop: np.ndarray, dome_mm: np.ndarray) -> tuple[float, bool]:
-    """Share of the straight way from one pose to another at which the object touches the dome, and whether it touches at all.
+def _first_touch(field: ObjectField, start: np.ndarray, stop: np.ndarray, skin_mm: np.ndarray) -> tuple[float, bool]:
+    """Share of the straight way from one pose to another at which the object touches the skin, and whether it touches at all.
 
-    The object advances by its smallest distance to the dome, again and again. Where distances are exact, that never passes the first
+    The object advances by its smallest distance to the skin, again and again. Where distances are exact, that never passes the first
     touch (sphere tracing, Hart 1996).
     """
     turn, way = start[:3, :3], stop[:3, 3] - start[:3, 3]
@@ -128,7 +130,7 @@ def _first_touch(field: ObjectField, start: np.ndarray, stop: np.ndarray, dome_m
     share = 0.0
     free: float | None = None  # the largest share known to be free of contact
     for _ in range(MOST_MARCHES):
-        gap_mm = float(field.distance((dome_mm - start[:3, 3] - share * way) @ turn).min())
+        gap_mm = float(field.distance((skin_mm - start[:3, 3] - share * way) @ turn).min())
         if abs(gap_mm) <= TOUCH_TOLERANCE_MM:
             return share, True
         if gap_mm < 0:

@@ -5,6 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from scenes.body import SkinSpec
 from scenes.experiment import ExperimentSpec
 from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
@@ -22,15 +23,17 @@ class Mounting:
     Attributes
     ----------
     axis : (3,) float
-        The sensor's z (out of the dome's apex) in the tool frame.
+        The sensor's z (out of the skin's apex) in the tool frame.
     across : (3,) float
         Direction of the tool frame, at right angles to the axis, along which the tool is fed.
     image_turn_deg : float
         Azimuth of ``across`` in the sensor frame, from image x towards image y.
     centre_mm : (3,) float
-        The dome's centre in the tool frame.
-    radius_mm : float
-        Of the dome.
+        The sensor's origin in the tool frame: a dome's centre, the middle of a pad's outside.
+    skin_apex_mm : float
+        z of the skin's apex in the sensor frame: a dome's radius, a pad's 0.
+    skin_reach_mm : float
+        Farthest that the skin reaches from the origin.
     depth_label, angle_label : str
         The labels that tell how deep the tool is, and how far it is turned from the surface's normal.
     zero_mm, zero_deg : float
@@ -43,7 +46,8 @@ class Mounting:
     across: np.ndarray
     image_turn_deg: float
     centre_mm: np.ndarray
-    radius_mm: float
+    skin_apex_mm: float
+    skin_reach_mm: float
     depth_label: str
     angle_label: str
     zero_mm: float
@@ -57,8 +61,8 @@ class Mounting:
 
     @property
     def apex_mm(self) -> np.ndarray:
-        """(3,) the dome's apex in the tool frame."""
-        apex: np.ndarray = self.centre_mm + self.radius_mm * self.axis
+        """(3,) the skin's apex in the tool frame."""
+        apex: np.ndarray = self.centre_mm + self.skin_apex_mm * self.axis
         return apex
 
     @property
@@ -95,11 +99,11 @@ class Mounting:
     @classmethod
     def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Mounting":
         """The mounting of a sensor on its own rig."""
-        return cls.on(rig_of(sensor), experiment, sensor.skin.outer_radius_mm)
+        return cls.on(rig_of(sensor), experiment, sensor.skin)
 
     @classmethod
-    def on(cls, rig: RigSpec, experiment: ExperimentSpec, radius_mm: float) -> "Mounting":
-        """The mounting of a dome of a radius that a rig describes, with the experiment's approach and zero."""
+    def on(cls, rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec) -> "Mounting":
+        """The mounting of a skin that a rig describes, with the experiment's approach and zero."""
         axis, across = (np.array(direction, float) for direction in _DIRECTIONS[experiment.approach])
         turn = np.cross(across, axis)
         about = TURNING[experiment.approach] - 3
@@ -109,7 +113,8 @@ class Mounting:
             across,
             rig.image_turn_deg,
             rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across + rig.tcp_aside_mm * np.cross(axis, across),
-            radius_mm,
+            skin.apex_mm,
+            max(skin.apex_mm, *skin.half_size_mm),
             f"pose_{experiment.axis + 1}",
             f"pose_{about + 4}",
             experiment.zero_mm + rig.contact_offset_mm,

@@ -1,10 +1,10 @@
 """What a rigid sensor would touch: depth and angle against the surface, the same for objects of any shape.
 
-The surface is replaced by a flat plate: through its place nearest to the dome's centre, with its normal there. With g the
-distance of the dome's centre from the surface, w the angle of the tool's axis from the normal, and ``tcp``, ``lateral`` the dome's
-centre from the tool point along the axis and across it,
+The surface is replaced by a flat plate: through its place nearest to the sensor's origin (a dome's centre, the middle of a pad's
+outside), with its normal there. With g the distance of the origin from the surface, w the angle of the tool's axis from the normal,
+``apex`` the apex' z (a dome's radius, a pad's 0), and ``tcp``, ``lateral`` the origin from the tool point along the axis and across it,
 
-    indentation = radius - g,   depth of the tool = radius + tcp - (g + tcp cos w + lateral sin w)
+    indentation = apex - g,   depth of the tool = apex + tcp - (g + tcp cos w + lateral sin w)
 """
 
 from dataclasses import dataclass
@@ -36,9 +36,9 @@ class Touch:
     angle_deg : (M,) float
         Of the tool from the surface's normal, in the plane of the mounting's ``axis`` and ``across``.
     indent_mm : (M,) float
-        Of the dome.
+        Of a dome, or of the middle of a pad.
     place_mm : (M, 3) float
-        Place of the surface nearest to the dome's centre, in the object frame.
+        Place of the surface nearest to the sensor's origin, in the object frame.
     """
 
     depth_mm: np.ndarray
@@ -97,9 +97,9 @@ class Surface:
         across, axial = inward[:, :2] @ [np.cos(azimuth), np.sin(azimuth)], inward[:, 2]
         along_mm, lateral_mm = mounting.centre_mm @ mounting.axis, mounting.centre_mm @ mounting.across
         return Touch(
-            mounting.radius_mm + along_mm - (gap_mm + along_mm * axial + lateral_mm * across),
+            mounting.skin_apex_mm + along_mm - (gap_mm + along_mm * axial + lateral_mm * across),
             np.degrees(np.arctan2(across, axial)),
-            mounting.radius_mm - gap_mm,
+            mounting.skin_apex_mm - gap_mm,
             centre_mm - gap_mm[:, None] * outward,
         )
 
@@ -123,7 +123,7 @@ def surface_labels(experiment: ExperimentSpec, mounting: Mounting, surface: Surf
 
 
 def tilted_labels(
-    rig: RigSpec, experiment: ExperimentSpec, surface: Surface, radius_mm: float, T_sensor_object: np.ndarray
+    rig: RigSpec, experiment: ExperimentSpec, surface: Surface, apex_mm: float, T_sensor_object: np.ndarray
 ) -> dict[str, float]:
     """Depth and both tilts, as an arm would have them that touches a flat plate alike: the inverse of ``object_pose`` for one pose (4, 4).
 
@@ -150,7 +150,7 @@ def tilted_labels(
     tilt_y = np.arctan2(unspun[0], unspun[2]) - np.arctan2(leaned[0], leaned[2])
     turn = about_z * Rotation.from_euler("xy", [tilt_x, tilt_y])
     arm_mm = turn.apply([rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm])
-    stands_mm = (radius_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * plate[2]
+    stands_mm = (apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * plate[2]
     depth_mm = (stands_mm - plate @ arm_mm - (distance_mm[0] - surface.raised_mm)) / plate[2]
     tilts = rig.turn_sign * np.degrees([tilt_x, tilt_y]) - np.array(rig.turn_offset_deg[:2])
     return {"pose_3": float(depth_mm), "pose_4": float(tilts[0]), "pose_5": float(tilts[1])}

@@ -22,7 +22,7 @@ from twin.frames.forms import from_raw
 from twin.geometry.solid import Resolution
 from twin.mechanics.follow import STEP_MM, Follower
 from twin.mechanics.law import ContactLaw
-from twin.mechanics.path import ContactPath, deepest_mm, dome_directions
+from twin.mechanics.path import ContactPath, deepest_mm
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
 from twin.pins import Pipeline
@@ -167,10 +167,11 @@ class MovingContact:
         self.camera = DomeCamera(setup.sensor)
         self.solver = SkinSolver(setup.sensor)
         self._fine_solver: SkinSolver | None = None
-        self._radius_mm = setup.sensor.skin.outer_radius_mm
-        shells_mm = np.arange(self._radius_mm - deepest_mm(setup.sensor.geometry), 0.0, -SHELL_MM)
-        directions = dome_directions(setup.sensor.skin, SHELL_POINTS)
-        self._deep_mm = (shells_mm[:, None, None] * directions).reshape(-1, 3)  # places of the gel that no object may reach
+        skin, shape = setup.sensor.skin, self.solver.shape
+        self._apex_mm = skin.apex_mm
+        depths_mm = np.arange(deepest_mm(setup.sensor.geometry), max(skin.apex_mm, skin.apex_mm - setup.sensor.lens.z_mm), SHELL_MM)
+        places = shape.even(SHELL_POINTS)
+        self._deep_mm = np.concatenate([shape.beneath(places, depth) for depth in depths_mm])  # where no object may reach
         self._experiment: ExperimentSpec | None = None
         self.model: SensorModel | None = None
         self._count = 0
@@ -240,12 +241,12 @@ class MovingContact:
         """Why the object may not stand at ``T`` (4, 4), "" if it may."""
         if (self._field.distance((self._deep_mm - T[:3, 3]) @ T[:3, :3]) < 0).any():
             limit = deepest_mm(self.setup.sensor.geometry)
-            return f"it would be more than {limit:.1f} mm inside the dome, which is half the gel's depth"
+            return f"it would be more than {limit:.1f} mm inside the skin, which is half the gel's depth"
         gap_mm, place = self._follower.nearest(T)
         if gap_mm >= 0:
             return ""
         if place[2] < self.setup.sensor.skin.rim_z_mm + RIM_MARGIN_MM:
-            return "it would press beyond the dome's rim, where the skin is clamped"
+            return "it would press beyond the rim, where the skin is clamped"
         return ""
 
     def admissible(self, wished: ObjectPose) -> tuple[FloatArray, str]:
@@ -254,7 +255,7 @@ class MovingContact:
         An object in an impossible place is lifted along the sensor's z until its place is possible.
         """
         within, reason = wished.within_limits()
-        T = within.matrix(self._radius_mm)
+        T = within.matrix(self._apex_mm)
         why = self.refusal(T)
         if not why:
             return T, reason
@@ -383,10 +384,10 @@ class MovingContact:
         if len(self._way) > KEPT_WAY:
             self._way.clear()
             self._fine_lost = f"the way in contact is longer than {KEPT_WAY} poses; lift the object off, and the fine mesh follows again"
-        self._T, self.pose = T, ObjectPose.of(T, self._radius_mm)
+        self._T, self.pose = T, ObjectPose.of(T, self._apex_mm)
 
     def _T_of(self, answer: Answer) -> FloatArray:
-        return answer.pose.matrix(self._radius_mm)
+        return answer.pose.matrix(self._apex_mm)
 
     def _answer(
         self, T: FloatArray, state: ContactState, light: FloatArray | None, mesh: Mesh, *, arrived: bool, stopped: str, ms: dict[str, float]
@@ -407,7 +408,7 @@ class MovingContact:
         times = {"picture": now - started, "pins": looked - now, "estimate": time.perf_counter() - looked}
         self._last = Answer(
             self._count,
-            ObjectPose.of(T, self._radius_mm),
+            ObjectPose.of(T, self._apex_mm),
             -self._follower.gap_mm(T),
             state,
             light,
@@ -432,7 +433,7 @@ class MovingContact:
             return {}
         flat = surface_labels(experiment, Mounting.of(sensor, experiment), self._surface, T[None])
         known = {name: float(value[0]) for name, value in flat.items()}
-        known |= tilted_labels(rig_of(sensor), experiment, self._surface, self._radius_mm, T) if not known else {}
+        known |= tilted_labels(rig_of(sensor), experiment, self._surface, self._apex_mm, T) if not known else {}
         return known
 
 

@@ -38,18 +38,18 @@ class ObjectPose:
     tilt_y_deg: float = 0.0
     twist_deg: float = 0.0
 
-    def matrix(self, radius_mm: float) -> FloatArray:
-        """``T_sensor_object`` (4, 4) before a dome of a radius."""
+    def matrix(self, apex_mm: float) -> FloatArray:
+        """``T_sensor_object`` (4, 4) before a skin with its apex at a z."""
         T = np.eye(4)
         T[:3, :3] = Rotation.from_euler("xyz", [self.tilt_x_deg, self.tilt_y_deg, self.twist_deg], degrees=True).as_matrix()
-        T[:3, 3] = self.x_mm, self.y_mm, radius_mm - self.depth_mm
+        T[:3, 3] = self.x_mm, self.y_mm, apex_mm - self.depth_mm
         return T
 
     @classmethod
-    def of(cls, T: FloatArray, radius_mm: float) -> "ObjectPose":
+    def of(cls, T: FloatArray, apex_mm: float) -> "ObjectPose":
         """The numbers of a pose ``T_sensor_object`` (4, 4)."""
         tilt_x, tilt_y, twist = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)
-        return cls(*map(float, (T[0, 3], T[1, 3], radius_mm - T[2, 3], tilt_x, tilt_y, twist)))
+        return cls(*map(float, (T[0, 3], T[1, 3], apex_mm - T[2, 3], tilt_x, tilt_y, twist)))
 
     def within_limits(self) -> tuple["ObjectPose", str]:
         """The nearest pose whose numbers are within ``LIMITS``, and why it is another one ("" if it is not).

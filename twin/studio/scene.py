@@ -173,12 +173,12 @@ class Scene:
 
     def __init__(self, server: viser.ViserServer, sensor: SensorSpec, mesh: SensorMesh, rest: ContactState) -> None:
         self._scene, self._rest = server.scene, rest
-        radius_mm = sensor.skin.outer_radius_mm
+        radius_mm = max(sensor.skin.half_size_mm)
         self._scene.configure_environment_map(None)
         self._scene.configure_default_lights(enabled=True, cast_shadow=False)
         self._scene.add_light_ambient("/light", intensity=1.2)
         server.initial_camera.position = (1.2 * radius_mm, -3.4 * radius_mm, 1.7 * radius_mm)
-        server.initial_camera.look_at = (0.0, 0.0, 0.7 * radius_mm)
+        server.initial_camera.look_at = (0.0, 0.0, 0.7 * sensor.skin.apex_mm)
         self._skin_shape = SkinShape(mesh)
         skin, pin = self._skin_shape.rest, pin_shape(sensor.pins)
         self._skin = self._scene.add_mesh_simple(

@@ -202,7 +202,7 @@ class TwinMode:
         self.worker.play(way)
 
     def _dragged(self, T: np.ndarray, ended: bool) -> None:
-        self.ask(ObjectPose.of(T, self.contact.setup.sensor.skin.outer_radius_mm))
+        self.ask(ObjectPose.of(T, self.contact.setup.sensor.skin.apex_mm))
         if ended and self.worker.newest is not None:
             self._publisher.give(self.worker.newest)
 
@@ -401,7 +401,7 @@ class TwinMode:
             follow(answer)
 
     def _gizmo_pose(self, answer: Answer) -> np.ndarray:
-        return answer.pose.matrix(self.contact.setup.sensor.skin.outer_radius_mm)
+        return answer.pose.matrix(self.contact.setup.sensor.skin.apex_mm)
 
     def _follow_sliders(self, answer: Answer) -> None:
         """Put the sliders to where the object came to stand, unless the user has wished on meanwhile."""

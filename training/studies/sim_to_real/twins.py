@@ -132,5 +132,5 @@ def as_mounted(sensor: SensorSpec) -> SensorSpec:
     """The sensor as known before any measurement: its turn about its axis to a quarter turn, and the tool point at the tip."""
     rig = rig_of(sensor)
     quarter = QUARTER_DEG * round(rig.image_turn_deg / QUARTER_DEG)
-    plain = RigSpec(tcp_to_dome_mm=-sensor.skin.outer_radius_mm, turn_sign=rig.turn_sign, image_turn_deg=quarter)
+    plain = RigSpec(tcp_to_dome_mm=-sensor.skin.apex_mm, turn_sign=rig.turn_sign, image_turn_deg=quarter)
     return sensor.model_copy(update={"rig": plain})

@@ -99,17 +99,17 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     FrameError
         The frames have no labels, or are too few.
     """
-    experiment, radius_mm = load_experiment(EXPERIMENT), spec.skin.outer_radius_mm
+    experiment, apex_mm = load_experiment(EXPERIMENT), spec.skin.apex_mm
     labels, fitted = labels_of_rows([real.label for real in frames], experiment), halves(len(frames))
     learnt = [label for label, used in zip(labels, fitted, strict=True) if used]
     solver, start = SkinSolver(spec), rig_of(spec)
     taps = PlateTaps(solver, experiment)
     with bar("simulate taps to fit the arm's rig") as progress:
-        spread = bank_labels(start, experiment, labels, radius_mm)
-        bank = TapBank(contacts_of(start, experiment, spread, radius_mm), taps.pins_px(start, spread, progress))
+        spread = bank_labels(start, experiment, labels, apex_mm)
+        bank = TapBank(contacts_of(start, experiment, spread, apex_mm), taps.pins_px(start, spread, progress))
     with bar("fit the arm's rig") as progress:
         seen_px = np.stack([real.pins_px for real in frames])[fitted]
-        rig = fit_rig(bank, start, experiment, learnt, seen_px, radius_mm, simulate=lambda tried: taps.pins_px(tried, learnt, progress))
+        rig = fit_rig(bank, start, experiment, learnt, seen_px, apex_mm, simulate=lambda tried: taps.pins_px(tried, learnt, progress))
     contact, shoot, pairs = taps.contact(rig), _Shooter(spec, disc, quality, mesh=solver.mesh), []
     with bar("press and render from the labels") as progress:
         for number, (real, label) in enumerate(zip(frames, labels, strict=True)):
@@ -117,7 +117,7 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
             error_px = mean_pin_error_px(project(spec.view, state.caps_mm), real.pins_px)
             pairs.append(shoot(real, state, float(error_px), seed=number))
             progress(number + 1, len(frames))
-    return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, radius_mm), pairs)
+    return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, apex_mm), pairs)
 
 
 def statistics(pairs: list[Pair], disc: Disc, *, progress: Step) -> Statistics:

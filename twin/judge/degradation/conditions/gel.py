@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from scenes.sensor import GelSpec, SensorSpec, SpeckSpec
+from scenes.body import GelSpec
+from scenes.sensor import SensorSpec, SpeckSpec
 from twin.judge.degradation.condition import Condition, OnSection, altered
 
 # Smallest and largest radius of a bubble, mm. Chosen.

@@ -3,7 +3,8 @@
 import cv2
 import numpy as np
 
-from scenes.sensor import AppearanceSpec, SensorSpec, SkinSpec
+from scenes.body import SkinSpec
+from scenes.sensor import AppearanceSpec, SensorSpec
 from twin.geometry.pins import rest_pins
 from twin.judge.degradation.condition import Condition, OnSection, View, altered, chosen, over_channels
 from twin.optics.surfaces import cap_albedo
@@ -106,7 +107,7 @@ def those_torn_off(value: float, view: View, rng: np.random.Generator) -> np.nda
 
 def swollen(skin: SkinSpec, value: float, rng: np.random.Generator) -> SkinSpec:
     """Skin swollen by oil: thicker and larger."""
-    grown = {name: getattr(skin, name) * (1 + value) for name in ("outer_radius_mm", "thickness_mm")}
+    grown = {name: getattr(skin, name) * (1 + value) for name in (*skin.size_keys, "thickness_mm")}
     return skin.model_copy(update=grown) if value else skin
 
 

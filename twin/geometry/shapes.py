@@ -1,0 +1,357 @@
+"""Shapes of a skin at rest: all that others ask of a cap, a flat round pad and a flat rectangular pad.
+
+A place on a skin is a complex number w. On caps and round pads it is a point of the unit disc: its angle is the azimuth, and its size is
+the share of the way along the skin from the middle to the rim. On a rectangular pad it is a point of the square with corners at
++-1 +-i. The same w on the outside, on the inside and on the window belong to one straight column through the body.
+
+Each place also has a direction, a unit vector: on a hemisphere that from its centre. The places of other skins are spread over a
+hemisphere in the same way, so that the grid's focus (``chart.Focus``) means the same on all of them. A cap that is larger than a hemisphere
+keeps its own directions.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.base import SpecError
+from scenes.body import SkinSpec
+from scenes.pins import PinsSpec
+from twin.geometry.chart import Chart, Focus, RectangleChart, disc_of_square, square_of_disc
+from twin.types import BoolArray, ComplexArray, FloatArray
+
+_GOLDEN_RAD = np.pi * (1 + np.sqrt(5))
+"""Turn from each point of a Fibonacci lattice to the next."""
+_PIN_ROUNDING_MM = 1e-6
+"""A pin may stand this far beyond the flat part of a pad: rounding."""
+
+
+@dataclass(frozen=True)
+class SkinShape(ABC):
+    """The places of one skin.
+
+    Attributes
+    ----------
+    skin : SkinSpec
+    """
+
+    skin: SkinSpec
+
+    @property
+    def largest_rad(self) -> float:
+        """Angle of the rim's direction from the axis."""
+        return float(np.pi / 2)
+
+    def chart(self, focus: Focus) -> Chart | RectangleChart:
+        """The map from the grid's square to places, fine around a focus."""
+        return Chart(focus, self.largest_rad)
+
+    @abstractmethod
+    def outside(self, place: ComplexArray) -> FloatArray:
+        """Points (k, 3) mm of the outside."""
+
+    @abstractmethod
+    def inside(self, place: ComplexArray) -> FloatArray:
+        """Points (k, 3) mm of the inside."""
+
+    @abstractmethod
+    def flat(self, place: ComplexArray) -> FloatArray:
+        """x and y (k, 2) mm of the columns' ends on the window."""
+
+    @abstractmethod
+    def place(self, inside_mm: FloatArray) -> ComplexArray:
+        """Places (k,) of points (k, 3) of the inside."""
+
+    @abstractmethod
+    def on_outside(self, near_mm: FloatArray) -> FloatArray:
+        """The points (k, 3) of the outside that belong to points (k, 3) close to it."""
+
+    @abstractmethod
+    def beneath(self, place: ComplexArray, depth_mm: float) -> FloatArray:
+        """Points (k, 3) mm this deep below the outside: towards a cap's centre, or along z below a pad."""
+
+    @abstractmethod
+    def pins(self, layout: FloatArray, pins: PinsSpec) -> tuple[FloatArray, FloatArray]:
+        """Feet (N, 3) mm and outward normals (N, 3) of pins, from their layout (N, 2) whose outermost pin is at 1 from the middle."""
+
+    @abstractmethod
+    def normals(self, inside_mm: FloatArray) -> FloatArray:
+        """Outward unit normals (k, 3) at points (k, 3) of the inside."""
+
+    def disc(self, place: ComplexArray) -> ComplexArray:
+        """Points (k,) of the unit disc that places are spread over; the rim is at 1."""
+        return place
+
+    def of_disc(self, disc: ComplexArray) -> ComplexArray:
+        """Inverse of ``disc``."""
+        return disc
+
+    def even(self, count: int, *, turn_rad: float = 0.0) -> ComplexArray:
+        """Places spread evenly over the outside, about ``count`` on a whole sphere; round shapes turn them by ``turn_rad``."""
+        k = np.arange(count // 2) + 0.5
+        return np.sqrt(2 * k / count) * np.exp(1j * (_GOLDEN_RAD * k + turn_rad))
+
+    def near(self, place: complex, spread: float, count: int) -> ComplexArray:
+        """About ``count`` places within ``spread`` (share of the way to the rim) around one."""
+        k = np.arange(count) + 0.5
+        around = place + spread * np.sqrt(k / count) * np.exp(1j * _GOLDEN_RAD * k)
+        return around[self.rim_share(around) <= 1]
+
+    def rim_share(self, place: ComplexArray) -> FloatArray:
+        """(k,) 0 in the middle, 1 at the rim."""
+        return np.abs(place)
+
+    def rim(self, around: int) -> ComplexArray:
+        """Places (around,) on the rim, once around from x towards y."""
+        return np.exp(2j * np.pi * np.arange(around) / around)
+
+    def directions(self, place: ComplexArray) -> FloatArray:
+        """Unit vectors (k, 3) of places."""
+        disc = self.disc(place)
+        polar, azimuth = self.largest_rad * np.abs(disc), np.angle(disc)
+        return np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+
+    def body(self, place: ComplexArray, depth: float, window_z_mm: float) -> FloatArray:
+        """Points (k, 3) of the body: depth 0 is the outside, 1 the inside, 2 the window, with straight lines between them."""
+        inner = self.inside(place)
+        if depth <= 1:
+            outer = self.outside(place)
+            return outer + depth * (inner - outer)
+        window = np.column_stack([self.flat(place), np.full(len(place), window_z_mm)])
+        return inner + (depth - 1) * (window - inner)
+
+
+@dataclass(frozen=True)
+class Cap(SkinShape):
+    """Part of a sphere."""
+
+    @property
+    def _inner_mm(self) -> float:
+        return self.skin.outer_radius_mm - self.skin.thickness_mm
+
+    def _polar(self, radius_mm: float) -> float:
+        return float(np.arccos(np.clip(self.skin.rim_z_mm / radius_mm, -1, 1)))
+
+    @property
+    def largest_rad(self) -> float:
+        return max(self._polar(self._inner_mm), np.pi / 2)
+
+    def _sphere(self, place: ComplexArray, radius_mm: float) -> FloatArray:
+        polar, azimuth = self._polar(radius_mm) * np.abs(place), np.angle(place)
+        return radius_mm * np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+
+    def outside(self, place: ComplexArray) -> FloatArray:
+        return self._sphere(place, self.skin.outer_radius_mm)
+
+    def inside(self, place: ComplexArray) -> FloatArray:
+        return self._sphere(place, self._inner_mm)
+
+    def flat(self, place: ComplexArray) -> FloatArray:
+        ends = np.sqrt(self._inner_mm**2 - self.skin.rim_z_mm**2) * place
+        return np.column_stack([ends.real, ends.imag])
+
+    def place(self, inside_mm: FloatArray) -> ComplexArray:
+        x, y, z = inside_mm.T
+        return np.arctan2(np.hypot(x, y), z) / self._polar(self._inner_mm) * np.exp(1j * np.arctan2(y, x))
+
+    def on_outside(self, near_mm: FloatArray) -> FloatArray:
+        return near_mm * (self.skin.outer_radius_mm / np.linalg.norm(near_mm, axis=1, keepdims=True))
+
+    def beneath(self, place: ComplexArray, depth_mm: float) -> FloatArray:
+        return self._sphere(place, self.skin.outer_radius_mm) * (1 - depth_mm / self.skin.outer_radius_mm)
+
+    def normals(self, inside_mm: FloatArray) -> FloatArray:
+        return inside_mm / np.linalg.norm(inside_mm, axis=1, keepdims=True)
+
+    def even(self, count: int, *, turn_rad: float = 0.0) -> ComplexArray:
+        k = np.arange(count) + 0.5
+        polar = np.arccos(1 - 2 * k / count)
+        disc = polar / self._polar(self.skin.outer_radius_mm) * np.exp(1j * (_GOLDEN_RAD * k + turn_rad))
+        return disc[np.abs(disc) <= 1]
+
+    def pins(self, layout: FloatArray, pins: PinsSpec) -> tuple[FloatArray, FloatArray]:
+        place = layout @ [1, 1j]
+        largest = pins.largest_polar_rad(self._inner_mm)
+        if largest is None:
+            raise SpecError("pins.reach_mm puts pins behind skin.rim_z_mm")
+        polar = largest * np.abs(place) if pins.spacing == "polar" else np.arcsin(np.sin(largest) * np.abs(place))
+        azimuth = np.angle(place) + np.radians(pins.phase_deg)
+        outward = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=1)
+        return self._inner_mm * outward, outward
+
+
+@dataclass(frozen=True)
+class Pad(SkinShape):
+    """A flat skin whose edge is rounded to a quarter of a circle, so that the rim lies ``edge_mm`` behind the outside."""
+
+    @property
+    def edge_mm(self) -> float:
+        """Radius of the rounded edge, seen from outside; 0: the skin is flat up to its rim."""
+        return -self.skin.rim_z_mm
+
+    @property
+    def _inner_edge_mm(self) -> float:
+        return max(self.edge_mm - self.skin.thickness_mm, 0.0)
+
+    def _profile(self, share: FloatArray, half_mm: float, edge_mm: float) -> tuple[FloatArray, FloatArray]:
+        """Distance from the middle (mm), and height (1 on the flat part, 0 at the rim), at a share of the way along the outside.
+
+        ``half_mm`` is half the outside's size, ``edge_mm`` the radius of the edge of the surface that is asked for.
+        """
+        size, flat_mm = np.abs(share), half_mm - self.edge_mm
+        length_mm = flat_mm + self.edge_mm * np.pi / 2
+        if self.edge_mm == 0:
+            return share * half_mm, np.ones_like(size)
+        angle = np.maximum(size * length_mm - flat_mm, 0) / self.edge_mm
+        return np.sign(share) * (np.minimum(size * length_mm, flat_mm) + edge_mm * np.sin(angle)), np.cos(np.minimum(angle, np.pi / 2))
+
+    def _share(self, at_mm: FloatArray, half_mm: float) -> FloatArray:
+        """Inverse of the profile of the inside, for its distances from the middle."""
+        size, flat_mm = np.abs(at_mm), half_mm - self.edge_mm
+        if self.edge_mm == 0:
+            return at_mm / half_mm
+        sine = np.clip((size - flat_mm) / self._inner_edge_mm, 0, 1)
+        return np.sign(at_mm) * (np.minimum(size, flat_mm) + self.edge_mm * np.arcsin(sine)) / (flat_mm + self.edge_mm * np.pi / 2)
+
+    def _checked(self, feet_mm: FloatArray, on_flat: BoolArray) -> tuple[FloatArray, FloatArray]:
+        if not on_flat.all():
+            raise SpecError(
+                f"{np.count_nonzero(~on_flat)} pins stand beyond the flat part of the pad; make pins.reach_mm smaller, or turn the layout"
+            )
+        outward = np.tile([0.0, 0.0, 1.0], (len(feet_mm), 1))
+        return np.column_stack([feet_mm, np.full(len(feet_mm), -self.skin.thickness_mm)]), outward
+
+    def _feet(self, layout: FloatArray, pins: PinsSpec) -> FloatArray:
+        if pins.reach_mm is None:
+            raise SpecError("pins.reach_mm is missing: on a flat pad it is the distance of the outermost pin from the axis")
+        turned = layout @ [1, 1j] * pins.reach_mm * np.exp(1j * np.radians(pins.phase_deg))
+        return np.column_stack([turned.real, turned.imag])
+
+    def on_outside(self, near_mm: FloatArray) -> FloatArray:
+        return self.outside(self._outside_place(near_mm))
+
+    def beneath(self, place: ComplexArray, depth_mm: float) -> FloatArray:
+        return self.outside(place) - [0, 0, depth_mm]
+
+    @abstractmethod
+    def _outside_place(self, near_mm: FloatArray) -> ComplexArray:
+        """Places (k,) of points (k, 3) near the outside."""
+
+    def normals(self, inside_mm: FloatArray) -> FloatArray:
+        place, step = self.place(inside_mm), 1e-6
+        along_x, along_y = (self.inside(place + d) - self.inside(place - d) for d in (step, 1j * step))
+        across = np.cross(along_x, along_y)
+        return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class RoundPad(Pad):
+    """A flat disc."""
+
+    def _surface(self, place: ComplexArray, edge_mm: float, drop_mm: float) -> FloatArray:
+        far, height = self._profile(np.abs(place), self.skin.outer_radius_mm, edge_mm)
+        at = far * np.exp(1j * np.angle(place))
+        return np.column_stack([at.real, at.imag, edge_mm * (height - 1) - drop_mm])
+
+    def outside(self, place: ComplexArray) -> FloatArray:
+        return self._surface(place, self.edge_mm, 0.0)
+
+    def inside(self, place: ComplexArray) -> FloatArray:
+        return self._surface(place, self._inner_edge_mm, self.skin.thickness_mm)
+
+    def flat(self, place: ComplexArray) -> FloatArray:
+        ends = (self.skin.outer_radius_mm - self.edge_mm + self._inner_edge_mm) * place
+        return np.column_stack([ends.real, ends.imag])
+
+    def place(self, inside_mm: FloatArray) -> ComplexArray:
+        far = np.hypot(inside_mm[:, 0], inside_mm[:, 1])
+        turn: ComplexArray = np.exp(1j * np.arctan2(inside_mm[:, 1], inside_mm[:, 0]))
+        return turn * self._share(far, self.skin.outer_radius_mm)
+
+    def _outside_place(self, near_mm: FloatArray) -> ComplexArray:
+        x, y, z = near_mm.T
+        flat_mm, far = self.skin.outer_radius_mm - self.edge_mm, np.hypot(x, y)
+        angle = np.arctan2(np.maximum(far - flat_mm, 0), np.maximum(z + self.edge_mm, 0))
+        along = np.where(far > flat_mm, flat_mm + self.edge_mm * angle, far) if self.edge_mm else far
+        return along / (flat_mm + self.edge_mm * np.pi / 2) * np.exp(1j * np.arctan2(y, x))
+
+    def pins(self, layout: FloatArray, pins: PinsSpec) -> tuple[FloatArray, FloatArray]:
+        feet = self._feet(layout, pins)
+        return self._checked(feet, np.hypot(*feet.T) <= self.skin.outer_radius_mm - self.edge_mm + _PIN_ROUNDING_MM)
+
+
+@dataclass(frozen=True)
+class RectangularPad(Pad):
+    """A flat rectangle. Over its rounded edge the height is the product of those of both directions, which also rounds the corners."""
+
+    def chart(self, focus: Focus) -> RectangleChart:
+        return RectangleChart(focus, self.largest_rad)
+
+    def disc(self, place: ComplexArray) -> ComplexArray:
+        return disc_of_square(np.column_stack([place.real, place.imag]))
+
+    def of_disc(self, disc: ComplexArray) -> ComplexArray:
+        return _complex(*square_of_disc(disc).T)
+
+    def even(self, count: int, *, turn_rad: float = 0.0) -> ComplexArray:
+        width, height = self.skin.half_size_mm
+        columns = int(np.ceil(np.sqrt(count / 2 * width / height)))
+        rows = int(np.ceil(count / 2 / columns))
+        y, x = np.mgrid[:rows, :columns]
+        return ((2 * x + 1) / columns - 1 + 1j * ((2 * y + 1) / rows - 1)).ravel()
+
+    def rim_share(self, place: ComplexArray) -> FloatArray:
+        return np.maximum(np.abs(place.real), np.abs(place.imag))
+
+    def rim(self, around: int) -> ComplexArray:
+        turn = np.exp(2j * np.pi * np.arange(around) / around)
+        return turn / np.maximum(np.abs(turn.real), np.abs(turn.imag))
+
+    def _surface(self, place: ComplexArray, edge_mm: float, drop_mm: float) -> FloatArray:
+        (x, high_x), (y, high_y) = (
+            self._profile(part, half, edge_mm) for part, half in zip((place.real, place.imag), self.skin.half_size_mm, strict=True)
+        )
+        return np.column_stack([x, y, edge_mm * (high_x * high_y - 1) - drop_mm])
+
+    def outside(self, place: ComplexArray) -> FloatArray:
+        return self._surface(place, self.edge_mm, 0.0)
+
+    def inside(self, place: ComplexArray) -> FloatArray:
+        return self._surface(place, self._inner_edge_mm, self.skin.thickness_mm)
+
+    def flat(self, place: ComplexArray) -> FloatArray:
+        shrunk = self._inner_edge_mm - self.edge_mm
+        width, height = self.skin.half_size_mm
+        return np.column_stack([(width + shrunk) * place.real, (height + shrunk) * place.imag])
+
+    def place(self, inside_mm: FloatArray) -> ComplexArray:
+        width, height = self.skin.half_size_mm
+        return _complex(self._share(inside_mm[:, 0], width), self._share(inside_mm[:, 1], height))
+
+    def _outside_place(self, near_mm: FloatArray) -> ComplexArray:
+        def along(at: FloatArray, half: float) -> FloatArray:
+            flat_mm = half - self.edge_mm
+            if self.edge_mm == 0:
+                return np.clip(at / half, -1, 1)
+            sine = np.clip((np.abs(at) - flat_mm) / self.edge_mm, 0, 1)
+            return np.sign(at) * (np.minimum(np.abs(at), flat_mm) + self.edge_mm * np.arcsin(sine)) / (flat_mm + self.edge_mm * np.pi / 2)
+
+        width, height = self.skin.half_size_mm
+        return _complex(along(near_mm[:, 0], width), along(near_mm[:, 1], height))
+
+    def pins(self, layout: FloatArray, pins: PinsSpec) -> tuple[FloatArray, FloatArray]:
+        feet = self._feet(layout, pins)
+        flat_mm = np.array(self.skin.half_size_mm) - self.edge_mm + _PIN_ROUNDING_MM
+        return self._checked(feet, np.abs(feet / flat_mm).max(axis=1) <= 1)
+
+
+def _complex(x: FloatArray, y: FloatArray) -> ComplexArray:
+    return x + 1j * y
+
+
+_SHAPES: dict[str, type[SkinShape]] = {"cap": Cap, "round-pad": RoundPad, "rectangular-pad": RectangularPad}
+
+
+def shape_of(skin: SkinSpec) -> SkinShape:
+    """The shape of a specification's skin."""
+    return _SHAPES[skin.shape](skin)

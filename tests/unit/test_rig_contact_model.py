@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from scenes import RigSpec, load_experiment, load_object, load_sensor
+from scenes.body import SkinSpec
 from twin.geometry.solid import Resolution
 from twin.mechanics.balance import Friction
 from twin.mechanics.follow import Follower
@@ -124,7 +125,7 @@ def test_the_rigs_friction_counts_and_the_objects_where_there_is_no_rig():
     rig = RigSpec(tcp_to_dome_mm=0.0, friction=0.3)
     assert friction_between(rig, rubber) == Friction(0.3, 0.3)
     assert friction_between(None, rubber) == Friction(0.7, 0.4, rubber.slip_weakening_mm, 0.05)
-    mounting = Mounting.on(rig, SURFACE, 20.0)
+    mounting = Mounting.on(rig, SURFACE, SkinSpec())
     assert contact_law(rig, mounting, rubber, friction=0.9).friction == Friction(0.9, 0.9)
     soft = rubber.model_copy(update={"compliance_mm_per_n": 0.1})
     assert contact_law(rig.model_copy(update={"compliance_mm_per_n": 0.2}), mounting, soft).compliance_mm_per_n == pytest.approx(0.3)

@@ -49,7 +49,7 @@ def test_pin_counts(sensor_name, pins):
             ["edited.toml", "skin.thicknes_mm", "did you mean 'thickness_mm'"],
         ),
         ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thickness_mm = -1.0", ["skin.thickness_mm", "greater than 0"]),
-        ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thickness_mm = 30.0", ["skin.thickness_mm must be smaller"]),
+        ("sensors/mg400-331.toml", "thickness_mm = 1.0", "thickness_mm = 30.0", ["skin: thickness_mm must be smaller"]),
         (
             "sensors/mg400-331.toml",
             "poisson_ratio = 0.47",

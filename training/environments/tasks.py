@@ -233,7 +233,7 @@ class EdgeFollow(Task):
     def begin(self, row: int, tool: Tool, touched: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         dome = tool.T_work_sensor[:3, 3]
         T = turn_about((0, 0, 1), rng.uniform(-self.off_deg, self.off_deg))
-        centre = np.array([rng.uniform(-self.off_mm, self.off_mm), 0.0, self.indent_mm - tool.mounting.radius_mm])
+        centre = np.array([rng.uniform(-self.off_mm, self.off_mm), 0.0, self.indent_mm - tool.mounting.skin_apex_mm])
         T[:3, 3] = centre - T[:3, :3] @ dome
         return Start(T, (0.0, 0.0), np.eye(4))
 
@@ -313,7 +313,7 @@ class ObjectRoll(Task):
         indent = rng.uniform(1.0, 2.0)
         start, goal = rng.uniform(-4.0, 4.0, (2, 2))
         T = np.eye(4)
-        T[:3, 3] = [0.0, 0.0, indent - tool.mounting.radius_mm] - tool.T_work_sensor[:3, 3]
+        T[:3, 3] = [0.0, 0.0, indent - tool.mounting.skin_apex_mm] - tool.T_work_sensor[:3, 3]
         T_object = np.eye(4)  # the ball lies beside the dome's apex, as deep as it would lie under it
         T_object[:2, 3] = start
         return Start(T, tuple(map(float, goal)), T_object)

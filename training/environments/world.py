@@ -104,7 +104,7 @@ def standing_on(tool: Tool, surface: Surface, along_mm: float, indent_mm: float,
     outward = turn_about((0, 1, 0), turned_deg)[:3, :3] @ [0.0, 0.0, -1.0]
     T = turn_about((0, 1, 0), turned_deg + angle_deg)
     dome = tool.T_work_sensor[:3, 3]
-    centre = place + (tool.mounting.radius_mm + surface.raised_mm - indent_mm) * outward
+    centre = place + (tool.mounting.skin_apex_mm + surface.raised_mm - indent_mm) * outward
     T[:3, 3] = centre - T[:3, :3] @ dome
     return T
 

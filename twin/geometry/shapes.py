@@ -238,7 +238,8 @@ class Pad(SkinShape):
         """Places (k,) of points (k, 3) near the outside."""
 
     def normals(self, inside_mm: FloatArray) -> FloatArray:
-        place, step = self.place(inside_mm), 1e-6
+        step = 1e-6
+        place = self.place(inside_mm) * (1 - 2 * step)  # beyond the rim there is no skin
         along_x, along_y = (self.inside(place + d) - self.inside(place - d) for d in (step, 1j * step))
         across = np.cross(along_x, along_y)
         return across / np.linalg.norm(across, axis=1, keepdims=True)

@@ -66,11 +66,17 @@ def test_a_typed_number_moves_the_object(studio):
         assert not messages
 
 
-@pytest.mark.parametrize("mode", ["Degrade", "Recording", "Live", "Twin"])
+@pytest.mark.parametrize("mode", ["Degrade", "Recording", "Live", "Your own sensor", "Twin"])
 def test_each_mode_opens(studio, mode):
     with open_page(studio.page.url) as (page, messages):
         studio.page.choose(mode)
-        wanted = {"Degrade": "Find the edge", "Recording": "Next doubt", "Live": "EMERGENCY STOP", "Twin": "Begin the contact anew"}[mode]
+        wanted = {
+            "Degrade": "Find the edge",
+            "Recording": "Next doubt",
+            "Live": "EMERGENCY STOP",
+            "Your own sensor": "Propose a specification",
+            "Twin": "Begin the contact anew",
+        }[mode]
         page.get_by_text(wanted).first.wait_for(state="visible", timeout=20_000)
         assert not messages
 

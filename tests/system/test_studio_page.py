@@ -190,7 +190,7 @@ def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_pa
     client.set("Connect", True)
     html = wait_html(client, "arm: read only")
     assert "tool within x 150 to 450" in html
-    robot = studio.modes[-1]._feed.robot
+    robot = studio.modes[3]._feed.robot
     before = robot._arm.state().pose.copy()
     with pytest.raises(TwinError, match="read only; arm it first"):
         robot.nudge(2, 1.0)
@@ -207,6 +207,28 @@ def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_pa
     assert not robot.armed and not robot._arm.state().enabled
     client.set("Disconnect", True)
     client.set("mode", "Twin")
+
+
+def test_a_specification_is_proposed_corrected_and_used(studio, client, tmp_path):
+    reference, rng = nominal_reference(load_sensor(SENSOR), Form.RECORDING), np.random.default_rng(1)
+    for k in range(4):
+        frame = drawn_frame(load_sensor(SENSOR), Form.RECORDING, smooth_warp(reference.pins_px, 2.0, rng))
+        write_image(tmp_path / f"mine_{k}.png", frame.image)
+    client.set("mode", "Your own sensor")
+    client.set("Use this sensor", True)
+    wait_html(client, "nothing has been proposed yet")
+    client.set("frames", str(tmp_path / "nothing"))
+    client.set("Propose a specification", True)
+    wait_html(client, "nothing: ")
+    client.set("frames", str(tmp_path))
+    client.set("Propose a specification", True)
+    html = wait_html(client, "127 pins in a hexagon of 6 rings")
+    assert "UNSURE" not in html and "mine_0.png (1 of 4)" in html and "127 of 127" in html
+    client.set("layout is", "one smaller")
+    assert "UNSURE" in wait_html(client, "91 pins in a hexagon of 5 rings")
+    client.set("Use this sensor", True)
+    client.wait(lambda update: update.number > 0 and "my-sensor" in str(client.value("sensor")), 2 * WAIT_S)
+    studio.twin.open(first_state(None, SENSOR, "sphere"))
 
 
 def test_a_page_of_another_site_is_refused(studio):

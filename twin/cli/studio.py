@@ -22,6 +22,9 @@ While the object moves, contacts are solved on the usual mesh and pictures are d
 and the contact is solved again on a fine mesh. The page says which of them it shows. Where the object may not go, it stops, and the
 page says why.
 
+Other modes: Degrade (what the pipeline and the model bear on this contact), Recording (labels against estimates), Live (camera and arm),
+Your own sensor (a specification from a folder of frames, as 'twin new' makes it, with the layout drawn over them and corrected).
+
 The page is served for this machine alone, loads nothing from elsewhere, and several browsers see the same state. Ctrl-C ends it.
 
 \b

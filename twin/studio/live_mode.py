@@ -116,26 +116,15 @@ class LiveMode:
             self._limits = gui.add_html("")
             nudges = gui.add_button_group("move, mm", NUDGES, visible=False)
         self._nudges = nudges
-        connect.on_click(self._guarded(self.connect))
-        disconnect.on_click(self._guarded(self.disconnect))
-        health.on_click(self._guarded(self.check_health))
-        stop.on_click(self._guarded(self.emergency_stop))
-        self._record.on_update(self._guarded(self._toggle_record))
-        self._armed.on_update(self._guarded(self._toggle_armed))
-        nudges.on_click(self._guarded(lambda: self._nudge(nudges.value)))
-        gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(self._guarded(self.emergency_stop))
+        connect.on_click(page.guarded(self.connect))
+        disconnect.on_click(page.guarded(self.disconnect))
+        health.on_click(page.guarded(self.check_health))
+        stop.on_click(page.guarded(self.emergency_stop))
+        self._record.on_update(page.guarded(self._toggle_record))
+        self._armed.on_update(page.guarded(self._toggle_armed))
+        nudges.on_click(page.guarded(lambda: self._nudge(nudges.value)))
+        gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(page.guarded(self.emergency_stop))
         self._chart = live_chart(page)
-
-    def _guarded(self, action: Callable[[], None]) -> Callable[[object], None]:
-        def called(event: object) -> None:
-            if getattr(event, "client", self) is None:
-                return
-            try:
-                action()
-            except TwinError as error:
-                self._failed(str(error))
-
-        return called
 
     def _failed(self, text: str) -> None:
         self._page.say(text, bad=True)
@@ -154,7 +143,7 @@ class LiveMode:
         self._active = True
         self._page.show_nothing("Give a camera and press 'Connect'.")
         if self._feed is None and self._camera.value:
-            self._guarded(self.connect)(self)
+            self._page.guarded(self.connect)(self)
 
     def leave(self) -> None:
         """Leave the pictures to another mode. The camera goes on, and a recording too."""

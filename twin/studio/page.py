@@ -14,6 +14,7 @@ import viser
 from viser import uplot
 from viser.infra import WebsockClientConnection
 
+from scenes.base import SpecError
 from twin.errors import TwinError
 from twin.studio.pictures import boxed, paragraph
 from twin.types import ImageArray
@@ -259,6 +260,19 @@ class Page:
             return
         done.result(CHANGE_S)
         self.server.flush()
+
+    def guarded(self, action: Callable[[], None]) -> Callable[[object], None]:
+        """A callback of a control that does an action, and says what the user did wrong. Changes by this program do nothing."""
+
+        def called(event: object) -> None:
+            if getattr(event, "client", self) is None:
+                return
+            try:
+                action()
+            except (TwinError, SpecError) as error:
+                self.say(str(error), bad=True)
+
+        return called
 
     def say(self, text: str, *, bad: bool = False) -> None:
         """Show a line for some seconds."""

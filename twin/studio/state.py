@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section
 from twin.errors import TwinError
-from twin.store import write_json, write_text
+from twin.store import unwritten, write_json, write_text
 from twin.studio.pictures import Drawn
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.scene import Shown
@@ -173,3 +173,21 @@ def tap_and_shear(pose: ObjectPose, *, depth_mm: float = 3.0, shear_mm: float = 
             turned = asdict(pose) | {"x_mm": x0 + s * (x1 - x0), "y_mm": 0.0, "depth_mm": d0 + s * (d1 - d0)}
             way.append((t0 + s * (t1 - t0), ObjectPose(**turned)))
     return [*way, (knots[-1][0], ObjectPose(**(asdict(pose) | {"x_mm": 0.0, "y_mm": 0.0, "depth_mm": knots[-1][1]})))]
+
+
+def next_path(folder: Path, stem: str, suffix: str) -> Path:
+    """A path ``STEM-NUMBER`` in a folder that does not exist yet; the folder is made if there is none.
+
+    Raises
+    ------
+    TwinError
+        The folder can't be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritten(folder, error) from error
+    number = 1
+    while (path := folder / f"{stem}-{number}{suffix}").exists():
+        number += 1
+    return path

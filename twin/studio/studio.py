@@ -8,6 +8,7 @@ from pathlib import Path
 
 from twin.studio.degrade_mode import DegradeMode
 from twin.studio.live_mode import FeedOpener, LiveMode
+from twin.studio.new_mode import NewMode
 from twin.studio.page import LOCAL, Mode, Page
 from twin.studio.recording_mode import RecordingMode
 from twin.studio.state import StudioState
@@ -74,12 +75,13 @@ class Studio:
 
     def __init__(self, plan: StudioPlan, model_of: ModelOf, open_feed: FeedOpener) -> None:
         self.page = Page(f"TacTip studio: {plan.state.sensor}", host=plan.host, port=plan.port)
-        self.page.add_mode_choice([mode.title for mode in (TwinMode, DegradeMode, RecordingMode, LiveMode)])
+        self.page.add_mode_choice([mode.title for mode in (TwinMode, DegradeMode, RecordingMode, LiveMode, NewMode)])
         self.twin = TwinMode(self.page, plan.state, plan.out, model_of, traces=plan.traces)
         degrade = DegradeMode(self.page, self.twin)
         self.twin.followers.append(degrade.follow)
         live = LiveMode(self.page, self.twin, open_feed, plan.out, camera=plan.camera, arm=plan.arm)
-        self.modes: list[Mode] = [self.twin, degrade, RecordingMode(self.page, self.twin, plan.recording), live]
+        recording, new = RecordingMode(self.page, self.twin, plan.recording), NewMode(self.page, self.twin, plan.out)
+        self.modes: list[Mode] = [self.twin, degrade, recording, live, new]
         self.page.set_modes(self.modes)
 
     def __enter__(self) -> "Studio":

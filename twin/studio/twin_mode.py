@@ -10,18 +10,16 @@ import numpy as np
 import viser
 
 from scenes import list_objects, list_sensors, load_object, load_sensor
-from scenes.base import SpecError
 from twin.errors import TwinError
 from twin.estimate import SensorModel
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
-from twin.store import unwritten
 from twin.studio.contact import Answer, Light, MovingContact, Setup
 from twin.studio.page import Chart, Page, put
 from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, spoken, unit_of
 from twin.studio.scene import FULL_SCALE, Scene, Shown
-from twin.studio.state import StudioState, Way, read_way, save_way, tap_and_shear
+from twin.studio.state import StudioState, Way, next_path, read_way, save_way, tap_and_shear
 from twin.studio.tracing import Tracer
 from twin.studio.video import FilmWriter
 from twin.studio.worker import Newest, Worker
@@ -209,7 +207,7 @@ class TwinMode:
     # controls
 
     def _build_controls(self) -> None:
-        gui, setup = self._page.gui, self.contact.setup
+        gui, guarded, setup = self._page.gui, self._page.guarded, self.contact.setup
         with self.folder:
             self._sliders = {}
             for name in NAMES:
@@ -242,31 +240,29 @@ class TwinMode:
                     "Save state": self.save_state,
                 }
                 for label, save in buttons.items():
-                    gui.add_button(label).on_click(self._guarded(save))
+                    gui.add_button(label).on_click(guarded(save))
                 opened = gui.add_upload_button("Open a state", mime_type=".json")
                 self._filming = gui.add_checkbox("record a video", False)
-        self._form.on_update(self._guarded(self._change_form))
-        self._drawing.on_update(self._guarded(self._change_look))
-        self._colour.on_update(self._guarded(self._change_look))
-        self._friction.on_update(self._guarded(self._change_friction))
-        self._object.on_update(self._guarded(self._change_object))
-        self._sensor.on_update(self._guarded(self._change_sensor))
-        anew.on_click(self._guarded(self.begin_anew))
-        tap.on_click(self._guarded(lambda: self.play(tap_and_shear(self._wish))))
-        undo.on_click(self._guarded(self.undo))
-        upload.on_upload(self._guarded(lambda: self.play(read_way(upload.value.content, upload.value.name))))
-        opened.on_upload(self._guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
-        self._record_way.on_update(self._guarded(self._toggle_way))
-        self._filming.on_update(self._guarded(self._toggle_film))
+        self._form.on_update(guarded(self._change_form))
+        self._drawing.on_update(guarded(self._change_look))
+        self._colour.on_update(guarded(self._change_look))
+        self._friction.on_update(guarded(self._change_friction))
+        self._object.on_update(guarded(self._change_object))
+        self._sensor.on_update(guarded(self._change_sensor))
+        anew.on_click(guarded(self.begin_anew))
+        tap.on_click(guarded(lambda: self.play(tap_and_shear(self._wish))))
+        undo.on_click(guarded(self.undo))
+        upload.on_upload(guarded(lambda: self.play(read_way(upload.value.content, upload.value.name))))
+        opened.on_upload(guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
+        self._record_way.on_update(guarded(self._toggle_way))
+        self._filming.on_update(guarded(self._toggle_film))
         for modifier, keys in (("shift", KEYS), ("cmd/ctrl+shift", TURN_KEYS)):
             for key, (name, sign) in keys.items():
                 label = f"{spoken(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
                 command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # a literal of viser's
                 command.on_trigger(self._key(name, sign))
-        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(self._guarded(self.undo))
-        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(
-            self._guarded(lambda: self.play(tap_and_shear(self._wish)))
-        )
+        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
+        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(lambda: self.play(tap_and_shear(self._wish))))
 
     def _slid(self, name: str) -> Callable[[viser.GuiEvent[viser.GuiSliderHandle[float]]], None]:
         def moved(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
@@ -277,19 +273,6 @@ class TwinMode:
 
     def _key(self, name: str, sign: int) -> Callable[[object], None]:
         return lambda event: self.nudge(name, sign)
-
-    def _guarded(self, action: Callable[[], None]) -> Callable[[object], None]:
-        """A callback of a control that does an action, and says what the user did wrong. Changes by this program do nothing."""
-
-        def called(event: object) -> None:
-            if getattr(event, "client", self) is None:
-                return
-            try:
-                action()
-            except (TwinError, SpecError) as error:
-                self._page.say(str(error), bad=True)
-
-        return called
 
     def _own_friction(self) -> float:
         setup = self.contact.setup
@@ -355,6 +338,7 @@ class TwinMode:
             self.contact, self.worker, self._tracer, self._scene = built
             setup = self.contact.setup
             self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
+            self._sensor.options = tuple(sorted({*self._sensor.options, state.sensor}))
             chosen = [(self._form, setup.form), (self._drawing, self._drawn), (self._colour, self._shown)]
             for control, value in [*chosen, (self._sensor, state.sensor), (self._object, state.object)]:
                 if str(value) in control.options:
@@ -452,17 +436,6 @@ class TwinMode:
 
     # saving
 
-    def _next_path(self, stem: str, suffix: str) -> Path:
-        """A path in the folder that does not exist yet."""
-        try:
-            self._out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise unwritten(self._out, error) from error
-        number = 1
-        while (path := self._out / f"{stem}-{number}{suffix}").exists():
-            number += 1
-        return path
-
     def _require_answer(self) -> Answer:
         if self.worker.newest is None:
             raise TwinError("there is no picture yet; wait for the first one")
@@ -471,7 +444,7 @@ class TwinMode:
     def save_picture(self) -> None:
         """Write the frame that is shown."""
         answer = self._require_answer()
-        path = self._next_path("picture", ".png")
+        path = next_path(self._out, "picture", ".png")
         write_image(path, answer.frame.image)
         self._page.say(f"saved {path} ({answer.lit})")
 
@@ -480,7 +453,7 @@ class TwinMode:
         answer = self._require_answer()
         if self._tracer is None:
             raise TwinError("without path tracing no contact can be saved; start the studio without --plain")
-        out = self._next_path("contact", "")
+        out = next_path(self._out, "contact", "")
         out.mkdir()
         pose = PressedPose(**asdict(answer.pose), indent_mm=answer.indent_mm)
         self._tracer.save(out, self.contact.setup.touched, pose, answer.state, answer.frame.form)
@@ -488,7 +461,7 @@ class TwinMode:
 
     def save_state(self) -> None:
         """Write the whole state, and offer it to the browsers."""
-        path = self.state.save(self._next_path("state", ".json"))
+        path = self.state.save(next_path(self._out, "state", ".json"))
         self._page.server.send_file_download(path.name, path.read_bytes())
         self._page.say(f"saved {path}; open it here or with: twin studio --state {path}")
 
@@ -499,11 +472,11 @@ class TwinMode:
         way, self._path = self._path, None
         if way:
             kept = [pair for k, pair in enumerate(way) if k == 0 or pair[0] > way[k - 1][0]]
-            self._page.say(f"saved {save_way(self._next_path('way', '.csv'), kept)} ({len(kept)} poses)")
+            self._page.say(f"saved {save_way(next_path(self._out, 'way', '.csv'), kept)} ({len(kept)} poses)")
 
     def _toggle_film(self) -> None:
         if self._filming.value:
-            self._film = FilmWriter(self._next_path("video", ".mp4"))
+            self._film = FilmWriter(next_path(self._out, "video", ".mp4"))
         else:
             self._end_film()
 

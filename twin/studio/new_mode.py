@@ -1,0 +1,219 @@
+"""The mode 'Your own sensor': from a folder of frames to a specification, with the layout drawn over the frames, and corrected by hand."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from scenes.base import SpecError
+from scenes.pins import PinsSpec, layout_from
+from scenes.sensor import SensorSpec
+from twin.errors import TwinError
+from twin.fit.new_sensor import NewSensor, new_sensor
+from twin.frames import Recording, frames_at, open_recording
+from twin.pins.pipeline import Pipeline
+from twin.studio.page import Page, put
+from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, number_table, paragraph
+from twin.studio.state import next_path
+from twin.studio.twin_mode import TwinMode
+from twin.studio.worker import Newest
+
+LARGER, SMALLER = "one larger", "one smaller"
+"""Corrections of a layout: a ring more or less; for a grid a row and a column."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What to make a specification of.
+
+    Attributes
+    ----------
+    frames : str
+        Folder, video or recording.
+    no_contact : str
+        A frame without contact, "" for none.
+    layout : str
+        As ``layout_from`` takes it, "" to have it identified.
+    """
+
+    frames: str
+    no_contact: str
+    layout: str
+
+
+def corrected(pins: PinsSpec, by: int) -> str:
+    """A layout like another one, larger or smaller by one ring (a grid: by one row and column), as ``layout_from`` takes it.
+
+    Raises
+    ------
+    SpecError
+        The layout is a list of positions, or there is none so small.
+    """
+    if pins.layout == "positions":
+        raise SpecError("a layout of given positions has no rings; correct its CSV file")
+    if pins.layout == "grid":
+        text = f"grid:{(pins.columns or 0) + by}x{(pins.rows or 0) + by}"
+    else:
+        text = f"{pins.layout}:{(pins.rings or 0) + by}"
+    layout_from(text)  # raises an error if there is none
+    return text
+
+
+class NewMode:
+    """The mode 'Your own sensor'.
+
+    Parameters
+    ----------
+    page : Page
+    twin : TwinMode
+        Takes the new sensor up.
+    out : Path
+        Folder for specifications.
+    """
+
+    title = "Your own sensor"
+
+    def __init__(self, page: Page, twin: TwinMode, out: Path) -> None:
+        self._page, self._twin, self._out = page, twin, out
+        self._made: NewSensor | None = None
+        self._recording: Recording | None = None
+        self._pipeline: Pipeline | None = None
+        self._active = False
+        self._making: Newest[Wish] = Newest(self._make, "studio-new", self._failed)
+        self._looking: Newest[int] = Newest(self._look, "studio-new-frame", self._failed)
+        gui, guarded = page.gui, page.guarded
+        self.folder = gui.add_folder(self.title, visible=False)
+        with self.folder:
+            self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
+            self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
+            self._layout = gui.add_text("layout", "", hint="empty: found; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
+            propose = gui.add_button("Propose a specification")
+            correct = gui.add_button_group("layout is", (SMALLER, LARGER))
+            self._number = gui.add_slider("frame to look at", 0, 1, 1, 0, disabled=True)
+            use = gui.add_button("Use this sensor")
+        propose.on_click(guarded(self.propose))
+        correct.on_click(guarded(lambda: self.correct(+1 if correct.value == LARGER else -1)))
+        use.on_click(guarded(self.use))
+        self._number.on_update(self._slid)
+
+    def start(self) -> None:
+        """Begin."""
+        self._making.start()
+        self._looking.start()
+
+    def stop(self) -> None:
+        """End."""
+        self._making.stop()
+        self._looking.stop()
+
+    def enter(self) -> None:
+        """Show the newest proposal."""
+        self._active = True
+        if self._made is None:
+            self._page.show_nothing("Give the folder of your sensor's frames, in contact or not, and press 'Propose a specification'.")
+        else:
+            self._looking.give(int(self._number.value))
+
+    def leave(self) -> None:
+        """Leave the pictures to another mode."""
+        self._active = False
+
+    def propose(self) -> None:
+        """Make a specification from what the user has written. The answer takes from some seconds to half a minute.
+
+        Raises
+        ------
+        TwinError
+            No frames are given.
+        """
+        if not self._frames.value.strip():
+            raise TwinError("give the folder of your sensor's frames first")
+        self._making.give(Wish(self._frames.value.strip(), self._no_contact.value.strip(), self._layout.value.strip()))
+
+    def correct(self, by: int) -> None:
+        """Propose anew with a layout that is larger or smaller by ``by``.
+
+        Raises
+        ------
+        TwinError, SpecError
+            Nothing has been proposed yet, or there is no such layout.
+        """
+        put(self._layout, corrected(self._proposal().sensor.pins, by))
+        self.propose()
+
+    def use(self) -> None:
+        """Take the proposed sensor up in the mode 'Twin'.
+
+        Raises
+        ------
+        TwinError
+            Nothing has been proposed yet.
+        """
+        written = str(self._proposal().written[0])
+        self._twin.open(self._twin.state.model_copy(update={"sensor": written, "form": "raw", "pose": {}}))
+        self._page.choose(self._twin.title)
+
+    def _proposal(self) -> NewSensor:
+        if self._made is None:
+            raise TwinError("nothing has been proposed yet; press 'Propose a specification' first")
+        return self._made
+
+    def _failed(self, text: str) -> None:
+        self._page.say(text, bad=True)
+
+    def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
+        if event.client is not None:  # else it is this program that moves the slider
+            self._looking.give(int(event.target.value))
+
+    def _make(self, wish: Wish) -> None:
+        def tell(stage: str, done: float, total: float, note: str = "") -> None:
+            share = f", {100 * done / total:.0f} %" if total else ""
+            self._page.say(f"looking at the frames: {stage}{share}")
+
+        no_contact = Path(wish.no_contact) if wish.no_contact else None
+        try:
+            layout = layout_from(wish.layout) if wish.layout else None
+            out = next_path(self._out, "my-sensor", ".toml")
+            made = new_sensor(Path(wish.frames), out, layout=layout, no_contact=no_contact, progress=tell)
+        except SpecError as error:
+            raise TwinError(str(error)) from error
+        recording = open_recording(frames_at(Path(wish.frames), None, no_contact), made.sensor)
+        self._take(made, recording)
+
+    def _take(self, made: NewSensor, recording: Recording) -> None:
+        self._made, self._recording = made, recording
+        self._pipeline = Pipeline(made.sensor, recording.form)
+        self._number.max, self._number.disabled = max(1, len(recording) - 1), False
+        self._page.say(f"wrote {made.written[0]}, and a page beside it")
+        self._looking.give(min(int(self._number.value), len(recording) - 1))
+
+    def _look(self, index: int) -> None:
+        made, recording, pipeline = self._made, self._recording, self._pipeline
+        if made is None or recording is None or pipeline is None or not self._active:
+            return
+        frame = recording.read(int(np.clip(index, 0, len(recording) - 1)))
+        seen = pipeline(frame)
+        camera = camera_picture(frame, seen, pipeline.reference.pins_px, Drawn.GRAPH)
+        cells = cell_picture(frame, seen, pipeline.reference.area_px2)
+        numbers = _numbers(made, f"{frame.name} ({index + 1} of {len(recording)})", f"{seen.found} of {seen.expected}", pipeline.spec)
+
+        def change() -> None:
+            if self._active:
+                self._page.show_pictures(camera, cells, f"frame {frame.name} with the proposed layout")
+                self._page.show_numbers(*numbers)
+
+        self._page.together(change)
+
+
+def _numbers(made: NewSensor, frame: str, found: str, sensor: SensorSpec) -> list[str]:
+    """HTML of a proposal: how sure it is, what speaks against it, how it does on the frames, and what to do next."""
+    sure = made.identified.sure
+    rows = {"layout": sensor.pins.in_words(), "frame": frame, "pins found": found, "file": made.written[0].name}
+    lines = made.lines()
+    return [
+        badge("sure" if sure else "UNSURE", "still" if sure else "moving"),
+        number_table(rows),
+        *(paragraph(line, "stop") for line in lines if line.startswith("doubt: ")),
+        *(paragraph(line, "said" if line.startswith(("or: ", "next: ")) else "note") for line in lines if not line.startswith("doubt: ")),
+    ]

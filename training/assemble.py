@@ -16,6 +16,7 @@ import torch
 
 from training.dataset import Dataset
 from training.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points, Processes, fit_processes
+from training.label_code import LabelCode, label_error
 from training.models.part import Inputs, Model, Modes, Prediction, Prepared
 from training.networks import predict_rows
 from twin.pins.reference import Reference
@@ -58,9 +59,11 @@ class Ensemble:
         self.blend, self.quantile = np.asarray(content["blend"]), np.asarray(content["quantile"])
         self.raw_quantile = np.asarray(content["raw_quantile"])
         self.beside = Processes.of_arrays(TWO_FIDELITIES, content["beside"]) if "beside" in content else None
+        none_circular = np.zeros(len(self.shift))  # as in runs that were made before directions were known
+        self.code = LabelCode(tuple(bool(circular) for circular in np.asarray(content.get("circular", none_circular))))
 
     def outputs(self, inputs: Inputs, rows: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Standardised mean and scale (B, K) and the probability (B,) of an executed move."""
+        """Standardised mean and scale (B, E) of the labels' numbers (``LabelCode``), and the probability (B,) of an executed move."""
         outs = [predict_rows(network, inputs, rows) for network in self.networks]
         mean = np.mean([out["mean"].double().numpy() for out in outs], axis=0)
         if self.kernels:
@@ -74,7 +77,7 @@ class Ensemble:
         return self.model.modes(self.networks[0], inputs, rows)
 
     def _kernels_say(self, modes: Modes) -> np.ndarray:
-        """(B, k) standardised labels: the mean over the views of a row, weighted by the row's share in each view."""
+        """(B, k) standardised numbers: the mean over the views of a row, weighted by the row's share in each view."""
         share = modes.share[:, None]
         said = np.zeros((len(modes.inputs), len(self.kernel_labels)))
         for kernel, part in zip(self.kernels, (1 - share, share), strict=False):
@@ -89,9 +92,17 @@ class Ensemble:
             modes = self.modes(inputs, rows)
             share = PROCESS_SHARE * (1 - modes.share[:, None])  # 0 in view 1, because the process has not seen a displaced camera
             mean = (1 - share) * mean + share * self.beside(Points.of(modes.inputs, second=True))
-        scale = self.scale * scale
+        labels, scale = self.labelled(mean, scale)
         raw = self.raw_quantile[undone(executed)]
-        return Prediction(self.shift + self.scale * mean, self.quantile * scale, raw * scale, executed)
+        return Prediction(labels, self.quantile * scale, raw * scale, executed)
+
+    def labelled(self, mean: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Labels and their expected errors (B, K), mm and deg, from standardised numbers and theirs (B, E)."""
+        return self.code.decode(self.shift + self.scale * mean, self.scale * scale)
+
+    def standardised(self, labels: np.ndarray) -> np.ndarray:
+        """Standardised numbers (M, E) of labels (M, K) in mm and deg."""
+        return (self.code.encode(labels) - self.shift) / self.scale
 
 
 def _scale_and_move(outs: list[dict[str, torch.Tensor]]) -> tuple[np.ndarray, np.ndarray]:
@@ -111,6 +122,7 @@ def calibrate(
     prepared: Prepared,
     train: np.ndarray,
     networks: list[dict],
+    code: LabelCode,
     scaling: tuple[np.ndarray, np.ndarray],
     *,
     labels: str,
@@ -127,23 +139,27 @@ def calibrate(
         Training rows.
     networks : list of dict
         Each with ``weights``, and ``held``: the rows that it was not trained on.
-    scaling : (K,) float, (K,) float
-        Shift and scale of the labels.
+    code : LabelCode
+        How the K labels are written as E numbers.
+    scaling : (E,) float, (E,) float
+        Shift and scale of these numbers.
     labels, helpers, kernel, size, seed
         As in ``RunConfig`` and its recipe.
 
     Returns
     -------
     dict
-        ``networks``, ``kernels``, ``shift``, ``scale``, ``blend``, ``quantile``, ``raw_quantile``: what ``Ensemble`` takes.
+        ``networks``, ``kernels``, ``circular``, ``shift``, ``scale``, ``blend``, ``quantile``, ``raw_quantile``: what ``Ensemble`` takes.
     """
     shift, scale = scaling
-    y = ((data.targets.corrected if labels == "corrected" else data.targets.raw) - shift) / scale
-    k = y.shape[1]
-    main = np.array([j for j, name in enumerate(data.targets.names) if name not in helpers], int)  # labels that the processes estimate
+    learnt = data.targets.corrected if labels == "corrected" else data.targets.raw
+    y = (code.encode(learnt) - shift) / scale
+    k, e, owner = learnt.shape[1], y.shape[1], code.label_of
+    helps = [name in helpers for name in data.targets.names]
+    main = np.array([j for j in range(e) if not helps[owner[j]]], int)  # numbers that the processes estimate
     content: dict = {"networks": [network["weights"] for network in networks], "kernels": [], "shift": shift, "scale": scale}
-    content |= {"blend": np.zeros(k), "quantile": np.ones(k), "raw_quantile": np.ones((2, k)), "kernel_labels": main.tolist()}
-    raw = (data.targets.raw - shift) / scale
+    content |= {"blend": np.zeros(e), "quantile": np.ones(k), "raw_quantile": np.ones((2, k)), "kernel_labels": main.tolist()}
+    content["circular"] = np.array(code.circular, np.int64)
     single = [Ensemble(model, data.pins.reference, content | {"networks": [weights]}, size) for weights in content["networks"]]
     left_out = np.full(y.shape, np.nan)
     if kernel:
@@ -156,22 +172,24 @@ def calibrate(
     parts: list[tuple] = []
     for ensemble, network in zip(single, networks, strict=True):
         held = network["held"].numpy()
-        parts.append((*ensemble.outputs(prepared.inputs, network["held"]), y[held], raw[held], left_out[held]))
-    mean, spread, executed, truth, published, said = (np.concatenate(part) for part in zip(*parts, strict=True))
+        parts.append((*ensemble.outputs(prepared.inputs, network["held"]), y[held], left_out[held], learnt[held], data.targets.raw[held]))
+    mean, spread, executed, truth, said, known, published = (np.concatenate(part) for part in zip(*parts, strict=True))
     if not len(mean):
         return content
     if kernel:
         errors = [np.abs(b * said + (1 - b) * mean - truth).mean(axis=0) for b in BLENDS]
         content["blend"][main] = BLENDS[np.argmin(errors, axis=0)][main]
         mean = np.where(content["blend"] > 0, content["blend"] * said + (1 - content["blend"]) * mean, mean)
-    return content | intervals(mean, truth, published, spread, executed)
+    return content | intervals(*single[0].labelled(mean, spread), known, published, executed, data.targets.units)
 
 
-def intervals(made: np.ndarray, truth: np.ndarray, published: np.ndarray, scale: np.ndarray, executed: np.ndarray) -> dict[str, np.ndarray]:
-    """Quantiles for corrected and for raw labels (n, K), from predictions and error scales (n, K) and the probability of a move (n,)."""
+def intervals(
+    made: np.ndarray, scale: np.ndarray, truth: np.ndarray, published: np.ndarray, executed: np.ndarray, units: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """Quantiles for corrected and for raw labels (n, K), from estimates and expected errors (n, K) and the probability of a move (n,)."""
     return {
-        "quantile": conformal_quantile(np.abs(made - truth) / scale),
-        "raw_quantile": group_quantiles(np.abs(made - published) / scale, undone(executed)),
+        "quantile": conformal_quantile(np.abs(label_error(made, truth, units)) / scale),
+        "raw_quantile": group_quantiles(np.abs(label_error(made, published, units)) / scale, undone(executed)),
     }
 
 

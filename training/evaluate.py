@@ -18,6 +18,7 @@ import torch
 from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
 from training.identity import rows_named
+from training.label_code import label_error
 from training.models.part import Prediction
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
@@ -83,7 +84,7 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
     targets = data.targets.rows(rows)
     found: dict = {"frames": len(rows), "without_prediction": int((~np.isfinite(made.mean)).any(axis=1).sum())}
     for kind in ("raw", "corrected"):
-        error = np.abs(made.mean - getattr(targets, kind))
+        error = np.abs(label_error(made.mean, getattr(targets, kind), targets.units))
         half_width = made.half_width_raw if kind == "raw" else made.half_width
         inside = error <= half_width
         found[kind] = {
@@ -128,7 +129,7 @@ def leak_check(mean: np.ndarray, targets: Targets) -> Leak:
     if not np.isfinite(targets.executed).any():
         return Leak(None, f"no file beside the table tells which moves were executed ({', '.join(EXECUTED_FILES)}; 'twin audit' makes one)")
     k = targets.names.index(LEAK_LABEL)
-    turn, error = targets.move[:, 1], (mean - targets.corrected)[:, k]
+    turn, error = targets.move[:, 1], label_error(mean, targets.corrected, targets.units)[:, k]
     usable = (targets.executed < 0.5) & np.isfinite(turn) & np.isfinite(error)
     if usable.sum() < LEAK_FRAMES:
         return Leak(None, f"{usable.sum()} frames with a prediction and a move that was not executed; {LEAK_FRAMES} are needed")
@@ -209,10 +210,12 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
     count = len(targets.names)
     figure, axes = new_figure(count, 2, panel_inch=3.6)
     undone = np.nan_to_num(targets.executed, nan=1.0) < 0.5
+    errors = label_error(made.mean, truth, targets.units)
     for k, (name, unit) in enumerate(zip(targets.names, targets.units, strict=True)):
-        error = made.mean[:, k] - truth[:, k]
+        error = errors[:, k]
         for chosen, colour, label in ((~undone, "#1f77b4", "move executed"), (undone, "#ff7f0e", "not executed")):
-            axes[k].plot(truth[chosen, k], made.mean[chosen, k], ".", color=colour, markersize=2, label=label)
+            near = truth[chosen, k] + error[chosen]  # a direction is drawn on the truth's turn of the circle
+            axes[k].plot(truth[chosen, k], near, ".", color=colour, markersize=2, label=label)
             axes[count + k].plot(truth[chosen, k], error[chosen], ".", color=colour, markersize=2)
         axes[k].set(title=f"{name}: MAE {np.abs(error).mean():.3g} {unit} ({labels})", ylabel=f"predicted, {unit}")
         axes[count + k].set(xlabel=f"label, {unit}", ylabel=f"error, {unit}")
@@ -298,7 +301,7 @@ def judge_changes(
     found = []
     for name, said in value.items():
         valid = np.isfinite(said).all(axis=1)
-        error, usual = np.abs(said - truth)[valid].mean(axis=0), np.abs(value["none"] - truth)[valid].mean(axis=0)
+        error, usual = (np.abs(label_error(made, truth, estimator.units))[valid].mean(axis=0) for made in (said, value["none"]))
         labels = {f"{label}_mae": float(error[k]) for k, label in enumerate(estimator.names)}
         labels |= {f"{label}_more": float(error[k] / usual[k] - 1) for k, label in enumerate(estimator.names)}
         found.append({"change": name, "frames": len(rows), "not_valid": int((~valid).sum())} | labels)

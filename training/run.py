@@ -23,6 +23,7 @@ import torch
 from training.assemble import calibrate
 from training.dataset import Dataset, split_rows
 from training.identity import ASIDE, difference, frame_marks, identity_of
+from training.label_code import LabelCode, goes_round
 from training.loop import Loop, Rows
 from training.models import model_named
 from training.models.part import Prepared
@@ -128,13 +129,14 @@ def train_run(
     resolved = resolve(config, data, train)
     state = _opened(out, resolved)
     prepared = model_named(config.model).prepare(data, train)
-    scaled, shift, scale = scaled_labels(data, config, train)
+    code = LabelCode(goes_round(data.targets.units, labels_learnt(data, config)[train]))
+    scaled, shift, scale = scaled_labels(data, config, train, code)
     done: list = state["done"] if state else []
     loop = None
     all_epochs = config.recipe.members * config.recipe.epochs
     while len(done) < config.recipe.members:
         member = len(done)
-        loop = _member(config, data, prepared, scaled, train, member, device)
+        loop = _member(config, data, prepared, scaled, code, train, member, device)
         if state and state["loop"] is not None:
             loop.load(state["loop"])
         state, kept = None, monotonic()
@@ -148,11 +150,11 @@ def train_run(
                 kept = monotonic()
             if out_of_time and not loop.finished:
                 networks = [*done, _finished(loop)]
-                _assemble(out, resolved, config, data, prepared, train, networks, (shift, scale))
+                _assemble(out, resolved, config, data, prepared, train, networks, code, (shift, scale))
                 return False
         done.append(_finished(loop))
         _keep(out, resolved, done, None)
-    _assemble(out, resolved, config, data, prepared, train, done, (shift, scale))
+    _assemble(out, resolved, config, data, prepared, train, done, code, (shift, scale))
     (out / CHECKPOINT).unlink(missing_ok=True)
     return True
 
@@ -208,9 +210,14 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
     } | ({"labelled": dict(config.labelled)} if config.labelled else {})
 
 
-def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
-    """Labels (M, K) as the network learns them, float32, and shift and scale (K,) back to mm and deg: ``label = shift + scale x``."""
-    labels = data.targets.corrected if config.labels == "corrected" else data.targets.raw
+def labels_learnt(data: Dataset, config: RunConfig) -> np.ndarray:
+    """Labels (M, K) of the kind that a run learns, mm and deg."""
+    return data.targets.corrected if config.labels == "corrected" else data.targets.raw
+
+
+def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
+    """Labels (M, E) as the network learns them, float32, and shift and scale (E,) back to the code's: ``number = shift + scale x``."""
+    labels = code.encode(labels_learnt(data, config))
     known, k = labels[train], labels.shape[1]
     if config.recipe.scaling == "standard":
         shift, scale = known.mean(axis=0), known.std(axis=0)
@@ -223,7 +230,14 @@ def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray) -> tuple[
 
 
 def _member(
-    config: RunConfig, data: Dataset, prepared: Prepared, scaled: torch.Tensor, train: np.ndarray, member: int, device: str
+    config: RunConfig,
+    data: Dataset,
+    prepared: Prepared,
+    scaled: torch.Tensor,
+    code: LabelCode,
+    train: np.ndarray,
+    member: int,
+    device: str,
 ) -> Loop:
     seed, model, views = 1000 * config.seed + member, model_named(config.model), prepared.views
     torch.manual_seed(seed)
@@ -231,7 +245,7 @@ def _member(
     held, learnt = fold_rows(train, config.seed, member, data.group)
     model.initialise(network, prepared.inputs, torch.from_numpy(train))
     network.to(device)
-    weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])
+    weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])[code.label_of]
     executed = torch.from_numpy(data.targets.executed.astype(np.float32))
     learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
     rows = Rows(prepared.inputs, scaled.repeat(views, 1), weight, executed.repeat(views), torch.from_numpy(learnt), torch.from_numpy(held))
@@ -264,6 +278,7 @@ def _assemble(
     prepared: Prepared,
     train: np.ndarray,
     networks: list[dict],
+    code: LabelCode,
     scaling: tuple[np.ndarray, np.ndarray],
 ) -> None:
     model = model_named(config.model)
@@ -273,6 +288,7 @@ def _assemble(
         prepared,
         train,
         networks,
+        code,
         scaling,
         labels=config.labels,
         helpers=config.helpers,
@@ -281,7 +297,7 @@ def _assemble(
         seed=config.seed,
     )
     content |= {"aside": dict(prepared.learnt), "reference_px": data.pins.reference.pins_px, "learnt_from": frame_marks(data)[train]}
-    content["parameters"] = parameter_count(model.build(data.pins.reference, len(data.targets.names), config.size))
+    content["parameters"] = parameter_count(model.build(data.pins.reference, len(code.label_of), config.size))
     write_tensors(out / TENSORS, content)
     write_text(out / CONFIG, json.dumps(resolved | {"parameters": content["parameters"]}, indent=1) + "\n")
     write_curves(out, [network["curves"] for network in networks])

@@ -78,7 +78,7 @@ def require_together(run: Path, config: Mapping[str, Any], content: Mapping[str,
         They are of other pins or of another number of labels.
     """
     sensor = SensorSpec.model_validate(config["sensor"])
-    pins, labels = len(content["reference_px"]), len(content["shift"])
+    pins, labels = len(content["reference_px"]), len(content.get("circular", content["shift"]))
     if pins != sensor.pins.count:
         raise damaged(run / CONFIG, f"a sensor of {sensor.pins.count} pins, the weights are of {pins}")
     if not labels == len(config["columns"]) == len(config["units"]):

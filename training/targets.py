@@ -23,6 +23,7 @@ PRESETS = {
     "surface-3d": ("pose_3", "pose_4", "pose_5"),
     "edge-2d": ("pose_1", "pose_6"),
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
+    "edge-circle": ("pose_2", "pose_3", "pose_6"),
 }
 # Fields of Targets that hold a row for each frame.
 TARGET_COLUMNS = ("raw", "corrected", "executed", "move")

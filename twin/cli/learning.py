@@ -159,8 +159,8 @@ cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters, on
                   128 x 128 px
 
 --target selects the labels, which are columns of the recording's table. It is a preset (surface-2d: pose_2 pose_6; surface-2d-shear:
-also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d) or names with commas between. With --labels corrected, a
-move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the table says so.
+also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d; edge-circle) or names with commas between. With --labels
+corrected, a move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the table says so.
 
 Depth and angle of simulated contacts are relative to the touched surface, whatever its shape: the indentation along the normal at
 the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.

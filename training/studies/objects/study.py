@@ -14,6 +14,7 @@ from scenes import ExperimentSpec
 from training.dataset import Dataset, load_dataset
 from training.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate
+from training.label_code import label_error
 from training.recipes import TrainingError
 from training.studies.objects.page import write_page
 from training.studies.objects.plan import MIXED, TIMES, Plan
@@ -108,7 +109,7 @@ def table(plan: Plan, runs: dict[str, Path], sets: dict[str, Dataset]) -> list[d
                 raise TrainingError(
                     f"{thing.name}: none of its contacts has labels within the ranges of {plan.experiment.name}; give more --tests"
                 )
-            off = estimator.predict_rows(data, chosen).mean - data.targets.corrected[chosen]
+            off = label_error(estimator.predict_rows(data, chosen).mean, data.targets.corrected[chosen], data.targets.units)
             error, bias = np.abs(off).mean(axis=0), off.mean(axis=0)
             flat = error if flat is None else flat
             row: dict[str, Any] = {"model": model, "object": thing.name, "seen": thing.name in learnt}

@@ -14,6 +14,7 @@ from training.estimator import PoseEstimator
 from training.evaluate import judge, leak_check
 from training.gaussian_process import fit_two_fidelities
 from training.identity import frame_marks, identity_of
+from training.label_code import LabelCode, goes_round, label_error
 from training.loop import epoch_step
 from training.models import model_named, recipe_of
 from training.pins import voronoi_areas
@@ -216,21 +217,25 @@ def put_beside(run: Path, out: Path, simulated: Dataset, labelled: Dataset, *, s
     mean, scale, executed = ensemble.outputs(inputs, rows)
     seen = ensemble.modes(inputs, rows).inputs
     known = ensemble.modes(*estimator.inputs_of(simulated.pins, together=not simulated.pins.measured)).inputs
-    truth, raw, told = (
-        (values - ensemble.shift) / ensemble.scale
-        for values in (getattr(labelled.targets, labels), labelled.targets.raw, getattr(simulated.targets, labels))
+    truth = getattr(labelled.targets, labels)
+    process, alone = fit_two_fidelities(
+        known, ensemble.standardised(getattr(simulated.targets, labels)), seen, ensemble.standardised(truth), seed=seed
     )
-    process, alone = fit_two_fidelities(known, told, seen, truth, seed=seed)
     content = read_tensors(run / TENSORS)
-    missed = [intervals(made, truth, raw, scale, executed) for made in (mean, alone)]
+
+    def widths(made: np.ndarray) -> dict[str, np.ndarray]:
+        return intervals(*ensemble.labelled(made, scale), truth, labelled.targets.raw, executed, labelled.targets.units)
+
+    missed = [widths(made) for made in (mean, alone)]
     wider = {key: np.maximum.reduce([content[key].numpy(), *(said[key] for said in missed)]) for key in missed[0]}
-    content |= intervals((mean + alone) / 2, truth, raw, scale, executed) | {"beside": process.arrays()}
+    content |= widths((mean + alone) / 2) | {"beside": process.arrays()}
     if "learnt_from" in content:
         content["learnt_from"] = np.concatenate([content["learnt_from"].numpy(), frame_marks(labelled)])
     write_tensors(out / TENSORS, content)
     about = {"data": str(labelled.folder), "frames": labelled.pins.image_name.tolist()}
     write_text(out / CONFIG, json.dumps(estimator.config | {"beside": about}, indent=1) + "\n")
-    return Beside(np.abs(alone - truth).mean(axis=0) * ensemble.scale, wider)
+    left_out = label_error(ensemble.labelled(alone, scale)[0], truth, labelled.targets.units)
+    return Beside(np.abs(left_out).mean(axis=0), wider)
 
 
 def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
@@ -263,7 +268,9 @@ def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) 
     modes = (moved - middle) @ directions[:keep].T * np.sqrt(len(rows)) / sizes[0]
     i, j = np.triu_indices(keep)
     x = np.concatenate([np.ones((len(real), 1)), modes, modes[:, i] * modes[:, j]], axis=1)
-    known, shift = real.targets.corrected[rows], real.targets.corrected[rows].mean(axis=0)
+    code = LabelCode(goes_round(real.targets.units, real.targets.corrected[rows]))
+    known = code.encode(real.targets.corrected[rows])
+    shift = known.mean(axis=0)
     made = np.empty((len(test), known.shape[1]))
     left, sizes, right = np.linalg.svd(x[rows], full_matrices=False)
     for k in range(known.shape[1]):
@@ -278,6 +285,6 @@ def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) 
     row = {"trained_on": name, "labelled_frames": len(rows), "model": "quadratic regression"}
     targets = real.targets.rows(test)
     for kind in ("corrected", "raw"):
-        errors = np.abs(made - getattr(targets, kind)).mean(axis=0)
+        errors = np.abs(label_error(code.decode(made, np.zeros_like(made))[0], getattr(targets, kind), targets.units)).mean(axis=0)
         row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}
-    return row | {"leak_slope": leak_check(made, targets).slope}
+    return row | {"leak_slope": leak_check(code.decode(made, np.zeros_like(made))[0], targets).slope}

@@ -1,0 +1,71 @@
+"""Labels as the numbers that a model estimates: a direction that goes round the whole circle as its sine and cosine, others as they are.
+
+A direction has no beginning: 179 deg and -179 deg are 2 deg apart. A model that estimated the number of degrees would have to jump
+there, and would err by up to 180 deg near the jump.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+# Range of an angle's labels, deg, above which the angle goes round the whole circle. Tilts and small turns stay far below it.
+HALF_CIRCLE_DEG = 180.0
+
+
+def goes_round(units: Sequence[str], labels: np.ndarray) -> tuple[bool, ...]:
+    """Which of K labels (M, K) with these units are directions on the whole circle."""
+    return tuple(unit == "deg" and bool(np.ptp(column) > HALF_CIRCLE_DEG) for unit, column in zip(units, labels.T, strict=True))
+
+
+def label_error(made: np.ndarray, truth: np.ndarray, units: Sequence[str]) -> np.ndarray:
+    """Estimates less truth, (..., K) both. Angles are compared the short way round, from -180 to 180 deg."""
+    angle = np.array([unit == "deg" for unit in units], bool)
+    return np.where(angle, wrapped_deg(made - truth), made - truth)
+
+
+def wrapped_deg(angle_deg: np.ndarray) -> np.ndarray:
+    """The same angles from -180 to 180 deg. Those that already are stay the same to the last bit."""
+    return np.where(np.abs(angle_deg) <= HALF_CIRCLE_DEG, angle_deg, (angle_deg + 180) % 360 - 180)
+
+
+@dataclass(frozen=True)
+class LabelCode:
+    """K labels as E numbers: each direction is two numbers, sine and cosine, in the place of one.
+
+    Attributes
+    ----------
+    circular : tuple of bool
+        Which of the K labels are directions on the whole circle.
+    """
+
+    circular: tuple[bool, ...]
+
+    @property
+    def label_of(self) -> np.ndarray:
+        """(E,) int: the label that each number belongs to."""
+        return np.repeat(np.arange(len(self.circular)), np.where(self.circular, 2, 1))
+
+    def encode(self, labels: np.ndarray) -> np.ndarray:
+        """Labels (M, K) in mm and deg as numbers (M, E)."""
+        parts = []
+        for column, circular in zip(labels.T, self.circular, strict=True):
+            parts += [np.sin(np.radians(column)), np.cos(np.radians(column))] if circular else [column]
+        return np.stack(parts, axis=1) if parts else np.zeros((len(labels), 0))
+
+    def decode(self, numbers: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Labels (B, K) in mm and deg from numbers (B, E), and the labels' expected errors from those of the numbers (both >= 0)."""
+        values, errors = [], []
+        at = 0
+        for circular in self.circular:
+            if not circular:
+                values.append(numbers[:, at])
+                errors.append(scale[:, at])
+                at += 1
+                continue
+            (sine, cosine), (of_sine, of_cosine) = numbers[:, at : at + 2].T, scale[:, at : at + 2].T
+            square = np.maximum(sine**2 + cosine**2, 1e-12)
+            values.append(np.degrees(np.arctan2(sine, cosine)))
+            errors.append(np.degrees(np.hypot(cosine * of_sine, sine * of_cosine) / square))
+            at += 2
+        return np.stack(values, axis=1), np.stack(errors, axis=1)

@@ -7,12 +7,16 @@ import shutil
 import pytest
 import torch
 from drawn_recording import config_of
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
+from scenes import SpecError
 from training.estimator import PoseEstimator
 from training.packed import pack
 from training.recipes import TrainingError
 from training.run import train_run
 from training.run_files import read_tensors, write_tensors
+from twin.errors import FrameError
 
 CONFIGS = {
     "a list": lambda config: [1],
@@ -51,6 +55,32 @@ def refused(call, path):
     assert str(path) in said and "train again" in said
     assert len(said.splitlines()) == 1 and len(said) < 600 and "weights_only" not in said and "pydantic" not in said
     return said
+
+
+anything = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.lists(st.integers(), max_size=2)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), value=anything | st.dictionaries(st.text(max_size=5), anything, max_size=2))
+def test_a_configuration_with_any_other_value_makes_a_model_or_is_refused(trained, tmp_path_factory, data, value):
+    """Whatever key of any depth has whatever value: the run is loaded, or one line names it."""
+    run = tmp_path_factory.mktemp("any") / "run"
+    shutil.copytree(trained, run)
+    config = json.loads((run / "config.json").read_text())
+    place = config
+    while True:
+        key = data.draw(st.sampled_from(sorted(place)))
+        if not isinstance(place[key], dict) or not place[key] or data.draw(st.booleans()):
+            break
+        place = place[key]
+    place[key] = value
+    (run / "config.json").write_text(json.dumps(config))
+    try:
+        estimator = PoseEstimator.load(run)
+    except (TrainingError, FrameError, SpecError) as error:
+        assert "\n" not in str(error) and len(str(error)) < 1500
+    else:
+        assert len(estimator.names) == len(estimator.units)
 
 
 @pytest.mark.parametrize("what", CONFIGS)

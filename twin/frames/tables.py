@@ -85,7 +85,7 @@ def _cells(path: Path) -> list[list[str]]:
         else:
             (row,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
         row = [cell.strip(AROUND_CELLS) for cell in row]
-        if separator == ";":
+        if separator != ",":
             row = [re.sub(r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$", r"\1.\2", cell) for cell in row]
         if any(row):
             rows.append(row)
@@ -218,7 +218,7 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
 def _as_array(cells: list[str]) -> np.ndarray:
     """A column as float if every cell is a number (an empty cell is NaN), else as text."""
     try:
-        return np.array([float(cell) if cell else np.nan for cell in cells])
+        return np.array([_written_number(cell) if cell else np.nan for cell in cells])
     except ValueError:
         return np.array(cells, str)
 
@@ -231,9 +231,16 @@ def numbers(cells: np.ndarray) -> np.ndarray:
 
 def _number(cell: str) -> float:
     try:
-        return float(cell)
+        return _written_number(cell)
     except ValueError:
         return float("nan")
+
+
+def _written_number(cell: str) -> float:
+    """The number in a cell. Python would also read 1_5 as 15: a slip of the hand is no number."""
+    if "_" in cell:
+        raise ValueError(cell)
+    return float(cell)
 
 
 def read_metadata(path: Path, problems: list[str]) -> object | None:

@@ -44,9 +44,7 @@ class Written:
 @st.composite
 def written(draw: st.DrawFn) -> tuple[Written, dict[str, dict[str, float]]]:
     """A sound table in some form, and the labels by frame."""
-    value = (
-        st.floats(-1e3, 1e3).map(lambda v: f"{v:.4f}") | st.integers(-99, 99).map(str) | st.sampled_from(["1.5e0", "+2", "-2e-3"])
-    )
+    value = st.floats(-1e3, 1e3).map(lambda v: f"{v:.4f}") | st.integers(-99, 99).map(str) | st.sampled_from(["1.5e0", "+2", "-2e-3"])
     columns = tuple(draw(st.permutations([*LABELS, "obj_id"])))
     rows = [(name, tuple(draw(value) for _ in columns)) for name in draw(st.permutations(FRAMES))]
     table = Written(rows, columns, *(draw(st.sampled_from(each)) for each in (FORMS, CODES, LINE_ENDS, NAMES)), draw(st.booleans()))

@@ -190,6 +190,8 @@ def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: to
     """
     error = out["mean"] - labels
     loss = ((error.abs() if kind == "l1" else error.square()) * weight).mean()
+    if "first" in out:  # a first guess, which a later part of the network refines
+        loss = loss + ((out["first"] - labels).abs() * weight).mean()
     if "log_scale" in out:
         scale = out["log_scale"]
         loss = loss + SCALE_LOSS * (error.detach().abs() * torch.exp(-scale) + scale).mean()

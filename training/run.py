@@ -226,6 +226,8 @@ def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: Lab
     else:
         shift, scale = np.zeros(k), np.ones(k)
     scale = np.where(scale > 0, scale, 1.0)
+    pair = np.array(code.circular)[code.label_of]
+    shift, scale = np.where(pair, 0.0, shift), np.where(pair, np.sqrt(0.5), scale)  # a direction stays one, whatever labels there are
     return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
 
 
@@ -243,7 +245,7 @@ def _member(
     torch.manual_seed(seed)
     network = model.build(data.pins.reference, scaled.shape[1], config.size)
     held, learnt = fold_rows(train, config.seed, member, data.group)
-    model.initialise(network, prepared.inputs, torch.from_numpy(train))
+    model.initialise(network, prepared.inputs, torch.from_numpy(train), scaled, code)
     network.to(device)
     weight = torch.tensor([EXTRA_WEIGHT if name in config.helpers else 1.0 for name in data.targets.names])[code.label_of]
     executed = torch.from_numpy(data.targets.executed.astype(np.float32))

@@ -5,6 +5,7 @@ from dataclasses import asdict, fields
 from training.models.cnn.model import CNN_V1, CNN_V2
 from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
 from training.models.part import Model, Variant
+from training.models.steered.model import STEERED
 from training.models.vgnn.model import VGNN
 from training.recipes import Recipe, TrainingError
 
@@ -27,6 +28,7 @@ def register(model: Model) -> None:
 
 
 register(VGNN)
+register(STEERED)
 register(GNN)
 register(TAC_VGNN)
 register(TAC_VGNN_RELEASE)

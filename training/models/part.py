@@ -18,6 +18,7 @@ from torch import nn
 
 from scenes.sensor import SensorSpec
 from training.dataset import Dataset
+from training.label_code import LabelCode
 from training.pins import PinTable
 from training.recipes import Recipe, TrainingError
 from twin.pins import Pipeline
@@ -204,8 +205,18 @@ class Model(ABC):
             The model has no such size.
         """
 
-    def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> None:  # noqa: B027  (most take nothing)
-        """Set what a network needs from the training rows (m,) before its first step. Most models need nothing."""
+    def initialise(  # noqa: B027  (most take nothing)
+        self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode
+    ) -> None:
+        """Set what a network needs from the training rows (m,) before its first step. Most models need nothing.
+
+        Parameters
+        ----------
+        numbers : (M, E) float
+            Standardised numbers of all frames' labels.
+        code : LabelCode
+            Which labels they are.
+        """
 
     def penalty(self, network: nn.Module) -> torch.Tensor | None:
         """The number that training adds to the loss of every batch; None if there is none."""

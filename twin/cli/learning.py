@@ -151,6 +151,7 @@ HELP_TRAIN = """Train a model that tells the pose from a frame.
 \b
 vgnn              ours: Voronoi graph network on matched pins, ensemble,
                   calibrated 90 % intervals
+steered           ours for an edge whose direction goes round the whole circle
 tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense
                   layers 96, 64
 tac-vgnn-release  the same with the published code's dense layers: 128, 96

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from training.label_code import LabelCode
 from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Variant, Weights, refuse_sizes
 from training.models.vgnn.inputs import PinInputs, filled, pin_features, seated_inputs
 from training.models.vgnn.network import Vgnn, VgnnSize
@@ -63,7 +64,7 @@ class VgnnModel(PinModel):
             return PinInputs(pin_features(nodes_px, area_px2, reference), pins.lost)
         return seated_inputs(registration, nodes_px, area_px2, pins.lost, reference, together=together)
 
-    def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> None:
+    def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the scales of the features and the pin modes."""
         cast(Vgnn, network).prepare(cast(PinInputs, inputs).x[rows])
 

@@ -16,6 +16,7 @@ import torch
 from training.dataset import Dataset
 from training.estimator import PoseEstimator
 from training.evaluate import judge, rows_to_judge
+from training.label_code import LabelCode
 from training.loop import Loop, Rows, epoch_step
 from training.models import model_named, recipe_of, variant_named
 from training.models.part import Inputs
@@ -210,9 +211,10 @@ def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, 
     torch.manual_seed(0)
     part, count = model_named(model), len(inputs)
     network = part.build(pins.reference, 2, {})
-    part.initialise(network, inputs, torch.arange(min(INITIAL_ROWS, count)))
+    labels = torch.randn(count, 2)
+    part.initialise(network, inputs, torch.arange(min(INITIAL_ROWS, count)), labels, LabelCode((False, False)))
     timed = count if part.timed_batches is None else min(part.timed_batches * batch, count)
-    labels, executed, none = torch.randn(count, 2), torch.full((count,), torch.nan), torch.zeros(0, dtype=torch.long)
+    executed, none = torch.full((count,), torch.nan), torch.zeros(0, dtype=torch.long)
     rows = Rows(inputs, labels, torch.ones(2), executed, torch.arange(timed), none)
     loop = Loop(network.to(device), recipe_of(model, batch=batch), rows, 0, part.penalty)
     with PeakMemory(device) as memory:

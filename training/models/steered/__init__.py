@@ -1,0 +1,1 @@
+"""``steered``: a model of one direction on the whole circle."""

@@ -1,0 +1,83 @@
+"""``steered``: our model of an edge's direction, a label that goes round the whole circle."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import cast
+
+import numpy as np
+import torch
+from torch import nn
+
+from training.label_code import LabelCode
+from training.models.part import Inputs, Learnt, PinModel, Weights, refuse_sizes
+from training.models.steered.field import waves_of
+from training.models.steered.network import Steered, SteeredSize
+from training.pins import PinTable
+from training.recipes import Recipe, TrainingError
+from twin.pins.reference import Reference
+
+# Buffers that a small copy leaves out, because they follow from the pins at rest.
+DERIVED = ("fit", "order")
+
+
+class Displacements:
+    """Displacements from rest of every frame: ``batch`` gives (B, N, 2), in mean rest spacings.
+
+    Parameters
+    ----------
+    moved : (M, N, 2) float
+    """
+
+    def __init__(self, moved: np.ndarray) -> None:
+        self.moved = torch.from_numpy(moved.astype(np.float32))
+
+    def __len__(self) -> int:
+        return len(self.moved)
+
+    def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Arguments of the network for some rows."""
+        return (self.moved[rows],)
+
+
+class SteeredModel(PinModel):
+    """See the module. Unlike ``vgnn`` it does not notice that the camera sits elsewhere than in training."""
+
+    counts_from_rest = True
+
+    def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Steered:
+        """See ``Model``; sizes are the fields of ``SteeredSize``."""
+        refuse_sizes(self, size, tuple(field.name for field in fields(SteeredSize)))
+        return Steered(waves_of(reference.pins_px), outputs, SteeredSize(**size))
+
+    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> Displacements:
+        """See ``PinModel``. A lost pin is where its neighbours predict it."""
+        return Displacements((pins.nodes_px - pins.reference.pins_px) / reference.spacing_px.mean())
+
+    def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
+        """See ``Model``. Sets the principal components, and in which sense the direction's label grows.
+
+        Raises
+        ------
+        TrainingError
+            Not exactly one label goes round the whole circle.
+        """
+        if sum(code.circular) != 1:
+            raise TrainingError(
+                f"{self.name} is for labels of which one is a direction on the whole circle, these have {sum(code.circular)}; train vgnn"
+            )
+        cast(Steered, network).prepare(cast(Displacements, inputs).moved[rows], numbers[rows], code)
+
+    def pack(self, weights: Weights) -> Weights:
+        """See ``Model``. Leaves out what follows from the pins at rest."""
+        return {key: value for key, value in weights.items() if key not in DERIVED}
+
+    def unpack(self, packed: Weights, blank: Weights) -> Weights:
+        """See ``Model``."""
+        return packed | {key: blank[key] for key in DERIVED}
+
+
+STEERED = SteeredModel(
+    name="steered",
+    description="ours for an edge's direction: the field of displacements, turned to the direction and looked at again",
+    recipe=Recipe(epochs=80, batch=128, members=2),
+)

@@ -1,7 +1,7 @@
-"""The reference of functions and classes: a page for each package, made by Sphinx from the docstrings."""
+"""The reference of functions and classes: a page for each package, made from signatures and docstrings. Nothing is imported for it."""
 
 import ast
-import inspect
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +10,8 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("scenes", "twin", "training", "hardware")
 # Options are in the reference of commands; Python's own entry is one function.
 LEFT_OUT = ("twin.cli",)
+# Characters of the longest signature on one line.
+WIDTH = 100
 
 
 @dataclass(frozen=True)
@@ -48,18 +50,113 @@ def pages() -> dict[str, list[Module]]:
 
 
 def text_of(page: str, members: list[Module]) -> str:
-    """One page, Markdown with Sphinx's directives."""
+    """One page, Markdown: each module with its public functions and classes."""
     lines = [f"# {page}", ""]
     for module in members:
-        package = module.path.name == "__init__.py"
-        if module.name != page:
-            lines += [f"## {module.name}", ""]
-        lines += ["```{eval-rst}", f".. automodule:: {module.name}", *([] if package else ["   :members:"]), "```", ""]
-        exported = _exported(module.tree) if package else {}
+        tree = module.tree
+        lines += [f"## {module.name}", "", markdown(ast.get_docstring(tree)), ""]
+        exported = _exported(tree) if module.path.name == "__init__.py" else {}
         if exported:
-            lines += [f"Imported from here, as in `from {module.name} import {min(exported)}`:", ""]
-            lines += ["```{eval-rst}", *(f"* :py:obj:`{name} <{place}>`" for name, place in sorted(exported.items())), "```", ""]
+            first = min(exported)
+            lines += [
+                f"Import from here, as in `from {module.name} import {first}`: "
+                + ", ".join(f"`{name}`" for name in sorted(exported))
+                + ".",
+                "",
+            ]
+        for node in _public(tree.body):
+            lines += _described(node, "###")
     return "\n".join(lines) + "\n"
+
+
+def _described(node: ast.FunctionDef | ast.ClassDef, level: str, owner: str = "") -> Iterator[str]:
+    """A function or class with its signature and its docstring; a class with its methods."""
+    kind = _kind(node)
+    yield from (f"{level} {owner}{node.name}", "", f"```python\n{signature(node, kind)}\n```", "", markdown(ast.get_docstring(node)), "")
+    if isinstance(node, ast.ClassDef):
+        seen: set[str] = set()
+        for each in _public(node.body):
+            if each.name not in seen:  # a setter stands with its property
+                seen.add(each.name)
+                yield from _described(each, f"{level}#", f"{node.name}.")
+
+
+def _kind(node: ast.FunctionDef | ast.ClassDef) -> str:
+    """What a definition is, as its decorators say."""
+    marks = {ast.unparse(mark).partition("(")[0].rpartition(".")[2] for mark in node.decorator_list}
+    return next((mark for mark in ("property", "cached_property", "classmethod", "staticmethod", "dataclass") if mark in marks), "")
+
+
+def signature(node: ast.FunctionDef | ast.ClassDef, kind: str = "") -> str:
+    """The head of a definition as a reader would call it: without ``self``, long ones with an argument on each line."""
+    if isinstance(node, ast.ClassDef):
+        made = next((each for each in node.body if isinstance(each, ast.FunctionDef) and each.name == "__init__"), None)
+        fields = [each for each in node.body if isinstance(each, ast.AnnAssign) and not ast.unparse(each.target).startswith("_")]
+        parts = _arguments(made) if made else [ast.unparse(field) for field in fields]
+        bases = ", ".join(map(ast.unparse, node.bases))
+        bases = f"  # a {', '.join(map(ast.unparse, node.bases))}" if node.bases else ""
+        return f"class {_call(node.name, parts) if parts else node.name}{bases}"
+    result = f" -> {ast.unparse(node.returns)}" if node.returns else ""
+    if kind.endswith("property"):
+        return f"{node.name}{result}"
+    return _call(node.name, _arguments(node)) + result
+
+
+def _call(name: str, parts: list[str]) -> str:
+    line = f"{name}({', '.join(parts)})"
+    return line if len(line) < WIDTH else "\n".join([f"{name}(", *(f"    {part}," for part in parts), ")"])
+
+
+def _arguments(node: ast.FunctionDef) -> list[str]:
+    """Arguments with annotations and defaults, as in the source."""
+    given = node.args
+    plain = [*given.posonlyargs, *given.args]
+    defaults: list[ast.expr | None] = [*[None] * (len(plain) - len(given.defaults)), *given.defaults]
+    parts = [_argument(each, default) for each, default in zip(plain, defaults, strict=True) if each.arg not in ("self", "cls")]
+    if given.vararg:
+        parts.append(f"*{ast.unparse(given.vararg)}")
+    elif given.kwonlyargs:
+        parts.append("*")
+    parts += [_argument(each, default) for each, default in zip(given.kwonlyargs, given.kw_defaults, strict=True)]
+    return parts + ([f"**{ast.unparse(given.kwarg)}"] if given.kwarg else [])
+
+
+def _argument(each: ast.arg, default: ast.expr | None) -> str:
+    return ast.unparse(each) + (f" = {ast.unparse(default)}" if default else "")
+
+
+def markdown(text: str | None) -> str:
+    """A numpydoc docstring as Markdown."""
+    head, *sections = re.split(r"^([A-Z][A-Za-z ]+)\n-{3,}\n", text or "", flags=re.MULTILINE)
+    parts = [plain(head)]
+    for title, body in zip(sections[::2], sections[1::2], strict=True):
+        entries = re.findall(r"^(\S[^\n]*)\n?((?:    [^\n]*\n?|\n)*)", body, re.MULTILINE)
+        parts.append(f"**{title}**")
+        parts.append(
+            plain(body) if title in ("Notes", "Examples", "References") else "\n".join(_entry(name, said) for name, said in entries)
+        )
+    return "\n\n".join(part.strip("\n") for part in parts if part.strip())
+
+
+def _entry(name: str, said: str) -> str:
+    """One parameter, attribute or error as an item of a list."""
+    names, _, kind = name.partition(" : ")
+    about = plain(" ".join(said.split()))
+    return f"- `{names.strip()}`" + (f" ({plain(kind)})" if kind else "") + (f": {about}" if about else "")
+
+
+def plain(text: str) -> str:
+    """Text of a docstring for Markdown: names in backticks become code, indented blocks stay, nothing else is markup."""
+    lines = []
+    for line in text.splitlines():
+        if line.startswith("    "):
+            lines.append(line)
+            continue
+        pieces = re.split(r"(``.*?``|`[^`]*`)", line)
+        lines.append(
+            "".join(f"`{piece.strip('`')}`" if k % 2 else re.sub(r"([*<$\[\]])", r"\\\1", piece) for k, piece in enumerate(pieces))
+        )
+    return "\n".join(lines)
 
 
 def _exported(tree: ast.Module) -> dict[str, str]:
@@ -111,8 +208,3 @@ def _methods(tree: ast.Module) -> Iterator[tuple[str, ast.FunctionDef | ast.Clas
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef):
             yield from ((each.name, each) for each in _public(node.body))
-
-
-def first_line(text: str | None) -> str:
-    """The first paragraph of a docstring on one line."""
-    return " ".join(inspect.cleandoc(text or "").split("\n\n")[0].split())

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from bench_training import drawn_table, inputs_of
 
-from figures.jobs import JOBS, WORK, FiguresError, Measured, Value, fingerprint, job, real_folder, run_twin
+from figures.jobs import FiguresError, Measured, Value, job, read, real_folder, run_twin
 from training.studies.tac_vgnn.models import measure_training
 
 SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
@@ -51,17 +51,16 @@ def trained(work: Path, *, model: str, sensor: str, split: int) -> Measured:
 
 
 def over_splits(work: Path, *, model: str, sensor: str) -> Measured:
-    """Mean, least and largest error over seeds and splits, of runs that the single jobs made."""
+    """Mean, least and largest error over seeds and splits, from the kept figures of the single jobs."""
     found = {}
-    each = []
-    for split in SPLITS:
-        name = f"training.{model}.{sensor}.split{split}"
-        metrics = WORK / name / fingerprint(JOBS[name]) / "judged" / "metrics.json"
-        if not metrics.is_file():
-            raise FiguresError(f"{metrics} is missing: run {name} first (make figures ONLY={name})")
-        each.append(json.loads(metrics.read_text()))
-    for kind, (name, unit) in product(("corrected", "raw"), UNITS.items()):
-        errors = [metrics[kind][name]["mae"] for metrics in each]
+    jobs = [f"training.{model}.{sensor}.split{split}" for split in SPLITS]
+    kept = read()
+    if missing := [name for name in jobs if name not in kept]:
+        raise FiguresError(f"{', '.join(missing)} must be measured first: make figures ONLY={','.join(missing)}")
+    if len({kept[name]["fingerprint"] for name in jobs}) > 1:
+        raise FiguresError(f"{', '.join(jobs)} were measured with different code: make figures ONLY={','.join(jobs)}")
+    for kind, unit in product(("corrected", "raw"), UNITS.values()):
+        errors = [kept[name]["figures"][f"{kind}_{unit}"]["value"] for name in jobs]
         parts = (("mean", np.mean(errors)), ("least", min(errors)), ("most", max(errors)))
         found |= {f"{kind}_{unit}_{key}": Value(float(value), unit) for key, value in parts}
     return found

@@ -7,7 +7,7 @@ import pytest
 from figures import __main__ as driver
 from figures import jobs as module
 from figures import tables
-from figures.jobs import FIGURES, JOBS, FiguresError, Job, Value, is_kept, run, values
+from figures.jobs import FIGURES, JOBS, FiguresError, Job, Value, is_kept, read, run, values
 
 
 @pytest.fixture
@@ -67,13 +67,19 @@ def test_every_figure_of_a_table_is_some_jobs():
 
 
 def test_a_document_gets_its_tables_and_numbers(monkeypatch, tmp_path):
-    (tmp_path / "forces.md").write_text("| force | {probe.force:.1f} N |\n| share | {probe.share:.0%} |\n")
+    table = "| what | |\n| --- | --- |\n| force | {probe.run.force:.1f} N, {probe.run.side:.1f} N |\n| share | {probe.other.share:.0%} |\n"
+    (tmp_path / "forces.md").write_text(table)
     monkeypatch.setattr(tables, "TEMPLATES", tmp_path)
-    text = "Before\n<!-- figures: forces -->\nold\n<!-- /figures -->\nand <!-- figure: probe.force .2f -->9<!-- /figure --> N."
-    made = tables.filled(text, {"probe.force": Value(1.25, "N")})
-    assert "| force | 1.2 N |\n| share | ? |" in made and "-->1.25<!-- /figure --> N." in made and "old" not in made
-    assert tables.filled(made, {"probe.force": Value(1.25, "N")}) == made
-    assert sorted(tables.used_in(text)) == ["probe.force", "probe.force", "probe.share"]
+    text = "Before\n<!-- figures: forces -->\nold\n<!-- /figures -->\nand <!-- figure: probe.run.force .2f -->9<!-- /figure --> N."
+    entry = {"command": "twin probe", "date": "2026-01-02", "commit": "abc", "minutes": 1.5, "machine": "a desk"}
+    jobs = {"probe.run": entry | {"figures": {"force": {"value": 1.25, "unit": "N"}}}}
+    made = tables.filled(text, jobs)
+    assert "| --- | --- |\n| force | 1.2 N, ? N |\n\nMeasured by `twin probe`; 2026-01-02.\n" in made
+    assert "-->1.25<!-- /figure --> N." in made and "old" not in made and "share" not in made
+    assert tables.filled(made, jobs) == made
+    assert "Nobody has measured this table with this version: `make figures ONLY=probe` does." in tables.filled(text, {})
+    assert sorted(tables.used_in(text)) == ["probe.other.share", "probe.run.force", "probe.run.force", "probe.run.side"]
+    assert "| probe.run | `twin probe` | 2026-01-02 | abc | 1.5 | a desk |" in tables.render("jobs", jobs)
     with pytest.raises(FiguresError, match="no table is called 'force'.*forces"):
         tables.filled(text.replace("figures: forces", "figures: force"), {})
 
@@ -82,4 +88,4 @@ def test_a_document_gets_its_tables_and_numbers(monkeypatch, tmp_path):
 def test_documents_state_what_was_measured(path):
     """Marked tables and numbers are those of figures.json: `make tables` writes them."""
     text = path.read_text()
-    assert tables.filled(text, values(FIGURES)) == text, f"{path.name} states other figures than {FIGURES.name}: run 'make tables'"
+    assert tables.filled(text, read(FIGURES)) == text, f"{path.name} states other figures than {FIGURES.name}: run 'make tables'"

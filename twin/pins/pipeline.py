@@ -78,7 +78,8 @@ class Pipeline:
         Form of the frames.
     reference : Reference, optional
         Layout without contact; by default that of the specification.
-        graph : {"voronoi", "delaunay", "knn"}
+    graph : {"voronoi", "delaunay", "knn"}
+        Kind of the graph.
     second_look : bool
         If an adaptive threshold loses pins, or finds many other blobs, also try thresholds from the frame's own contrast.
     """

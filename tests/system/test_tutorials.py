@@ -1,0 +1,67 @@
+"""Every tutorial runs as it stands and prints what it says: Python in one namespace, commands by the program itself."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from command import run_twin
+from generators.notebooks import Block, blocks, tutorials
+
+QUICK = {"first-contact"}
+"""Tutorials that take a few seconds."""
+
+
+def run_block(block: Block, names: dict[str, object], capsys: pytest.CaptureFixture[str]) -> str:
+    """What a block prints."""
+    capsys.readouterr()
+    if block.language == "python":
+        exec(compile(block.code, f"line {block.line}", "exec"), names)
+        return capsys.readouterr().out
+    said = ""
+    for line in re.sub(r"\\\n\s*", "", block.code).strip().splitlines():
+        done = run_twin(*shlex.split(line)[1:])
+        assert line.startswith("twin ") and done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+        said += done.stdout
+    return said
+
+
+def agrees(stated: str, printed: str) -> bool:
+    """Whether a text has been printed; ``...`` stands for anything, runs of blanks for one."""
+    parts = [re.escape(" ".join(part.split())) for part in stated.split("...")]
+    return re.fullmatch(r"\s*" + ".*?".join(parts) + r"\s*", " ".join(printed.split()), re.DOTALL) is not None
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.slow) for path in tutorials()]
+)
+def test_a_tutorial_runs_as_it_stands(page: Path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "__main__"}
+    printed = ""
+    for block in blocks(page.read_text(encoding="utf-8")):
+        if block.language in ("python", "bash"):
+            printed = run_block(block, names, capsys)
+        elif block.language == "text":
+            assert agrees(block.code, printed), f"{page.name}, line {block.line}: it printed\n{printed}"
+
+
+def test_every_tutorial_has_code_that_runs():
+    assert {path.stem for path in tutorials()} >= QUICK
+    for path in tutorials():
+        languages = [block.language for block in blocks(path.read_text(encoding="utf-8"))]
+        assert "python" in languages and "bash" in languages, path.name
+
+
+@pytest.mark.parametrize(
+    ("stated", "printed", "same"),
+    [
+        ("a ... c\n", "a b c\n", True),
+        ("a ... c", "a b d", False),
+        ("[1.0 ... 2]", "[ 1.0  0 2]", False),
+        ("x", "x y", False),
+        ("...", "", True),
+    ],
+)
+def test_what_is_stated_is_compared(stated, printed, same):
+    assert agrees(stated, printed) is same

@@ -6,7 +6,7 @@ OUT ?= $(DEMO)
 export TACTIP_REAL ?= ../shared/real
 SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
-.PHONY: help setup demo test golden bench figures film tables validate lint types wheel clean
+.PHONY: help setup demo test golden bench figures film tables docs validate lint types wheel clean
 help:            ## what can be made
 	@sed -n 's/^\([a-z]*\): .*## /\1\t/p' $(MAKEFILE_LIST)
 
@@ -50,6 +50,11 @@ film: setup      ## the studio's film and three pictures, in out/film; needs Deb
 
 tables: setup    ## make the documents' tables from figures.json
 	@$(SCRIPT) -m figures --tables
+
+docs: setup      ## the documentation, from this code, in out/docs; a warning is an error
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,docs]'
+	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
+	@echo "wrote out/docs/index.html"
 
 lint: setup      ## style
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .

@@ -1,10 +1,12 @@
-"""Tutorials: one Markdown page each, from which a notebook is written and whose code the tests run.
+"""Pages whose code the tests run: tutorials, from which notebooks are written, and how to add things.
 
 Blocks of ``python`` are run in one namespace, lines of ``bash`` that begin with ``twin`` by the program, and a block of ``text`` after
-either states what it prints; ``...`` in it stands for anything.
+either states what it prints; ``...`` in it stands for anything. A block of ``toml`` that begins with a comment of one word is the file of
+that name. A block may stand in an item of a list.
 """
 
 import re
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,11 +42,16 @@ def tutorials() -> list[Path]:
     return [path for path in sorted((DOCS / FOLDER).glob("*.md")) if path.stem != "index"]
 
 
+def run_pages() -> list[Path]:
+    """Every page whose code is run."""
+    return [*tutorials(), *(path for path in sorted((DOCS / "how-to").glob("*.md")) if path.stem != "index")]
+
+
 def blocks(text: str) -> list[Block]:
-    """The blocks of code of a page."""
+    """The blocks of code of a page, without the indentation of a list."""
     return [
-        Block(found[1], found[2], text[: found.start()].count("\n") + 1)
-        for found in re.finditer(r"^```([\w{}-]*)[^\n]*\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+        Block(found[2], textwrap.dedent(found[3]), text[: found.start()].count("\n") + 1)
+        for found in re.finditer(r"^( *)```([\w{}-]*)[^\n]*\n(.*?)^\1```$", text, re.DOTALL | re.MULTILINE)
     ]
 
 

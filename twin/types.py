@@ -91,15 +91,16 @@ class ContactState:
     force_n, torque_nmm : (3,) float
         Total contact force of the *skin on the object* and its torque about the sensor's origin.
     area_mm2 : float
-        Area of the outer skin in contact, at rest.
+        Area of the outer skin in contact, at rest: skin that is nearer to the object than 0.05 mm. Zero where nothing presses.
     contact_mm : (c, 3) float
-        Places of the outer skin that touch the object. Each represents an area ``point_area_mm2 (c,)`` of the skin at rest.
+        Places of the outer skin that the object presses. Each represents an area ``point_area_mm2 (c,)`` of the skin at rest.
     normal : (c, 3) float
         The object's outward unit normal at each place.
     normal_n : (c,) float
-        Magnitude of the normal force at each place. Divided by ``point_area_mm2`` it is the pressure in MPa.
+        Magnitude of the normal force at each place. ``pressure_mpa`` is the pressure.
     tangential_n : (c, 3) float
-        Friction force of the skin on the object at each place. The sum of ``tangential_n - normal_n normal`` is ``force_n``.
+        Friction force of the skin on the object at each place; ``traction_mpa`` by area. The sum of ``tangential_n - normal_n normal``
+        is ``force_n``.
     slipping : (c,) bool
         Whether the place slides; otherwise it sticks.
     T_sensor_object : (4, 4) float
@@ -129,6 +130,21 @@ class ContactState:
     elastic_nmm: float
     dissipated_nmm: float
     residual: float
+
+    @property
+    def pressure_mpa(self) -> FloatArray:
+        """Normal pressure (c,) at each place that is pressed, by the skin's area at rest."""
+        return self.normal_n / self.point_area_mm2
+
+    @property
+    def traction_mpa(self) -> FloatArray:
+        """Friction of the skin on the object (c, 3) at each place that is pressed, by the skin's area at rest."""
+        return self.tangential_n / self.point_area_mm2[:, None]
+
+    @property
+    def slip_share(self) -> float:
+        """Share of the pressed area that slides, 0 to 1; 0 where nothing presses."""
+        return float(self.point_area_mm2[self.slipping].sum() / max(self.point_area_mm2.sum(), 1e-9))
 
     @classmethod
     def untouched(

@@ -109,4 +109,4 @@ class FiniteElements:
             felt.lost[row] = ""
             felt.base_mm[row], felt.axis[row], felt.caps_mm[row] = state.base_mm, state.axis, state.caps_mm
             felt.force_n[row], felt.torque_nmm[row], felt.area_mm2[row] = state.force_n, state.torque_nmm, state.area_mm2
-            felt.slip[row] = float(state.point_area_mm2[state.slipping].sum()) / max(state.area_mm2, 1e-9)
+            felt.slip[row] = state.slip_share

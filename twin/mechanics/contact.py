@@ -26,6 +26,9 @@ SMOOTH_GAP_MM = 0.006
 """eps: penetration below which the pressure rises with its square, so that touching is smooth."""
 STICK_CREEP_MM = 0.01
 """delta: travel from its anchor at which a sticking point starts to slip; about a hundredth of a usual shear."""
+TOUCHING_MM = 0.05
+"""Skin that is nearer to a pressed object than this counts as touching it. Within a patch the skin lifts by some micrometres where it bears
+almost nothing, so that the area with pressure alone depends on the mesh."""
 POINTS_PER_ELEMENT = 4
 """Contact points along each side of an outer element."""
 
@@ -81,6 +84,17 @@ def contact_points(solid: Solid, shape: SkinShape) -> ContactPoints:
         area_mm2=np.linalg.norm(growth, axis=1) * step**2,
         element=element,
     )
+
+
+def touching_mm2(points: ContactPoints, gap_mm: FloatArray) -> float:
+    """Rest area of the skin whose gap to the object, (p,) at the points, is less than ``TOUCHING_MM``.
+
+    Between the points, which form a square grid, the gap is taken as linear, so that the area changes continuously.
+    """
+    side = round(len(gap_mm) ** 0.5)
+    along = np.gradient(gap_mm.reshape(side, side))
+    change = np.maximum(np.abs(along[0]) + np.abs(along[1]), 1e-12).ravel()  # of the gap across a point's own cell
+    return float(np.clip(0.5 + (TOUCHING_MM - gap_mm) / change, 0, 1) @ points.area_mm2)
 
 
 @compiled()

@@ -10,6 +10,7 @@ import numpy as np
 
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
+from twin.mechanics.contact import touching_mm2
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
 from twin.objects import ObjectField
@@ -152,6 +153,10 @@ class LoadStepper:
             else:
                 return self._accepted(state, problem, control, border, balance), balance, looked
         raise NoConvergence(balance.relative)
+
+    def touching_mm2(self, state: LoadState) -> float:
+        """Rest area of the skin that touches the object in a state (see ``contact.touching_mm2``)."""
+        return touching_mm2(self._body.points, self._field.distance(self._seen(state.control_mm, state.border, state.T)))
 
     def _provide(self, looked: IntArray, gap: FloatArray) -> None:
         """Prepare the elimination for contact at the points looked at (q,); ``gap`` (p,) in mm are the distances of all points."""

@@ -82,7 +82,7 @@ class OngoingContact:
         with self._one_thread():
             self.stepper.follow(replace(self.setting.body, kinds=tuple(kind for kind, _ in now)))
             self.load, balance, looked = self.stepper.step(self.load, T, [given for _, given in now])
-            result = contact_state(self.setting, self.load, balance, looked)
+            result = contact_state(self.setting, self.load, balance, looked, self.stepper.touching_mm2(self.load))
         control_mm = self.load.control_mm
         self._past = [p.after(kind, term, span_s, control_mm) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
         return result
@@ -129,8 +129,11 @@ class OngoingContact:
             yield at, result
 
 
-def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: IntArray) -> ContactState:
-    """What others see of a converged load step; ``looked`` (q,) int are the contact points the balance speaks of."""
+def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: IntArray, touching_mm2: float) -> ContactState:
+    """What others see of a converged load step; ``looked`` (q,) int are the contact points the balance speaks of.
+
+    ``touching_mm2``: skin near the object; it counts where anything presses.
+    """
     contact, points = balance.contact, setting.body.points
     touched = np.flatnonzero(contact.penetration_mm > 0)
     where = looked[touched]
@@ -149,7 +152,7 @@ def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: 
         caps_mm=caps,
         force_n=force.sum(axis=0),
         torque_nmm=np.cross(at, force).sum(axis=0),
-        area_mm2=float(points.area_mm2[where].sum()),
+        area_mm2=touching_mm2 if len(where) else 0.0,
         contact_mm=at,
         normal=normal,
         normal_n=normal_n,

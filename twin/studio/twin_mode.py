@@ -403,13 +403,12 @@ class TwinMode:
         mesh = str(answer.mesh) if len(state.contact_mm) else "no contact"
         force = state.force_n + 0.0
         across = float(np.hypot(force[0], force[1]))
-        slipping = 100 * float(state.slipping.mean()) if len(state.slipping) else 0.0
         rows = {
             "force x, y, z": f"{force[0]:+.2f}  {force[1]:+.2f}  {force[2]:+.2f} N",
             "across, friction used": f"{across:.2f} N, {across / force[2]:.2f}" if force[2] > 0.01 else "-",
             "torque about z": f"{state.torque_nmm[2]:+.1f} N mm",
             "indentation": f"{answer.indent_mm:+.2f} mm",
-            "contact area, slipping": f"{state.area_mm2:.0f} mm2, {slipping:.0f} %",
+            "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",
             "pins found": f"{seen.found} of {len(seen.pins_px)}" + ("" if seen.valid else f": {seen.reason}"),
         }
         full, unit = FULL_SCALE[self._shown]

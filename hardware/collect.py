@@ -32,6 +32,7 @@ from scenes.files import shown
 from twin.frames.images import write_image
 from twin.pins import require_untouched
 from twin.progress import Progress, Step, silent, stage
+from twin.records import KeptAlso
 from twin.store import contents, made_by, output, write_json, write_text, writes
 from twin.types import Form, Frame
 
@@ -414,6 +415,8 @@ class CollectPlan:
         Safety limits, by name or file. None: those of the arm's kind.
     plain_light : bool
         The twin's frames without path tracing; see ``build_rig``.
+    also : tuple of str
+        Further formats that each contact is kept in as soon as it is made, each in a subfolder.
     """
 
     sensor: SensorSpec
@@ -427,6 +430,7 @@ class CollectPlan:
     form: Form | None = None
     limits: str | None = None
     plain_light: bool = False
+    also: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST_CONTACTS:
@@ -462,6 +466,7 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
     FrameError
         The sensor seems to be pressed in the frame without contact.
     """
+    kept = KeptAlso(out, plan.also, plan.sensor)
     rig = build_rig(
         plan.sensor,
         plan.stimulus,
@@ -485,23 +490,37 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         )
         require_untouched(plan.sensor, rig.source.form, frame, remedy)
 
-    if before < plan.count:
-        with rig, stage(progress, "contacts") as step:
-            rig.await_frame()
-            collect(
-                rig.source,
-                rig.arm,
-                plan.experiment,
-                rig.placed,
-                collection,
-                plan.count,
-                seed=plan.drawn_with,
-                speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
-                frame_timeout_s=rig.frame_timeout_s,
-                on_rest=require_rest,
-                progress=step,
-            )
+    with kept:
+        if before < plan.count:
+            _collect_on_rig(plan, rig, collection, kept, require_rest, progress)
+        kept.catch_up()
     return Collected(out, collection.count, before)
+
+
+def _collect_on_rig(
+    plan: CollectPlan, rig: Rig, collection: Collection, kept: KeptAlso, require_rest: Callable[[Frame], None], progress: Progress
+) -> None:
+    """Make the contacts that are missing; each is kept in the further formats before the next one is made."""
+    with rig, stage(progress, "contacts") as step:
+
+        def made(done: float, total: float = 1.0, note: str = "") -> None:
+            kept.catch_up()
+            step(done, total, note)
+
+        rig.await_frame()
+        collect(
+            rig.source,
+            rig.arm,
+            plan.experiment,
+            rig.placed,
+            collection,
+            plan.count,
+            seed=plan.drawn_with,
+            speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
+            frame_timeout_s=rig.frame_timeout_s,
+            on_rest=require_rest,
+            progress=made,
+        )
 
 
 def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:

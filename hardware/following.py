@@ -13,19 +13,22 @@ from hardware.errors import DeviceError
 from hardware.last_axis import LastAxis, turns_back_mm
 from hardware.loop import ServoLoop
 from hardware.rig import Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
-from hardware.session import SessionWriter, plain
 from hardware.step import LoopSettings, StepRecord
 from hardware.timing import Timing
 from hardware.trajectory import Measures, Trajectory, measure, trajectory_figure, trajectory_of, write_csv
 from scenes import ObjectSpec, ServoSpec, load_experiment
-from twin.errors import TwinError
+from twin.errors import OptionError, TwinError
 from twin.estimate import Estimate, SensorModel
 from twin.progress import Progress, Step, silent, stage
+from twin.records import KeptAlso
+from twin.records.session import SessionWriter, plain
 from twin.report.charts import save_figure
 from twin.store import write_json, writes
 from twin.types import FIRST, Frame
 
 LOG = logging.getLogger(__name__)
+# Folder of the session in that of the results.
+SESSION = "session"
 # Following ends after this time in s without a usable frame.
 GIVE_UP_S = 5.0
 # Rate in Hz from which the loop's period is set if no rate is given. Then each decision waits for the move before it, and the period is
@@ -67,6 +70,8 @@ class FollowPlan:
     at_rest : str
         What pins are counted from: ``first`` (the frame that is taken clear of the object), ``none`` (the specification's layout), or
         a file.
+    also : tuple of str
+        Further formats that the session is kept in at its end, each in a subfolder of it.
     """
 
     stimulus: ObjectSpec
@@ -81,8 +86,11 @@ class FollowPlan:
     plain_light: bool = False
     known_place: bool = False
     at_rest: str = FIRST
+    also: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.also and not self.record:
+            raise OptionError("--also goes with --record: it keeps that session in a further format")
         if self.stream_hz is not None and not SLOWEST_HZ <= self.stream_hz <= FASTEST_HZ:
             raise DeviceError(f"--rate {self.stream_hz:g}: expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} decisions a second")
         if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
@@ -122,7 +130,7 @@ class Followed:
         return out + ([f"ended early: {self.failure}"] if self.failure else [])
 
 
-@writes("trajectory.csv", "trajectory.png", "measures.json", "session")
+@writes("trajectory.csv", "trajectory.png", "measures.json", SESSION)
 def follow(
     plan: FollowPlan, model: SensorModel, out: Path, *, about: dict[str, Any] | None = None, progress: Progress = silent
 ) -> Followed:
@@ -140,6 +148,7 @@ def follow(
     TwinError
         The run could not begin, or it ended before its first step.
     """
+    kept = KeptAlso(out / SESSION, plan.also, model.sensor)
     rest = given_frame(plan.at_rest, model)
     if rest is not None:
         model = model.at_rest(rest)
@@ -154,7 +163,7 @@ def follow(
         first = rig.await_frame()
         loop = servo_loop(rig, plan.servo, model, _settings(plan, rig, steps))
         loop.require_labels(model(first).names)
-        session = stack.enter_context(SessionWriter(out / "session", told)) if plan.record else None
+        session = stack.enter_context(SessionWriter(out / SESSION, told)) if plan.record else None
         if session is not None and rest is not None:
             session.keep_rest(rest)
         loop.on_step = partial(_note_step, session, step, steps)
@@ -171,6 +180,8 @@ def follow(
             if loop.records:
                 followed = _results(plan, rig, loop, wanted_mm, failure)
                 followed.written.extend(_write(out, plan, model, followed, told))
+                with kept:
+                    kept.catch_up()
     if followed is None:
         raise DeviceError(f"{rig.source.name}: ended before the first step, nothing was followed; give a camera or a longer recording")
     return followed

@@ -19,11 +19,13 @@ from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from hardware.rerun_view import RerunView
 from hardware.rig import counting_from_first, given_frame
-from hardware.session import SESSION_FILES, SessionSource, SessionWriter
+from hardware.session import SessionSource
 from hardware.timing import Spread, Timing
 from twin.errors import FrameError, OptionError, TwinError
 from twin.estimate import Estimate, Estimator, SensorModel
 from twin.pins import Pipeline
+from twin.records import KeptAlso
+from twin.records.session import SESSION_FILES, SessionWriter
 from twin.store import output
 from twin.studio.live_page import LivePage, LiveShot
 from twin.types import FIRST, NONE, Frame
@@ -240,6 +242,8 @@ class WatchPlan:
         What pins are counted from: ``first`` (the first frame), ``none`` (the specification's layout), or a file.
     port : int
         Port of the page; 0: a free one.
+    also : tuple of str
+        Further formats that the session is kept in at its end, each in a subfolder of ``record``.
     """
 
     camera: str = ""
@@ -251,8 +255,11 @@ class WatchPlan:
     count: int | None = None
     at_rest: str = NONE
     port: int = PORT
+    also: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.also and self.record is None:
+            raise OptionError("--also goes with --record: it keeps that session in a further format")
         if bool(self.camera) == (self.replay is not None):
             raise OptionError("give either --camera or --replay")
         if self.replay is not None and self.at_rest != NONE:
@@ -325,6 +332,7 @@ def watch(
     TwinError
         There is no such camera or session, its sensor is not the model's, or the view can't be opened or broke.
     """
+    kept = KeptAlso(plan.record or Path(), plan.also, model.sensor)
     source = SessionSource(plan.replay) if plan.replay is not None else open_camera(plan.camera, model.sensor, model.form)
     model.check(model.sensor, source.form)
     rest = source.rest if isinstance(source, SessionSource) else given_frame(plan.at_rest, model)
@@ -349,6 +357,8 @@ def watch(
         if plan.record is not None:  # the last step: no folder is made if one of the steps before fails
             about = {"sensor": model.sensor.name, "form": str(source.form), "camera": source.name, "model": name}
             stack.enter_context(output(plan.record, *SESSION_FILES))
+            stack.enter_context(kept)
+            stack.callback(_catch_up, session, kept)
             session.record = stack.enter_context(SessionWriter(plan.record, about))
             if rest is not None:
                 session.record.keep_rest(rest)
@@ -360,6 +370,12 @@ def watch(
         same = (same_estimates(source.steps, found), len(found)) if isinstance(source, SessionSource) else None
         notes = source.notes() if isinstance(source, SequentialSource) else []
         return Watched(session.timing(), interrupted, same, plan.record, session.count, notes)
+
+
+def _catch_up(session: LiveSession, kept: KeptAlso) -> None:
+    """Keep a session that has a step in the further formats, however it ended."""
+    if session.count:
+        kept.catch_up()
 
 
 def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Frame | None) -> tuple[SensorModel, Frame | None]:

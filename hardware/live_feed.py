@@ -14,9 +14,9 @@ from hardware.errors import DeviceError
 from hardware.live import LiveSession, estimate_line
 from hardware.safe_arm import SafeArm, try_each
 from hardware.safety import SHIPPED_LIMITS, load_limits
-from hardware.session import SessionWriter
 from twin.errors import TwinError
 from twin.estimate import Estimate, SensorModel
+from twin.records.session import SessionWriter
 from twin.studio.live_page import LiveShot
 from twin.types import Frame
 

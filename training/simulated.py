@@ -1,34 +1,26 @@
 """Simulated data sets: reading those without pictures, and what is known of their contacts besides the table of labels."""
 
 import csv
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import zarr
 from pydantic import ValidationError
 
 from scenes.load import explained
 from scenes.sensor import SensorSpec
 from training.generation.config import GenerationConfig
-from training.generation.store import CONFIG, DRAWS, TRUTH, image_name, read_record
+from training.generation.store import CONFIG, DRAWS, read_record
 from twin.errors import DatasetError, FrameError
 from twin.frames import Recording
 from twin.frames.folders import image_folders
 from twin.frames.forms import frame_size
 from twin.frames.tables import order_by_table, read_table
+from twin.frames.truth import AGAIN, TRUTH, arrays_of, open_truth, row_of
 from twin.rig.kinematics import object_pose, rig_of
 from twin.rig.mounting import Mounting
 from twin.rig.touch import Surface, surface_labels
-from twin.types import Form
 
 TABLE = "targets.csv"
-AGAIN = "copy the data set anew, or make it again"
-NEVER_ZERO = (
-    "pins_px",
-    "rest_px",
-    "visible",
-)  # no part of these arrays is all zeros, so zarr, which reads a missing part as zeros, has all
 
 
 def is_simulated(folder: Path) -> bool:
@@ -49,7 +41,7 @@ def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str,
     FrameError
         The data set was simulated for another sensor, or its table and its truth have different numbers of rows.
     """
-    truth, sensor, form = _truth(folder)
+    truth, sensor, form = open_truth(folder)
     if sensor != spec.name:
         raise FrameError(f"{folder}: simulated for '{sensor}', not for '{spec.name}'; give the matching --sensor")
     problems: list[str] = []
@@ -58,13 +50,13 @@ def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str,
         raise FrameError(f"{folder}: no {TABLE} of a finished data set; give the command that made it once more")
     _, labels = order_by_table([folder / TABLE], [folder / name for name in table.name_lists[0]], problems)
     names = table.name_lists[0]
-    row_of = _row_of(truth)
-    strange = [name for name in names if name not in row_of]
-    if strange or len(names) != len(row_of):
+    rows_by_name = row_of(truth)
+    strange = [name for name in names if name not in rows_by_name]
+    if strange or len(names) != len(rows_by_name):
         said = f", among them {strange[0]}, which is not there" if strange else ""
-        raise FrameError(f"{folder / TABLE}: {len(names)} rows{said}; {TRUTH} has {len(row_of)}: the data set is damaged; {AGAIN}")
-    rows = [row_of[name] for name in names]
-    arrays = {key: array[rows] for key, array in _arrays(truth, ("pins_px", "rest_px", "visible")).items()}
+        raise FrameError(f"{folder / TABLE}: {len(names)} rows{said}; {TRUTH} has {len(rows_by_name)}: the data set is damaged; {AGAIN}")
+    rows = [rows_by_name[name] for name in names]
+    arrays = {key: array[rows] for key, array in arrays_of(truth, ("pins_px", "rest_px", "visible")).items()}
     if arrays["pins_px"].shape[1] != spec.pins.count:
         raise FrameError(f"{folder}: pins {arrays['pins_px'].shape} in {TRUTH}, '{spec.name}' has {spec.pins.count}; {AGAIN}")
     return Recording(folder, form, names, frame_size(spec, form), labels, problems=problems), arrays
@@ -105,12 +97,12 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         and one angle do not describe how the surface is touched.
     """
     config = config_of(folder)
-    truth, _, _ = _truth(folder)
-    row_of = _row_of(truth)
+    truth, _, _ = open_truth(folder)
+    rows_by_name = row_of(truth)
     with (folder / DRAWS).open(newline="", encoding="utf-8") as file:
         draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
-    rows = np.array([row_of.get(name, -1) for name in names.tolist()], int)
-    arrays = _arrays(truth, ("pose", "move", "executed", "force_n", "path_id"))
+    rows = np.array([rows_by_name.get(name, -1) for name in names.tolist()], int)
+    arrays = arrays_of(truth, ("pose", "move", "executed", "force_n", "path_id"))
     pose = (arrays["pose"] - arrays["move"] * ~arrays["executed"][:, None])[rows]
     force_n, contact = arrays["force_n"][rows], np.where(rows < 0, -1, arrays["path_id"][rows])
     surface = Surface(config.object)
@@ -122,41 +114,6 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         sent[:, 2, 3] += config.object.compliance_mm_per_n * force_n[mine, 2]
         for label, values in surface_labels(config.experiment, Mounting.of(sensor, config.experiment), surface, sent).items():
             found.setdefault(label, np.full(len(rows), np.nan))[mine] = values
-    return found
-
-
-def _truth(folder: Path) -> tuple[zarr.Group, str, Form]:
-    """The truth of a data set, the name of its sensor, and the form of its frames."""
-    path = folder / TRUTH
-    try:
-        truth = zarr.open_group(path, mode="r")
-        return truth, str(truth.attrs["sensor"]), Form(str(truth.attrs["form"]))
-    except Exception as error:  # damaged metadata raise whatever zarr runs into
-        raise FrameError(f"{path}: damaged, or of no finished data set; {AGAIN}") from error
-
-
-def _row_of(truth: zarr.Group) -> dict[str, int]:
-    """Row of each frame's name: the truth has the frames in the order of their contacts, whatever order the table has."""
-    found: dict[str, int] = {}
-    states: dict[int, int] = {}
-    for row, contact in enumerate(_arrays(truth, ("path_id",))["path_id"].tolist()):
-        states[contact] = states.get(contact, -1) + 1
-        found[image_name(contact, states[contact])] = row
-    return found
-
-
-def _arrays(truth: zarr.Group, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Arrays of ``truth.zarr`` by name."""
-    found = {}
-    for name in names:
-        try:
-            array = truth.get(name)
-            if isinstance(array, zarr.Array) and not (name in NEVER_ZERO and array.nchunks_initialized < array.nchunks):
-                found[name] = np.asarray(array[:])
-        except Exception as error:  # damaged bytes raise whatever zarr and its codecs run into
-            raise FrameError(f"{truth.store_path}: array '{name}' is damaged; {AGAIN}") from error
-        if name not in found:
-            raise FrameError(f"{truth.store_path}: array '{name}' is missing, or a part of it; {AGAIN}")
     return found
 
 

@@ -7,10 +7,11 @@ from hardware.cameras.recorded import RecordedSource
 from hardware.cameras.source import FrameSource
 from hardware.cameras.uvc import UvcCamera, UvcSettings
 from hardware.errors import DeviceError
-from hardware.session import SessionSource, is_session
+from hardware.session import SessionSource
 from scenes.files import LONGEST_PATH, shown
 from scenes.sensor import SensorSpec
 from twin.frames.forms import frame_size
+from twin.records.session import is_session
 from twin.types import Form
 
 

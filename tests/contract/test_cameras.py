@@ -25,10 +25,10 @@ from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotC
 from hardware.examining import frames_of
 from hardware.lerobot import LeRobotCamera
 from hardware.rig_geometry import PlacedObject
-from hardware.session import SessionWriter
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from twin.errors import FrameError
 from twin.frames.images import write_image
+from twin.records.session import SessionWriter
 from twin.rig.mounting import Mounting
 from twin.types import Form, Frame
 

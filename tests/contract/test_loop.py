@@ -14,10 +14,11 @@ from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.loop import Decided, ServoLoop
 from hardware.rig_geometry import PlacedObject
-from hardware.session import SessionSource, SessionWriter, read_steps
+from hardware.session import SessionSource
 from hardware.step import LoopSettings
 from hardware.trajectory import measure, trajectory_of, write_csv
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
+from twin.records.session import SessionWriter, read_steps
 from twin.rig.mounting import Mounting
 
 SPEED = 20.0  # of the simulated arm, times real

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import save
 
 from hardware.collect import Collection
-from hardware.session import SessionSource, SessionWriter, read_steps
+from hardware.session import SessionSource
 from scenes import SpecError, load_sensor
 from training.packed import unpack
 from twin.errors import TwinError
@@ -26,6 +26,7 @@ from twin.frames import open_recording, read_image
 from twin.frames.tables import order_by_table, read_metadata, read_table
 from twin.pins import nominal_reference
 from twin.pins.graph_files import read_pins
+from twin.records.session import SessionWriter, read_steps
 from twin.rig.labels import read_executed
 from twin.store import Item, find_arrays, find_json, keep_arrays, keep_json
 from twin.types import Form

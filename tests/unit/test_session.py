@@ -10,15 +10,15 @@ import time
 import numpy as np
 import pytest
 
-from hardware.errors import DeviceError
-from hardware.session import FRAMES, REST, STEPS, SessionSource, SessionWriter, is_session, read_steps
-from twin.errors import FrameError
+from hardware.session import SessionSource
+from twin.errors import FrameError, StoreError
 from twin.frames.images import write_image
+from twin.records.session import FRAMES, REST, STEPS, SessionWriter, is_session, read_steps
 from twin.types import Form, Frame
 
 WRITER = """
 import sys, numpy as np
-from hardware.session import SessionWriter
+from twin.records.session import SessionWriter
 from twin.types import Form, Frame
 rng = np.random.default_rng(0)
 with SessionWriter(sys.argv[1], {"camera": "none"}) as session:
@@ -57,7 +57,7 @@ def test_a_session_that_ended_before_its_first_step_is_begun_anew_and_no_other(t
         session.append(frame(0), {"k": 0})
     assert [step["k"] for step in read_steps(tmp_path / "s")] == [0]
     assert not (tmp_path / "s" / REST).exists()
-    with pytest.raises(DeviceError, match="not empty"):
+    with pytest.raises(StoreError, match="not empty"):
         SessionWriter(tmp_path / "s", {})
 
 
@@ -93,7 +93,7 @@ def test_what_is_no_number_becomes_null_and_lines_stay_json(tmp_path):
 
 def test_a_session_overwrites_nothing(tmp_path):
     (tmp_path / "other.txt").write_text("mine")
-    with pytest.raises(DeviceError, match="not empty"):
+    with pytest.raises(StoreError, match="not empty"):
         SessionWriter(tmp_path, {})
     assert not is_session(tmp_path)
     with pytest.raises(FrameError, match="no recorded session"):

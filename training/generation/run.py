@@ -1,5 +1,6 @@
 """Generation of a simulated data set in this process, in several processes, or on a cluster."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,8 +8,10 @@ from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, lo
 from training.generation.config import GenerationConfig, Images, Quality, States, require_count
 from training.generation.make import REST, make_contact
 from training.generation.store import CONFIG, FILES, Store, refuse_foreign
+from twin.errors import OptionError
 from twin.frames.forms import frame_size
 from twin.progress import Progress, Step, silent, stage
+from twin.records import KeptAlso
 from twin.rig.contact import friction_between
 from twin.store import output
 from twin.store.resume import MADE_BY
@@ -150,8 +153,33 @@ def config_for(
 
 
 def simulate_dataset(
-    config: GenerationConfig, out: Path, count: int, *, workers: int = 1, scheduler: str = "", progress: Progress = silent
+    config: GenerationConfig,
+    out: Path,
+    count: int,
+    *,
+    workers: int = 1,
+    scheduler: str = "",
+    also: Sequence[str] = (),
+    progress: Progress = silent,
 ) -> Simulated:
-    """Make a data set of ``count`` contacts, or continue the one in the folder; parameters and errors as of ``generate``."""
-    with stage(progress, f"{config.experiment.name}, {config.sensor.name}") as step:
-        return Simulated(out, generate(out, config, count, workers=workers, scheduler=scheduler, progress=step))
+    """Make a data set of ``count`` contacts, or continue the one in the folder; other parameters and errors as of ``generate``.
+
+    Parameters
+    ----------
+    also : sequence of str
+        Further formats (``twin.records.ALSO``) that the finished data set is kept in, each in a subfolder.
+
+    Raises
+    ------
+    OptionError
+        A further format is wanted of pins without pictures.
+    RecordError
+        There is no such format, or a library is missing.
+    """
+    if also and config.images == "none":
+        raise OptionError("--also keeps pictures; give --images raw, gray or recording with it")
+    with KeptAlso(out, also, config.sensor, at_once=False) as kept:
+        with stage(progress, f"{config.experiment.name}, {config.sensor.name}") as step:
+            made = generate(out, config, count, workers=workers, scheduler=scheduler, progress=step)
+        kept.catch_up()
+    return Simulated(out, made)

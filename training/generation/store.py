@@ -21,6 +21,7 @@ from scenes.experiment import LABELS
 from training.generation.config import DatasetError, GenerationConfig
 from training.generation.make import REST, Outcome, make_contact
 from twin.errors import StoreError
+from twin.frames.truth import TRUTH, image_name
 from twin.store import (
     contents,
     remove_parts,
@@ -41,8 +42,6 @@ RECORDS = "records"
 DRAWS = "draws.csv"
 # Columns of the table of draws that failed.
 FAILURE_COLUMNS = ("path_id", "attempt", "reason")
-# Zarr group of everything that is known about the frames.
-TRUTH = "truth.zarr"
 # Files and folders of a data set, except CONFIG and MADE_BY.
 FILES = (
     *("meta.json", "init_0.png", "images", "frames_bw", RECORDS, TRUTH),
@@ -233,11 +232,6 @@ def refuse_foreign(folder: Path) -> None:
     strange = [name for name in found if name not in ours]
     if strange:
         raise DatasetError(f"{folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with --out")
-
-
-def image_name(index: int, state: int) -> str:
-    """Name of a contact's picture, in the way that recordings number them."""
-    return f"frame_{index}_{state}.png"
 
 
 class TruthFile:

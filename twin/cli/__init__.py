@@ -28,6 +28,7 @@ COMMANDS = {
     "learning": "Data sets and models",
     "studies": "Studies",
     "live": "Cameras and arms",
+    "records": "Cameras and arms",
 }
 
 # Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as shells count).

@@ -18,6 +18,7 @@ from twin.cli.options import (
     CORES,
     MOST_SEED,
     Across,
+    Also,
     Device,
     Force,
     FormOrAuto,
@@ -74,6 +75,7 @@ Writes:
                       frames would differ
   records/            one for each finished contact; with them the same
                       command continues after any end, or to a larger --count
+  lerobot/, huggingface/, mcap/: with --also, when the data set is finished
 
 The result depends on the options alone. Every byte is the same with any number of workers and after any interruption.
 
@@ -123,6 +125,7 @@ def dataset(
         Quality | None, typer.Option(help="samples per pixel", show_default="preview for --images recording, else standard")
     ] = None,
     across: Across = FINE,
+    also: Also = None,
     force: Force = False,
 ) -> None:
     from scenes import load_experiment, load_object, load_randomisation, load_sensor
@@ -142,7 +145,7 @@ def dataset(
         across=across,
     )
     with overwriting(force), shown() as progress:
-        made = simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, progress=progress)
+        made = simulate_dataset(config, out, count, workers=workers, scheduler=scheduler, also=tuple(also or ()), progress=progress)
     tell(made)
 
 

@@ -14,6 +14,7 @@ import typer
 from twin.cli import app
 from twin.cli.options import (
     SHIPPED_MODEL,
+    Also,
     ArmOption,
     AtRest,
     Camera,
@@ -39,7 +40,7 @@ the same in its mode 'Live', with an arm and the sensor's health beside it.
 
 With --record DIR every frame is kept, lossless, with its estimate. The folder can be read even if the program was killed. --replay
 DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
-contact at the start; the first frame is then kept with the session.
+contact at the start; the first frame is then kept with the session. --also keeps the session in further formats when it ends.
 
 \b
 Example:
@@ -63,6 +64,7 @@ def live(
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="stop after this time")] = None,
     count: Annotated[int | None, typer.Option("--count", min=1, help="stop after this number of frames")] = None,
     at_rest: AtRest = NONE,
+    also: Also = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
 ) -> None:
     from hardware.live import WatchPlan, watch
@@ -79,6 +81,7 @@ def live(
         count=count,
         at_rest=at_rest,
         port=port,
+        also=tuple(also or ()),
     )
     with signals_as_ctrl_c():
         watched = watch(plan, PoseEstimator.load(model), name=str(model), on_shown=tell_view)
@@ -100,7 +103,8 @@ stays in front of it. It lifts off between contacts; at the end it stands 50 mm 
 links and the object's holder: make sure that both have room. The frame without contact is refused if the sensor seems pressed in it.
 
 The folder has the recordings' own format (targets.csv, frames_bw/ or images/, init_0.png without contact, meta.json). The times are in
-contacts.jsonl. The same command continues an interrupted collection.
+contacts.jsonl. The same command continues an interrupted collection. With --also each contact is kept in further formats before the
+next one is made.
 
 \b
 Example:
@@ -127,6 +131,7 @@ def collect_command(
     limits: Limits = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of the drawn contacts; the experiment's own if not given")] = None,
     plain_light: PlainLight = False,
+    also: Also = None,
     force: Force = False,
 ) -> None:
     from hardware.collect import CollectPlan, collect_frames
@@ -148,6 +153,7 @@ def collect_command(
         form=form,
         limits=limits,
         plain_light=plain_light,
+        also=tuple(also or ()),
     )
     with overwriting(force), signals_as_ctrl_c(), shown() as progress:
         collected = collect_frames(plan, out, progress=progress)
@@ -184,7 +190,7 @@ Writes to --out:
   measures.json   smoothness S as the Tac-VGNN paper defines it, path, depth
                   and angle errors, jerk, share of the way, lost contacts;
                   rate, latency and age of the frames
-  session/        with --record
+  session/        with --record; in further formats with --also
 
 The exit code is 1 if it ended early.
 """
@@ -207,6 +213,7 @@ def servo(
     known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")] = False,
     plain_light: PlainLight = False,
     at_rest: AtRest = FIRST,
+    also: Also = None,
     force: Force = False,
 ) -> None:
     from hardware.following import FollowPlan, follow
@@ -229,6 +236,7 @@ def servo(
         plain_light=plain_light,
         known_place=known_place,
         at_rest=at_rest,
+        also=tuple(also or ()),
     )
     with overwriting(force), signals_as_ctrl_c(), shown() as progress:
         followed = follow(plan, PoseEstimator.load(model), out, about={"model": str(model)}, progress=progress)

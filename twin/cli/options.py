@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeVar
 
@@ -72,6 +73,20 @@ Tuning = Annotated[
 SHIPPED_MODEL = Path("mg400-331")
 Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
 ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
+
+
+class AlsoFormat(StrEnum):
+    """Formats that a record may be kept in besides its own (``twin.records.ALSO``, which would load the pin detection)."""
+
+    LEROBOT = "lerobot"
+    HUGGINGFACE = "huggingface"
+    MCAP = "mcap"
+
+
+Also = Annotated[
+    list[AlsoFormat] | None,
+    typer.Option("--also", help="keep it in this format, too, in a subfolder of that name; may be repeated ('twin convert --help')"),
+]
 PlainLight = Annotated[bool, typer.Option("--plain-light", help="draw the twin's frames with direct light alone, without path tracing")]
 ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
 Limits = Annotated[str | None, typer.Option("--limits", help="safety limits: mg400, magician, or a TOML file")]

@@ -1,0 +1,66 @@
+"""The command ``twin convert``: records in the formats of other tools."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.cli import app
+from twin.cli.options import Force, Out, if_given, tell
+
+HELP_CONVERT = """Translate records into the formats of other tools, and back.
+
+A SOURCE is a recording, a simulated data set, a collection, the session of 'twin live --record' or 'twin servo --record', or what this
+command wrote. One contact path, or one round of a servo, is one episode.
+
+\b
+--to recording    pictures with targets.csv, as this program reads everywhere
+     lerobot      LeRobotDataset v3; pictures lossless (PNG), or with --video
+     huggingface  pictures with metadata, as 'imagefolder' and the viewer read
+     mcap         a file with ROS 2 messages for each episode
+
+Every format holds the picture, the time, and as far as the source knows them pins, pose, move, wrench, estimate and action. Pins are found
+in the pictures if the source has none and its sensor is known. docs/records.md has names, units, frames and axes.
+
+The same command goes on after any end, and adds what is new: several rounds become one data set. Episodes that are there already are not
+written again.
+
+\b
+Examples:
+  twin convert out/servo/session --to lerobot --out out/dataset
+  twin convert sim/surface --to mcap --out out/bags
+  twin convert recordings/mine --sensor mine.toml --to huggingface \\
+      --out out/pictures
+"""
+
+
+class To(StrEnum):
+    """Formats that can be written (``twin.records.FORMATS``, which would load the pin detection)."""
+
+    RECORDING = "recording"
+    LEROBOT = "lerobot"
+    HUGGINGFACE = "huggingface"
+    MCAP = "mcap"
+
+
+@app.command("convert", help=HELP_CONVERT)
+def convert_command(
+    sources: Annotated[list[Path], typer.Argument(metavar="SOURCE...", help="recordings, sessions, or translated records")],
+    to: Annotated[To, typer.Option("--to", help="format to write")],
+    out: Out,
+    sensor: Annotated[
+        str | None, typer.Option("--sensor", metavar="S", help="sensor whose pins are found; a source's own if not given")
+    ] = None,
+    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="what the episodes do; by default what each source says")] = "",
+    video: Annotated[bool, typer.Option("--video", help="with lerobot: pictures as video, which loses detail")] = False,
+    force: Force = False,
+) -> None:
+    from scenes import load_sensor
+    from twin.cli.progress import shown
+    from twin.records import convert
+    from twin.store import overwriting
+
+    with overwriting(force), shown() as progress:
+        done = convert(sources, out, to.value, sensor=if_given(load_sensor, sensor), task=task, video=video, progress=progress)
+    tell(done)

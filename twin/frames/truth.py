@@ -1,0 +1,59 @@
+"""What is known of the frames of a simulated data set besides their table: the arrays of ``truth.zarr``."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import zarr
+
+from twin.errors import FrameError
+from twin.types import Form
+
+# Zarr group of everything that is known about the frames.
+TRUTH = "truth.zarr"
+AGAIN = "copy the data set anew, or make it again"
+NEVER_ZERO = (
+    "pins_px",
+    "rest_px",
+    "visible",
+)  # no part of these arrays is all zeros, so zarr, which reads a missing part as zeros, has all
+
+
+def image_name(index: int, state: int) -> str:
+    """Name of a contact's picture, in the way that recordings number them."""
+    return f"frame_{index}_{state}.png"
+
+
+def open_truth(folder: Path) -> tuple[zarr.Group, str, Form]:
+    """The truth of a data set, the name of its sensor, and the form of its frames."""
+    path = folder / TRUTH
+    try:
+        truth = zarr.open_group(path, mode="r")
+        return truth, str(truth.attrs["sensor"]), Form(str(truth.attrs["form"]))
+    except Exception as error:  # damaged metadata raise whatever zarr runs into
+        raise FrameError(f"{path}: damaged, or of no finished data set; {AGAIN}") from error
+
+
+def row_of(truth: zarr.Group) -> dict[str, int]:
+    """Row of each frame's name: the truth has the frames in the order of their contacts, whatever order the table has."""
+    found: dict[str, int] = {}
+    states: dict[int, int] = {}
+    for row, contact in enumerate(arrays_of(truth, ("path_id",))["path_id"].tolist()):
+        states[contact] = states.get(contact, -1) + 1
+        found[image_name(contact, states[contact])] = row
+    return found
+
+
+def arrays_of(truth: zarr.Group, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Arrays of ``truth.zarr`` by name."""
+    found = {}
+    for name in names:
+        try:
+            array = truth.get(name)
+            if isinstance(array, zarr.Array) and not (name in NEVER_ZERO and array.nchunks_initialized < array.nchunks):
+                found[name] = np.asarray(array[:])
+        except Exception as error:  # damaged bytes raise whatever zarr and its codecs run into
+            raise FrameError(f"{truth.store_path}: array '{name}' is damaged; {AGAIN}") from error
+        if name not in found:
+            raise FrameError(f"{truth.store_path}: array '{name}' is missing, or a part of it; {AGAIN}")
+    return found

@@ -1,0 +1,24 @@
+"""Records that other tools read: recordings, sessions, LeRobot's data sets, Hugging Face's folders of pictures, and MCAP files of ROS 2.
+
+``open_records`` reads each of them, ``convert`` translates, and ``KeptAlso`` keeps a record in further formats while it is being made.
+"""
+
+from twin.records.convert import ALSO, FORMATS, Converted, KeptAlso, convert, open_records, open_writer, with_pins
+from twin.records.record import CHANNELS, About, Episode, RecordError, Records, Step
+
+__all__ = [
+    "ALSO",
+    "CHANNELS",
+    "FORMATS",
+    "About",
+    "Converted",
+    "Episode",
+    "KeptAlso",
+    "RecordError",
+    "Records",
+    "Step",
+    "convert",
+    "open_records",
+    "open_writer",
+    "with_pins",
+]

@@ -1,0 +1,290 @@
+"""Translation of records from any format into any other, and keeping a record in further formats while it is being made."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from scenes import SensorSpec, SpecError, load_sensor
+from scenes.files import LONGEST_PATH, shown
+from twin.errors import FrameError
+from twin.pins.pipeline import Pipeline, measure_reference
+from twin.progress import Progress, silent, stage
+from twin.records.folder import HELD_STEPS, FolderWriter, format_of
+from twin.records.huggingface import HuggingFaceWriter, huggingface_records
+from twin.records.lerobot import DATA_MB, INFO, LeRobotWriter, lerobot_records
+from twin.records.record import About, Episode, RecordError, Records, Step, library
+from twin.records.recording import RecordingWriter, recording_records
+from twin.records.ros2 import Ros2Writer, ros2_records
+from twin.records.session import is_session, session_records
+from twin.types import Frame
+
+READERS: dict[str, Callable[[Path], Records]] = {
+    RecordingWriter.FORMAT: recording_records,
+    LeRobotWriter.FORMAT: lerobot_records,
+    HuggingFaceWriter.FORMAT: huggingface_records,
+    Ros2Writer.FORMAT: ros2_records,
+}
+"""Of each format that says what it is."""
+WRITERS: dict[str, type[FolderWriter]] = {each.FORMAT: each for each in (RecordingWriter, LeRobotWriter, HuggingFaceWriter, Ros2Writer)}
+"""Of each format."""
+FORMATS = tuple(READERS)
+"""Formats that can be written."""
+ALSO = tuple(name for name in FORMATS if name != RecordingWriter.FORMAT)
+"""Formats that a record may be kept in besides its own."""
+
+
+def open_records(path: Path) -> Records:
+    """Records of any format: a session, a recording or data set, or what a translation wrote.
+
+    Raises
+    ------
+    RecordError
+        There is nothing, or it is damaged.
+    FrameError
+        A recording or session can't be read.
+    """
+    if not path.exists():
+        raise RecordError(f"{shown(path, LONGEST_PATH)}: no such file or folder; give a recording, a session or a translated record")
+    if path.suffix == ".mcap":
+        return ros2_records(path)
+    if path.is_dir():
+        if is_session(path):
+            return session_records(path)
+        if told := format_of(path):
+            if told not in READERS:
+                raise RecordError(f"{path}: of the unknown format {shown(told)}; read it with the program that wrote it")
+            return READERS[told](path)
+        if (path / INFO).is_file():
+            return lerobot_records(path)
+    return recording_records(path)
+
+
+def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
+    """Records with the pins that are found in their pictures, if they have none. They are NaN where a pin is not found.
+
+    Parameters
+    ----------
+    spec : SensorSpec, optional
+        The sensor. By default the one that the records name; without one, or if it is not known here, they stay as they are.
+
+    Raises
+    ------
+    FrameError
+        The pictures are not of this sensor.
+    """
+    if "pins" in records.about.numbers:
+        return records
+    if spec is None:
+        try:
+            spec = load_sensor(records.about.sensor) if records.about.sensor else None
+        except SpecError:
+            spec = None
+    if spec is None:
+        note = "no pins: the record does not name a sensor that is known here; give --sensor to have them found"
+        return replace(records, notes=[*records.notes, note])
+    numbers = {"pins": 2 * spec.pins.count, **records.about.numbers}
+    about = replace(records.about, sensor=spec.name, numbers=numbers)
+    found = [replace(episode, steps=partial(_seen, episode, about, spec, records.notes)) for episode in records.episodes]
+    return Records(about, found, records.notes)
+
+
+def _seen(episode: Episode, about: About, spec: SensorSpec, notes: list[str]) -> Iterator[Step]:
+    reference = None
+    if episode.rest is not None:
+        try:
+            reference = measure_reference(spec, about.form, Frame(episode.rest, about.form, "the picture without contact"))
+        except FrameError as error:
+            if (note := str(error)) not in notes:
+                notes.append(note)
+    pipeline = Pipeline(spec, about.form, reference)
+    for step in episode.steps():
+        pins_px = pipeline(Frame(step.image, about.form)).pins_px.astype(np.float32)
+        yield replace(step, values={"pins": pins_px, **step.values})
+
+
+def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: bool = False, at_once: bool = False) -> FolderWriter:
+    """The writer of a format for a folder; it is entered as a context.
+
+    Parameters
+    ----------
+    to : str
+        One of ``FORMATS``.
+    video : bool
+        LeRobot's pictures as video, which loses detail.
+    at_once : bool
+        Finish a file for each episode, so that an episode is safe as soon as it is written, instead of larger files.
+
+    Raises
+    ------
+    RecordError
+        There is no such format, or it has no videos.
+    """
+    if to not in FORMATS:
+        raise RecordError(f"no format {shown(to)}; there are {', '.join(FORMATS)}")
+    if video and to != LeRobotWriter.FORMAT:
+        raise RecordError(f"--video goes with the format {LeRobotWriter.FORMAT}; {to} keeps every picture as it is")
+    if to == LeRobotWriter.FORMAT:
+        return LeRobotWriter(folder, about, rate_hz, video=video, held_mb=0.0 if at_once else DATA_MB)
+    if to == Ros2Writer.FORMAT:
+        return Ros2Writer(folder, about, rate_hz)
+    pictures = HuggingFaceWriter if to == HuggingFaceWriter.FORMAT else RecordingWriter
+    return pictures(folder, about, rate_hz, held_steps=0 if at_once else HELD_STEPS)
+
+
+@dataclass(frozen=True)
+class Converted:
+    """The result of ``convert``.
+
+    Attributes
+    ----------
+    folder : Path
+    to : str
+        Format.
+    episodes, steps : int
+        Number in the folder.
+    before : int
+        Episodes that it held before.
+    notes : list of str
+        What was odd in the sources.
+    """
+
+    folder: Path
+    to: str
+    episodes: int
+    steps: int
+    before: int
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def written(self) -> list[Path]:
+        """The folder."""
+        return [self.folder]
+
+    def lines(self) -> list[str]:
+        """The result in words."""
+        new = f" ({self.episodes - self.before} new)" if self.before else ""
+        return [*(f"note: {note}" for note in self.notes), f"{self.episodes} episodes, {self.steps} frames{new} as {self.to}"]
+
+
+def convert(
+    sources: Sequence[Path],
+    out: Path,
+    to: str,
+    *,
+    sensor: SensorSpec | None = None,
+    task: str = "",
+    video: bool = False,
+    progress: Progress = silent,
+) -> Converted:
+    """Translate records into a format. A folder that holds such records already gets the episodes that it lacks.
+
+    Parameters
+    ----------
+    sources : sequence of Path
+        As of ``open_records``.
+    out : Path
+        New or empty folder, or one with records of the same format, sensor and numbers.
+    to : str
+        One of ``FORMATS``.
+    sensor : SensorSpec, optional
+        The sensor whose pins are to be found, if a source does not name it.
+    task : str
+        What all episodes do, in words; by default what each source says.
+    video : bool
+        LeRobot's pictures as video, which loses detail.
+
+    Raises
+    ------
+    RecordError
+        A source can't be read or does not fit to the others, the folder holds something else, or a library is missing.
+    FrameError
+        A recording or session can't be read, or is not of the sensor.
+    StoreError
+        The folder can't be written to, or another run is at work there.
+    """
+    opened = [with_pins(open_records(Path(source)), sensor).named(task) for source in sources]
+    if not any(records.episodes for records in opened):
+        named = ", ".join(map(str, sources[:3])) or "nothing was given"
+        raise RecordError(f"{named}: no finished episode to translate; give a recording, a session or a translated record")
+    first = opened[0]
+    for source, records in zip(sources, opened, strict=True):
+        if wrong := first.about.differs(records.about):
+            raise RecordError(f"{source}: does not fit to {sources[0]} ({'; '.join(wrong)}); translate it into another --out")
+    with open_writer(out, to, first.about, first.rate_hz(), video=video) as writer, stage(progress, "episodes") as step:
+        before, total = len(writer.facts), sum(len(records.episodes) for records in opened)
+        writer.write(_missing(opened, writer, lambda done: step(done, total)))
+        facts = writer.facts
+    notes = list(dict.fromkeys(note for records in opened for note in records.notes))
+    return Converted(out, to, len(facts), sum(int(each["length"]) for each in facts), before, notes)
+
+
+def _missing(opened: Sequence[Records], writer: FolderWriter, done: Callable[[int], object]) -> Iterator[Episode]:
+    """Episodes that a writer does not hold yet, each once."""
+    given = set(writer.keys)
+    for number, episode in enumerate((episode for records in opened for episode in records.episodes), 1):
+        if episode.key not in given:
+            given.add(episode.key)
+            yield episode
+        done(number)
+
+
+class KeptAlso:
+    """Keeps a record in further formats, each in a subfolder of its own, while the record grows. A context manager.
+
+    The record itself is always complete, so what is missing here after a kill is made up for when the same command goes on, or by
+    ``convert``.
+
+    Parameters
+    ----------
+    folder : Path
+        The record in its own format.
+    formats : sequence of str
+        Some of ``ALSO``.
+    sensor : SensorSpec
+    at_once : bool
+        As of ``open_writer``.
+
+    Raises
+    ------
+    RecordError
+        There is no such format, or a library is missing.
+    """
+
+    def __init__(self, folder: Path, formats: Sequence[str], sensor: SensorSpec, *, at_once: bool = True) -> None:
+        self.folder, self.formats, self.sensor, self.at_once = folder, tuple(dict.fromkeys(formats)), sensor, at_once
+        for name in self.formats:
+            if name not in ALSO:
+                raise RecordError(f"no format {shown(name)} to keep the record in, too; there are {', '.join(ALSO)}")
+            for needed in WRITERS[name].LIBRARIES:
+                library(needed)
+        self._writers: list[FolderWriter] = []
+        self._open = ExitStack()
+
+    def __enter__(self) -> "KeptAlso":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def catch_up(self) -> None:
+        """Write the episodes that the record has and the others lack.
+
+        Raises
+        ------
+        TwinError
+            As of ``convert``.
+        """
+        if not self.formats:
+            return
+        records = with_pins(open_records(self.folder), self.sensor)
+        if not self._writers:
+            rate_hz = records.rate_hz()
+            for name in self.formats:
+                writer = open_writer(self.folder / name, name, records.about, rate_hz, at_once=self.at_once)
+                self._writers.append(self._open.enter_context(writer))
+        for writer in self._writers:
+            writer.write(_missing([records], writer, lambda done: None))

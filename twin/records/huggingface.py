@@ -1,0 +1,156 @@
+"""Records as a folder of pictures with metadata, which Hugging Face's ``datasets`` and its viewer read as ``imagefolder``.
+
+``data/NNNNNN/`` has the pictures of one or more episodes and ``metadata.jsonl``, a line for each picture. Each of these folders appears
+whole. ``episodes/NNNNNN.json`` says what its episodes are.
+"""
+
+import json
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes.files import read_regular
+from twin.errors import FrameError
+from twin.frames.images import read_image, write_image
+from twin.records.folder import AGAIN, HELD_STEPS, LARGEST_BYTES, FolderWriter, read_json, records_in
+from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, Step, float32
+from twin.store import remove_parts, replace_folder, write_json, write_text
+from twin.store.atomic import PART
+
+DATA, EPISODES, METADATA, CARD = "data", "episodes", "metadata.jsonl", "README.md"
+CARD_TEXT = """---
+configs:
+- config_name: default
+  drop_labels: true
+  data_files: data/**
+tags:
+- tactile
+---
+
+# Records of the tactile sensor {sensor}
+
+Pictures with metadata. In Python: `datasets.load_dataset("imagefolder", data_dir=...)`. NaN is null.
+
+{lines}
+"""
+
+
+class HuggingFaceWriter(FolderWriter):
+    """Writes records as pictures with ``metadata.jsonl``.
+
+    Parameters
+    ----------
+    folder, about, rate_hz
+        As of ``FolderWriter``.
+    held_steps : int
+        Pictures from which on a folder of several episodes is finished. 0: a folder for each, so that each is safe at once.
+    """
+
+    FORMAT = "huggingface"
+    NAMES = (DATA, EPISODES, CARD)
+    FOLDERS = (DATA, EPISODES)
+
+    def __init__(self, folder: Path, about: About, rate_hz: int, *, held_steps: int = HELD_STEPS) -> None:
+        super().__init__(folder, about, rate_hz)
+        self.held_steps = held_steps
+        self._next = 0  # number of the next folder
+
+    def _begin(self) -> None:
+        super()._begin()
+        lines = "\n".join(f"- `{CHANNELS[name].column}`: {CHANNELS[name].meaning}" for name in self.about.numbers)
+        write_text(self.folder / CARD, CARD_TEXT.format(sensor=self.about.sensor, lines=lines))
+
+    def _find(self) -> list[dict[str, Any]]:
+        self._begin()
+        remove_parts(self.folder / DATA)
+        listed = _listed(self.folder)
+        self._next = len(listed)
+        return [facts for _, facts in _facts_in(self.folder)]
+
+    def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
+        group: list[dict[str, Any]] = []
+        lines: list[str] = []
+        for episode in episodes:
+            part = self.folder / DATA / f".{self._next:06d}{PART}"
+            part.mkdir(exist_ok=True)
+            length, number = 0, len(self.facts) + len(group)
+            for length, step in enumerate(episode.steps(), 1):
+                self._require_fitting(episode, step)
+                name = f"episode_{number:06d}_{length - 1:06d}.png"
+                write_image(part / name, step.image)
+                lines.append(json.dumps(self._line(name, number, length - 1, episode, step)))
+            if length:
+                group.append(self._facts(episode, length))
+            if len(lines) > self.held_steps:
+                yield self._commit(part, group, lines)
+                group, lines = [], []
+        if group:
+            yield self._commit(part, group, lines)
+        remove_parts(self.folder / DATA)
+
+    def _line(self, name: str, episode: int, number: int, whole: Episode, step: Step) -> dict[str, Any]:
+        """One line of the metadata. Every line has the same keys, as the reader wants it."""
+        numbers = {CHANNELS[key].column: _nulls(step.values[key]) for key in self.about.numbers}
+        head = {"file_name": name, "episode_index": episode, "frame_index": number, "task": whole.task}
+        return head | {TIME: float(step.time_s)} | numbers
+
+    def _commit(self, part: Path, group: list[dict[str, Any]], lines: list[str]) -> list[dict[str, Any]]:
+        write_text(part / METADATA, "\n".join(lines) + "\n")
+        replace_folder(part, self.folder / DATA / f"{self._next:06d}")
+        write_json(self.folder / EPISODES / f"{self._next:06d}.json", {"episodes": group})
+        self._next += 1
+        return group
+
+
+def huggingface_records(folder: Path) -> Records:
+    """A folder that ``HuggingFaceWriter`` wrote.
+
+    Raises
+    ------
+    RecordError
+        It is damaged, or someone else wrote it.
+    """
+    found = _facts_in(folder)
+    return records_in(folder, HuggingFaceWriter.FORMAT, [facts for _, facts in found], partial(_reader, folder, found))
+
+
+def _reader(folder: Path, found: list[tuple[str, dict[str, Any]]], about: About, index: int) -> Any:
+    return partial(_steps_of, folder / DATA / found[index][0], about, index)
+
+
+def _steps_of(folder: Path, about: About, index: int) -> Iterator[Step]:
+    try:
+        for text in read_regular(folder / METADATA, LARGEST_BYTES).decode().splitlines():
+            line = json.loads(text)
+            if line["episode_index"] != index:
+                continue
+            values = {name: float32(line[CHANNELS[name].column]).reshape(about.shape(name)) for name in about.numbers}
+            yield Step(read_image(folder / str(line["file_name"]))[0], float(line[TIME]), values)
+    except (OSError, KeyError, ValueError, TypeError, FrameError, RecursionError) as error:
+        raise RecordError(f"{folder}: damaged ({error}); {AGAIN}") from error
+
+
+def _listed(folder: Path) -> list[Path]:
+    """Files that say which episodes are there, in their order."""
+    return sorted((folder / EPISODES).glob("*.json"))
+
+
+def _facts_in(folder: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Folder and facts of each episode."""
+    found = []
+    for path in _listed(folder):
+        episodes = read_json(path).get("episodes")
+        if not isinstance(episodes, list) or not all(isinstance(each, dict) for each in episodes):
+            raise RecordError(f"{path}: damaged; {AGAIN}")
+        found += [(path.stem, facts) for facts in episodes]
+    return found
+
+
+def _nulls(values: np.ndarray) -> Any:
+    """Numbers as JSON has them, NaN as null."""
+    if values.ndim > 1:
+        return [_nulls(row) for row in values]
+    return [value if np.isfinite(value) else None for value in values.tolist()]

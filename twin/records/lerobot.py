@@ -1,0 +1,478 @@
+"""Records as a LeRobotDataset of version 3, written with pyarrow alone.
+
+Each file is written whole under its name, and ``meta/info.json`` counts an episode only after its files. So a data set can be read after
+any end, up to its last finished episode. ``timestamp`` is the number of the frame divided by the whole number of frames a second, as
+LeRobot wants it; the true times are in ``observation.time_s``. Beside LeRobot's columns the table of episodes has ``tactip/facts``.
+"""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+
+from twin.errors import FrameError
+from twin.frames import open_recording
+from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, records_in
+from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, Step, library
+from twin.store import write_json, write_text, write_with
+from twin.types import Form
+
+CODEBASE = "v3.0"
+"""Version of LeRobot's format."""
+INFO, STATS, TASKS, CARD = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "README.md"
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+FACTS = "tactip/facts"
+"""Column of the table of episodes that holds what the other formats keep, too."""
+CHUNK_FILES = 1000
+"""Files in a folder, LeRobot's own number."""
+DATA_MB, VIDEO_MB = 100, 200
+"""Most megabytes of a data file that holds several episodes, and what LeRobot states for videos."""
+ROWS = 64
+"""Rows that are written at once."""
+SAMPLED = 100
+"""Pictures of an episode from which its statistics are made."""
+PIXEL_STEP = 4
+"""Of these pictures every fourth pixel in each direction counts."""
+QUANTILES = {"q01": 1.0, "q10": 10.0, "q50": 50.0, "q90": 90.0, "q99": 99.0}
+"""Names of the quantiles that LeRobot's statistics have, in %."""
+COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+"""Columns of whole numbers that LeRobot wants."""
+FOURCC = "mp4v"
+"""Codec of videos that every build of OpenCV has (MPEG-4 part 2)."""
+
+
+class LeRobotWriter(FolderWriter):
+    """Writes records as a LeRobotDataset of version 3.
+
+    Parameters
+    ----------
+    folder, about, rate_hz
+        As of ``FolderWriter``.
+    video : bool
+        Keep pictures in videos, which lose detail, instead of PNG in the tables.
+    held_mb : float
+        Size from which on a file of several episodes is finished. 0: a file for each, so that each is safe at once.
+    """
+
+    FORMAT = "lerobot"
+    NAMES = ("meta", "data", "videos", CARD)
+    LIBRARIES = ("pyarrow.parquet",)
+
+    def __init__(self, folder: Path, about: About, rate_hz: int, *, video: bool = False, held_mb: float = DATA_MB) -> None:
+        super().__init__(folder, about, rate_hz)
+        self.video, self.held_bytes = video, held_mb * 1e6
+        self._file = self._frames = 0  # number of the next file, and of frames
+        self._tasks: list[str] = []
+        self._stats: dict[str, dict[str, np.ndarray]] = {}
+
+    def _said(self) -> dict[str, Any]:
+        return super()._said() | {"video": self.video}
+
+    def _begin(self) -> None:
+        write_text(_made(self.folder / CARD), _card(self.about))
+
+    def _find(self) -> list[dict[str, Any]]:
+        self.video = bool(read_sidecar(self.folder)[1].get("video", False))
+        rows = _episode_rows(self.folder)
+        if rows:
+            self._file, self._frames = 1 + _file_number(rows[-1], "data"), int(rows[-1]["dataset_to_index"])
+            self._tasks = _tasks(self.folder)
+            stats = read_json(self.folder / STATS)
+            self._stats = {key: {k: np.asarray(v, float) for k, v in each.items()} for key, each in stats.items()}
+        for pattern in (DATA_PATH, EPISODES_PATH, VIDEO_PATH.replace("{video_key}", IMAGE)):  # of a run that was killed
+            for path in self.folder.glob(pattern.partition("/chunk")[0] + "/chunk-*/file-*"):
+                chunk, file = (int(part.split("-")[1].split(".")[0]) for part in path.parts[-2:])
+                if chunk * CHUNK_FILES + file >= self._file:
+                    path.unlink()
+        return [_facts_of(row) for row in rows]
+
+    def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
+        waiting = _Peeked(episodes)
+        while waiting.has_next:
+            if group := self._write_group(waiting):
+                yield [facts for _, facts, _ in group]
+
+    def _write_group(self, waiting: "_Peeked") -> list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]]:
+        """Write a file of episodes, then what the data set says of them. Returns a row, the facts and the statistics of each."""
+        group: list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]] = []
+        at = {"chunk_index": self._file // CHUNK_FILES, "file_index": self._file % CHUNK_FILES}
+        path = _made(self.folder / DATA_PATH.format(**at))
+        with tempfile.TemporaryDirectory(prefix="twin-video-") as aside:
+            video = Path(aside) / "episodes.mp4"
+            write_with(path, partial(self._fill, waiting=waiting, group=group, at=at, video=video))
+            if not group:
+                path.unlink()
+                return []
+            if self.video:
+                into = _made(self.folder / VIDEO_PATH.format(video_key=IMAGE, **at))
+                with video.open("rb") as made:
+                    write_with(into, lambda file: shutil.copyfileobj(made, file))
+        stats = self._stats
+        for _, _, each in group:
+            stats = _together(stats, each)
+        self._write_meta(group, at, stats)
+        self._stats, self._file = stats, self._file + 1
+        self._frames += sum(row["length"] for row, _, _ in group)
+        return group
+
+    def _fill(self, file: BinaryIO, *, waiting: "_Peeked", group: list, at: dict[str, int], video: Path) -> None:
+        """Write episodes into an open data file until it is large enough."""
+        parquet, pa = library("pyarrow.parquet"), library("pyarrow")
+        schema = pa.schema(self._schema(pa), metadata={"huggingface": json.dumps({"info": {"features": self._hf_features()}})})
+        frames, written = self._frames, 0
+        film = _Film(video, self.rate_hz, self.about.size_px) if self.video else None
+        with parquet.ParquetWriter(file, schema, compression="snappy") as table:
+            while (not group or written < self.held_bytes) and waiting.has_next:
+                episode = next(waiting)
+                number, rows, length = len(self.facts) + len(group), [], 0
+                task = self._task(episode.task)
+                gathered = _Gathered(self.about)
+                for step in episode.steps():
+                    self._require_fitting(episode, step)
+                    gathered.add(step, length)
+                    row = self._row(step, length, number, frames + length, task)
+                    if film is not None:
+                        film.add(step.image)
+                    rows.append(row)
+                    written += len(row[IMAGE]["bytes"]) if IMAGE in row else 4 * sum(self.about.numbers.values())
+                    length += 1
+                    if len(rows) == ROWS:
+                        table.write_table(pa.Table.from_pylist(rows, schema))
+                        rows = []
+                if rows:
+                    table.write_table(pa.Table.from_pylist(rows, schema))
+                if not length:
+                    continue
+                stats = gathered.stats(self.rate_hz, number, frames, task)
+                row = self._episode_row(episode, number, frames, length, at)
+                group.append((row, self._facts(episode, length), stats))
+                frames += length
+        if film is not None:
+            film.close()
+
+    def _task(self, text: str) -> int:
+        if text not in self._tasks:
+            self._tasks.append(text)
+        return self._tasks.index(text)
+
+    def _row(self, step: Step, number: int, episode: int, index: int, task: int) -> dict[str, Any]:
+        row: dict[str, Any] = {} if self.video else {IMAGE: {"bytes": png(_colour(step.image)), "path": f"frame-{number:06d}.png"}}
+        row |= {CHANNELS[name].column: np.asarray(step.values[name], np.float32).tolist() for name in self.about.numbers}
+        counted = dict(zip(COUNTERS, (number, episode, index, task), strict=True))
+        return row | {TIME: float(step.time_s), "timestamp": number / self.rate_hz} | counted
+
+    def _schema(self, pa: Any) -> list[tuple[str, Any]]:
+        """Columns of the data files and their Arrow types."""
+        picture = [] if self.video else [(IMAGE, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))]
+        kinds = {
+            name: pa.list_(pa.list_(pa.float32())) if len(self.about.shape(name)) == 2 else pa.list_(pa.float32(), count)
+            for name, count in self.about.numbers.items()
+        }
+        named = [(CHANNELS[name].column, kind if self.about.numbers[name] > 1 else pa.float32()) for name, kind in kinds.items()]
+        return [*picture, *named, (TIME, pa.float64()), ("timestamp", pa.float32()), *((name, pa.int64()) for name in COUNTERS)]
+
+    def _features(self) -> dict[str, dict[str, Any]]:
+        """The columns as LeRobot describes them."""
+        width, height = self.about.size_px
+        image: dict[str, Any] = {"dtype": "image", "shape": [height, width, 3], "names": ["height", "width", "channels"]}
+        if self.video:
+            said = {"video.height": height, "video.width": width, "video.codec": "mpeg4", "video.pix_fmt": "yuv420p", "video.channels": 3}
+            image |= {"dtype": "video", "info": said | {"video.fps": self.rate_hz, "video.is_depth_map": False, "has_audio": False}}
+        features = {IMAGE: image}
+        for name in self.about.numbers:
+            shape, names = list(self.about.shape(name)), list(self.about.axes(name))
+            features[CHANNELS[name].column] = {"dtype": "float32", "shape": shape, "names": names if len(shape) == 1 else ["pin", "axis"]}
+        features[TIME] = {"dtype": "float64", "shape": [1], "names": None}
+        features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+        return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
+
+    def _hf_features(self) -> dict[str, Any]:
+        """The columns as Hugging Face's library describes them in a file's own metadata."""
+        found: dict[str, Any] = {}
+        for name, feature in self._features().items():
+            value = {"dtype": feature["dtype"], "_type": "Value"}
+            if feature["dtype"] == "image":
+                found[name] = {"_type": "Image"}
+            elif feature["dtype"] != "video":
+                shape = feature["shape"]
+                several = {"feature": value, "length": shape[0], "_type": "Sequence"}
+                flat = {"shape": shape, "dtype": feature["dtype"], "_type": "Array2D"}
+                found[name] = value if shape == [1] else several if len(shape) == 1 else flat
+        return found
+
+    def _episode_row(self, episode: Episode, number: int, start: int, length: int, at: dict[str, int]) -> dict[str, Any]:
+        row = {
+            "episode_index": number,
+            "tasks": [episode.task],
+            "length": length,
+            "dataset_from_index": start,
+            "dataset_to_index": start + length,
+        }
+        for what in ("data", "meta/episodes", *([f"videos/{IMAGE}"] if self.video else [])):
+            row |= {f"{what}/{key}": value for key, value in at.items()}
+        if self.video:
+            before = start - self._frames  # frames of this file before it
+            ends_s = {"from": before / self.rate_hz, "to": (before + length) / self.rate_hz}
+            row |= {f"videos/{IMAGE}/{end}_timestamp": time_s for end, time_s in ends_s.items()}
+        return row
+
+    def _write_meta(self, group: list, at: dict[str, int], stats: dict[str, dict[str, np.ndarray]]) -> None:
+        """Write what the data set says of itself; the number of episodes comes last."""
+        parquet, pa = library("pyarrow.parquet"), library("pyarrow")
+        index = {"name": None, "field_name": "__index_level_0__", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+        column = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+        pandas = {"index_columns": ["__index_level_0__"], "column_indexes": [], "columns": [column, index], "pandas_version": "2.2.0"}
+        tasks = pa.table({"task_index": pa.array(range(len(self._tasks)), pa.int64()), "__index_level_0__": self._tasks})
+        tasks = tasks.replace_schema_metadata({"pandas": json.dumps(pandas)})
+        write_with(_made(self.folder / TASKS), lambda file: parquet.write_table(tasks, file))
+        rows = [
+            row | {f"stats/{key}/{k}": v.tolist() for key, each in found.items() for k, v in each.items()} | {FACTS: json.dumps(facts)}
+            for row, facts, found in group
+        ]
+        write_with(_made(self.folder / EPISODES_PATH.format(**at)), lambda file: parquet.write_table(pa.Table.from_pylist(rows), file))
+        write_json(self.folder / STATS, {key: {k: v.tolist() for k, v in each.items()} for key, each in stats.items()})
+        last = group[-1][0]
+        write_json(
+            self.folder / INFO,
+            {
+                "codebase_version": CODEBASE,
+                "robot_type": self.about.robot or None,
+                "total_episodes": last["episode_index"] + 1,
+                "total_frames": last["dataset_to_index"],
+                "total_tasks": len(self._tasks),
+                "chunks_size": CHUNK_FILES,
+                "data_files_size_in_mb": DATA_MB,
+                "video_files_size_in_mb": VIDEO_MB,
+                "fps": self.rate_hz,
+                "splits": {"train": f"0:{last['episode_index'] + 1}"},
+                "data_path": DATA_PATH,
+                "video_path": VIDEO_PATH if self.video else None,
+                "features": self._features(),
+            },
+        )
+
+
+class _Peeked(Iterator[Episode]):
+    """An iterator that says whether there is one more."""
+
+    def __init__(self, episodes: Iterator[Episode]) -> None:
+        self._episodes = iter(episodes)
+        self._next: Episode | None = None
+
+    @property
+    def has_next(self) -> bool:
+        """Whether there is one more. It is taken only now."""
+        if self._next is None:
+            self._next = next(self._episodes, None)
+        return self._next is not None
+
+    def __next__(self) -> Episode:
+        if not self.has_next or self._next is None:
+            raise StopIteration
+        found, self._next = self._next, None
+        return found
+
+
+class _Gathered:
+    """What an episode's statistics are made from."""
+
+    def __init__(self, about: About) -> None:
+        self._values: dict[str, list[np.ndarray]] = {name: [] for name in about.numbers}
+        self._times: list[float] = []
+        self._pictures: list[np.ndarray] = []
+        self._every = 1
+
+    def add(self, step: Step, number: int) -> None:
+        """Take a step. Of a long episode every second, then every fourth picture is kept, and so on."""
+        for name, values in self._values.items():
+            values.append(np.asarray(step.values[name], np.float32))
+        self._times.append(step.time_s)
+        if number % self._every == 0:
+            self._pictures.append(_colour(step.image)[::PIXEL_STEP, ::PIXEL_STEP])
+        if len(self._pictures) > 2 * SAMPLED:
+            self._pictures, self._every = self._pictures[::2], 2 * self._every
+
+    def stats(self, rate_hz: int, number: int, start: int, task: int) -> dict[str, dict[str, np.ndarray]]:
+        """Statistics of each column, in the shapes that LeRobot has: of pictures (3, 1, 1) within 0 to 1, of pins (2,)."""
+        length = len(self._times)
+        pixels = np.stack(self._pictures).reshape(-1, 3) / 255.0
+        found = {IMAGE: {key: value.reshape(-1, 1, 1) for key, value in _spread(pixels).items()}}
+        for name, values in self._values.items():
+            stacked = np.stack(values).astype(float)
+            found[CHANNELS[name].column] = _spread(stacked.reshape(-1, stacked.shape[-1]))
+        frames = np.arange(length)
+        counters = (frames, np.full(length, number), start + frames, np.full(length, task))
+        plain = {TIME: np.array(self._times), "timestamp": frames / rate_hz} | dict(zip(COUNTERS, counters, strict=True))
+        found |= {name: _spread(np.asarray(values, float)[:, None]) for name, values in plain.items()}
+        return {name: each | {"count": np.array([len(self._pictures) if name == IMAGE else length])} for name, each in found.items()}
+
+
+def _spread(rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Statistics (K,) of rows (M, K) without those that are NaN; 0 where there are no others."""
+    known = np.isfinite(rows)
+    some = known.any(axis=0)
+    safe = np.where(some, rows, 0.0)
+    levels = np.nanpercentile(safe, list(QUANTILES.values()), axis=0)
+    return {
+        "min": np.nanmin(safe, axis=0),
+        "max": np.nanmax(safe, axis=0),
+        "mean": np.nanmean(safe, axis=0),
+        "std": np.nanstd(safe, axis=0),
+        **dict(zip(QUANTILES, levels, strict=True)),
+    }
+
+
+def _together(a: dict[str, dict[str, np.ndarray]], b: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
+    """Statistics of two sets of rows together. Quantiles are averaged with the numbers of rows as weights, as LeRobot does."""
+    found = {}
+    for key, new in b.items():
+        old = a.get(key)
+        if old is None:
+            found[key] = new
+            continue
+        n, m = float(old["count"][0]), float(new["count"][0])
+        mean = (n * old["mean"] + m * new["mean"]) / (n + m)
+        square = (n * (old["std"] ** 2 + old["mean"] ** 2) + m * (new["std"] ** 2 + new["mean"] ** 2)) / (n + m)
+        found[key] = {
+            "min": np.minimum(old["min"], new["min"]),
+            "max": np.maximum(old["max"], new["max"]),
+            "mean": mean,
+            "std": np.sqrt(np.maximum(square - mean**2, 0.0)),
+            **{q: (n * old[q] + m * new[q]) / (n + m) for q in QUANTILES},
+            "count": old["count"] + new["count"],
+        }
+    return found
+
+
+class _Film:
+    """A video that frames are written to."""
+
+    def __init__(self, path: Path, rate_hz: int, size_px: tuple[int, int]) -> None:
+        self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), float(rate_hz), size_px)
+        if not self._writer.isOpened():
+            raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out --video")
+
+    def add(self, image: np.ndarray) -> None:
+        self._writer.write(np.ascontiguousarray(_colour(image)[..., ::-1]))
+
+    def close(self) -> None:
+        self._writer.release()
+
+
+def lerobot_records(folder: Path) -> Records:
+    """A data set that ``LeRobotWriter`` wrote.
+
+    Raises
+    ------
+    RecordError
+        It is damaged, or LeRobot or someone else wrote it.
+    """
+    rows = _episode_rows(folder)
+    return records_in(folder, LeRobotWriter.FORMAT, [_facts_of(row) for row in rows], partial(_reader, folder, rows))
+
+
+def _reader(folder: Path, rows: list[dict[str, Any]], about: About, index: int) -> Any:
+    return partial(_steps_of, folder, rows[index], about)
+
+
+def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Step]:
+    parquet = library("pyarrow.parquet")
+    at = {key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}
+    path, number = folder / DATA_PATH.format(**at), row["episode_index"]
+    video = f"videos/{IMAGE}/from_timestamp" in row
+    pictures: Iterator[np.ndarray] = iter(())
+    if video:
+        pictures = _film_pictures(folder, row, about)
+    try:
+        file = parquet.ParquetFile(path)
+        leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
+        for group in range(file.num_row_groups):
+            told = file.metadata.row_group(group).column(leaf).statistics
+            if told is not None and told.has_min_max and not told.min <= number <= told.max:
+                continue
+            for line in file.read_row_group(group).to_pylist():
+                if line["episode_index"] != number:
+                    continue
+                image = next(pictures) if video else image_of(line[IMAGE]["bytes"], about.gray, str(path))
+                values = {name: np.asarray(line[CHANNELS[name].column], np.float32).reshape(about.shape(name)) for name in about.numbers}
+                yield Step(image, float(line[TIME]), values)
+    except (OSError, KeyError, ValueError, TypeError, StopIteration, library("pyarrow").ArrowException) as error:
+        raise RecordError(f"{path}: damaged ({error}); {AGAIN}") from error
+
+
+def _film_pictures(folder: Path, row: dict[str, Any], about: About) -> Iterator[np.ndarray]:
+    """An episode's pictures from its video."""
+    at = {key: row[f"videos/{IMAGE}/{key}"] for key in ("chunk_index", "file_index")}
+    rate_hz = int(read_json(folder / INFO)["fps"])
+    first = round(row[f"videos/{IMAGE}/from_timestamp"] * rate_hz)
+    try:
+        for k, frame in enumerate(open_recording(folder / VIDEO_PATH.format(video_key=IMAGE, **at), None, Form.RAW)):
+            if first <= k < first + row["length"]:
+                yield frame.image[..., 0] if about.gray and frame.image.ndim == 3 else frame.image
+    except FrameError as error:
+        raise RecordError(f"{folder}: {error}") from error
+
+
+def _episode_rows(folder: Path) -> list[dict[str, Any]]:
+    """The table of episodes without statistics, up to the number of them that the data set states."""
+    if not (folder / INFO).is_file():
+        return []
+    parquet, total = library("pyarrow.parquet"), read_json(folder / INFO).get("total_episodes")
+    rows: list[dict[str, Any]] = []
+    try:
+        for path in sorted(folder.glob("meta/episodes/chunk-*/file-*.parquet")):
+            names = [name for name in parquet.read_schema(path).names if not name.startswith("stats/")]
+            rows += parquet.read_table(path, columns=names).to_pylist()
+    except (OSError, library("pyarrow").ArrowException) as error:
+        raise RecordError(f"{folder / 'meta/episodes'}: damaged ({error}); {AGAIN}") from error
+    if not isinstance(total, int) or len(rows) < total:
+        raise RecordError(f"{folder}: {INFO} states {total!r} episodes, {len(rows)} are there; {AGAIN}")
+    return rows[:total]
+
+
+def _facts_of(row: dict[str, Any]) -> dict[str, Any]:
+    try:
+        facts = json.loads(row[FACTS])
+        if isinstance(facts, dict):
+            return facts
+    except (KeyError, TypeError, ValueError, RecursionError):
+        pass
+    raise RecordError("the table of episodes is damaged, or this data set was not written by this program; give one that it wrote")
+
+
+def _tasks(folder: Path) -> list[str]:
+    try:
+        return [str(task) for task in library("pyarrow.parquet").read_table(folder / TASKS)["__index_level_0__"].to_pylist()]
+    except (OSError, KeyError, library("pyarrow").ArrowException) as error:
+        raise RecordError(f"{folder / TASKS}: damaged ({error}); {AGAIN}") from error
+
+
+def _file_number(row: dict[str, Any], what: str) -> int:
+    return int(row[f"{what}/chunk_index"]) * CHUNK_FILES + int(row[f"{what}/file_index"])
+
+
+def _colour(image: np.ndarray) -> np.ndarray:
+    """The picture with three channels."""
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+
+def _made(path: Path) -> Path:
+    """The path, its folder made if missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _card(about: About) -> str:
+    """The data set's page."""
+    files = "configs:\n- config_name: default\n  data_files: data/*/*.parquet\n"
+    head = f"---\ntask_categories:\n- robotics\ntags:\n- LeRobot\n- tactile\n{files}---\n\n"
+    lines = [f"- `{CHANNELS[name].column}`: {CHANNELS[name].meaning}" for name in about.numbers]
+    return head + f"# Records of the tactile sensor {about.sensor}\n\nA LeRobotDataset of version 3.\n\n" + "\n".join(lines) + "\n"

@@ -1,0 +1,320 @@
+"""What a record is, whatever format it is kept in: episodes of steps, each with a picture and numbers.
+
+The tables here are the only place that names the numbers, their columns in LeRobot's and Hugging Face's formats and their topics in ROS 2.
+Numbers are kept as 32-bit floats (a pose of 300 mm to 0.00003 mm) and times as 64-bit floats in every format, so a record that is read
+back equals the one that was written.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+
+from twin.errors import TwinError
+from twin.types import Form, ImageArray
+
+POSE_AXES = ("x", "y", "z", "rx", "ry", "rz")
+"""Names of the numbers of a pose: mm, and Euler angles about the fixed axes x, y, z in this order, in deg."""
+WRENCH_AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
+"""Names of the numbers of a wrench: N and N mm."""
+NOMINAL_HZ = 10.0
+"""Frames a second of a record whose times are not known."""
+FASTEST_HZ = 1000
+"""Highest whole number of frames a second that a record is said to have."""
+DIGEST = 16
+"""Hexadecimal digits of the digest in an episode's key: 64 bits."""
+
+
+class RecordError(TwinError):
+    """A record can't be read, written or translated. The message says what came and what to do."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A kind of numbers that each step of a record may have.
+
+    Attributes
+    ----------
+    name : str
+        In this program, and the first part of column names in the recordings' table.
+    column : str
+        Name in LeRobot's and Hugging Face's formats.
+    topic : str
+        ROS 2 topic.
+    axes : tuple of str
+        Names of the numbers. () if the record itself names them.
+    meaning : str
+        What they are, with unit and frame.
+    """
+
+    name: str
+    column: str
+    topic: str
+    axes: tuple[str, ...]
+    meaning: str
+
+
+CHANNELS = {
+    channel.name: channel
+    for channel in (
+        Channel("pins", "observation.tactile.pins", "/tactip/pins", (), "x, y of each pin in px of the picture; NaN: not found"),
+        Channel("pose", "observation.state", "/tactip/arm_pose", POSE_AXES, "the tool's pose, mm and deg"),
+        Channel("move", "observation.tactile.move", "/tactip/move", POSE_AXES, "the move (shear) before the picture, mm and deg"),
+        Channel(
+            "wrench",
+            "observation.tactile.wrench",
+            "/tactip/wrench",
+            WRENCH_AXES,
+            "force (N) and torque (N mm) of the skin on the object, in the sensor frame",
+        ),
+        Channel("estimate", "observation.tactile.estimate", "/tactip/estimate", (), "the model's estimate, mm and deg; NaN: not valid"),
+        Channel("low", "observation.tactile.estimate_low", "/tactip/estimate_low", (), "lower end of its 90 % interval"),
+        Channel("high", "observation.tactile.estimate_high", "/tactip/estimate_high", (), "upper end of its 90 % interval"),
+        Channel("action", "action", "/tactip/command", POSE_AXES, "the pose that the arm was sent to, mm and deg"),
+    )
+}
+"""All channels, in the order in which formats have them."""
+IMAGE, TIME = "observation.images.tactip", "observation.time_s"
+"""Columns of the picture and of the time of its exposure (s, from the episode's first one on)."""
+_NAMED_HERE = {name for name, channel in CHANNELS.items() if not channel.axes and name != "pins"}
+
+
+@dataclass(frozen=True)
+class About:
+    """What all episodes of a record have in common.
+
+    Attributes
+    ----------
+    sensor : str
+        Name of the specification; "" if unknown.
+    form : Form
+    size_px : (int, int)
+        Width and height of the pictures.
+    gray : bool
+        Whether the pictures have one channel.
+    numbers : dict of str to int
+        The channels that every step has, in the order of ``CHANNELS``, and how many numbers each has (of pins: 2 N).
+    estimates : tuple of str
+        Names of the estimated labels.
+    frame : str
+        In which frame poses and actions are: ``base`` (of the arm) or ``work`` (of the experiment).
+    robot : str
+        What the arm is; "" if unknown.
+    """
+
+    sensor: str
+    form: Form
+    size_px: tuple[int, int]
+    gray: bool
+    numbers: dict[str, int]
+    estimates: tuple[str, ...] = ()
+    frame: str = "work"
+    robot: str = ""
+
+    def axes(self, channel: str) -> tuple[str, ...]:
+        """Names of the numbers of a channel. Pins have ``pin_0_x, pin_0_y, pin_1_x, ...``."""
+        if channel == "pins":
+            return tuple(f"pin_{k}_{axis}" for k in range(self.numbers["pins"] // 2) for axis in "xy")
+        return self.estimates if channel in _NAMED_HERE else CHANNELS[channel].axes
+
+    def shape(self, channel: str) -> tuple[int, ...]:
+        """Shape of a channel's array in one step."""
+        count = self.numbers[channel]
+        return (count // 2, 2) if channel == "pins" else (count,)
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON."""
+        return {
+            "sensor": self.sensor,
+            "form": str(self.form),
+            "size_px": list(self.size_px),
+            "gray": self.gray,
+            "numbers": self.numbers,
+            "estimates": list(self.estimates),
+            "frame": self.frame,
+            "robot": self.robot,
+            "channels": {name: CHANNELS[name].meaning for name in self.numbers},
+        }
+
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> "About":
+        """From what ``plain`` gives.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            Something is missing or wrong.
+        """
+        numbers = {name: int(plain["numbers"][name]) for name in CHANNELS if name in plain["numbers"]}
+        if set(numbers) != set(plain["numbers"]) or not all(0 < count < 1_000_000 for count in numbers.values()):
+            raise ValueError("unknown channels")
+        width, height = plain["size_px"]
+        return cls(
+            str(plain["sensor"]),
+            Form(plain["form"]),
+            (int(width), int(height)),
+            bool(plain["gray"]),
+            numbers,
+            tuple(map(str, plain["estimates"])),
+            str(plain["frame"]),
+            str(plain["robot"]),
+        )
+
+    def differs(self, other: "About") -> list[str]:
+        """What speaks against episodes of another record beside those of this one."""
+        mine, its = self.plain(), other.plain()
+        return [
+            f"{key} {its[key]!r} instead of {mine[key]!r}" for key in mine if key not in ("channels", "robot") and mine[key] != its[key]
+        ]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One moment of an episode.
+
+    Attributes
+    ----------
+    image : (H, W) or (H, W, 3) uint8
+    time_s : float
+        Time of the exposure, from the episode's first one on.
+    values : dict of str to array of float32
+        The numbers of each channel; shapes as ``About.shape``.
+    """
+
+    image: ImageArray
+    time_s: float
+    values: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One contact path, or one round of a servo.
+
+    Attributes
+    ----------
+    key : str
+        Tells it from all others: readable, with a digest of what it holds.
+    task : str
+        In words.
+    steps : callable
+        Gives the steps from the first on, reading each when it is needed.
+    length : int
+        Number of steps.
+    rest : array or None
+        The picture without contact.
+    started_s : float
+        Unix time of the first exposure; 0 if unknown.
+    T_tool_sensor : (4, 4) float or None
+        Where the sensor is on the tool, mm.
+    """
+
+    key: str
+    task: str
+    steps: Callable[[], Iterator[Step]]
+    length: int
+    rest: ImageArray | None = None
+    started_s: float = 0.0
+    T_tool_sensor: np.ndarray | None = field(default=None, compare=False)
+
+    def facts(self) -> dict[str, Any]:
+        """What is kept of it beside its steps, as JSON."""
+        T = None if self.T_tool_sensor is None else np.asarray(self.T_tool_sensor, float).tolist()
+        return {"key": self.key, "task": self.task, "length": self.length, "started_s": self.started_s, "T_tool_sensor": T}
+
+    @classmethod
+    def from_facts(cls, facts: Mapping[str, Any], steps: Callable[[], Iterator[Step]], rest: ImageArray | None) -> "Episode":
+        """From what ``facts`` gives.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            Something is missing or wrong.
+        """
+        T = None if facts["T_tool_sensor"] is None else np.array(facts["T_tool_sensor"], float).reshape(4, 4)
+        return cls(str(facts["key"]), str(facts["task"]), steps, int(facts["length"]), rest, float(facts["started_s"]), T)
+
+
+@dataclass(frozen=True)
+class Records:
+    """Episodes that were opened for reading.
+
+    Attributes
+    ----------
+    about : About
+    episodes : list of Episode
+    notes : list of str
+        What was odd, one line each.
+    """
+
+    about: About
+    episodes: list[Episode]
+    notes: list[str] = field(default_factory=list)
+
+    def named(self, task: str) -> "Records":
+        """The same records with another task; as they are for ""."""
+        return self if not task else replace(self, episodes=[replace(episode, task=task) for episode in self.episodes])
+
+    def rate_hz(self) -> int:
+        """Whole number of frames a second, from the times of the first episode of several steps."""
+        for episode in self.episodes:
+            if episode.length > 1:
+                *_, last = episode.steps()
+                lasted_s = max(last.time_s, 1.0 / FASTEST_HZ)
+                return int(np.clip(round((episode.length - 1) / lasted_s), 1, FASTEST_HZ))
+        return round(NOMINAL_HZ)
+
+
+class RecordWriter(Protocol):
+    """Where episodes are written to. Each format has one."""
+
+    folder: Path
+
+    @property
+    def keys(self) -> set[str]:
+        """Keys of the episodes that are there."""
+
+    def write(self, episodes: Iterator[Episode]) -> int:
+        """Write episodes, and return how many. Those that are not finished when the process ends are not there afterwards."""
+
+
+def digest(*parts: object) -> str:
+    """A short digest of bytes, and of what JSON can hold, for an episode's key."""
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(part if isinstance(part, bytes) else json.dumps(part, sort_keys=True, default=str).encode())
+    return found.hexdigest()[:DIGEST]
+
+
+def float32(numbers: object, count: int | None = None) -> np.ndarray:
+    """Numbers as a channel has them; None and missing ones at the end become NaN."""
+    values = np.array([np.nan if value is None else value for value in np.ravel(np.asarray(numbers, object))], np.float32)
+    if count is not None and len(values) != count:
+        values = np.concatenate([values[:count], np.full(max(0, count - len(values)), np.nan, np.float32)])
+    return values
+
+
+def seconds(time_s: float) -> float:
+    """A time to the nanosecond, as every format can hold it."""
+    return round(float(time_s), 9)
+
+
+def library(name: str) -> ModuleType:
+    """A library that formats need and that need not be installed.
+
+    Raises
+    ------
+    RecordError
+        It is missing.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise RecordError(
+            f"this format needs the library {name.partition('.')[0]}, which is not installed; pip install 'tactip-twin[records]'"
+        ) from error

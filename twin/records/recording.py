@@ -1,0 +1,307 @@
+"""Records in the recordings' own format: pictures, ``targets.csv``, ``init_0.png``, and beside them what else is known.
+
+Read are recordings of any origin, collections, and simulated data sets with their truth. A frame is an episode of its own unless a column
+``path_id`` says which frames are states of one contact.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from scenes import ExperimentSpec, SensorSpec, load_sensor
+from scenes.base import SpecError
+from scenes.files import read_regular
+from twin.errors import FrameError
+from twin.frames import Recording, open_recording
+from twin.frames.images import write_image
+from twin.frames.tables import numbers
+from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, episode_of, format_of, read_json, read_sidecar
+from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, Step, digest, float32, seconds
+from twin.rig.mounting import Mounting
+from twin.store import write_json, write_npz, write_text
+from twin.types import Form
+
+TABLE, PINS, EPISODES, META, REST = "targets.csv", "pins.npz", "episodes.json", "meta.json", "init_0.png"
+MADE, TRUTH, LOG = "generation.json", "truth.zarr", "contacts.jsonl"
+"""Files of simulated data sets (how it was made, what is known) and of collections (what was asked for, and when)."""
+PATH, TIME_S = "path_id", "time_s"
+"""Columns of the table: the episode that a frame belongs to, and its time."""
+NOT_CARRIED = {"image_name", "sensor_image", "file_name", "data_name", "obj_id", "pose_id", "fraction", PATH, TIME_S}
+"""Columns that records do not have as numbers, and nobody misses."""
+
+
+def columns_of(channel: Channel, axes: tuple[str, ...]) -> list[str]:
+    """Columns of a channel in the table. Poses and moves have those that recordings have."""
+    if channel.name in ("pose", "move"):
+        return [f"{channel.name}_{k}" for k in range(1, 7)]
+    return [f"{channel.name}_{axis}" for axis in axes]
+
+
+def recording_records(path: Path, form: Form | None = None) -> Records:
+    """A recording, a collection or a simulated data set as a record.
+
+    Raises
+    ------
+    FrameError
+        As of ``open_recording``, or what lies beside the frames is damaged.
+    RecordError
+        The folder holds pins alone, or is damaged.
+    """
+    if path.is_dir() and (path / TRUTH).is_dir() and not any((path / name).is_dir() for name in ("images", "frames_bw")):
+        raise RecordError(f"{path}: holds pins without pictures; make the data set with --images raw, gray or recording")
+    own = format_of(path) == RecordingWriter.FORMAT if path.is_dir() else False
+    if own and not (path / EPISODES).is_file():
+        return Records(read_sidecar(path)[0], [])
+    recording = open_recording(path, None, form)
+    values, estimates = _table_values(recording)
+    values |= _pins_beside(path, recording) | _truth_beside(path, recording) | _asked_beside(path, recording)
+    values = {name: values[name] for name in CHANNELS if name in values}
+    found = next(iter(recording), None)
+    if found is None:
+        raise RecordError(f"{path}: no frame can be read; {AGAIN}")
+    said = _said_beside(path)
+    about = About(
+        sensor=str(said.get("sensor", "")),
+        form=recording.form,
+        size_px=recording.size_px,
+        gray=found.image.ndim == 2,
+        numbers={name: int(np.prod(values[name].shape[1:])) for name in CHANNELS if name in values},
+        estimates=estimates,
+        robot=str(said.get("arm", "")),
+    )
+    about = read_sidecar(path)[0] if own else about
+    carried = {column for name in values for column in columns_of(CHANNELS[name], about.axes(name))} | NOT_CARRIED
+    left = [name for name, cells in recording.labels.items() if name not in carried and cells.dtype.kind == "f"]
+    notes = [*recording.problems, *([f"columns {', '.join(left)} are not taken over"] if left else [])]
+    records = Records(about, [], notes)
+    rest = None if recording.reference is None else recording.reference.image
+    facts = _own_facts(path) if own else []
+    for number, rows in enumerate(_paths(recording)):
+        times_s = recording.labels[TIME_S][rows] if TIME_S in recording.labels else np.arange(len(rows)) / NOMINAL_HZ
+        steps = partial(_steps_of, recording, values, rows, times_s, notes)
+        if own:
+            if number == len(facts):  # what follows was being written when a run was killed
+                break
+            records.episodes.append(replace(episode_of(path, facts[number] | {"rest": None}, steps), rest=rest))
+            continue
+        labels = {name: array[rows[0]].tolist() for name, array in values.items() if name in ("pose", "move")}
+        key = f"{path.name}/{recording.names[rows[0]]}#{digest(labels, len(rows))}"
+        records.episodes.append(Episode(key, str(said["task"]), steps, len(rows), rest, T_tool_sensor=said.get("T_tool_sensor")))
+    return records
+
+
+def _steps_of(
+    recording: Recording, values: dict[str, np.ndarray], rows: np.ndarray, times_s: np.ndarray, notes: list[str]
+) -> Iterator[Step]:
+    for row, time_s in zip(rows.tolist(), times_s.tolist(), strict=True):
+        try:
+            frame = recording.read(row)
+        except FrameError as error:
+            if (note := f"skipped {error}") not in notes:
+                notes.append(note)
+            continue
+        yield Step(frame.image, seconds(time_s - times_s[0]), {name: array[row] for name, array in values.items()})
+
+
+def _paths(recording: Recording) -> list[np.ndarray]:
+    """Rows of each episode, in the order of their first frames."""
+    if PATH not in recording.labels:
+        return [np.array([row]) for row in range(len(recording))]
+    rows: dict[float, list[int]] = {}
+    for row, path_id in enumerate(numbers(recording.labels[PATH]).tolist()):
+        rows.setdefault(path_id if np.isfinite(path_id) else -1.0 - row, []).append(row)
+    return [np.array(each) for each in rows.values()]
+
+
+def _table_values(recording: Recording) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """What the table has of each channel, and the names of estimated labels."""
+    labels = recording.labels
+    estimates = tuple(name.removeprefix("estimate_") for name in labels if name.startswith("estimate_"))
+    found = {}
+    for channel in CHANNELS.values():
+        axes = channel.axes or (estimates if channel.name != "pins" else ())
+        columns = columns_of(channel, axes)
+        if not any(column in labels for column in columns):
+            continue
+        # Recordings leave out what they never move: a coordinate of a pose or a move that has no column is 0.
+        missing = np.zeros(len(recording)) if channel.name in ("pose", "move") else np.full(len(recording), np.nan)
+        found[channel.name] = np.stack([numbers(labels[c]) if c in labels else missing for c in columns], axis=1).astype(np.float32)
+    return found, estimates
+
+
+def _pins_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
+    """Pins that ``twin preprocess`` or a translation found, for the recording's frames; NaN for frames without."""
+    if not (path / PINS).is_file():
+        return {}
+    try:
+        with np.load(path / PINS, allow_pickle=False) as file:
+            names, pins_px = file["image_name"].tolist(), file["pins_px"].astype(np.float32)
+    except Exception as error:  # zipfile and numpy raise exceptions of any type for damaged files
+        raise FrameError(f"{path / PINS}: damaged; {AGAIN}") from error
+    row_of = {name: row for row, name in enumerate(names)}
+    rows = np.array([row_of.get(name, -1) for name in recording.names])
+    return {"pins": np.where((rows >= 0)[:, None, None], pins_px[rows], np.float32(np.nan))}
+
+
+def _truth_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
+    """Pins, wrench and the pose to which the arm was sent, of a simulated data set."""
+    if not (path / TRUTH).is_dir():
+        return {}
+    from twin.frames.truth import arrays_of, open_truth, row_of
+
+    truth, _, _ = open_truth(path)
+    by_name = row_of(truth)
+    if strange := [name for name in recording.names if name not in by_name]:
+        raise FrameError(f"{path}: {TRUTH} knows nothing of {strange[0]}: the data set is damaged; {AGAIN}")
+    rows = [by_name[name] for name in recording.names]
+    arrays = arrays_of(truth, ("pins_px", "force_n", "torque_nmm", "pose"))
+    wrench = np.concatenate([arrays["force_n"], arrays["torque_nmm"]], axis=1)
+    return {name: a[rows].astype(np.float32) for name, a in (("pins", arrays["pins_px"]), ("wrench", wrench), ("action", arrays["pose"]))}
+
+
+def _asked_beside(path: Path, recording: Recording) -> dict[str, np.ndarray]:
+    """The poses that a collection asked for."""
+    if not (path / LOG).is_file():
+        return {}
+    asked = {}
+    for line in read_regular(path / LOG, 1_000_000_000).decode("utf-8", "replace").splitlines():
+        try:
+            found = json.loads(line)
+            asked[str(found["image_name"])] = float32(found["asked"][:6], 6)
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue
+    none = np.full(6, np.nan, np.float32)
+    return {"action": np.stack([asked.get(name, none) for name in recording.names])} if asked else {}
+
+
+def _said_beside(path: Path) -> dict[str, Any]:
+    """Sensor, arm, task and ``T_tool_sensor`` of a recording, as far as its files tell."""
+    told: dict[str, Any] = {"task": "touch"}
+    for name in (META, MADE):
+        if path.is_dir() and (path / name).is_file():
+            try:
+                content = read_json(path / name)
+            except RecordError:  # a recording of someone else, whose metadata are noted when it is opened
+                continue
+            told |= {key: content[key] for key in ("arm", "sensor", "experiment") if key in content}
+            if isinstance(content.get("comments"), str) and content["comments"]:
+                told["task"] = content["comments"]
+    sensor, experiment = told.get("sensor", ""), told.get("experiment")
+    try:
+        spec = SensorSpec.model_validate(sensor) if isinstance(sensor, dict) else load_sensor(str(sensor)) if sensor else None
+        told["sensor"] = "" if spec is None else spec.name
+        if spec is not None and isinstance(experiment, dict):
+            told["T_tool_sensor"] = Mounting.of(spec, ExperimentSpec.model_validate(experiment)).T_tool_sensor
+    except (SpecError, ValidationError):
+        told["sensor"] = sensor if isinstance(sensor, str) else ""
+    return told
+
+
+def _own_facts(path: Path) -> list[dict[str, Any]]:
+    facts = read_json(path / EPISODES).get("episodes")
+    if not isinstance(facts, list) or not all(isinstance(each, dict) for each in facts):
+        raise RecordError(f"{path / EPISODES}: damaged; {AGAIN}")
+    return facts
+
+
+class RecordingWriter(FolderWriter):
+    """Writes records as a recording, with the numbers that recordings do not have in further columns and in ``pins.npz``.
+
+    A recording has one picture without contact: that of the first episode with one.
+
+    Parameters
+    ----------
+    folder, about, rate_hz
+        As of ``FolderWriter``.
+    held_steps : int
+        Frames from which on the table is written anew. 0: after each episode, so that each is safe at once.
+    """
+
+    FORMAT = "recording"
+    NAMES = (TABLE, PINS, EPISODES, META, REST, "images", "frames_bw")
+
+    def __init__(self, folder: Path, about: About, rate_hz: int, *, held_steps: int = HELD_STEPS) -> None:
+        super().__init__(folder, about, rate_hz)
+        self.held_steps = held_steps
+
+    @property
+    def _pictures(self) -> Path:
+        return self.folder / ("frames_bw" if self.about.form is Form.RECORDING else "images")
+
+    def _begin(self) -> None:
+        self._rows: list[list[str]] = []
+        self._pins: list[np.ndarray] = []
+        self._pictures.mkdir(exist_ok=True)
+
+    def _find(self) -> list[dict[str, Any]]:
+        """The episodes that are listed, and their rows. Pictures and rows of others are written over."""
+        self._begin()
+        if not (self.folder / EPISODES).is_file():
+            return []
+        facts = _own_facts(self.folder)
+        length = sum(int(each["length"]) for each in facts)
+        try:
+            with (self.folder / TABLE).open(newline="", encoding="utf-8") as file:
+                self._rows = list(csv.reader(file))[1 : length + 1]
+            if "pins" in self.about.numbers:
+                with np.load(self.folder / PINS, allow_pickle=False) as arrays:
+                    self._pins = list(arrays["pins_px"][:length])
+        except Exception as error:  # zipfile and numpy raise exceptions of any type for damaged files
+            raise RecordError(f"{self.folder}: {TABLE} or {PINS} is damaged; {AGAIN}") from error
+        return facts
+
+    def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
+        group: list[dict[str, Any]] = []
+        rows: list[list[str]] = []
+        pins: list[np.ndarray] = []
+        for episode in episodes:
+            number, before = len(self.facts) + len(group), len(rows)
+            for k, step in enumerate(episode.steps()):
+                self._require_fitting(episode, step)
+                name = f"frame_{number}_{k}.png"
+                write_image(self._pictures / name, step.image)
+                rows.append(self._row(name, number, step))
+                pins += [step.values["pins"]] if "pins" in self.about.numbers else []
+            if len(rows) > before:
+                if episode.rest is not None and not (self.folder / REST).is_file():
+                    write_image(self.folder / REST, episode.rest)
+                group.append(episode.facts() | {"length": len(rows) - before})
+            if len(rows) > self.held_steps:
+                yield self._commit(group, rows, pins)
+                group, rows, pins = [], [], []
+        if group:
+            yield self._commit(group, rows, pins)
+
+    def _row(self, name: str, number: int, step: Step) -> list[str]:
+        cells = [name, name.rpartition("_")[0], "1", str(number + 1), str(number), repr(float(step.time_s))]
+        for channel in self._columns():
+            cells += ["" if np.isnan(value) else repr(float(value)) for value in step.values[channel]]
+        return cells
+
+    def _columns(self) -> dict[str, list[str]]:
+        return {name: columns_of(CHANNELS[name], self.about.axes(name)) for name in self.about.numbers if name != "pins"}
+
+    def _commit(self, group: list[dict[str, Any]], rows: list[list[str]], pins: list[np.ndarray]) -> list[dict[str, Any]]:
+        """Write the table, the pins and, last, the list of episodes, each anew and whole."""
+        self._rows += rows
+        self._pins += pins
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        named = [column for columns in self._columns().values() for column in columns]
+        writer.writerow(["image_name", "data_name", "obj_id", "pose_id", PATH, TIME_S, *named])
+        writer.writerows(self._rows)
+        facts = [*self.facts, *group]
+        if self._pins:
+            write_npz(self.folder / PINS, {"image_name": np.array([row[0] for row in self._rows]), "pins_px": np.stack(self._pins)})
+        write_text(self.folder / TABLE, text.getvalue())
+        write_json(self.folder / META, {"comments": facts[0]["task"], "sensor": self.about.sensor, "num_poses": len(facts)})
+        write_json(self.folder / EPISODES, {"episodes": facts})
+        return group

@@ -1,0 +1,315 @@
+"""A live session on disk: every frame as it was, and a line of JSON for each step.
+
+``session.json`` says what the session is. ``steps.jsonl`` has one line a step, ``frames/`` the pictures (PNG, lossless). A picture is
+written before its line, so every picture that a line names exists, and the session can be read up to its last complete line at any
+time. ``rest.png`` is the frame without contact that pins were counted from, if one was taken.
+"""
+
+import json
+import math
+import os
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from scenes import load_experiment, load_sensor
+from scenes.base import Name, SpecError
+from scenes.files import read_regular, shown
+from twin.errors import FrameError, StoreError
+from twin.frames.images import read_image, write_image
+from twin.records.record import CHANNELS, About, Episode, Records, Step, digest, float32, seconds
+from twin.rig.mounting import Mounting
+from twin.store import contents, unwritten, write_json
+from twin.types import Form, Frame
+
+ABOUT, STEPS, FRAMES, REST = "session.json", "steps.jsonl", "frames", "rest.png"
+SESSION_FILES = (ABOUT, STEPS, FRAMES, REST)
+VERSION = 1
+LARGEST_BYTES = 1_000_000_000  # of the steps: a million of them, which a day at 10 Hz has
+LARGEST_ABOUT_BYTES = 1_000_000  # of what the session is
+
+
+def is_session(path: str | Path) -> bool:
+    """Whether a folder holds a recorded session."""
+    return (Path(path) / ABOUT).is_file() and (Path(path) / STEPS).is_file()
+
+
+class SessionWriter:
+    """Appends the steps of a session.
+
+    Parameters
+    ----------
+    folder : path
+        A new or empty folder, or the folder of a session that ended before its first step. Such a session is begun anew.
+    about : dict
+        Sensor, camera, model and arm, in types that JSON can hold.
+
+    Raises
+    ------
+    StoreError
+        The folder holds something else, or can't be written to.
+    """
+
+    def __init__(self, folder: str | Path, about: dict) -> None:
+        self.folder = Path(folder)
+        begun_only = is_session(self.folder) and not (self.folder / STEPS).stat().st_size
+        if contents(self.folder) and not begun_only:
+            raise StoreError(f"{self.folder}: not empty; give a new folder for the session")
+        (self.folder / FRAMES).mkdir(parents=True, exist_ok=True)
+        (self.folder / REST).unlink(missing_ok=True)
+        clock = {"unix_s": time.time(), "monotonic_s": time.monotonic()}  # the same moment on the clock of the frames
+        write_json(self.folder / ABOUT, {"version": VERSION, "clock": clock, **about})
+        self._lines = (self.folder / STEPS).open("a", encoding="utf-8")
+        self._written: dict[int, str] = {}  # the newest picture by its number: a frame may serve several steps
+        self.count = 0
+
+    def append(self, frame: Frame, step: dict) -> None:
+        """Write a step and its frame."""
+        name = self._written.get(frame.sequence)
+        if name is None:
+            name = f"frame_{self.count:06d}.png"
+            write_image(self.folder / FRAMES / name, frame.image)
+            self._written = {frame.sequence: name}
+        about_frame = {"file": name, "name": frame.name, "form": str(frame.form), "time_s": frame.time_s, "sequence": frame.sequence}
+        line = {"step": self.count, "frame": about_frame, **{key: plain(value) for key, value in step.items()}}
+        try:
+            self._lines.write(json.dumps(line) + "\n")
+            self._lines.flush()
+        except OSError as error:
+            raise unwritten(self.folder / STEPS, error) from error
+        self.count += 1
+
+    def keep_rest(self, frame: Frame) -> None:
+        """Keep the frame without contact that pins are counted from."""
+        write_image(self.folder / REST, frame.image)
+
+    def close(self) -> None:
+        """End the session; its lines are on disk already."""
+        self._lines.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _FrameLine(BaseModel):
+    """What a step's line says about its frame."""
+
+    file: Name
+    name: str
+    form: Form
+    time_s: float
+    sequence: int
+
+
+class _StepLine(BaseModel):
+    """What a replay needs of a step's line."""
+
+    step: int
+    frame: _FrameLine
+    value: list[float | None] = []
+
+
+def read_steps(folder: str | Path) -> list[dict]:
+    """Every complete step of a session; a line that was being written when it ended is left out, with all after it.
+
+    Raises
+    ------
+    FrameError
+        The file can't be read.
+    """
+    return _steps_and_note(Path(folder))[0]
+
+
+def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
+    """A session's complete steps, and what is wrong with the line after them ("" if there is none)."""
+    try:
+        text = read_regular(folder / STEPS, LARGEST_BYTES).decode("utf-8", "replace")
+    except OSError as error:
+        raise FrameError(f"{folder}: {STEPS} can't be read ({error.strerror}); give the folder of a session") from error
+    steps: list[dict] = []
+    lines = text.split("\n")
+    for line in lines[:-1]:
+        try:
+            step = json.loads(line)
+        except (ValueError, RecursionError):
+            break
+        if not isinstance(step, dict):
+            break
+        steps.append(step)
+    whole = len(steps) == len(lines) - 1 and not lines[-1]
+    return steps, "" if whole else f"{STEPS}: line {len(steps) + 1} is cut or damaged; the {len(steps)} steps before it are read"
+
+
+class Session:
+    """A recorded session, opened for reading.
+
+    Parameters
+    ----------
+    folder : path
+
+    Attributes
+    ----------
+    about : dict
+        What the session is.
+    steps : list of dict
+        Its complete steps.
+    form : Form
+    notes : list of str
+        What is odd, one line each.
+
+    Raises
+    ------
+    FrameError
+        The folder holds no session, one of another version, or a damaged one. A line that was being written when the session ended is
+        no damage.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        if not is_session(self.folder):
+            raise FrameError(f"{folder}: holds no recorded session ({ABOUT} and {STEPS} are expected); '--record DIR' writes one")
+        self.about = self._read_about()
+        self.steps, note = _steps_and_note(self.folder)
+        if not self.steps:
+            raise FrameError(f"{folder}: {note or 'the session ended before its first step'}; nothing to replay, record it again")
+        self._lines = [self._checked(number, step).frame for number, step in enumerate(self.steps, 1)]
+        loose = {path.name for path in (self.folder / FRAMES).glob("*.png")} - {line.file for line in self._lines}
+        loose_note = f"{len(loose)} pictures in {FRAMES}/ have no step in {STEPS}: the session was cut" if loose else ""
+        self.notes = [each for each in (note, loose_note) if each]
+        self.form = self._lines[0].form
+
+    def _read_about(self) -> dict:
+        try:
+            about = json.loads(read_regular(self.folder / ABOUT, LARGEST_ABOUT_BYTES).decode("utf-8-sig"))
+        except OSError as error:
+            raise FrameError(f"{self.folder}: {ABOUT} can't be read ({error.strerror}); copy the session again") from error
+        except (ValueError, RecursionError) as error:
+            raise FrameError(f"{self.folder}: {ABOUT} is no JSON; copy the session again") from error
+        if not isinstance(about, dict) or "version" not in about:
+            raise FrameError(f"{self.folder}: {ABOUT} is not that of a session; copy the session again")
+        if about["version"] != VERSION:
+            version = shown(about["version"])
+            raise FrameError(
+                f"{self.folder}: {ABOUT} is of version {version}, expected {VERSION}; replay it with the program that wrote it"
+            )
+        return about
+
+    def _checked(self, number: int, step: dict) -> _StepLine:
+        try:
+            line = _StepLine.model_validate(step)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            key, problem = ".".join(shown(part) for part in first["loc"]), shown(first["msg"].removeprefix("Value error, "))
+            raise FrameError(f"{self.folder}: {STEPS}, line {number}: {key}: {problem}; copy the session again") from error
+        if line.step != number - 1:
+            raise FrameError(f"{self.folder}: {STEPS}, line {number} is of step {line.step}: lines are missing; copy the session again")
+        return line
+
+    def _picture(self, name: str) -> np.ndarray:
+        """A picture of the session by its path in the folder; one that lies elsewhere is not read, even where a link leads to it."""
+        path = self.folder / name
+        if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(self.folder)):
+            raise FrameError(f"{self.folder}: {name} is a link to outside the session; put the picture itself there")
+        try:
+            return read_image(path)[0]
+        except FrameError as error:
+            raise FrameError(f"{self.folder}: {error}") from error
+
+    @property
+    def rest(self) -> Frame | None:
+        """The frame without contact that pins were counted from; None if they were counted from the nominal layout."""
+        if not (self.folder / REST).is_file():
+            return None
+        return Frame(self._picture(REST), self.form, REST)
+
+    def frame(self, index: int) -> Frame:
+        """The frame of a step. A frame that served several steps is given for each.
+
+        Raises
+        ------
+        FrameError
+            The picture can't be read.
+        """
+        line = self._lines[index]
+        return Frame(self._picture(f"{FRAMES}/{line.file}"), line.form, line.name, line.time_s, line.sequence)
+
+
+def session_records(folder: Path) -> Records:
+    """A session as a record of one episode.
+
+    Raises
+    ------
+    FrameError
+        As of ``Session``, or its first picture can't be read.
+    """
+    session = Session(folder)
+    first, image = session.steps[0], session.frame(0).image
+    estimates = tuple(map(str, first.get("names", [])))
+    numbers = {name: 6 for name, key in _POSES.items() if key in first} | {name: len(estimates) for name in _ESTIMATES if estimates}
+    size_px = image.shape[1], image.shape[0]
+    about = About(
+        sensor=str(session.about.get("sensor", "")),
+        form=session.form,
+        size_px=size_px,
+        gray=image.ndim == 2,
+        numbers={name: numbers[name] for name in CHANNELS if name in numbers},
+        estimates=estimates,
+        frame="base",
+        robot=str(session.about.get("arm", "")),
+    )
+    clock, first_s = session.about.get("clock"), session.frame(0).time_s
+    started_s = clock["unix_s"] + first_s - clock["monotonic_s"] if isinstance(clock, dict) else 0.0
+    touched = session.about.get("object")
+    rest = session.rest
+    episode = Episode(
+        key=f"{folder.name}#{digest(session.about, first)}",
+        task=f"follow the {touched}" if touched else "watch what the sensor touches",
+        steps=partial(_steps_of, session, about, first_s),
+        length=len(session.steps),
+        rest=None if rest is None else rest.image,
+        started_s=float(started_s),
+        T_tool_sensor=_sensor_on_tool(session.about),
+    )
+    return Records(about, [episode], list(session.notes))
+
+
+# Keys of a step's line that hold what a channel holds.
+_POSES = {"pose": "exposed_pose", "action": "sent"}
+_ESTIMATES = {"estimate": "value", "low": "low", "high": "high"}
+
+
+def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Step]:
+    keys = {name: (_POSES | _ESTIMATES)[name] for name in about.numbers}
+    for index, line in enumerate(session.steps):
+        frame = session.frame(index)
+        values = {name: float32(line.get(key, []), about.numbers[name]) for name, key in keys.items()}
+        yield Step(frame.image, seconds(frame.time_s - first_s), values)
+
+
+def _sensor_on_tool(about: dict[str, Any]) -> np.ndarray | None:
+    """``T_tool_sensor`` (4, 4) of a session that says its sensor and its servo; None if it says neither or they are not known here."""
+    try:
+        return Mounting.of(load_sensor(about["sensor"]), load_experiment(about["servo"]["experiment"])).T_tool_sensor
+    except (KeyError, TypeError, SpecError):
+        return None
+
+
+def plain(value: object) -> object:
+    """The value as JSON can hold it: an array becomes a list, a number that is not finite becomes null."""
+    if isinstance(value, dict):
+        return {key: plain(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [plain(part) for part in (value.tolist() if isinstance(value, np.ndarray) else value)]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -213,7 +213,8 @@ def whole_steps(path: Path, facts: dict[str, Any], steps: Callable[[], Iterator[
         There are not as many as it had.
     """
     count = 0
-    for count, step in enumerate(steps(), 1):
+    for step in steps():
+        count += 1
         yield step
     if count != facts["length"]:
         raise RecordError(f"{path}: damaged, {count} of {facts['length']} steps of {shown(facts['key'])} are there; {AGAIN}")

@@ -451,7 +451,13 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--at-rest": "nowhere.png",
     },
     f"collect --camera twin --arm simulated {S} --out {{out}}": {"--count": "0 -1 2000000000", "--seed": "-1", "--object": "nowhere"},
+    "convert {session} --out {out}": {
+        "--to": "cooked",
+        "--to mcap --sensor": "nowhere",
+        "--video --to": "recording mcap",
+    },
     f"live --model {SENSOR} --camera {{frames}} --headless": {
+        "--also": "mcap cooked",
         "--count": "0 -1",
         "--seconds": "-1 nan",
         "--port": "-1 65536",
@@ -536,7 +542,7 @@ def _numbers() -> list[Entry]:
 
 
 EVERY = (
-    *("audit", "calibrate contact", "calibrate optics", "check", "collect", "dataset", "demo", "doctor", "emulate camera"),
+    *("audit", "calibrate contact", "calibrate optics", "check", "collect", "convert", "dataset", "demo", "doctor", "emulate camera"),
     *("emulate magician", "emulate mg400", "evaluate", "experiments", "graph", "live", "new", "objects", "pack", "predict", "preprocess"),
     *(
         "randomisations",
@@ -574,6 +580,7 @@ WRITE = {
     "collect": f"collect --camera twin --arm simulated {S} --count 1 --out {{there}}",
     "servo": "servo --object can --steps 1 --out {there}",
     "live": f"live --model {SENSOR} --camera {{frames}} --headless --record {{there}}",
+    "convert": "convert {session} --to lerobot --out {there}",
     "demo": "demo --out {there}",
     "study servo": f"study servo --model {SENSOR} --objects can --steps 1 --out {{there}}",
     "study objects": f"study objects {S} --count 2 --tests 1 --across 6 --workers 1 --epochs 1 --out {{there}}",
@@ -581,7 +588,20 @@ WRITE = {
     "study tac-vgnn": f"study tac-vgnn --data {{recording}} {S} --out {{there}} --models gnn --epochs 1 --batches 8 --no-contacts",
 }
 # commands that take seconds and may be given again for the same folder
-AGAIN = ("audit", "evaluate", "preprocess", "graph", "tune", "dataset", "render", "validate", "collect", "servo", "study tac-vgnn")
+AGAIN = (
+    "audit",
+    "evaluate",
+    "preprocess",
+    "graph",
+    "tune",
+    "dataset",
+    "render",
+    "validate",
+    "collect",
+    "convert",
+    "servo",
+    "study tac-vgnn",
+)
 
 
 def _dangling(folder: Path, good: given.Harmless) -> Path:
@@ -631,6 +651,7 @@ OVERWRITTEN = {  # files of the user's own in --out that a command of the same n
     "collect": ("targets.csv", "meta.json"),
     "servo": ("measures.json", "trajectory.csv"),
     "live": ("session.json", "steps.jsonl"),
+    "convert": ("tactip.json", "README.md"),
     "demo": ("index.html",),
     "study servo": ("study.csv",),
     "study objects": ("objects.csv", "index.html"),
@@ -776,7 +797,7 @@ def _gone_on() -> list[Entry]:
 
 
 def _sessions() -> list[Entry]:
-    call = f"live --model {SENSOR} --replay {{data}} --headless"
+    calls = {"live": f"live --model {SENSOR} --replay {{data}} --headless", "convert": "convert {data} --to mcap --out {out}"}
     found = []
     for name, what, edit, exits in (
         ("steps.jsonl", "empty", given.with_bytes(lambda data: b""), (REFUSED,)),
@@ -797,17 +818,21 @@ def _sessions() -> list[Entry]:
         ("frames/frame_000000.png", "half the size", given.PICTURES["half the size"], (REFUSED,)),
     ):  # fmt: skip
         sample = what in ("a picture elsewhere", "text")
-        found.append(
-            Entry(
-                "sessions",
-                f"{name} {what}",
-                call,
-                {"data": edited("session", name, edit)},
-                exits,
-                ("session|frame_",) if exits == (REFUSED,) else (),
-                sample=sample,
+        for command, call in calls.items():
+            if command == "convert" and what == "missing" and not name.endswith("png"):  # it is then a folder of frames
+                continue
+            found.append(
+                Entry(
+                    "sessions",
+                    f"{name} {what}",
+                    call,
+                    {"data": edited("session", name, edit)},
+                    exits,
+                    ("session|frame_",) if exits == (REFUSED,) else (),
+                    sample=sample and (command, what) != ("convert", "a picture elsewhere"),
+                )
             )
-        )
+    found.append(Entry("sessions", "nowhere", "convert nowhere --to lerobot --out {out}", says=("nowhere",)))
     return found
 
 

@@ -38,6 +38,7 @@ from twin.frames import open_recording
 from twin.frames.images import write_image
 from twin.pins import Pipeline
 from twin.pins.batch import voronoi_map
+from twin.records import open_records
 from twin.rig.mounting import Mounting
 from twin.studio.live_page import LivePage, shot_pictures
 from twin.types import Form, Frame
@@ -85,7 +86,7 @@ def run(*arguments) -> str:
 
 def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path):
     out = tmp_path / "servo"
-    told = run("servo", "--object", "can", "--model", "any", "--out", out, "--steps", STEPS, "--plain-light", "--record")
+    told = run("servo", "--object", "can", "--model", "any", "--out", out, "--steps", STEPS, "--plain-light", "--record", "--also", "mcap")
     assert f"{STEPS} steps" in told
     with (out / "trajectory.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -96,6 +97,10 @@ def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path
     assert (out / "trajectory.png").stat().st_size > 10_000
     with SessionSource(out / "session") as session:
         frames = [session.read() for _ in range(STEPS)]
+    kept = open_records(out / "session" / "mcap")
+    assert [episode.length for episode in kept.episodes] == [STEPS]
+    for row, step in zip(rows, kept.episodes[0].steps(), strict=True):
+        assert step.values["action"][0] == np.float32(session.steps[int(row["step"])]["sent"][0])
     # the frames show a contact: pins have moved, and the pipeline sees them
     seen = stand_in.pipeline(frames[-1])
     assert seen.valid
@@ -165,10 +170,15 @@ def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
         "--out",
         tmp_path,
         "--plain-light",
+        "--also",
+        "huggingface",
         "--count",
     )
     assert "1 contacts" in run(*arguments, 1)
+    assert len(open_records(tmp_path / "huggingface").episodes) == 1
     assert "(1 new)" in run(*arguments, 2)
+    kept = open_records(tmp_path / "huggingface")
+    assert len(kept.episodes) == 2 and kept.about.sensor == "mg400-331" and set(kept.about.numbers) == {"pins", "pose", "move", "action"}
     sensor = load_sensor("mg400-331")
     recording = open_recording(tmp_path, sensor)
     assert recording.form is Form.RECORDING and len(recording) == 2 and not recording.problems
@@ -189,8 +199,11 @@ def test_live_records_and_replays_the_same(stand_in, tmp_path):
     rng = np.random.default_rng(0)
     for k in range(5):
         write_image(folder / f"frame_{k}.png", (rng.random((360, 360)) > 0.7).astype(np.uint8) * 255)
-    told = run("live", "--camera", folder, "--model", "any", "--headless", "--record", tmp_path / "s")
+    told = run("live", "--camera", folder, "--model", "any", "--headless", "--record", tmp_path / "s", "--also", "lerobot")
     assert "5 steps" in told
+    assert [episode.length for episode in open_records(tmp_path / "s" / "lerobot").episodes] == [5]
+    with pytest.raises(OptionError, match="--also goes with --record"):
+        run("live", "--camera", folder, "--model", "any", "--headless", "--also", "lerobot")
     assert "5 of 5 estimates" in run("live", "--replay", tmp_path / "s", "--model", "any", "--headless")
 
 

@@ -149,7 +149,7 @@ def damage(path, keep):
         ("lerobot", "meta/episodes/chunk-000/file-000.parquet"),
         ("lerobot", "data/chunk-000/file-000.parquet"),
         ("huggingface", "episodes/000000.json"),
-        ("huggingface", "data/000000/metadata.jsonl"),
+        ("huggingface", "data/000000/metadata.parquet"),
         ("huggingface", "data/000000/episode_000000_000001.png"),
         ("mcap", "episode_000000.mcap"),
     ]

@@ -1,13 +1,12 @@
 """The command ``twin convert``: records in the formats of other tools."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from twin.cli import app
-from twin.cli.options import Force, Out, if_given, tell
+from twin.cli.options import AlsoFormat, Force, Out, if_given, tell
 
 HELP_CONVERT = """Translate records into the formats of other tools, and back.
 
@@ -35,19 +34,21 @@ Examples:
 """
 
 
-class To(StrEnum):
-    """Formats that can be written (``twin.records.FORMATS``, which would load the pin detection)."""
+# Formats that can be written (``twin.records.FORMATS``, which would load the pin detection).
+FORMATS = ("recording", *AlsoFormat)
 
-    RECORDING = "recording"
-    LEROBOT = "lerobot"
-    HUGGINGFACE = "huggingface"
-    MCAP = "mcap"
+
+def known_format(text: str) -> str:
+    """The format, if there is one of that name."""
+    if text not in FORMATS:
+        raise typer.BadParameter(f"expected {', '.join(FORMATS)}, got {text!r}")
+    return text
 
 
 @app.command("convert", help=HELP_CONVERT)
 def convert_command(
     sources: Annotated[list[Path], typer.Argument(metavar="SOURCE...", help="recordings, sessions, or translated records")],
-    to: Annotated[To, typer.Option("--to", help="format to write")],
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", callback=known_format, help="recording, lerobot, huggingface or mcap")],
     out: Out,
     sensor: Annotated[
         str | None, typer.Option("--sensor", metavar="S", help="sensor whose pins are found; a source's own if not given")
@@ -62,5 +63,5 @@ def convert_command(
     from twin.store import overwriting
 
     with overwriting(force), shown() as progress:
-        done = convert(sources, out, to.value, sensor=if_given(load_sensor, sensor), task=task, video=video, progress=progress)
+        done = convert(sources, out, to, sensor=if_given(load_sensor, sensor), task=task, video=video, progress=progress)
     tell(done)

@@ -11,6 +11,7 @@ import numpy as np
 from scenes import SensorSpec, SpecError, load_sensor
 from scenes.files import LONGEST_PATH, shown
 from twin.errors import FrameError
+from twin.frames.forms import frame_size, times
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.progress import Progress, silent, stage
 from twin.records.folder import HELD_STEPS, FolderWriter, format_of
@@ -86,6 +87,9 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
     if spec is None:
         note = "no pins: the record does not name a sensor that is known here; give --sensor to have them found"
         return replace(records, notes=[*records.notes, note])
+    if (expected := frame_size(spec, records.about.form)) != records.about.size_px:
+        got = f"{records.episodes[0].key if records.episodes else 'the record'}: frames of {times(records.about.size_px)}"
+        raise FrameError(f"{got}, those of {spec.name} are {times(expected)}; give the matching --sensor, or another recording or session")
     numbers = {"pins": 2 * spec.pins.count, **records.about.numbers}
     about = replace(records.about, sensor=spec.name, numbers=numbers)
     found = [replace(episode, steps=partial(_seen, episode, about, spec, records.notes)) for episode in records.episodes]

@@ -4,6 +4,7 @@
 """
 
 import json
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -67,7 +68,7 @@ class FolderWriter(ABC):
     def __enter__(self) -> Self:
         for name in self.LIBRARIES:
             library(name)
-        fresh = not (self.folder / SIDECAR).is_file()
+        fresh = not os.path.isfile(self.folder / SIDECAR)  # unlike ``Path.is_file`` False for what is no path at all
         if fresh and contents(self.folder):
             raise RecordError(f"{self.folder}: holds something else; give a new or empty folder")
         with ExitStack() as held:

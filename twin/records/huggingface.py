@@ -1,10 +1,11 @@
 """Records as a folder of pictures with metadata, which Hugging Face's ``datasets`` and its viewer read as ``imagefolder``.
 
-``data/NNNNNN/`` has the pictures of one or more episodes and ``metadata.jsonl``, a line for each picture. Each of these folders appears
+``data/NNNNNN/`` has the pictures of one or more episodes and ``metadata.parquet``, a row for each picture. Each of these folders appears
 whole. ``episodes/NNNNNN.json`` says what its episodes are.
+
+The metadata are no JSON lines, because pyarrow's reader of JSON, which ``datasets`` uses, loses nulls at the beginning of nested lists.
 """
 
-import json
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -12,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from scenes.files import read_regular
 from twin.errors import FrameError
 from twin.frames.images import read_image, write_image
-from twin.records.folder import AGAIN, HELD_STEPS, LARGEST_BYTES, FolderWriter, read_json, records_in
-from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, Step, float32
-from twin.store import remove_parts, replace_folder, write_json, write_text
+from twin.frames.tables import base_name
+from twin.records.folder import AGAIN, HELD_STEPS, FolderWriter, read_json, records_in
+from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, Step, library
+from twin.store import remove_parts, replace_folder, write_json, write_text, write_with
 from twin.store.atomic import PART
 
-DATA, EPISODES, METADATA, CARD = "data", "episodes", "metadata.jsonl", "README.md"
+DATA, EPISODES, METADATA, CARD = "data", "episodes", "metadata.parquet", "README.md"
 CARD_TEXT = """---
 configs:
 - config_name: default
@@ -32,14 +33,14 @@ tags:
 
 # Records of the tactile sensor {sensor}
 
-Pictures with metadata. In Python: `datasets.load_dataset("imagefolder", data_dir=...)`. NaN is null.
+Pictures with metadata. In Python: `datasets.load_dataset("imagefolder", data_dir=...)`.
 
 {lines}
 """
 
 
 class HuggingFaceWriter(FolderWriter):
-    """Writes records as pictures with ``metadata.jsonl``.
+    """Writes records as pictures with ``metadata.parquet``.
 
     Parameters
     ----------
@@ -52,6 +53,7 @@ class HuggingFaceWriter(FolderWriter):
     FORMAT = "huggingface"
     NAMES = (DATA, EPISODES, CARD)
     FOLDERS = (DATA, EPISODES)
+    LIBRARIES = ("pyarrow.parquet",)
 
     def __init__(self, folder: Path, about: About, rate_hz: int, *, held_steps: int = HELD_STEPS) -> None:
         super().__init__(folder, about, rate_hz)
@@ -72,7 +74,7 @@ class HuggingFaceWriter(FolderWriter):
 
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
         group: list[dict[str, Any]] = []
-        lines: list[str] = []
+        lines: list[dict[str, Any]] = []
         for episode in episodes:
             part = self.folder / DATA / f".{self._next:06d}{PART}"
             part.mkdir(exist_ok=True)
@@ -81,7 +83,7 @@ class HuggingFaceWriter(FolderWriter):
                 self._require_fitting(episode, step)
                 name = f"episode_{number:06d}_{length - 1:06d}.png"
                 write_image(part / name, step.image)
-                lines.append(json.dumps(self._line(name, number, length - 1, episode, step)))
+                lines.append(self._line(name, number, length - 1, episode, step))
             if length:
                 group.append(self._facts(episode, length))
             if len(lines) > self.held_steps:
@@ -92,13 +94,18 @@ class HuggingFaceWriter(FolderWriter):
         remove_parts(self.folder / DATA)
 
     def _line(self, name: str, episode: int, number: int, whole: Episode, step: Step) -> dict[str, Any]:
-        """One line of the metadata. Every line has the same keys, as the reader wants it."""
-        numbers = {CHANNELS[key].column: _nulls(step.values[key]) for key in self.about.numbers}
+        """One row of the metadata. Every row has the same keys, as the reader wants it."""
+        numbers = {CHANNELS[key].column: step.values[key].tolist() for key in self.about.numbers}
         head = {"file_name": name, "episode_index": episode, "frame_index": number, "task": whole.task}
         return head | {TIME: float(step.time_s)} | numbers
 
-    def _commit(self, part: Path, group: list[dict[str, Any]], lines: list[str]) -> list[dict[str, Any]]:
-        write_text(part / METADATA, "\n".join(lines) + "\n")
+    def _commit(self, part: Path, group: list[dict[str, Any]], lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        parquet, pa = library("pyarrow.parquet"), library("pyarrow")
+        counted = [("file_name", pa.string()), ("episode_index", pa.int64()), ("frame_index", pa.int64()), ("task", pa.string())]
+        kinds = {name: pa.list_(pa.float32()) for name in self.about.numbers}
+        named = [(CHANNELS[name].column, pa.list_(kind) if len(self.about.shape(name)) == 2 else kind) for name, kind in kinds.items()]
+        table = pa.Table.from_pylist(lines, pa.schema([*counted, (TIME, pa.float64()), *named]))
+        write_with(part / METADATA, lambda file: parquet.write_table(table, file))
         replace_folder(part, self.folder / DATA / f"{self._next:06d}")
         write_json(self.folder / EPISODES / f"{self._next:06d}.json", {"episodes": group})
         self._next += 1
@@ -123,13 +130,12 @@ def _reader(folder: Path, found: list[tuple[str, dict[str, Any]]], about: About,
 
 def _steps_of(folder: Path, about: About, index: int) -> Iterator[Step]:
     try:
-        for text in read_regular(folder / METADATA, LARGEST_BYTES).decode().splitlines():
-            line = json.loads(text)
+        for line in library("pyarrow.parquet").read_table(folder / METADATA, partitioning=None).to_pylist():
             if line["episode_index"] != index:
                 continue
-            values = {name: float32(line[CHANNELS[name].column]).reshape(about.shape(name)) for name in about.numbers}
-            yield Step(read_image(folder / str(line["file_name"]))[0], float(line[TIME]), values)
-    except (OSError, KeyError, ValueError, TypeError, FrameError, RecursionError) as error:
+            values = {name: np.array(line[CHANNELS[name].column], np.float32).reshape(about.shape(name)) for name in about.numbers}
+            yield Step(read_image(folder / base_name(line["file_name"]))[0], float(line[TIME]), values)
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, FrameError, library("pyarrow").ArrowException) as error:
         raise RecordError(f"{folder}: damaged ({error}); {AGAIN}") from error
 
 
@@ -147,10 +153,3 @@ def _facts_in(folder: Path) -> list[tuple[str, dict[str, Any]]]:
             raise RecordError(f"{path}: damaged; {AGAIN}")
         found += [(path.stem, facts) for facts in episodes]
     return found
-
-
-def _nulls(values: np.ndarray) -> Any:
-    """Numbers as JSON has them, NaN as null."""
-    if values.ndim > 1:
-        return [_nulls(row) for row in values]
-    return [value if np.isfinite(value) else None for value in values.tolist()]

@@ -21,6 +21,7 @@ from scenes import load_experiment, load_sensor
 from scenes.base import Name, SpecError
 from scenes.files import read_regular, shown
 from twin.errors import FrameError, StoreError
+from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
 from twin.records.record import CHANNELS, About, Episode, Records, Step, digest, float32, seconds
 from twin.rig.mounting import Mounting
@@ -290,6 +291,11 @@ def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Step]:
     keys = {name: (_POSES | _ESTIMATES)[name] for name in about.numbers}
     for index, line in enumerate(session.steps):
         frame = session.frame(index)
+        if frame.image.shape[1::-1] != about.size_px:
+            got, expected = times(frame.image.shape[1::-1]), times(about.size_px)
+            raise FrameError(
+                f"{session.folder}: {line['frame']['file']}: expected {expected} as the first frame, got {got}; record it again"
+            )
         values = {name: float32(line.get(key, []), about.numbers[name]) for name, key in keys.items()}
         yield Step(frame.image, seconds(frame.time_s - first_s), values)
 

@@ -225,7 +225,9 @@ def declared(*extras: str) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    ("folders", "extras"), [(tuple(MAY_IMPORT), ("rerun", "rl", "records")), (("tests",), ("rerun", "dev", "browser"))], ids=["product", "tests"]
+    ("folders", "extras"),
+    [(tuple(MAY_IMPORT), ("rerun", "rl", "records")), (("tests",), ("rerun", "dev", "browser"))],
+    ids=["product", "tests"],
 )
 def test_what_is_imported_is_asked_for(folders, extras):
     """A library that only happens to be installed is missing on the next machine."""

@@ -26,9 +26,9 @@ COMMANDS = {
     "frames": "Frames and pins",
     "calibration": "Your own sensor, and how true its twin is",
     "learning": "Data sets and models",
+    "records": "Data sets and models",
     "studies": "Studies",
     "live": "Cameras and arms",
-    "records": "Cameras and arms",
 }
 
 # Exit codes: a failure, a wrong command line, an end by Ctrl-C (128 + the signal's number, as shells count).

@@ -14,13 +14,14 @@ from twin.errors import FrameError
 from twin.frames.forms import frame_size, times
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.progress import Progress, silent, stage
-from twin.records.folder import HELD_STEPS, FolderWriter, format_of
+from twin.records.folder import HELD_STEPS, RESTS, SIDECAR, FolderWriter, format_of
 from twin.records.huggingface import HuggingFaceWriter, huggingface_records
 from twin.records.lerobot import DATA_MB, INFO, LeRobotWriter, lerobot_records
 from twin.records.record import About, Episode, RecordError, Records, Step, library
 from twin.records.recording import RecordingWriter, recording_records
 from twin.records.ros2 import Ros2Writer, ros2_records
 from twin.records.session import is_session, session_records
+from twin.store import writes
 from twin.types import Frame
 
 READERS: dict[str, Callable[[Path], Records]] = {
@@ -174,6 +175,7 @@ class Converted:
         return [*(f"note: {note}" for note in self.notes), f"{self.episodes} episodes, {self.steps} frames{new} as {self.to}"]
 
 
+@writes(gone_on=tuple(dict.fromkeys((SIDECAR, RESTS, *(name for each in WRITERS.values() for name in each.NAMES)))))
 def convert(
     sources: Sequence[Path],
     out: Path,

@@ -66,18 +66,6 @@ class Mounting:
         return apex
 
     @property
-    def T_tool_sensor(self) -> np.ndarray:
-        """(4, 4) the sensor's frame in the tool frame, mm."""
-        turn = np.radians(self.image_turn_deg)
-        side = np.cross(self.axis, self.across)  # where the sensor's azimuth goes on to, a quarter turn after ``across``
-        T = np.eye(4)
-        T[:3, 0] = np.cos(turn) * self.across - np.sin(turn) * side
-        T[:3, 1] = np.sin(turn) * self.across + np.cos(turn) * side
-        T[:3, 2] = self.axis
-        T[:3, 3] = self.centre_mm
-        return T
-
-    @property
     def across_in_sensor(self) -> np.ndarray:
         """(3,) ``across`` in the sensor frame."""
         return np.array([np.cos(np.radians(self.image_turn_deg)), np.sin(np.radians(self.image_turn_deg)), 0.0])
@@ -92,7 +80,7 @@ class Mounting:
 
     @property
     def T_tool_sensor(self) -> np.ndarray:
-        """(4, 4) pose of the sensor's frame in the tool's."""
+        """(4, 4) pose of the sensor's frame in the tool's, mm."""
         turn = np.radians(self.image_turn_deg)
         side = np.cross(self.axis, self.across)  # where the sensor's azimuth goes on to, a quarter turn after ``across``
         T = np.eye(4)

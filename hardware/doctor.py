@@ -1,6 +1,7 @@
 """What this machine has, what is missing, and the remedy: packages, renderer, 3D pictures, cameras, serial ports. Opens no device."""
 
 import importlib.metadata
+import importlib.util
 import platform
 import sys
 from dataclasses import dataclass
@@ -11,11 +12,14 @@ from serial.tools import list_ports
 from twin.errors import RenderError
 from twin.optics.variant import report
 from twin.report.skin3d import probe_offscreen
+from twin.store import cache_folder
 
 # Folder in which the Linux kernel lists its cameras.
 SYSFS_CAMERAS = Path("/sys/class/video4linux")
 # Packages whose versions are listed.
 PACKAGES = ("mitsuba", "drjit", "pyvista", "vtk", "trimesh", "torch", "scikit-image", "pyserial", "opencv-python-headless", "numba")
+# The program's own packages. Another project may have one of the same name.
+OWN = ("scenes", "twin", "training", "hardware")
 # Kinds of devices, each with the remedy if none is found.
 DEVICES = {
     "camera": "plug in the sensor's USB camera; in a container pass --device /dev/video0",
@@ -61,6 +65,10 @@ class Machine:
         Why VTK draws no 3D pictures ("" if it does). Without VTK the pictures are drawn plainly.
     devices : dict of str to list of Device
         By kind: ``camera`` and ``serial``.
+    places : dict of str to Path
+        The folder that each of the program's own packages is imported from.
+    kept : Path or None
+        The folder of kept results; None if nothing is kept.
     """
 
     packages: dict[str, str]
@@ -68,11 +76,14 @@ class Machine:
     can_render: bool
     plain_pictures: str
     devices: dict[str, list[Device]]
+    places: dict[str, Path]
+    kept: Path | None
 
     def lines(self) -> list[str]:
         """The result in words."""
         lines = [f"Python      {platform.python_version()} ({sys.executable}) on {platform.system()} {platform.machine()}"]
         lines += [f"{name:11} {version or 'MISSING; run ' + repr('make setup')}" for name, version in self.packages.items()]
+        lines += ["", *self._own_lines(), f"kept results {self.kept or 'none: the cache is off'}"]
         lines += ["", "Rendering (Mitsuba)", *(f"  {line}" for line in self.rendering)]
         lines += ["", "3D pictures (VTK offscreen)", f"  {'PLAIN ONLY: ' + self.plain_pictures if self.plain_pictures else 'works'}"]
         lines += ["", "Devices"]
@@ -82,12 +93,26 @@ class Machine:
                 lines.append(f"  {kind}: none found; {DEVICES[kind]}")
         return lines
 
+    def _own_lines(self) -> list[str]:
+        """Where the program's own packages are; a line of each if they do not lie in one place."""
+        if len(set(self.places.values())) == 1:
+            return [f"{', '.join(self.places)} in {next(iter(self.places.values()))}"]
+        said = [f"{name} in {place}" for name, place in self.places.items()]
+        return [*said, "MIXED: another project has a package of the same name; install this program into an environment of its own"]
+
 
 def examine_machine() -> Machine:
     """Look for packages, Mitsuba's variants, LLVM, a GPU, offscreen 3D, cameras and serial ports. Opens no device."""
     rendering, can_render = _rendering()
     devices = dict(zip(DEVICES, (cameras(), serial_ports()), strict=True))
-    return Machine({name: _version(name) for name in PACKAGES}, rendering, can_render, probe_offscreen(), devices)
+    versions = {name: _version(name) for name in PACKAGES}
+    return Machine(versions, rendering, can_render, probe_offscreen(), devices, _places(), cache_folder())
+
+
+def _places() -> dict[str, Path]:
+    """The folder that each of the program's own packages is imported from."""
+    found = {name: importlib.util.find_spec(name) for name in OWN}
+    return {name: Path(spec.origin).parents[1] for name, spec in found.items() if spec is not None and spec.origin}
 
 
 def _version(package: str) -> str:

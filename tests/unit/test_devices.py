@@ -1,6 +1,8 @@
 """What is attached is found without opening it."""
 
-from hardware.doctor import Device, cameras, serial_ports
+from pathlib import Path
+
+from hardware.doctor import OWN, Device, Machine, _places, cameras, serial_ports
 
 
 def test_cameras_are_read_from_the_kernels_list(tmp_path):
@@ -16,3 +18,15 @@ def test_no_camera_is_an_empty_list(tmp_path):
 
 def test_serial_ports_are_listed():
     assert all(port.node for port in serial_ports())
+
+
+def test_a_package_of_another_project_is_noticed():
+    places = {"scenes": Path("/a"), "twin": Path("/a"), "training": Path("/b")}
+    found = Machine({}, [], True, "", {}, places, None)
+    assert any(line.startswith("MIXED") for line in found.lines()) and "training in /b" in found.lines()
+    one = Machine({}, [], True, "", {}, dict.fromkeys(places, Path("/a")), Path("/kept"))
+    assert "scenes, twin, training in /a" in one.lines() and "kept results /kept" in one.lines()
+
+
+def test_the_packages_of_this_program_are_found():
+    assert _places() == dict.fromkeys(OWN, Path(__file__).parents[2])

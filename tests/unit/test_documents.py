@@ -93,6 +93,12 @@ def test_every_figure_comes_from_a_measurement(path):
     assert not unmeasured(path.read_text(encoding="utf-8")), "mark it '<!-- figure: NAME FORMAT --><!-- /figure -->' and run 'make tables'"
 
 
+@pytest.mark.parametrize("path", RESULTS, ids=name_of)
+def test_no_line_begins_with_the_mark_of_a_figure(path):
+    """Markdown would end the paragraph before it."""
+    assert not re.findall(r"^<!-- figure: ", path.read_text(encoding="utf-8"), re.MULTILINE)
+
+
 def test_a_figure_from_nowhere_is_found():
     marked = "<!-- figure: a.b .2f -->0.12<!-- /figure --> px with a 90 % interval, Python 3.11, `0.5`"
     assert unmeasured(marked) == [] and unmeasured(f"{marked}, 0.3 px, 7 %, 4 times") == ["0.3", "7 %", "4 times"]

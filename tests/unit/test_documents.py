@@ -11,6 +11,8 @@ from figures import tables
 from generators import api, commands
 from generators.notebooks import blocks
 
+from twin.demo.page import NEXT
+
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [path for path in tables.documents() if "generated" not in path.parts]
 RESULTS = [path for path in DOCUMENTS if path.name == "README.md" or path.parent.name == "results"]
@@ -141,6 +143,11 @@ def test_examples_of_the_help_are_commands_of_the_program(name):
     lines = re.sub(r"\\\n\s*", "", COMMANDS[name].example).splitlines()
     wrong = {line: wrong_words(part.strip()) for line in lines for part in line.split("&") if "twin " in part and wrong_words(part.strip())}
     assert not wrong
+
+
+@pytest.mark.parametrize("line", [command for command, _ in NEXT])
+def test_what_the_demo_says_to_try_are_commands_of_the_program(line):
+    assert line == "twin --help" or not wrong_words(line)
 
 
 def test_a_wrong_command_is_found():

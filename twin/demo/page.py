@@ -25,6 +25,15 @@ from twin.report.plots import (
 from twin.report.table import Column
 from twin.types import Form
 
+# Commands that a reader of the page may try next, and what each shows.
+NEXT = (
+    ("twin studio", "a page on which you drag the object over the skin, and see picture, graph, forces and the estimated pose at once"),
+    ("twin render --sensor ur5-331 --object ball-40 --indent-mm 2 --out out/ball", "a contact of your own; 'twin objects' names others"),
+    ("twin servo --object can --steps 30 --out out/can", "the sensor follows a can, by the pose that a model reads from its frames"),
+    ("twin new FRAMES --out mine.toml", "your own sensor, from a folder of its frames"),
+    ("twin --help", "all commands; each one's help ends with an example"),
+)
+
 
 @dataclass(frozen=True)
 class ContactContent:
@@ -126,6 +135,10 @@ def write_page(
     _motions_section(page, motions, motion_sensor)
     _tables_section(page, tables)
     _time_section(page, seconds)
+    page.section(
+        "What to try next", "The tutorials in docs/tutorials go through each of these; 'make docs' builds the whole documentation."
+    )
+    page.items([sentence(code(command) + ":", what + ".") for command, what in NEXT])
     return page.write(path, embed=True)
 
 

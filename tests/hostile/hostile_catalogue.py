@@ -555,6 +555,7 @@ EVERY = (
         "study objects",
         "study servo",
         "study sim-to-real",
+        "surrogate",
     ),
     *("study tac-vgnn", "train", "tune", "validate"),
 )
@@ -583,6 +584,7 @@ WRITE = {
     "convert": "convert {session} --to lerobot --out {there}",
     "demo": "demo --out {there}",
     "study servo": f"study servo --model {SENSOR} --objects can --steps 1 --out {{there}}",
+    "surrogate": f"surrogate {S} --paths 10 --workers 1 --out {{there}}/mine.safetensors",
     "study objects": f"study objects {S} --count 2 --tests 1 --across 6 --workers 1 --epochs 1 --out {{there}}",
     "study sim-to-real": f"study sim-to-real {S} --frames {{recording}} --labels 12 --count 10 --epochs 1 --workers 1 --out {{there}}",
     "study tac-vgnn": f"study tac-vgnn --data {{recording}} {S} --out {{there}} --models gnn --epochs 1 --batches 8 --no-contacts",
@@ -642,6 +644,7 @@ OVERWRITTEN = {  # files of the user's own in --out that a command of the same n
     "new": ("mine.toml",),
     "dataset": ("targets.csv", "meta.json", "generation.json"),
     "pack": ("config.json", "weights.safetensors"),
+    "surrogate": ("mine.safetensors",),
     "render": ("frame.png", "truth.json"),
     "realism": ("metrics.json", "index.html"),
     "robustness": ("frames.csv", "index.html"),

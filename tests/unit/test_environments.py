@@ -1,18 +1,22 @@
 """The environments' own laws: geometry of tasks, options, spaces, seeds. Contacts are solved on few poses, by the finite elements."""
 
+import warnings
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 from scipy.spatial.transform import Rotation
+from stable_baselines3.common.env_checker import check_env as check_for_baselines
 
 from scenes import load_experiment, load_object, load_sensor
 from training.environments import ids
 from training.environments.batch import Batch, Options
-from training.environments.felt import Felt
 from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
 from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, work_frame
-from twin.errors import OptionError
+from training.surrogate.felt import Felt
+from twin.errors import ContactError, OptionError
 
 PLACE_TOLERANCE_MM = 1e-6  # of geometry computed in double precision
 FAST = {"backend": "fem", "sensor": "mg400-127", "observation": "oracle"}
@@ -166,6 +170,90 @@ def test_the_same_seed_gives_the_same_episode_on_finite_elements():
 
 def test_gymnasium_accepts_an_environment_on_finite_elements():
     check_env(gymnasium.make("tactip/SurfaceFollow-v0", steps=2, **FAST).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("observation", ["pins", "oracle", "graph", "image", "pose"])
+@pytest.mark.parametrize("name", ids())
+def test_gymnasium_and_stable_baselines_accept_every_environment(name, observation):
+    env = gymnasium.make(name, observation=observation, steps=3, disable_env_checker=True).unwrapped
+    check_env(env, skip_render_check=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # hints for images that are no pictures for a CNN
+        check_for_baselines(env)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_the_vector_and_the_single_environment_agree(mode):
+    """Row i with seed s is the single environment with seed s + i, over the ends of episodes too."""
+    options = {"steps": 3, "randomise": "moves", "stack": 2}
+    vector = gymnasium.make_vec("tactip/EdgeFollow-v0", num_envs=2, autoreset_mode=mode, **options)
+    actions = np.random.default_rng(0).uniform(-1, 1, (8, 2, 2)).astype(np.float32)
+    seen, _ = vector.reset(seed=5)
+    together = [seen["tactile"]]
+    for action in actions:
+        seen, *_ = vector.step(action)
+        together.append(seen["tactile"])
+    for row in range(2):
+        env = gymnasium.make("tactip/EdgeFollow-v0", disable_env_checker=True, **options).unwrapped
+        seen, _ = env.reset(seed=5 + row)
+        alone, ended = [seen["tactile"]], False
+        for action in actions:
+            if ended and mode is AutoresetMode.NEXT_STEP:
+                seen, ended = env.reset()[0], False
+            else:
+                seen, _, terminated, truncated, _ = env.step(action[row])
+                ended = terminated or truncated
+                if ended and mode is AutoresetMode.SAME_STEP:
+                    seen = env.reset()[0]
+            alone.append(seen["tactile"])
+        assert np.allclose([step[row] for step in together], alone, atol=1e-5)
+
+
+def test_the_same_seed_gives_the_same_episode_on_the_surrogate():
+    def episode(seed):
+        env = gymnasium.make("tactip/GentlePress-v0", disable_env_checker=True, randomise="moves").unwrapped
+        env.reset(seed=seed)
+        return np.array([env.step(np.array([0.1, 0.8], np.float32))[0]["tactile"] for _ in range(4)])
+
+    assert np.array_equal(episode(3), episode(3))
+    assert not np.array_equal(episode(3), episode(4))
+
+
+def test_a_randomised_skin_needs_finite_elements():
+    with pytest.raises(OptionError, match="skin|gel|pins"):
+        Batch("SurfaceFollow", 1, Options(randomise="contact"))
+
+
+def test_of_the_papers_objects_the_surrogate_leaves_out_the_wire_mesh():
+    assert set(Batch("ContourFollow", 1, Options()).objects) == set(TASKS["ContourFollow"].objects) - {"mesh-can"}
+    env = gymnasium.make("tactip/ContourFollow-v0", objects=("mesh-can",), disable_env_checker=True)
+    with pytest.raises(ContactError, match="domain"):
+        env.reset(seed=0)
+
+
+def test_too_deep_an_episode_ends_and_says_why():
+    env = gymnasium.make("tactip/SurfaceFollow-v0", disable_env_checker=True).unwrapped
+    env.reset(seed=0, options={"object": "plane"})
+    for _ in range(8):
+        _, reward, terminated, _, info = env.step(np.array([1.0, 0.0], np.float32))
+        if terminated:
+            break
+    assert terminated and reward < 0 and "domain" in info["outside"] and not info["is_success"]
+
+
+def test_a_picture_of_the_sensor_is_rendered():
+    env = gymnasium.make("tactip/SurfaceFollow-v0", render_mode="rgb_array", disable_env_checker=True).unwrapped
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.dtype == np.uint8 and picture.shape == (360, 360, 3) and picture.std() > 10
+
+
+def test_pins_found_in_drawn_frames_are_near_the_projected_ones():
+    told = []
+    for pictures in ("none", "preview"):
+        env = gymnasium.make("tactip/SurfaceFollow-v0", pictures=pictures, disable_env_checker=True).unwrapped
+        told.append(env.reset(seed=2)[0]["tactile"])
+    assert np.abs(told[0]).max() > 0.3 and np.abs(told[0] - told[1]).mean() < 0.05  # spacings
 
 
 def test_goals_of_a_follower_lie_in_its_range():

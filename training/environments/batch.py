@@ -8,18 +8,20 @@ from typing import Any, Literal, get_args
 import numpy as np
 from gymnasium import spaces
 
-from scenes import load_experiment, load_object, load_randomisation, load_sensor
-from training.environments.felt import Backend, Contact, FiniteElements
+from scenes import RandomisationSpec, load_experiment, load_object, load_randomisation, load_sensor
 from training.environments.observe import IMAGE_PX, KINDS, LARGEST, PICTURES, Eye, Kind, Pictures
 from training.environments.tasks import TASKS, Judged, Seen
 from training.environments.world import AXES, Surfaces, Tool, motions
 from training.generation.config import draw_friction, draw_sensor
+from training.surrogate.contacts import SurrogateContacts
+from training.surrogate.felt import Backend, Contact, FiniteElements
+from training.surrogate.model import MECHANICS, surrogate_of
 from twin.errors import OptionError
 from twin.rig.contact import contact_law
 from twin.rig.touch import Touch
 from twin.types import BoolArray, FloatArray, ImageArray, IntArray
 
-BackendName = Literal["fem"]
+BackendName = Literal["surrogate", "fem"]
 BACKENDS: tuple[str, ...] = get_args(BackendName)
 """What solves the contacts."""
 Control = Literal["increment", "velocity"]
@@ -57,7 +59,10 @@ class Options:
     axes : tuple of str, optional
         Axes that are moved, of x, y, z, Rx, Ry, Rz in the tool's work frame; the task's by default.
     action : {"increment", "velocity"}
-    backend : {"fem"}
+    backend : {"surrogate", "fem"}
+        A fast stand-in with a stated error, or finite elements.
+    surrogate : str, optional
+        File of ``twin surrogate``; that which goes with the package by default.
     objects : tuple of str, optional
         Names or files, of which one is drawn for each episode; the task's by default.
     randomise : str, optional
@@ -75,7 +80,8 @@ class Options:
     stack: int = 1
     axes: tuple[str, ...] | None = None
     action: Control = "increment"
-    backend: BackendName = "fem"
+    backend: BackendName = "surrogate"
+    surrogate: str | None = None
     objects: tuple[str, ...] | None = None
     randomise: str | None = None
     pictures: Pictures = "none"
@@ -125,6 +131,16 @@ class Options:
         return cls(**options)
 
 
+def require_known(how: RandomisationSpec | None) -> None:
+    """Raise ``OptionError`` for a randomisation that draws what a surrogate holds fixed."""
+    drawn = [] if how is None else [key for key in how.sensor if key.split(".")[0] in MECHANICS]
+    if how is not None and drawn:
+        raise OptionError(
+            f"randomise={how.name!r} draws {drawn[0]}, which the surrogate holds fixed; use backend='fem', "
+            "or a randomisation of friction, camera and noise, such as 'moves'"
+        )
+
+
 @dataclass(frozen=True)
 class Stepped:
     """What a step of B environments gives: as in gymnasium, with arrays (B,) for each number of ``info``."""
@@ -164,6 +180,8 @@ class Batch:
         self.steps = options.steps or self.task.steps
         self._surfaces = Surfaces()
         self.backend = self._make_backend()
+        if options.objects is None:  # of the task's own objects those that the backend knows
+            self.objects = {name: thing for name, thing in self.objects.items() if self.backend.knows(thing)}
         self.eye = self._make_eye()
         self.axes = options.axes or self.task.axes
         self._scale = self._action_scale()
@@ -260,7 +278,7 @@ class Batch:
     def picture(self, row: int) -> ImageArray:
         """(H, W, 3) uint8: the sensor's frame of one environment."""
         eye = self.eye or Eye(self.sensor, self.count, "pins", pictures="none", pin_noise_px=0.0)
-        image = eye.frame(self.backend.felt, row, np.random.default_rng(int(self.steps_done[row]))).image
+        image = eye.frame(self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row]))).image
         return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
     def object_name(self, row: int) -> str:
@@ -316,7 +334,7 @@ class Batch:
             newest = np.clip(self.task.oracle(self._seen_now())[rows], -MOST_ORACLE, MOST_ORACLE).astype(np.float32)
             valid = np.ones(len(rows), bool)
         else:
-            newest, valid = self.eye.look(self.backend.felt, rows, self._rngs)
+            newest, valid = self.eye.look(self.backend, rows, self._rngs)
         if self._seen is None:
             self._seen = np.zeros((self.count, self.options.stack, *newest.shape[1:]), newest.dtype)
         if first:
@@ -330,7 +348,11 @@ class Batch:
         return np.array([deg if axis.startswith("R") else mm for axis in self.axes])
 
     def _make_backend(self) -> Backend:
-        return FiniteElements(self.sensor, self.count)
+        if self.options.backend == "fem":
+            return FiniteElements(self.sensor, self.count)
+        require_known(self.randomisation)
+        found = surrogate_of(self.sensor, self.options.surrogate)
+        return SurrogateContacts(found, self.sensor, self.count, friction_memory=self.options.friction_memory)
 
     def _make_eye(self) -> Eye | None:
         options = self.options

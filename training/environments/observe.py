@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from training.environments.felt import Felt
 from training.estimator import PoseEstimator
 from training.packed import shipped_names
 from training.pins import PinTable
+from training.surrogate.felt import Backend, Felt
 from twin.camera.capture import expose, record
 from twin.camera.projection import project
 from twin.errors import OptionError
@@ -20,7 +20,7 @@ from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
 from twin.optics.render import Renderer
 from twin.pins import Pipeline, features, make_graph, measure_reference, nominal_reference
-from twin.types import BoolArray, ContactState, FloatArray, Form, Frame, ImageArray, IntArray
+from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, IntArray, PinState
 
 Kind = Literal["oracle", "pins", "graph", "image", "pose"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -69,7 +69,7 @@ class Eye:
         self._spacing = float(self.reference.spacing_px.mean())
         self._views: list[View] = [View(sensor, caps_px(sensor, self.form, rest_pins(sensor.geometry).caps_mm))] * count
         self._nominal = self._views[0]
-        self._painter: Callable[[Felt, int, np.random.Generator], Frame] | None = None
+        self._painter: Callable[[PinState, np.random.Generator], Frame] | None = None
         self._pipeline: Pipeline | None = None
         self._estimator: PoseEstimator | None = None
         if kind == "pose":
@@ -99,20 +99,20 @@ class Eye:
             self._nominal if sensor is self.sensor else View(sensor, caps_px(sensor, self.form, rest_pins(sensor.geometry).caps_mm))
         )
 
-    def frame(self, felt: Felt, row: int, rng: np.random.Generator) -> Frame:
+    def frame(self, pins: PinState, rng: np.random.Generator) -> Frame:
         """The frame of one environment, drawn where no kind of pictures was chosen."""
         if self._painter is None:
             self._painter = _painter(self.sensor, self.form, "preview")
-        return self._painter(felt, row, rng)
+        return self._painter(pins, rng)
 
-    def look(self, felt: Felt, rows: IntArray, rngs: list[np.random.Generator]) -> tuple[FloatArray | ImageArray, BoolArray]:
+    def look(self, backend: Backend, rows: IntArray, rngs: list[np.random.Generator]) -> tuple[FloatArray | ImageArray, BoolArray]:
         """Observations of some rows (R, ...), and which of them could be made (R,); the others are zero."""
         if self.kind == "image" or self.pictures != "none":
-            frames = [self.frame(felt, row, rngs[row]) for row in rows.tolist()]
+            frames = [self.frame(backend.attitude(row), rngs[row]) for row in rows.tolist()]
             if self.kind == "image":
                 return np.stack([_small(frame.image) for frame in frames]), np.ones(len(rows), bool)
             return self._of_frames(frames)
-        pins_px = self.pins_px(felt, rows)
+        pins_px = self.pins_px(backend.felt, rows)
         if self._noise_px:
             pins_px = pins_px + self._noise_px * np.stack([rngs[row].standard_normal(pins_px.shape[1:]) for row in rows.tolist()])
         rest_px = np.stack([self._views[row].rest_px for row in rows.tolist()])
@@ -152,7 +152,7 @@ class Eye:
     def _of_frames(self, frames: list[Frame]) -> tuple[FloatArray, BoolArray]:
         """The same from frames, through the real pipeline."""
         if self._pipeline is None:
-            rest = self.frame(_resting(self.sensor), 0, np.random.default_rng(0))
+            rest = self.frame(rest_pins(self.sensor.geometry), np.random.default_rng(0))
             self._pipeline = Pipeline(self.sensor, self.form, measure_reference(self.sensor, self.form, rest))
         seen = [self._pipeline(frame) for frame in frames]
         valid = np.array([one.valid for one in seen])
@@ -172,15 +172,7 @@ def caps_px(sensor: SensorSpec, form: Form, caps_mm: FloatArray) -> FloatArray:
     return from_raw(sensor.recording, form, project(sensor.view, caps_mm))
 
 
-def _resting(sensor: SensorSpec) -> Felt:
-    """A sensor that nothing touches."""
-    rest = rest_pins(sensor.geometry)
-    felt = Felt.at_rest(1, sensor.pins.count)
-    felt.base_mm[0], felt.axis[0], felt.caps_mm[0] = rest.base_mm, rest.axis, rest.caps_mm
-    return felt
-
-
-def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[Felt, int, np.random.Generator], Frame]:
+def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:
     """Makes a frame of one environment's state."""
     recording = sensor.recording if form is Form.RECORDING else None
     window_px = recording.crop_px if recording else None
@@ -188,9 +180,8 @@ def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[Fe
     renderer = Renderer(sensor, quality="preview", window_px=window_px) if pictures == "traced" else None
     frame_size(sensor, form)
 
-    def paint(felt: Felt, row: int, rng: np.random.Generator) -> Frame:
-        state = ContactState.untouched(np.zeros((0, 3)), felt.base_mm[row], felt.axis[row], felt.caps_mm[row])
-        light = preview.render(state) if renderer is None else renderer.render(state, seed=int(rng.integers(2**31)))
+    def paint(pins: PinState, rng: np.random.Generator) -> Frame:
+        light = preview.render(pins) if renderer is None else renderer.render(pins, seed=int(rng.integers(2**31)))
         image = expose(light, sensor.capture, rng, origin_px=preview.window_px[:2])
         return Frame(record(image, recording, origin_px=preview.window_px[:2]) if recording else image, form)
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.object import ObjectSpec, SphereShape
-from training.environments.felt import Felt
 from training.environments.world import Surfaces, Tool, motions, standing_on, turn_about
+from training.surrogate.felt import Felt
 from twin.errors import OptionError
 from twin.rig.touch import Touch
 from twin.types import BoolArray, FloatArray

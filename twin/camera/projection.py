@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from scenes.sensor import CameraSpec, HousingSpec, ViewSpec
+from twin.compiled import compiled
 from twin.types import FloatArray
 
 NEWTON_STEPS = 12
@@ -108,15 +109,10 @@ def project(view: ViewSpec, points_mm: FloatArray) -> FloatArray:
 def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
     """Tangent u of the angle in air of the rays from (0, z0) to (rho, z), where z0 is that of the pupil or ``behind_mm``."""
     heights, indices = _layers(view, z_mm, -view.camera.distance_mm if behind_mm is None else behind_mm)
-    u = rho_mm / sum(h / n for h, n in zip(heights, indices, strict=True))
-    for _ in range(NEWTON_STEPS):
-        reach, slope = 0.0, 0.0
-        for h, n in zip(heights, indices, strict=True):
-            rest = n * n + (n * n - 1) * u * u  # tan(theta) = u / sqrt(rest)
-            reach = reach + h * u / np.sqrt(rest)
-            slope = slope + h * n * n / rest**1.5
-        u = np.clip(u + (rho_mm - reach) / slope, 0, GRAZING)
-    return u
+    rho = np.asarray(rho_mm, float)
+    shape = np.broadcast_shapes(rho.shape, *(np.shape(h) for h in heights))
+    air, window, gel = (np.ravel(np.broadcast_to(np.asarray(h, float), shape)) for h in heights)
+    return _tangents(np.ravel(np.broadcast_to(rho, shape)), air, window, gel, indices[1], indices[2]).reshape(shape)
 
 
 def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -186,6 +182,26 @@ def lens_disc(view: ViewSpec, housing: HousingSpec) -> Disc:
     inside = np.zeros(disc.inside.shape, np.uint8)
     cv2.fillConvexPoly(inside, np.round(rim_px).astype(np.int32), 1)
     return replace(disc, inside=inside.astype(bool))
+
+
+@compiled()
+def _tangents(rho: FloatArray, air: FloatArray, window: FloatArray, gel: FloatArray, n_window: float, n_gel: float) -> FloatArray:
+    """Tangents (k,) of the angle in air of rays that reach rho (k,) through three layers, by Newton's method."""
+    out = np.empty(len(rho))
+    a, b = n_window * n_window, n_gel * n_gel
+    for k in range(len(rho)):
+        u = rho[k] / (air[k] + window[k] / n_window + gel[k] / n_gel)
+        for _ in range(NEWTON_STEPS):
+            p, q = a + (a - 1) * u * u, b + (b - 1) * u * u  # tan(theta) = u / sqrt(p)
+            root_p, root_q = np.sqrt(p), np.sqrt(q)
+            reach = air[k] * u + window[k] * u / root_p + gel[k] * u / root_q
+            slope = air[k] + window[k] * a / (p * root_p) + gel[k] * b / (q * root_q)
+            step = (rho[k] - reach) / slope
+            u = min(max(u + step, 0.0), GRAZING)
+            if abs(step) <= 1e-15 * (1.0 + u):
+                break
+        out[k] = u
+    return out
 
 
 def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:

@@ -14,9 +14,9 @@ Three things happen where an arm presses a sensor against an object with the for
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
@@ -51,9 +51,16 @@ class ArmTurning:
     tool_mm: np.ndarray
     deg_per_n: float
 
+    @cached_property
+    def _cross(self) -> np.ndarray:
+        """(3, 3) cross product with the axis, for Rodrigues' formula."""
+        x, y, z = self.axis
+        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
     def __call__(self, T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         """The object's pose (4, 4) under a force (3,), N: seen from the sensor it turns the other way about the tool point."""
-        turn = Rotation.from_rotvec(-self.deg_per_n * (self.across @ force_n) * self.axis, degrees=True).as_matrix()
+        angle = -np.radians(self.deg_per_n * (self.across @ force_n))
+        turn = np.eye(3) + np.sin(angle) * self._cross + (1 - np.cos(angle)) * self._cross @ self._cross
         there = T.copy()
         there[:3, :3] = turn @ T[:3, :3]
         there[:3, 3] = self.tool_mm + turn @ (T[:3, 3] - self.tool_mm)

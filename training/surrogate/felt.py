@@ -9,6 +9,7 @@ import numpy as np
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import ContactError
+from twin.geometry.pins import PinRest, rest_pins
 from twin.mechanics.follow import Follower
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.solver import SkinSolver
@@ -33,8 +34,8 @@ class Felt:
 
     Attributes
     ----------
-    base_mm, axis, caps_mm : (B, N, 3) float
-        As ``ContactState``.
+    caps_mm : (B, N, 3) float
+        Centres of the pins' caps.
     force_n : (B, 3) float
         Of the skin on the object.
     torque_nmm : (B, 3) float
@@ -47,8 +48,6 @@ class Felt:
         Why a contact could not be computed ("" where it could); its row then holds the last state that could.
     """
 
-    base_mm: FloatArray
-    axis: FloatArray
     caps_mm: FloatArray
     force_n: FloatArray
     torque_nmm: FloatArray
@@ -59,15 +58,18 @@ class Felt:
     @classmethod
     def at_rest(cls, count: int, pins: int) -> "Felt":
         """``count`` rows to be filled."""
-        base, axis, caps = np.zeros((3, count, pins, 3))
         force, torque = np.zeros((2, count, 3))
-        return cls(base, axis, caps, force, torque, np.zeros(count), np.zeros(count), [""] * count)
+        return cls(np.zeros((count, pins, 3)), force, torque, np.zeros(count), np.zeros(count), [""] * count)
 
 
 class Backend(Protocol):
     """Solves contacts with all that they remember, pose after pose."""
 
     felt: Felt
+
+    def knows(self, touched: ObjectSpec) -> bool:
+        """Whether an object is within the backend's domain."""
+        return True
 
     def begin(self, row: int, contact: Contact) -> None:
         """Begin an environment's episode, the sensor at rest.
@@ -81,14 +83,24 @@ class Backend(Protocol):
     def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
         """Bring the objects of some rows (R,) to their poses (R, 4, 4) at times (R,); ``felt`` then holds what the sensors feel."""
 
+    def attitude(self, row: int) -> PinRest:
+        """Feet, axes and caps of one sensor's pins."""
+
 
 class FiniteElements:
     """The skin's finite elements, one ``Follower`` for each environment."""
 
     def __init__(self, sensor: SensorSpec, count: int) -> None:
         self.felt = Felt.at_rest(count, sensor.pins.count)
+        rest = rest_pins(sensor.geometry)
+        self.felt.caps_mm[:] = rest.caps_mm
+        self._pins = [rest] * count
         self._followers: list[Follower | None] = [None] * count
         self._solver = lru_cache(maxsize=_KEPT_SOLVERS)(SkinSolver)
+
+    def knows(self, touched: ObjectSpec) -> bool:
+        """See ``Backend``: any."""
+        return True
 
     def begin(self, row: int, contact: Contact) -> None:
         """See ``Backend``; a sensor that was drawn anew needs a solver of its own, which takes about a second."""
@@ -107,6 +119,11 @@ class FiniteElements:
                 felt.lost[row] = str(error)
                 continue
             felt.lost[row] = ""
-            felt.base_mm[row], felt.axis[row], felt.caps_mm[row] = state.base_mm, state.axis, state.caps_mm
+            self._pins[row] = PinRest(state.base_mm, state.axis, state.caps_mm)
+            felt.caps_mm[row] = state.caps_mm
             felt.force_n[row], felt.torque_nmm[row], felt.area_mm2[row] = state.force_n, state.torque_nmm, state.area_mm2
             felt.slip[row] = state.slip_share
+
+    def attitude(self, row: int) -> PinRest:
+        """See ``Backend``."""
+        return self._pins[row]

@@ -1,0 +1,249 @@
+"""Laws of the surrogate: contact and friction of its linear skin, its memory, its domain, its file, and its closeness to the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes import load_object, load_sensor
+from training.surrogate.compliance import NODE_RINGS, compliance_of
+from training.surrogate.contact import LinearContacts
+from training.surrogate.contacts import SurrogateContacts
+from training.surrogate.felt import Contact, FiniteElements
+from training.surrogate.fit import averaged, distil, require_dome
+from training.surrogate.model import SurrogateError, load_surrogate, representatives, rest_of, surrogate_of, unfolded
+from training.surrogate.paths import draw_path
+from training.surrogate.samples import lattice_sensor
+from training.surrogate.symmetry import ring_directions, symmetries
+from twin.camera.projection import project
+from twin.errors import OptionError
+from twin.frames.forms import from_raw
+from twin.geometry.solid import Resolution
+from twin.mechanics import Friction
+from twin.mechanics.law import ContactLaw
+from twin.objects import build_field
+from twin.types import Form
+
+SENSOR = "mg400-331"
+COARSE = Resolution(across=8)
+ROW = np.zeros(1, int)
+PINS_BOUND_PX = 1.0  # largest mean error of the contacts below; the stated mean over all is half of it
+FORCE_BOUND = 0.25  # of the force after a reversal of the shear, the hardest; the stated mean over all contacts is a quarter of it
+SLIP_BOUND = 0.2  # of the share that slides, on average over these five poses; over all contacts it is a third of it
+ANSWER_TOLERANCE = 2e-3  # relative: half precision in the file
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    return load_sensor(SENSOR)
+
+
+@pytest.fixture(scope="module")
+def surrogate(sensor):
+    return surrogate_of(sensor)
+
+
+def pose(depth_mm, radius_mm=20.0, across=(0.0, 0.0)):
+    T = np.eye(4)
+    T[:3, 3] = [*across, radius_mm - depth_mm]
+    return T
+
+
+def contacts(surrogate, sensor, thing="plane", friction=0.5, **options):
+    made = SurrogateContacts(surrogate, sensor, 1, **options)
+    touched = load_object(thing)
+    made.begin(0, Contact(sensor, touched, ContactLaw(Friction(friction, friction))))
+    return made
+
+
+def go(made, *poses):
+    for T in poses:
+        made.move(ROW, T[None], np.zeros(1))
+        assert made.felt.lost[0] == ""
+    return made.felt.caps_mm[0].copy()
+
+
+def test_the_answers_of_the_linear_skin_are_reciprocal(sensor):
+    """Maxwell and Betti: node i answers to a force at j as j does to the same at i."""
+    skin = compliance_of(lattice_sensor(sensor), resolution=COARSE)
+    flat = skin.nodes.reshape(3 * len(skin.node_mm), -1)
+    assert np.allclose(flat, flat.T, atol=1e-9 * np.abs(flat).max())
+    ends = np.linalg.eigvalsh(flat)[[0, -1]]
+    assert ends[0] > -1e-9 * ends[1]  # more nodes than the coarse mesh has unknowns: some forces cancel
+    answer = averaged(skin.nodes, sensor.pins.phase_deg)
+    kept = answer[representatives(sensor.pins.phase_deg)]
+    assert np.allclose(unfolded(kept, sensor.pins.phase_deg), answer, rtol=1e-5, atol=1e-5 * np.abs(answer).max())
+
+
+def test_every_symmetry_maps_the_lattice_onto_itself():
+    phase = 17.0
+    lattice = ring_directions(4, 50.0, phase)
+    for g in symmetries(phase):
+        assert np.allclose(lattice[g.places(4)], lattice @ g.matrix.T)
+
+
+def test_forces_keep_to_coulomb_and_nothing_is_pulled(surrogate, sensor):
+    made = contacts(surrogate, sensor, friction=0.3)
+    go(made, pose(0.0), pose(2.0), pose(2.0, across=(0.8, 0.0)))
+    linear: LinearContacts = made._linear
+    press, across = -linear.force_n[0, :, 2], np.linalg.norm(linear.force_n[0, :, :2], axis=1)  # a plate's normal is -z
+    assert press.min() >= 0 and press.max() > 0.01
+    assert (across <= 0.3 * press * (1 + 1e-6) + 1e-9).all()
+    assert np.array_equal(linear.held[0], press > 1e-7)
+
+
+def test_clear_of_the_object_the_sensor_is_exactly_at_rest(surrogate, sensor):
+    made = contacts(surrogate, sensor)
+    rest = rest_of(sensor)
+    go(made, pose(-1.0), pose(2.5), pose(2.5, across=(1.0, 0.5)))
+    assert np.linalg.norm(made.felt.force_n[0]) > 0.5
+    caps = go(made, pose(-0.01, across=(1.0, 0.5)))
+    assert np.array_equal(caps, rest[:, 0] + made._cap_mm * rest[:, 1])
+    assert not made.felt.force_n[0].any() and made.felt.area_mm2[0] == 0 and made.felt.slip[0] == 0
+
+
+def test_a_thousand_steps_do_not_drift(surrogate, sensor):
+    """Held still nothing creeps, and a cycle of shear comes back to itself each time."""
+    made = contacts(surrogate, sensor)
+    go(made, pose(0.0), pose(2.0))
+    still = go(made, pose(2.0))
+    for _ in range(300):
+        made.move(ROW, pose(2.0)[None], np.zeros(1))
+    assert np.array_equal(made.felt.caps_mm[0], still)
+    cycle = [pose(2.0, across=(x, 0.0)) for x in (0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0)]
+    go(made, *cycle, *cycle)
+    first = go(made, *cycle)
+    for _ in range(80):
+        go(made, *cycle)
+    assert np.abs(made.felt.caps_mm[0] - first).max() < 0.02  # mm; a tenth of a pixel
+
+
+def test_friction_remembers_the_way(surrogate, sensor):
+    """The same pose after a shear and without: with friction the pins tell them apart, without they do not, nor without memory."""
+
+    def apart(friction, **options):
+        straight = contacts(surrogate, sensor, friction=friction, **options)
+        sheared = contacts(surrogate, sensor, friction=friction, **options)
+        end = pose(2.0, across=(1.0, 0.0))
+        one = go(straight, pose(-0.5, across=(1.0, 0.0)), end)
+        other = go(sheared, pose(-0.5), pose(2.0), end)
+        return np.abs(one - other).max()
+
+    assert apart(0.8) > 0.3  # mm
+    assert apart(0.0) < 0.02
+    assert apart(0.8, friction_memory=False) < 0.02
+
+
+def test_an_arm_that_gives_way_presses_less(surrogate, sensor):
+    stiff, soft = contacts(surrogate, sensor), SurrogateContacts(surrogate, sensor, 1)
+    soft.begin(0, Contact(sensor, load_object("plane"), ContactLaw(Friction(0.5, 0.5), compliance_mm_per_n=0.5)))
+    go(stiff, pose(0.0), pose(2.0))
+    go(soft, pose(0.0), pose(2.0))
+    given = 0.5 * soft.felt.force_n[0, 2]
+    go(stiff, pose(2.0 - given))
+    assert soft.felt.force_n[0, 2] == pytest.approx(stiff.felt.force_n[0, 2], rel=0.05)
+
+
+@pytest.mark.parametrize("thing", ["plane", "ball-40", "edge", "cylinder"])
+def test_pins_and_force_are_near_those_of_the_finite_elements(surrogate, sensor, thing):
+    """Tap, shear and back: a path that no surrogate was trained on."""
+    touched = load_object(thing)
+    contact = Contact(sensor, touched, ContactLaw(Friction(0.46, 0.46)))
+    fast, true = SurrogateContacts(surrogate, sensor, 1), FiniteElements(sensor, 1)
+    way = [pose(-0.2), pose(1.2), pose(2.2), pose(2.2, across=(1.0, 0.4)), pose(2.2, across=(0.3, 0.1))]
+    fast.begin(0, contact)
+    true.begin(0, contact)
+
+    def px(made):
+        return from_raw(sensor.recording, Form.RECORDING, project(sensor.view, made.felt.caps_mm[0]))
+
+    slips = []
+    for number, T in enumerate(way):
+        fast.move(ROW, T[None], np.zeros(1))
+        true.move(ROW, T[None], np.full(1, float(number)))
+        off = np.linalg.norm(px(fast) - px(true), axis=1)
+        assert off.mean() < PINS_BOUND_PX
+        slips.append(abs(fast.felt.slip[0] - true.felt.slip[0]))
+    force = true.felt.force_n[0]
+    assert np.linalg.norm(fast.felt.force_n[0] - force) < FORCE_BOUND * np.linalg.norm(force)
+    assert np.mean(slips) < SLIP_BOUND
+
+
+def test_the_stated_errors_meet_the_bounds_and_the_files_are_small():
+    for name in ("mg400-127", "mg400-331"):
+        found = surrogate_of(load_sensor(name))
+        told = found.about["errors"]["all"]
+        assert told["pins_px"] < PINS_BOUND_PX and told["slip"] < 0.08 and told["force_share"] < 0.15
+        assert {"object", "depth_mm", "shear_mm"} <= set(found.about["errors"]["by"])
+
+
+def test_a_file_gives_back_what_was_saved(surrogate, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    assert surrogate.save(path) < 1_000_000
+    again = load_surrogate(path)
+    assert np.allclose(again.answer, surrogate.answer, rtol=ANSWER_TOLERANCE, atol=ANSWER_TOLERANCE * np.abs(surrogate.answer).max())
+    assert again.stiffness == pytest.approx(surrogate.stiffness) and again.about == surrogate.about
+
+
+@pytest.mark.parametrize(("content", "says"), [(b"", "damaged"), (b"no surrogate" * 40, "damaged"), (None, "no such file")])
+def test_a_file_that_is_no_surrogate_is_refused(content, says, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SurrogateError, match=says):
+        load_surrogate(path)
+
+
+def test_a_surrogate_of_another_skin_is_refused(surrogate, sensor, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    surrogate.save(path)
+    softer = sensor.model_copy(update={"gel": sensor.gel.model_copy(update={"young_modulus_mpa": 0.5})})
+    with pytest.raises(SurrogateError, match=r"another \[gel\]"):
+        surrogate_of(softer, path)
+    with pytest.raises(SurrogateError, match="twin surrogate"):
+        surrogate_of(softer)
+
+
+@pytest.mark.parametrize(
+    ("thing", "friction", "poses", "says"),
+    [
+        ("mesh-can", 0.5, [], "texture"),
+        ("plane", 4.0, [], "friction of 4"),
+        ("plane", 0.5, [pose(0.0), pose(7.0)], "7.0 mm inside"),
+    ],
+)
+def test_outside_its_domain_it_says_so(surrogate, sensor, thing, friction, poses, says):
+    try:
+        made = contacts(surrogate, sensor, thing, friction)
+        for T in poses:
+            made.move(ROW, T[None], np.zeros(1))
+        told = made.felt.lost[0]
+    except Exception as error:
+        told = str(error)
+    assert says in told and "domain" in told and "fem" in told
+
+
+def test_sensors_that_remember_time_are_refused(sensor):
+    gel = sensor.gel.model_copy(update={"sealed": True})
+    with pytest.raises(OptionError, match="sealed"):
+        require_dome(sensor.model_copy(update={"gel": gel}))
+    with pytest.raises(OptionError, match="half sphere"):
+        require_dome(load_sensor("pad-round"))
+    with pytest.raises(OptionError, match="--paths 3"):
+        distil(sensor, "never.safetensors", paths=3)
+
+
+def test_drawn_paths_start_clear_and_stay_within_the_domain(sensor, surrogate):
+    for number in range(8):
+        drawn = draw_path(sensor, np.random.default_rng(number))
+        again = draw_path(sensor, np.random.default_rng(number))
+        assert np.array_equal(drawn.path.poses, again.path.poses)
+        thing = build_field(load_object("plane").model_copy(update={"shape": drawn.shape}))
+        node = replace(surrogate).node_mm
+        depths = [-thing.distance((node - T[:3, 3]) @ T[:3, :3]).min() for T in drawn.path.poses]
+        assert depths[0] <= 0.1 and max(depths) <= surrogate.domain["depth_mm"]
+
+
+def test_the_lattice_of_a_sensor_has_its_rings(sensor):
+    assert lattice_sensor(load_sensor("mg400-127")).pins.count == 331
+    assert len(ring_directions(NODE_RINGS, 58.0, 0.0)) == 271

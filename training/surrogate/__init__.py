@@ -1,0 +1,1 @@
+"""A fast stand-in for the skin's finite elements: friction's memory by bristles, all else by a small network."""

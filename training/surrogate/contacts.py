@@ -1,0 +1,189 @@
+"""The surrogate's contacts: many sensors at once, each with its object and all that friction remembers."""
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scenes.object import ObjectSpec
+from scenes.sensor import SensorSpec
+from training.surrogate.contact import LinearContacts
+from training.surrogate.felt import Contact, Felt
+from training.surrogate.model import Surrogate, features, mechanics_of, outside, rest_of
+from twin.errors import ContactError
+from twin.geometry.pins import PinRest
+from twin.objects import ObjectField, build_field
+from twin.types import FloatArray, IntArray
+
+STEP_MM = 1.2
+"""Largest motion across the dome in one solution, as of the finite elements' ``Follower``."""
+LARGEST_MOVE_MM = 30.0
+"""Largest motion between two poses; beyond it the way between them is unknown, and the contact begins anew."""
+CLEAR_MM = 0.5
+"""A contact begins this far in front of the object."""
+SETTLED_MM = 0.02
+"""Most that the dome still has to move where an arm has given way."""
+MOST_SETTLING = 3
+"""Solutions until an arm that gives way stands."""
+
+
+class SurrogateContacts:
+    """A ``Backend`` (see ``training.surrogate.felt``) on a surrogate.
+
+    Parameters
+    ----------
+    surrogate : Surrogate
+    sensor : SensorSpec
+        Of the same mechanics; its pins at rest are those of ``felt``.
+    count : int
+    friction_memory : bool
+        False: at every pose the contact begins anew.
+    """
+
+    def __init__(self, surrogate: Surrogate, sensor: SensorSpec, count: int, *, friction_memory: bool = True) -> None:
+        self._surrogate, self._sensor, self._memory = surrogate, sensor, friction_memory
+        self._rest = rest_of(sensor)
+        self._cap_mm = sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
+        modes = surrogate.modes
+        flat = len(modes), -1
+        self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(flat), np.float32)
+        self._caps_rest = self._rest[:, 0] + self._cap_mm * self._rest[:, 1]
+        self._linear = LinearContacts.at_rest(surrogate.node_mm, surrogate.answer, count)
+        self._contacts: list[Contact | None] = [None] * count
+        self._fields: list[ObjectField | None] = [None] * count
+        self._field = lru_cache(maxsize=64)(build_field)
+        self._before: list[FloatArray | None] = [None] * count
+        self._depth, self._friction, self._compliance = np.zeros((3, count))
+        self._parts = np.zeros((count, len(modes)), np.float32)
+        self._radius = float(np.linalg.norm(surrogate.node_mm[0]))
+        self._domain = surrogate.domain
+        self.felt = Felt.at_rest(count, sensor.pins.count)
+        self.felt.caps_mm[:] = self._caps_rest
+
+    def knows(self, touched: ObjectSpec) -> bool:
+        """Whether an object is of a kind that the surrogate was trained on."""
+        return touched.texture is None
+
+    def begin(self, row: int, contact: Contact) -> None:
+        """See ``Backend``."""
+        touched, friction = contact.touched, contact.law.friction
+        if not self.knows(touched):
+            raise outside(f"{touched.name} has a texture, which lies between the surrogate's nodes")
+        if friction.kinetic != friction.static or np.isfinite(friction.shear_strength_mpa):
+            raise outside(f"{touched.name} has a kinetic friction of its own or a shear strength")
+        if friction.static > self._domain["friction"]:
+            raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
+        if contact.sensor is not self._sensor and mechanics_of(contact.sensor) != self._surrogate.about["mechanics"]:
+            raise outside("the skin, gel, lens or pins of the sensor are drawn anew; randomise friction, camera and noise only ('moves')")
+        self._contacts[row], self._fields[row] = contact, self._field(touched)
+        self._friction[row] = friction.static
+        self._compliance[row] = contact.law.compliance_mm_per_n * self._surrogate.stiffness
+        self._forget(row)
+        self.felt.lost[row] = ""
+
+    def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
+        """See ``Backend``."""
+        for row, T in zip(rows.tolist(), T_sensor_object, strict=True):
+            try:
+                self._bring(row, T)
+                self.felt.lost[row] = ""
+            except ContactError as error:
+                self.felt.lost[row] = str(error)
+                self._forget(row)
+        self._answer(rows)
+
+    def attitude(self, row: int) -> PinRest:
+        """See ``Backend``."""
+        moved = np.tensordot(self._parts[row], self._surrogate.modes, axes=1)
+        axis = self._rest[:, 1] + moved[:, 1]
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        return PinRest(self._rest[:, 0] + moved[:, 0], axis, self.felt.caps_mm[row].copy())
+
+    @property
+    def depth_mm(self) -> FloatArray:
+        """(B,) how deep the objects are inside the undeformed domes."""
+        return self._depth
+
+    def _forget(self, row: int) -> None:
+        self._linear.free(row)
+        self._before[row] = None
+        self._depth[row] = 0.0
+
+    def _bring(self, row: int, T: FloatArray) -> None:
+        """Solve the way to a commanded pose."""
+        contact, field = self._contacts[row], self._fields[row]
+        assert contact is not None and field is not None, "begin first"
+        gaps = field.distance((self._surrogate.node_mm - T[:3, 3]) @ T[:3, :3])
+        deepest = int(gaps.argmin())
+        depth = -float(gaps[deepest])
+        if depth <= 0 and not self._linear.held[row].any():
+            self._linear.free(row)
+            self._before[row], self._depth[row] = T.copy(), 0.0
+            return
+        self._require_inside(depth, self._surrogate.node_mm[deepest], field, T)
+        before = self._before[row] if self._memory else None
+        if before is not None and np.array_equal(before, T):
+            return
+        way = LARGEST_MOVE_MM if before is None else self._moved(before, T)
+        if before is None or way >= LARGEST_MOVE_MM:
+            self._linear.free(row)
+            before = T.copy()
+            before[2, 3] += max(depth, 0.0) / max(self._surrogate.node_mm[deepest, 2] / self._radius, 0.5) + CLEAR_MM
+            way = self._moved(before, T)
+        law, force = contact.law, self._force(row)
+        for share in np.arange(1, int(np.ceil(way / STEP_MM)) + 1) / np.ceil(way / STEP_MM) if way > 0 else (1.0,):
+            here = _between(before, T, share)
+            for _ in range(MOST_SETTLING):
+                there = law.pose(here, force)
+                self._linear.move(row, field, there, self._friction[row], self._compliance[row])
+                force = self._force(row)
+                if law.given_way is None or self._moved(there, law.pose(here, force)) <= SETTLED_MM:
+                    break
+        self._before[row] = T.copy()
+        yielded = np.array([0.0, 0.0, law.compliance_mm_per_n * force[2]])
+        self._depth[row] = -float(field.distance((self._surrogate.node_mm - there[:3, 3] - yielded) @ there[:3, :3]).min())
+
+    def _force(self, row: int) -> FloatArray:
+        """Force (3,) of the linear skin on the object, at the true skin's stiffness."""
+        return -self._surrogate.stiffness * self._linear.force_n[row].sum(axis=0)
+
+    def _require_inside(self, depth: float, place: FloatArray, field: ObjectField, T: FloatArray) -> None:
+        domain = self._domain
+        if depth > domain["depth_mm"]:
+            raise outside(f"the object is {depth:.1f} mm inside the dome, at most {domain['depth_mm']:.1f} was trained")
+        polar = float(np.degrees(np.arccos(place[2] / self._radius)))
+        if polar > domain["polar_deg"]:
+            raise outside(f"the contact is {polar:.0f} deg from the dome's apex, at most {domain['polar_deg']:.0f} was trained")
+
+    def _moved(self, start: FloatArray, stop: FloatArray) -> float:
+        """How far the object moves at most over the dome."""
+        turn = stop[:3, :3] @ start[:3, :3].T
+        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0))
+        return float(np.linalg.norm(stop[:3, 3] - turn @ start[:3, 3]) + angle * self._radius)
+
+    def _answer(self, rows: IntArray) -> None:
+        """What the sensors feel, from the linear skin and the network."""
+        felt, linear, surrogate = self.felt, self._linear, self._surrogate
+        force = linear.force_n[rows]
+        wrench = -np.concatenate([force.sum(axis=1), np.cross(surrogate.node_mm, force).sum(axis=1)], axis=1)
+        held, slides = linear.held[rows].sum(axis=1), linear.slides[rows].sum(axis=1)
+        slip = slides / np.maximum(held, 1)
+        beside = features(self._depth[rows], self._friction[rows], held, slip, wrench)
+        parts, added = surrogate.correct(force, beside, self._depth[rows])
+        self._parts[rows] = parts
+        felt.caps_mm[rows] = self._caps_rest + (parts @ self._cap_modes).reshape(len(rows), -1, 3)
+        felt.force_n[rows] = surrogate.stiffness * wrench[:, :3] + added[:, :3]
+        felt.torque_nmm[rows] = surrogate.stiffness * wrench[:, 3:] + added[:, 3:6]
+        felt.area_mm2[rows] = np.maximum(added[:, 6], 0.0) * 100.0
+        felt.slip[rows] = slip
+
+
+def _between(start: FloatArray, stop: FloatArray, share: float) -> FloatArray:
+    """A pose (4, 4) on the way: the origin goes straight, the object turns about a fixed axis."""
+    if share == 1.0:
+        return stop
+    T = stop.copy()
+    turn = Rotation.from_matrix(stop[:3, :3] @ start[:3, :3].T).as_rotvec()
+    T[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ start[:3, :3]
+    T[:3, 3] = (1 - share) * start[:3, 3] + share * stop[:3, 3]
+    return T

@@ -1,0 +1,358 @@
+"""Making a surrogate: the linear skin from the solver's own elements, and a network fitted to solved paths."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.interpolate import RBFInterpolator
+
+from scenes.object import ObjectSpec
+from scenes.sensor import SensorSpec
+from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of
+from training.surrogate.contact import LinearContacts
+from training.surrogate.contacts import SurrogateContacts
+from training.surrogate.felt import Contact
+from training.surrogate.model import VERSION, Surrogate, features, gate, mechanics_of
+from training.surrogate.paths import DEEPEST_MM, FRICTION
+from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
+from training.surrogate.symmetry import ring_directions, symmetries
+from twin.camera.projection import project
+from twin.errors import OptionError
+from twin.frames.forms import from_raw
+from twin.geometry.pins import rest_pins
+from twin.mechanics import Friction
+from twin.mechanics.law import ContactLaw
+from twin.objects import build_field
+from twin.progress import Progress, silent, stage
+from twin.store import writes_file
+from twin.types import FloatArray, Form
+
+PATHS = 120
+"""Solved paths that a surrogate learns from by default: about 5000 states."""
+RADII_MM = (15.0, 25.0)
+"""Radii of domes on which the drawn contacts, of up to 5 mm, are usual ones."""
+LEAST_PATHS = 10
+"""Fewer paths teach nothing."""
+JUDGED = 5
+"""Every path of this number is kept out of the training and judged with."""
+MODES = 64
+"""Modes of the pins' motion: what they leave out is 0.01 mm on average."""
+WIDTH = 128
+"""Neurons of each of the network's two hidden layers."""
+EPOCHS = 25
+BATCH = 512
+RATE = 3e-3
+"""Largest rate of Adam, at the middle of a cycle."""
+DECAY = 0.02
+"""Decay of the weights."""
+POLAR_DEG = 48.0
+"""Largest angle of a contact's deepest place from the apex: paths begin within 35 deg and go on from there."""
+SMALL_SCALE = 0.02
+"""No input of the network is scaled by less than this share of the largest."""
+NEIGHBOURS = 24
+"""Points of the lattice by which the motion of a pin between them is interpolated."""
+TOUCHES_MM = 0.05
+"""Contacts shallower than this are not judged."""
+LARGE_PX = 2.0
+"""The quantile of the errors relative to the largest displacement counts states in which that is at least as large."""
+BINS = {"depth_mm": (0.0, 1.5, 3.0, 6.0), "shear_mm": (0.0, 0.5, 1.5, 20.0)}
+"""Ends of the ranges by which errors are told; the shear is the largest sideways motion of a cap."""
+
+
+@dataclass(frozen=True)
+class Distilled:
+    """A surrogate that was made, its errors on paths that it has not seen, and the files that were written."""
+
+    surrogate: Surrogate
+    size_bytes: int
+    written: list[Path] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """The result in words."""
+        found = self.surrogate.about["errors"]
+        every = found["all"]
+        lines = [
+            f"{self.surrogate.about['states']} states of {self.surrogate.about['paths']} paths, {self.size_bytes / 1e3:.0f} kB",
+            f"on {found['paths']} paths that it has not seen: pins {every['pins_px']:.2f} px on average, "
+            f"{every['pins_share_95']:.1%} of the largest displacement at the 95 % quantile, force {every['force_share']:.1%}, "
+            f"slip share {every['slip']:.3f}",
+        ]
+        for kind, parts in found["by"].items():
+            lines.append(
+                f"by {kind}: " + ", ".join(f"{name} {told['pins_px']:.2f} px, {told['force_share']:.0%}" for name, told in parts.items())
+            )
+        return lines
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """States S to learn from, on the lattices: the linear skin's answer, and the truth."""
+
+    force: FloatArray  # (S, M, 3) float32, of the linear skin
+    beside: FloatArray  # (S, FEATURES)
+    depth: FloatArray  # (S,)
+    linear: FloatArray  # (S, 6), the linear skin's wrench on the object
+    pins: FloatArray  # (S, 2, P, 3), displacements of feet and changes of axes
+    wrench: FloatArray  # (S, 6)
+    area: FloatArray  # (S,)
+
+
+@writes_file("out")
+def distil(
+    sensor: SensorSpec, out: Path, *, paths: int = PATHS, processes: int = 1, seed: int = 0, progress: Progress = silent
+) -> Distilled:
+    """Make the surrogate of a sensor and write it to ``out``.
+
+    Parameters
+    ----------
+    paths : int
+        Solved with finite elements, some seconds each on one core.
+    processes : int
+    seed : int
+        Another seed draws other paths.
+
+    Raises
+    ------
+    OptionError
+        Too few paths, or a sensor that relaxes or is sealed: the surrogate has no memory of time and volume.
+    """
+    require_dome(sensor)
+    if paths < LEAST_PATHS:
+        raise OptionError(f"--paths {paths}: expected at least {LEAST_PATHS}")
+    with stage(progress, f"contacts of {sensor.name}") as step:
+        solved = solve_paths(sensor, range(seed * 100_000, seed * 100_000 + paths), processes=processes, progress=step)
+    with stage(progress, "network") as step:
+        surrogate = fit(sensor, solved, progress=step)
+    return Distilled(surrogate, surrogate.save(out), [out])
+
+
+def require_dome(sensor: SensorSpec) -> None:
+    """Raise ``OptionError`` for sensors that a surrogate can't stand for."""
+    low, high = RADII_MM
+    if sensor.skin.shape != "cap" or sensor.skin.rim_z_mm != 0 or not low <= sensor.skin.outer_radius_mm <= high:
+        raise OptionError(
+            f"{sensor.name}: a surrogate is of a half sphere of {low:g} to {high:g} mm radius, whose contacts and symmetries it knows; "
+            "use backend='fem'"
+        )
+    for part in ("skin", "gel"):
+        if getattr(sensor, part).relaxation:
+            raise OptionError(f"{sensor.name}: its {part} relaxes, and a surrogate remembers no time; use backend='fem'")
+    if sensor.gel.sealed:
+        raise OptionError(f"{sensor.name}: its gel is sealed, which a surrogate does not know; use backend='fem'")
+
+
+def fit(
+    sensor: SensorSpec, solved: Sequence[SolvedPath], *, extra: Sequence[SolvedPath] = (), progress: Any = lambda *_: None
+) -> Surrogate:
+    """The surrogate from solved paths of the sensor's lattice; every fifth path is only judged with, those of ``extra`` never."""
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    seen = [path for number, path in enumerate(solved) if number % JUDGED] + list(extra)
+    kept = [path for number, path in enumerate(solved) if not number % JUDGED]
+    skin = compliance_of(lattice_sensor(sensor))
+    answer = averaged(skin.nodes, sensor.pins.phase_deg)
+    rows = _joined([sampled(sensor, skin, answer, path) for path in seen])
+    flat_linear, flat_true = rows.linear[:, :3], rows.wrench[:, :3]
+    stiffness = float((flat_linear * flat_true).sum() / (flat_linear**2).sum())
+    cap_mm = sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
+    weights = np.array([1.0, cap_mm], np.float32)[:, None, None]
+    linear_pins = np.stack([skin.base, skin.axis]).astype(np.float32) * weights[..., None, None]  # (2, P, 3, M, 3)
+    flat = linear_pins.reshape(linear_pins.shape[0] * linear_pins.shape[1] * 3, -1)
+    force, pins, beside, depth, wrench, linear = _turned(rows, sensor.pins.phase_deg)
+    truth = (pins * weights).reshape(len(pins), -1)
+    residual = truth - force @ flat.T
+    some = np.random.default_rng(0).choice(len(truth), min(3000, len(truth)), replace=False)
+    modes = np.linalg.svd(np.concatenate([truth[some], 3 * residual[some]]), full_matrices=False)[2][:MODES]
+    read = modes @ flat
+    x = np.concatenate([force @ read.T, beside], axis=1).astype(np.float32)
+    mean, scale = x.mean(axis=0), x.std(axis=0)
+    scale[:MODES] = np.maximum(scale[:MODES], SMALL_SCALE * scale[:MODES].max())
+    wanted = residual @ modes.T
+    out_scale = np.concatenate([np.full(MODES, wanted.std(axis=0).max()), np.full(3, 0.5), np.full(3, 5.0), [1.0]]).astype(np.float32)
+    area = np.tile(rows.area, len(pins) // len(rows.area))
+    y = np.concatenate([wanted, wrench - stiffness * linear, area[:, None] / 100.0], axis=1) / out_scale
+    layers = _trained((x - mean) / scale, y.astype(np.float32), gate(depth).astype(np.float32), progress)
+    onto = _interpolation(sensor)
+    on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(MODES, 2, -1, 3) / weights[None], optimize=True)
+    about = {
+        "version": VERSION,
+        "sensor": sensor.name,
+        "mechanics": mechanics_of(sensor),
+        "domain": {"depth_mm": DEEPEST_MM + 0.5, "polar_deg": POLAR_DEG, "friction": 3.0},
+        "trained_friction": list(FRICTION),
+        "paths": len(solved) + len(extra),
+        "states": int(sum(len(path.T) for path in (*solved, *extra))),
+    }
+    made = Surrogate(
+        about,
+        skin.node_mm,
+        answer.astype(np.float32),
+        on_pins.astype(np.float32),
+        read.astype(np.float32),
+        stiffness,
+        mean,
+        scale,
+        layers,
+        out_scale,
+    )
+    about["errors"] = judge(made, sensor, kept)
+    return made
+
+
+def averaged(nodes: FloatArray, phase_deg: float) -> FloatArray:
+    """Answers (M, M, 3, 3), force node first, as a body of revolution gives them: the mesh of squares breaks its symmetry by a little."""
+    answer = nodes.transpose(2, 0, 1, 3)
+    total = np.zeros_like(answer)
+    group = symmetries(phase_deg)
+    for g in group:
+        places = g.places(NODE_RINGS)
+        total[np.ix_(places, places)] += np.einsum("pr,ijrs,qs->ijpq", g.matrix, answer, g.matrix, optimize=True)
+    return np.ascontiguousarray(total / len(group))
+
+
+def sampled(sensor: SensorSpec, skin: Compliance, answer: FloatArray, path: SolvedPath) -> _Samples:
+    """The linear skin led along a solved path, with the truth beside it."""
+    thing = build_field(ObjectSpec(name="drawn", description="", shape=path.shape))
+    linear = LinearContacts.at_rest(skin.node_mm, answer.astype(np.float32), 1)
+    rest = rest_pins(lattice_sensor(sensor).geometry)
+    force, depth, held, slip = [], [], [], []
+    for T in path.T:
+        linear.move(0, thing, T, path.friction, 0.0)
+        force.append(linear.force_n[0].astype(np.float32))
+        depth.append(max(-float(thing.distance((skin.node_mm - T[:3, 3]) @ T[:3, :3]).min()), 0.0))
+        held.append(linear.held[0].sum())
+        slip.append(linear.slides[0].sum() / max(held[-1], 1))
+    forces, deep = np.array(force), np.array(depth)
+    wrench = -np.concatenate([forces.sum(axis=1), np.cross(skin.node_mm, forces).sum(axis=1)], axis=1)
+    beside = features(deep, np.full(len(deep), path.friction), np.array(held), np.array(slip), wrench)
+    pins = np.stack([path.base_mm - rest.base_mm, path.axis - rest.axis], axis=1).astype(np.float32)
+    return _Samples(forces, beside, deep, wrench, pins, np.concatenate([path.force_n, path.torque_nmm], axis=1), path.area_mm2)
+
+
+def judge(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
+    """Errors against solved paths: pins in px of the sensor's frames, force, share that slides; also by kind of contact."""
+    lattice, form = lattice_sensor(sensor), Form.RECORDING if sensor.recording else Form.RAW
+    onto, cap_mm = _interpolation(sensor), sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
+    rest, lattice_rest = rest_pins(sensor.geometry), rest_pins(lattice.geometry)
+
+    def px(caps_mm: FloatArray) -> FloatArray:
+        return from_raw(sensor.recording, form, project(sensor.view, caps_mm))
+
+    columns: dict[str, list[Any]] = {
+        key: [] for key in ("error", "share", "force_error", "force", "slip", "depth_mm", "shear_mm", "object", "largest")
+    }
+    rest_px = px(rest.caps_mm)
+    for path in solved:
+        thing = ObjectSpec(name="drawn", description="", shape=path.shape)
+        contacts = SurrogateContacts(surrogate, sensor, 1)
+        contacts.begin(0, Contact(sensor, thing, ContactLaw(Friction(path.friction, path.friction))))
+        for number, T in enumerate(path.T):
+            contacts.move(np.zeros(1, int), T[None], np.zeros(1))
+            depth = float(contacts.depth_mm[0])
+            if contacts.felt.lost[0] or depth < TOUCHES_MM:
+                continue
+            moved = (path.base_mm[number] - lattice_rest.base_mm) + cap_mm * (path.axis[number] - lattice_rest.axis)
+            true_px = px(rest.caps_mm + onto @ moved)
+            off = np.linalg.norm(px(contacts.felt.caps_mm[0]) - true_px, axis=1)
+            largest = float(np.linalg.norm(true_px - rest_px, axis=1).max())
+            columns["error"].append(off)
+            columns["largest"].append(largest)
+            columns["share"].append(off / max(largest, 1e-9))
+            columns["force_error"].append(float(np.linalg.norm(contacts.felt.force_n[0] - path.force_n[number])))
+            columns["force"].append(float(np.linalg.norm(path.force_n[number])))
+            columns["slip"].append(abs(float(contacts.felt.slip[0]) - path.slip[number]))
+            columns["depth_mm"].append(depth)
+            columns["shear_mm"].append(float(np.linalg.norm(moved[:, :2], axis=1).max()))
+            columns["object"].append(path.shape.kind)
+    values = {key: np.array(column) for key, column in columns.items()}
+
+    large = values["largest"] >= LARGE_PX
+
+    def told(rows: Any) -> dict[str, float]:
+        return {
+            "states": int(np.sum(rows)),
+            "pins_px": round(float(values["error"][rows].mean()), 4),
+            "pins_share_95": round(float(np.quantile(values["share"][rows & large], 0.95)), 4) if (rows & large).any() else 0.0,
+            "force_share": round(float(values["force_error"][rows].mean() / values["force"][rows].mean()), 4),
+            "slip": round(float(values["slip"][rows].mean()), 4),
+        }
+
+    by: dict[str, dict[str, Any]] = {"object": {kind: told(values["object"] == kind) for kind in sorted(set(columns["object"]))}}
+    for key, ends in BINS.items():
+        rows = [
+            (f"{low:g} to {high:g}", (values[key] >= low) & (values[key] < high)) for low, high in zip(ends[:-1], ends[1:], strict=True)
+        ]
+        by[key] = {name: told(inside) for name, inside in rows if inside.any()}
+    return {"paths": len(solved), "all": told(np.ones(len(values["force"]), bool)), "by": by}
+
+
+def _joined(parts: Sequence[_Samples]) -> _Samples:
+    every = _Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in _Samples.__dataclass_fields__))
+    rows = every.depth > TOUCHES_MM
+    return _Samples(*(getattr(every, name)[rows] for name in _Samples.__dataclass_fields__))
+
+
+def _turned(rows: _Samples, phase_deg: float) -> tuple[FloatArray, ...]:
+    """Forces (S', 3 M), pins (S', 2, P, 3), features, depths, wrenches of truth and of the linear skin: each state twelve times."""
+    out: list[list[FloatArray]] = [[] for _ in range(6)]
+    for g in symmetries(phase_deg):
+        force = g.moved(rows.force, NODE_RINGS).reshape(len(rows.force), -1)
+        pins = np.stack([g.moved(rows.pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
+        turned = [np.concatenate([w[:, :3] @ g.matrix.T, g.parity * (w[:, 3:] @ g.matrix.T)], axis=1) for w in (rows.wrench, rows.linear)]
+        beside = rows.beside.copy()
+        beside[:, -6:-3] = beside[:, -6:-3] @ g.matrix.T
+        beside[:, -3:] = g.parity * (beside[:, -3:] @ g.matrix.T)
+        for values, part in zip(out, (force, pins, beside, rows.depth, *turned), strict=True):
+            values.append(part)
+    force_, pins_, beside_, depth_, wrench_, linear_ = (np.concatenate(part) for part in out)
+    return force_, pins_, beside_, depth_, wrench_, linear_
+
+
+def _trained(x: FloatArray, y: FloatArray, gates: FloatArray, progress: Any) -> tuple[tuple[FloatArray, FloatArray], ...]:
+    """Weights and offsets of a network that tells y (S, o) from x (S, i), times the gates (S,)."""
+    net = torch.nn.Sequential(
+        torch.nn.Linear(x.shape[1], WIDTH),
+        torch.nn.SiLU(),
+        torch.nn.Linear(WIDTH, WIDTH),
+        torch.nn.SiLU(),
+        torch.nn.Linear(WIDTH, y.shape[1]),
+    )
+    inputs, wanted, share = (
+        torch.from_numpy(np.ascontiguousarray(x)),
+        torch.from_numpy(np.ascontiguousarray(y)),
+        torch.from_numpy(gates)[:, None],
+    )
+    batches = max(len(x) // BATCH, 1)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=DECAY)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=EPOCHS * batches)
+    generator = torch.Generator().manual_seed(0)
+    for epoch in range(EPOCHS):
+        order = torch.randperm(len(x), generator=generator)
+        for batch in order[: batches * BATCH].tensor_split(batches):
+            loss = ((net(inputs[batch]) * share[batch] - wanted[batch]) ** 2).sum(dim=1).mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            cycle.step()
+        progress(epoch + 1, EPOCHS, f"loss {loss.item():.3f}")
+    linear = [layer for layer in net if isinstance(layer, torch.nn.Linear)]
+    return tuple((layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()) for layer in linear)
+
+
+def _interpolation(sensor: SensorSpec) -> FloatArray:
+    """(N, P) shares by which motions on the lattice give those of the sensor's pins."""
+    lattice = ring_directions(PIN_RINGS, sensor.pins.max_polar_deg, sensor.pins.phase_deg)
+    places = -rest_pins(sensor.geometry).axis
+    if places.shape == lattice.shape and np.allclose(places, lattice, atol=1e-9):
+        return np.eye(len(lattice))
+
+    def laid_flat(directions: FloatArray) -> FloatArray:
+        across = np.linalg.norm(directions[:, :2], axis=1, keepdims=True)
+        return directions[:, :2] * np.arctan2(across, directions[:, 2:]) / np.maximum(across, 1e-12)
+
+    shares = RBFInterpolator(laid_flat(lattice), np.eye(len(lattice)), neighbors=NEIGHBOURS, kernel="thin_plate_spline")
+    found: FloatArray = shares(laid_flat(places))
+    return found

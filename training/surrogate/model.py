@@ -1,0 +1,230 @@
+"""The surrogate: a linear skin with exact contact and friction, and a small network that adds what large deformations change.
+
+Of one contact, with the forces f at the linear skin's nodes,
+
+    pins = rest + modes (R f + gate(depth) net(R f, features)),   force = stiffness (-sum f) + gate net,
+
+where R is the linear skin's answer in the modes, and the gate goes to zero with the depth: a sensor that touches nothing is exactly at
+rest. The features are depth, friction, nodes that press and slide, force and torque of the linear skin. What happened before is in f
+alone, so the network has no memory of its own that could drift.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from scenes.sensor import SensorSpec
+from training.surrogate.compliance import NODE_RINGS, POLAR_DEG
+from training.surrogate.symmetry import ring_directions, symmetries
+from twin.errors import ContactError, TwinError
+from twin.geometry.pins import rest_pins
+from twin.store import output_file, write_bytes
+from twin.types import FloatArray
+
+SHIPPED = Path(__file__).parents[1] / "surrogates"
+SUFFIX = ".safetensors"
+VERSION = 1
+"""Of the file; another version is made anew."""
+GATE_MM = 0.3
+"""Depth at which the network has three quarters of its say."""
+MECHANICS = ("skin", "gel", "lens", "pins")
+"""Sections of a specification that a surrogate stands for; camera, light and rig may differ."""
+FEATURES = 12
+"""Numbers beside the modes that the network sees."""
+WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
+"""N and N mm that count as 1."""
+BESIDE = 7
+"""Numbers beside the modes that it gives: force, torque, area in 100 mm2."""
+
+
+class SurrogateError(TwinError):
+    """A surrogate's file can't be used, or no surrogate is known for a sensor."""
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """A surrogate of one sensor's mechanics.
+
+    Attributes
+    ----------
+    about : dict
+        What it was made of, the ends of its domain and its errors (JSON).
+    node_mm : (M, 3) float
+        Nodes of the linear skin at rest.
+    answer : (M, M, 3, 3) float32
+        Displacement of node j (second) for a force at node i (first), mm/N.
+    modes : (K, N, 2, 3) float32
+        Displacements of the pins' feet, mm, and changes of their axes.
+    read : (K, 3 M) float32
+        The linear skin's answer in the modes.
+    stiffness : float
+        Force of the true skin over that of the linear one.
+    mean, scale : (K + FEATURES,) float32
+        Of the network's inputs.
+    layers : tuple of ((o, i), (o,)) float32
+        The network's weights and offsets.
+    out_scale : (K + BESIDE,) float32
+    """
+
+    about: dict[str, Any]
+    node_mm: FloatArray
+    answer: FloatArray
+    modes: FloatArray
+    read: FloatArray
+    stiffness: float
+    mean: FloatArray
+    scale: FloatArray
+    layers: tuple[tuple[FloatArray, FloatArray], ...]
+    out_scale: FloatArray
+
+    @property
+    def phase_deg(self) -> float:
+        """Azimuth of the first node of each ring."""
+        return float(self.about["mechanics"]["pins"]["phase_deg"])
+
+    @property
+    def domain(self) -> dict[str, float]:
+        """Ends of what it was trained on: depth (mm), angle from the apex (deg) and friction."""
+        return {key: float(value) for key, value in self.about["domain"].items()}
+
+    def correct(self, force_n: FloatArray, beside: FloatArray, depth_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Coefficients of the modes (R, K), and what is added to force, torque and area (R, BESIDE), for node forces (R, M, 3)."""
+        linear = force_n.reshape(len(force_n), -1).astype(np.float32) @ self.read.T
+        x = (np.concatenate([linear, beside.astype(np.float32)], axis=1) - self.mean) / self.scale
+        for number, (weights, offset) in enumerate(self.layers):
+            x = x @ weights.T + offset
+            if number < len(self.layers) - 1:
+                x = x / (1.0 + np.exp(-x))  # SiLU
+        x = x * (self.out_scale * gate(depth_mm)[:, None]).astype(np.float32)
+        return linear + x[:, : len(self.modes)], x[:, len(self.modes) :]
+
+    def save(self, path: Path) -> int:
+        """Write it to a file; its size in bytes. Large arrays have half precision, and the answers of symmetric nodes are left out."""
+        whole = {"stiffness": np.array([self.stiffness]), "mean": self.mean, "scale": self.scale, "out_scale": self.out_scale}
+        half = {"modes": self.modes, "read": self.read, "answer": self.answer[representatives(self.phase_deg)]}
+        for number, (weights, offset) in enumerate(self.layers):
+            half[f"layers.{number}.weights"], whole[f"layers.{number}.offset"] = weights, offset
+        arrays = {key: np.ascontiguousarray(value, np.float32) for key, value in whole.items()}
+        arrays |= {key: np.ascontiguousarray(value, np.float16) for key, value in half.items()}
+        content = save(arrays, {"about": json.dumps(self.about, sort_keys=True)})
+        with output_file(path):
+            write_bytes(path, content)
+        return len(content)
+
+
+def features(depth_mm: FloatArray, friction: FloatArray, held: FloatArray, slip: FloatArray, wrench: FloatArray) -> FloatArray:
+    """What the network sees beside the modes, (R, FEATURES)."""
+    return np.column_stack(
+        [depth_mm, depth_mm**2 / 5.0, np.log(np.maximum(friction, 0.01)), friction * depth_mm, held / 10.0, slip, wrench / WRENCH_SCALE]
+    )
+
+
+def gate(depth_mm: FloatArray) -> FloatArray:
+    """How much the network has to say, 0 without contact."""
+    return np.tanh(np.maximum(depth_mm, 0.0) / GATE_MM)
+
+
+def representatives(phase_deg: float) -> list[int]:
+    """Nodes from which all others are reached by the lattice's symmetries."""
+    return sorted(set(np.min([g.places(NODE_RINGS) for g in symmetries(phase_deg)], axis=0).tolist()))
+
+
+def unfolded(kept: FloatArray, phase_deg: float) -> FloatArray:
+    """The answers (M, M, 3, 3) of all nodes from those of the representatives."""
+    count = kept.shape[1]
+    out = np.zeros((count, count, 3, 3), np.float32)
+    for g in symmetries(phase_deg):
+        places, turn = g.places(NODE_RINGS), g.matrix.astype(np.float32)
+        turned = np.einsum("pr,ijrs,qs->ijpq", turn, kept, turn, optimize=True)
+        for row, i in enumerate(representatives(phase_deg)):
+            out[places[i], places] = turned[row]
+    return out
+
+
+def load_surrogate(path: Path) -> Surrogate:
+    """Read a surrogate.
+
+    Raises
+    ------
+    SurrogateError
+        There is no such file, or it is no surrogate of this version.
+    """
+    try:
+        with safe_open(path, framework="numpy") as file:
+            about = json.loads((file.metadata() or {})["about"])
+            arrays = {key: file.get_tensor(key).astype(np.float32) for key in file.keys()}  # noqa: SIM118 (no mapping)
+        if about["version"] != VERSION:
+            raise SurrogateError(f"{path}: made by another version of this program; make it anew with 'twin surrogate'")
+        radius = float(about["mechanics"]["skin"]["outer_radius_mm"])
+        phase = float(about["mechanics"]["pins"]["phase_deg"])
+        count = sum(key.endswith(".weights") for key in arrays)
+        return Surrogate(
+            about,
+            radius * ring_directions(NODE_RINGS, POLAR_DEG, phase),
+            unfolded(arrays["answer"], phase),
+            arrays["modes"],
+            arrays["read"],
+            float(arrays["stiffness"][0]),
+            arrays["mean"],
+            arrays["scale"],
+            tuple((arrays[f"layers.{number}.weights"], arrays[f"layers.{number}.offset"]) for number in range(count)),
+            arrays["out_scale"],
+        )
+    except FileNotFoundError:
+        raise SurrogateError(f"{path}: no such file; make one with 'twin surrogate'") from None
+    except OSError as error:
+        raise SurrogateError(f"{path}: can't be read ({error.strerror or error}); give a file of 'twin surrogate'") from error
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise SurrogateError(f"{path}: damaged, or no surrogate ({error}); make it anew with 'twin surrogate'") from error
+
+
+def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:
+    """The sections of a specification that decide its mechanics, without what only the optics need."""
+    plain = sensor.model_dump(mode="json")
+    optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px", "thickness_mm", "diameter_mm", "cap_diameter_mm"}
+    found = {part: {key: value for key, value in plain[part].items() if key not in optical} for part in MECHANICS}
+    found["skin"]["thickness_mm"] = plain["skin"]["thickness_mm"]
+    return found
+
+
+def surrogate_of(sensor: SensorSpec, file: str | Path | None = None) -> Surrogate:
+    """The surrogate of a sensor: the given file, or the shipped one of the same skin, gel and pins.
+
+    Raises
+    ------
+    SurrogateError
+        The file is of another sensor, or none is shipped for this one.
+    """
+    wanted = mechanics_of(sensor)
+    if file is not None:
+        found = load_surrogate(Path(file))
+        if found.about["mechanics"] != wanted:
+            parts = [part for part in MECHANICS if found.about["mechanics"][part] != wanted[part]]
+            raise SurrogateError(
+                f"{file}: of a sensor with another [{'], ['.join(parts)}]; make one of {sensor.name} with 'twin surrogate'"
+            )
+        return found
+    for path in sorted(SHIPPED.glob(f"*{SUFFIX}")):
+        found = load_surrogate(path)
+        if found.about["mechanics"] == wanted:
+            return found
+    raise SurrogateError(
+        f"no surrogate of {sensor.name} goes with the package; make one: twin surrogate --sensor {sensor.name} --out FILE, "
+        "and give it as surrogate=FILE, or use backend='fem'"
+    )
+
+
+def rest_of(sensor: SensorSpec) -> FloatArray:
+    """Feet and axes of a sensor's pins at rest, (N, 2, 3)."""
+    rest = rest_pins(sensor.geometry)
+    return np.stack([rest.base_mm, rest.axis], axis=1)
+
+
+def outside(reason: str) -> ContactError:
+    """The error for a contact that the surrogate was not trained for."""
+    return ContactError(f"outside the surrogate's domain: {reason}; use backend='fem', or a surrogate that was trained for it")

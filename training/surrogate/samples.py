@@ -1,0 +1,104 @@
+"""Solved paths to learn from and to judge with, kept in one file."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from scenes.object import ObjectSpec, Shape
+from scenes.pins import PinsSpec
+from scenes.sensor import SensorSpec
+from training.surrogate.paths import DrawnPath, draw_path
+from twin.errors import ContactError
+from twin.mechanics import Friction, SkinSolver
+from twin.mechanics.law import ContactLaw
+from twin.objects import build_field
+from twin.progress import Step
+from twin.types import FloatArray
+from twin.workers import in_processes
+
+PIN_RINGS = 10
+"""Rings of the lattice on which the pins' motion is learnt."""
+STEP_MM = 0.8
+"""Largest motion across the contact in one load step: as long as the steps of a servo or an agent."""
+
+
+@dataclass(frozen=True)
+class SolvedPath:
+    """Converged states of one path; S of them, the object free of the skin at the first.
+
+    Attributes
+    ----------
+    shape : Shape
+    friction : float
+    T : (S, 4, 4) float
+        The object's pose, sensor frame.
+    base_mm, axis : (S, N, 3) float32
+        Pins' feet and axes.
+    force_n, torque_nmm : (S, 3) float
+    area_mm2, slip : (S,) float
+        Area in contact, and the share of it that slides.
+    """
+
+    shape: Shape
+    friction: float
+    T: FloatArray
+    base_mm: FloatArray
+    axis: FloatArray
+    force_n: FloatArray
+    torque_nmm: FloatArray
+    area_mm2: FloatArray
+    slip: FloatArray
+
+
+def lattice_sensor(sensor: SensorSpec) -> SensorSpec:
+    """The sensor with pins on a lattice of rings: pins do not change the mechanics, and what is learnt on rings has their symmetries."""
+    pins = {**sensor.pins.model_dump(mode="json", exclude_defaults=True), "layout": "rings", "rings": PIN_RINGS, "spacing": "polar"}
+    kept = {key: value for key, value in pins.items() if key not in ("missing", "positions", "columns", "rows", "row_distance")}
+    return sensor.model_copy(update={"pins": PinsSpec.model_validate(kept)})
+
+
+def solve_path(solver: SkinSolver, drawn: DrawnPath, *, step_mm: float = STEP_MM) -> SolvedPath | None:
+    """Follow a path with the finite elements as far as they converge; None if not even the first step does."""
+    field = build_field(ObjectSpec(name="drawn", description="", shape=drawn.shape))
+    rest = solver.rest(T_sensor_object=drawn.path.at(0.0))
+    states = [rest]
+    try:
+        law = ContactLaw(Friction(drawn.friction, drawn.friction))
+        for _, state in solver.path(field, drawn.path, law=law, step_mm=step_mm):
+            states.append(state)
+    except ContactError:
+        if len(states) == 1:
+            return None
+    slip = [float(s.point_area_mm2[s.slipping].sum()) / max(s.area_mm2, 1e-9) for s in states]
+    return SolvedPath(
+        drawn.shape,
+        drawn.friction,
+        np.array([s.T_sensor_object for s in states]),
+        np.array([s.base_mm for s in states], np.float32),
+        np.array([s.axis for s in states], np.float32),
+        np.array([s.force_n for s in states]),
+        np.array([s.torque_nmm for s in states]),
+        np.array([s.area_mm2 for s in states]),
+        np.array(slip),
+    )
+
+
+def solve_paths(sensor: SensorSpec, numbers: Sequence[int], *, processes: int, progress: Step) -> list[SolvedPath]:
+    """Solve the paths of these numbers; the same number gives the same path."""
+    found: dict[int, SolvedPath] = {}
+    for done, (number, solved) in enumerate(in_processes(_begin, (lattice_sensor(sensor),), list(numbers), processes=processes), 1):
+        if solved is not None:
+            found[number] = solved
+        progress(done, len(numbers))
+    return [found[number] for number in sorted(found)]
+
+
+def _begin(sensor: SensorSpec) -> Callable[[int], tuple[int, SolvedPath | None]]:
+    return partial(_solve, sensor, SkinSolver(sensor))
+
+
+def _solve(sensor: SensorSpec, solver: SkinSolver, number: int) -> tuple[int, SolvedPath | None]:
+    drawn = draw_path(sensor, np.random.default_rng((number, 26)))
+    return number, solve_path(solver, drawn)

@@ -1,0 +1,72 @@
+"""Lattices of rings around the apex, and the twelve turns and mirrorings that leave them as they are.
+
+The body is a body of revolution, so a contact that is turned or mirrored gives the turned or mirrored answer: every solved contact
+teaches twelve.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.types import FloatArray, IntArray
+
+
+def ring_directions(rings: int, largest_polar_deg: float, phase_deg: float) -> FloatArray:
+    """(3 rings (rings + 1) + 1, 3) unit vectors: the apex, then ring by ring by increasing azimuth."""
+    out = [np.array([[0.0, 0.0, 1.0]])]
+    for ring in range(1, rings + 1):
+        polar = np.radians(largest_polar_deg) * ring / rings
+        azimuth = 2 * np.pi * np.arange(6 * ring) / (6 * ring) + np.radians(phase_deg)
+        out.append(np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.full(6 * ring, np.cos(polar))]))
+    return np.concatenate(out)
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """A turn by a multiple of 60 deg about z, after a mirroring at the plane through z and the lattice's phase, or without.
+
+    Attributes
+    ----------
+    turns : int
+        Of 60 deg.
+    mirrored : bool
+    matrix : (3, 3) float
+        What it does to vectors; to torques it does the same times ``parity``.
+    """
+
+    turns: int
+    mirrored: bool
+    matrix: FloatArray
+
+    @property
+    def parity(self) -> float:
+        """-1 for a mirroring: torques are axial vectors."""
+        return -1.0 if self.mirrored else 1.0
+
+    def places(self, rings: int) -> IntArray:
+        """(M,) where each point of a lattice goes."""
+        out, start = [np.zeros(1, int)], 1
+        for ring in range(1, rings + 1):
+            place = np.arange(6 * ring)
+            out.append(start + ((-place if self.mirrored else place) + self.turns * ring) % (6 * ring))
+            start += 6 * ring
+        return np.concatenate(out)
+
+    def moved(self, vectors: FloatArray, rings: int) -> FloatArray:
+        """Vectors (S, M, 3) at a lattice's points, turned and mirrored with their places."""
+        out = np.empty_like(vectors)
+        out[:, self.places(rings)] = vectors @ self.matrix.T.astype(vectors.dtype)
+        return out
+
+
+def symmetries(phase_deg: float) -> list[Symmetry]:
+    """The twelve symmetries of a lattice of rings, the identity first."""
+    phase = np.radians(phase_deg)
+    along = np.array([[np.cos(phase), -np.sin(phase), 0], [np.sin(phase), np.cos(phase), 0], [0, 0, 1.0]])
+    found = []
+    for mirrored in (False, True):
+        for turns in range(6):
+            angle = np.radians(60.0 * turns)
+            turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+            found.append(Symmetry(turns, mirrored, along @ turn @ np.diag([1.0, -1.0 if mirrored else 1.0, 1.0]) @ along.T))
+    return found

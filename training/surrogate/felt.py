@@ -41,7 +41,7 @@ class Felt:
     torque_nmm : (B, 3) float
         About the sensor's origin.
     area_mm2 : (B,) float
-        In contact.
+        Of the skin at rest that is pressed.
     slip : (B,) float
         Share of that area that slides.
     lost : list of str
@@ -121,7 +121,8 @@ class FiniteElements:
             felt.lost[row] = ""
             self._pins[row] = PinRest(state.base_mm, state.axis, state.caps_mm)
             felt.caps_mm[row] = state.caps_mm
-            felt.force_n[row], felt.torque_nmm[row], felt.area_mm2[row] = state.force_n, state.torque_nmm, state.area_mm2
+            felt.force_n[row], felt.torque_nmm[row] = state.force_n, state.torque_nmm
+            felt.area_mm2[row] = float(state.point_area_mm2.sum())
             felt.slip[row] = state.slip_share
 
     def attitude(self, row: int) -> PinRest:

@@ -38,7 +38,7 @@ class SolvedPath:
         Pins' feet and axes.
     force_n, torque_nmm : (S, 3) float
     area_mm2, slip : (S,) float
-        Area in contact, and the share of it that slides.
+        Area of the skin at rest that is pressed, and the share of it that slides.
     """
 
     shape: Shape
@@ -71,7 +71,6 @@ def solve_path(solver: SkinSolver, drawn: DrawnPath, *, step_mm: float = STEP_MM
     except ContactError:
         if len(states) == 1:
             return None
-    slip = [float(s.point_area_mm2[s.slipping].sum()) / max(s.area_mm2, 1e-9) for s in states]
     return SolvedPath(
         drawn.shape,
         drawn.friction,
@@ -80,8 +79,8 @@ def solve_path(solver: SkinSolver, drawn: DrawnPath, *, step_mm: float = STEP_MM
         np.array([s.axis for s in states], np.float32),
         np.array([s.force_n for s in states]),
         np.array([s.torque_nmm for s in states]),
-        np.array([s.area_mm2 for s in states]),
-        np.array(slip),
+        np.array([s.point_area_mm2.sum() for s in states]),
+        np.array([s.slip_share for s in states]),
     )
 
 

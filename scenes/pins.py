@@ -7,9 +7,16 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from scenes.base import Positive, Section, SpecError
+from scenes.files import read_regular
 
 MOST_PINS = 5000
 """Largest number of pins. The finest printed sensors have about 3000."""
+
+LARGEST_PLACES = 1_000_000
+"""Bytes of a file of pins' places: of ``MOST_PINS`` in full precision."""
+
+_Place = Annotated[float, Field(ge=-1e9, le=1e9)]
+"""A coordinate of a pin, in any unit: even nanometres stay below the bound."""
 
 LEAST_WIDTH = 0.01
 """Places nearer to a line than this share of its length lie on it."""
@@ -63,7 +70,7 @@ class PinsSpec(Section):
     columns: Annotated[int, Field(ge=2, le=100)] | None = None
     rows: Annotated[int, Field(ge=2, le=100)] | None = None
     row_distance: Annotated[float, Field(ge=0.1, le=10)] = 1.0
-    positions: Annotated[tuple[tuple[float, float], ...], Field(max_length=MOST_PINS)] = ()
+    positions: Annotated[tuple[tuple[_Place, _Place], ...], Field(max_length=MOST_PINS)] = ()
     missing: tuple[Annotated[int, Field(ge=0)], ...] = ()
     spacing: Literal["polar", "plan"] = "polar"
     max_polar_deg: Annotated[float, Field(gt=0, lt=90)] = 64.0
@@ -153,6 +160,8 @@ def layout_from(text: str) -> PinsSpec:
             return PinsSpec(layout="grid", columns=int(columns), rows=int(rows))
         if kind == "positions":
             return PinsSpec(layout="positions", positions=_places_in(Path(size)))
+    except SpecError:
+        raise
     except ValidationError as error:
         raise SpecError(f"layout {text}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
     except ValueError as error:
@@ -163,9 +172,10 @@ def layout_from(text: str) -> PinsSpec:
 def _places_in(path: Path) -> tuple[tuple[float, float], ...]:
     """x and y in each line of a CSV file; lines that begin with # or hold no numbers (a header) are passed over."""
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_regular(path, LARGEST_PLACES).decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise SpecError(f"{path}: not readable as text ({error}); give a CSV file with x,y of one pin in each line") from error
+        how = error.strerror if isinstance(error, OSError) else "no UTF-8 text"
+        raise SpecError(f"{path}: can't be read ({how}); give a CSV file with x,y of one pin in each line") from error
     places: list[tuple[float, float]] = []
     for number, line in enumerate(lines, 1):
         cells = [cell.strip() for cell in line.replace(";", ",").split(",")]

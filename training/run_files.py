@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from scenes.files import read_regular
 from scenes.load import explained
 from scenes.sensor import SensorSpec
 from training.models import model_named
@@ -21,6 +22,7 @@ from twin.types import Form
 CONFIG = "config.json"  # what a run was told, resolved
 TENSORS = "weights.pt"  # its trained networks
 CHECKPOINT = "checkpoint.pt"  # the state of training, while it goes on
+LARGEST_CONFIG = 100_000_000  # bytes; a configuration names the frames that were kept out, a million of them take 20 MB
 AGAIN = "train again, or copy the run's folder anew"
 
 
@@ -55,7 +57,7 @@ def read_config(run: Path) -> dict[str, Any]:
     """
     path = run / CONFIG
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
+        config = json.loads(read_regular(path, LARGEST_CONFIG).decode())
     except (OSError, ValueError, RecursionError) as error:
         raise damaged(path, getattr(error, "strerror", None) or "no readable JSON") from error
     try:

@@ -1,11 +1,13 @@
 """Simulated data sets: reading those without pictures, and what is known of their contacts besides the table of labels."""
 
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
 
+from scenes.files import read_regular
 from scenes.load import explained
 from scenes.sensor import SensorSpec
 from training.generation.config import GenerationConfig
@@ -14,7 +16,7 @@ from twin.errors import DatasetError, FrameError
 from twin.frames import Recording
 from twin.frames.folders import image_folders
 from twin.frames.forms import frame_size
-from twin.frames.tables import order_by_table, read_table
+from twin.frames.tables import LARGEST_BYTES, order_by_table, read_table
 from twin.frames.truth import AGAIN, TRUTH, arrays_of, open_truth, row_of
 from twin.rig.kinematics import object_pose, rig_of
 from twin.rig.mounting import Mounting
@@ -99,8 +101,7 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     config = config_of(folder)
     truth, _, _ = open_truth(folder)
     rows_by_name = row_of(truth)
-    with (folder / DRAWS).open(newline="", encoding="utf-8") as file:
-        draws = {int(row["path_id"]): row for row in csv.DictReader(file)}
+    draws = _draws(folder / DRAWS)
     rows = np.array([rows_by_name.get(name, -1) for name in names.tolist()], int)
     arrays = arrays_of(truth, ("pose", "move", "executed", "force_n", "path_id"))
     pose = (arrays["pose"] - arrays["move"] * ~arrays["executed"][:, None])[rows]
@@ -109,6 +110,8 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for path_id in np.unique(contact[rows >= 0]):
         mine = contact == path_id
+        if int(path_id) not in draws:
+            raise FrameError(f"{folder / DRAWS}: has no row of contact {path_id}; {AGAIN}")
         sensor = _rigged(config.sensor, draws[int(path_id)])
         sent = np.stack([object_pose(rig_of(sensor), config.experiment, each, sensor.skin.apex_mm) for each in pose[mine]])
         sent[:, 2, 3] += config.object.compliance_mm_per_n * force_n[mine, 2]
@@ -117,7 +120,17 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
     return found
 
 
-def _rigged(sensor: SensorSpec, drawn: dict[str, str]) -> SensorSpec:
+def _draws(path: Path) -> dict[int, dict[str, float]]:
+    """The rig's parameters that were drawn for each contact, by its number."""
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_regular(path, LARGEST_BYTES).decode(), newline=""), strict=True))
+        return {int(row["path_id"]): {key: float(row[key]) for key in row if str(key).startswith("rig.")} for row in rows}
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        how = getattr(error, "strerror", None) or "no whole table of numbers"
+        raise FrameError(f"{path}: damaged ({how}); {AGAIN}") from error
+
+
+def _rigged(sensor: SensorSpec, drawn: dict[str, float]) -> SensorSpec:
     """The sensor with the rig's parameters that were drawn for a contact."""
-    rig = {key.removeprefix("rig."): float(value) for key, value in drawn.items() if key.startswith("rig.")}
+    rig = {key.removeprefix("rig."): value for key, value in drawn.items()}
     return sensor.model_copy(update={"rig": rig_of(sensor).model_copy(update=rig)})

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scenes.files import shown
 from twin.errors import FrameError
 from twin.frames import Recording
 from twin.frames.tables import numbers
@@ -148,5 +149,5 @@ def _numbers(cells: np.ndarray, name: str, problems: list[str]) -> np.ndarray:
     """A column as floats; a cell without a finite number becomes NaN, and such cells are counted in ``problems``."""
     values = numbers(cells)
     if (bad := np.isnan(values)).any():
-        problems.append(f"column {name}: {bad.sum()} cells hold no finite number")
+        problems.append(f"column {name}: {bad.sum()} cells hold no finite number, the first '{shown(cells[bad][0])}'")
     return values

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 from forked_program import Ended, Limits, Program
-from hostile_catalogue import CATALOGUE, REFUSED, USAGE, Entry
+from hostile_catalogue import CATALOGUE
+from hostile_entry import REFUSED, USAGE, Entry
 from hostile_inputs import SENSOR, Harmless, copied
 from hostile_known import KNOWN
 

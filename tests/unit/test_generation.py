@@ -146,6 +146,11 @@ def with_a_strange_row(folder):
     (folder / "targets.csv").write_text(text.replace("frame_1_0", "frame_99_0"))
 
 
+def without_a_draw(folder):
+    lines = (folder / "draws.csv").read_text().splitlines()
+    (folder / "draws.csv").write_text("\n".join(lines[:1] + lines[2:]) + "\n")
+
+
 DAMAGES = {
     "generation.json empty": lambda folder: (folder / "generation.json").write_text(""),
     "generation.json a list": lambda folder: (folder / "generation.json").write_text("[1]"),
@@ -155,6 +160,9 @@ DAMAGES = {
     "truth.zarr a part damaged": with_a_damaged_chunk,
     "targets.csv a row missing": without_a_row,
     "targets.csv a strange row": with_a_strange_row,
+    "draws.csv a contact missing": without_a_draw,
+    "draws.csv binary": lambda folder: (folder / "draws.csv").write_bytes(bytes(range(256))),
+    "draws.csv not there": lambda folder: (folder / "draws.csv").unlink(),
 }
 
 

@@ -1,5 +1,7 @@
 """Layouts are data: any of them has a border, a reference, a graph, and is labelled in frames; missing pins stay missing."""
 
+import os
+
 import numpy as np
 import pytest
 from drawn_frames import draw_discs, smooth_warp
@@ -99,9 +101,21 @@ def test_positions_come_from_a_file_with_or_without_a_header(tmp_path):
     file.write_text("0,0\n1,1\n2,2\n")
     with pytest.raises(SpecError, match="on one line"):
         layout_from(f"positions:{file}")
+    file.write_text("1e308,1e308\n-1e308,1e308\n1,1\n0,0\n")
+    with pytest.raises(SpecError, match="less than or equal to 1000000000"):
+        layout_from(f"positions:{file}")
     file.write_text("0,0\n1,one\n")
     with pytest.raises(SpecError, match="line 2"):
         layout_from(f"positions:{file}")
+
+
+@pytest.mark.parametrize("place", ["/dev/zero", "/", "pipe"])
+def test_places_of_pins_are_read_from_a_file_alone(tmp_path, place):
+    if place == "pipe":
+        place = str(tmp_path / "pipe")
+        os.mkfifo(place)
+    with pytest.raises(SpecError, match=f"^{place}: can't be read .*give a CSV file"):
+        layout_from(f"positions:{place}")
 
 
 @pytest.mark.parametrize(

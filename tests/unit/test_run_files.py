@@ -1,6 +1,7 @@
 """Damaged files of a run are named, with what to do; none of them changes an answer in silence."""
 
 import json
+import os
 import pickle
 import shutil
 
@@ -90,6 +91,14 @@ def test_a_configuration_that_makes_no_model_is_refused(trained, tmp_path, what)
     config = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps(CONFIGS[what](config)))
     refused(lambda: PoseEstimator.load(run), run)
+
+
+def test_a_configuration_that_is_a_named_pipe_is_not_waited_for(trained, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    (run / "config.json").unlink()
+    os.mkfifo(run / "config.json")
+    refused(lambda: PoseEstimator.load(run), run / "config.json")
 
 
 def test_a_configuration_that_is_no_json_is_refused(trained, tmp_path):

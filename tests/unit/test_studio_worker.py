@@ -1,5 +1,6 @@
 """The worker goes to the newest wish, in order, and traces and refines what stands still; files of the studio are read with care."""
 
+import os
 import threading
 import time
 from dataclasses import replace
@@ -167,6 +168,13 @@ def test_what_is_no_state_is_refused_in_one_line(content):
     with pytest.raises(TwinError, match="some.json: .*open a file that 'Save state' wrote") as error:
         StudioState.read(content, "some.json")
     assert "\n" not in str(error.value)
+
+
+def test_a_state_is_read_from_a_file_alone(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
+        with pytest.raises(TwinError, match=f"^{place}: can't be read .*give a file that 'Save state' wrote"):
+            StudioState.load(place)
 
 
 def test_a_way_is_written_and_read(tmp_path):

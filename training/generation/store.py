@@ -18,6 +18,7 @@ import numpy as np
 import zarr
 
 from scenes.experiment import LABELS
+from scenes.files import read_regular
 from training.generation.config import DatasetError, GenerationConfig
 from training.generation.make import REST, Outcome, make_contact
 from twin.errors import StoreError
@@ -34,6 +35,8 @@ from twin.store import (
     written_by_us,
 )
 
+# Bytes of a JSON file of a data set: a sensor's measured tables are the most of it.
+LARGEST_RECORD = 100_000_000
 # File of the data set's configuration.
 CONFIG = "generation.json"
 # Folder that holds a record of each contact that is done.
@@ -214,7 +217,7 @@ def read_record(path: Path) -> dict[str, Any]:
         It can't be read, or does not hold what it should.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_regular(path, LARGEST_RECORD).decode())
         if isinstance(found, dict):
             return found
         how = "it holds no record"

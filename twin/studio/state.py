@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section
+from scenes.files import read_regular
 from twin.errors import TwinError
 from twin.store import unwritten, write_json, write_text
 from twin.studio.pictures import Drawn
@@ -85,8 +86,7 @@ class StudioState(Section):
     def load(cls, path: Path) -> "StudioState":
         """Read a state's file; errors as ``read``."""
         try:
-            with path.open("rb") as file:
-                return cls.read(file.read(MOST_BYTES + 1), str(path))
+            return cls.read(read_regular(path, MOST_BYTES), str(path))
         except OSError as error:
             raise TwinError(f"{path}: can't be read ({error.strerror}); give a file that 'Save state' wrote") from error
 

@@ -1,6 +1,7 @@
 """The worker goes to the newest wish, in order, and traces and refines what stands still; files of the studio are read with care."""
 
 import os
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -11,6 +12,7 @@ import pytest
 
 from twin.errors import ContactError, TwinError
 from twin.studio.contact import Light, Mesh
+from twin.studio.page import PORTS_TRIED, Page, free_port
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.state import MOST_BYTES, StudioState, first_state, read_way, save_way, tap_and_shear
 from twin.studio.tracing import Failed, Traced
@@ -168,6 +170,20 @@ def test_what_is_no_state_is_refused_in_one_line(content):
     with pytest.raises(TwinError, match="some.json: .*open a file that 'Save state' wrote") as error:
         StudioState.read(content, "some.json")
     assert "\n" not in str(error.value)
+
+
+def test_a_page_that_can_not_listen_says_so_and_does_not_wait():
+    with socket.create_server(("127.0.0.1", 65535)):
+        for host, port in (("999.1.1.1", 8090), ("nowhere.invalid", 8090), ("127.0.0.1", 65535)):
+            with pytest.raises(TwinError, match=f"--host {host} --port {port}: can't listen there"):
+                Page("page", host=host, port=port)
+
+
+def test_the_next_free_port_is_taken():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert port < free_port("127.0.0.1", port) <= port + PORTS_TRIED
+    assert free_port("127.0.0.1", 0) == 0
 
 
 def test_a_state_is_read_from_a_file_alone(tmp_path):

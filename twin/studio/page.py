@@ -1,5 +1,7 @@
 """The page's frame: server, panels, pictures, numbers, charts, and the choice of the mode."""
 
+import errno
+import socket
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -21,6 +23,8 @@ from twin.types import ImageArray
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine reaches."""
+PORTS_TRIED, MOST_PORT = 100, 65535
+"""Number of ports that are tried one after the other, and the largest port."""
 PICTURES_PX, CONTROLS_PX = 330, 350
 """Widths of the panels with the pictures and with the controls."""
 JPEG_QUALITY = 88
@@ -93,6 +97,26 @@ def refuse_foreign_pages(server: viser.ViserServer, hosts: Sequence[str]) -> Non
     websocket_server.on_client_connect(check)
 
 
+def free_port(host: str, port: int) -> int:
+    """The port, or the next one above it on which this machine can listen; 0 stays 0.
+
+    viser itself would try a thousand ports, and then wait for ever.
+
+    Raises
+    ------
+    OSError
+        The host is no address of this machine, or no such port is free.
+    """
+    for candidate in range(port, min(port + PORTS_TRIED, MOST_PORT + 1)):
+        try:
+            with socket.create_server((host, candidate), family=socket.AF_INET6 if ":" in host else socket.AF_INET):
+                return candidate
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+    raise OSError(errno.EADDRINUSE, f"no port from {port} on is free")
+
+
 class Chart:
     """Lines over the last seconds.
 
@@ -158,6 +182,7 @@ class Page:
 
     def __init__(self, title: str, *, host: str, port: int) -> None:
         try:
+            port = free_port(host, port)
             with redirect_stdout(StringIO()):  # it prints its addresses
                 self.server = _Server(host=host, port=port, label=title, verbose=False)
         except (OSError, RuntimeError) as error:

@@ -5,6 +5,31 @@ from typing import Annotated, Literal
 from scenes.base import NonNegative, NotTruth, Section
 
 
+class ForceSensorSpec(Section):
+    """How the force sensor of a recording reads: what its columns mean in the rig's own axes.
+
+    Readings r belong to the force f in N with which the sensor pushes on the object, in the axes ``frame``:
+    ``r = offset_n + gain * f``, each axis for itself.
+
+    Attributes
+    ----------
+    columns : three str
+        Columns of the table of labels, for the forces along x, y and z of the frame.
+    frame : {"work", "tool"}
+        Axes of the readings: those of the robot's work frame, or of the tool, which turns with the sensor. At angles of zero both are the
+        same.
+    gain : three numbers
+        Reading for each N; a negative one has the other sign.
+    offset_n : three numbers
+        Reading without contact.
+    """
+
+    columns: tuple[str, str, str] = ("Fx", "Fy", "Fz")
+    frame: Literal["work", "tool"] = "work"
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    offset_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 class RigSpec(Section):
     """One sensor on one robot before one plate; calibrated from labelled frames (``twin calibrate contact``).
 
@@ -53,6 +78,8 @@ class RigSpec(Section):
     turn_compliance_deg_per_n : float
         Turn of the arm about its tool point for each N with which the sensor pushes the object across, in the sensor's own frame. Its
         sign is that of the label in the plane of approach and across.
+    force_sensor : ForceSensorSpec, optional
+        Where the recordings' tables hold measured forces: how they are read.
     """
 
     contact_offset_mm: float = 0.0
@@ -67,3 +94,4 @@ class RigSpec(Section):
     friction: NonNegative = 0.5
     compliance_mm_per_n: NonNegative = 0.0
     turn_compliance_deg_per_n: float = 0.0
+    force_sensor: ForceSensorSpec | None = None

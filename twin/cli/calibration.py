@@ -31,6 +31,7 @@ from twin.cli.options import (
     sensor_with,
     tell,
 )
+from twin.errors import OptionError
 from twin.types import FINE
 
 HELP_NEW = """Make a specification of your own sensor from its frames.
@@ -40,11 +41,15 @@ kinds, and one no contact. Nothing else need be known: the layout of the pins is
 init_0.png or --no-contact, in a frame that shows no contact, or made from many contacts, and it says which), and mask, threshold and
 camera fitted. Where the layout is unsure, the two likeliest are named with what would decide; then give --layout.
 
+With --labels TABLE it goes on to the contact, as 'twin calibrate contact' does; with --optics to light and colours, as 'twin calibrate
+optics' does (raw frames). With --camera a live camera takes the place of the folder: it says when to press.
+
 \b
 Writes:
   MY.toml             a short, commented specification: --sensor MY.toml
   MY-new/index.html   what is known, what is assumed, what to do to know more;
                       pictures of frames with their pins beside it
+  MY-contact/, MY-calibration/, MY-frames/   with --labels, --optics, --camera
 
 \b
 --layout rings:10         331 pins in 10 rings
@@ -55,13 +60,24 @@ Writes:
 \b
 Example:
   twin new recordings/mine --out mine.toml
+  twin new recordings/mine --labels targets.csv --out mine.toml
+  twin new --camera /dev/video0 --out mine.toml
 """
 
 
 @app.command("new", help=HELP_NEW)
 def new(
-    frames: Annotated[Path, typer.Argument(help="folder of frames, video or recording")],
     out: Annotated[Path, typer.Option("--out", metavar="MY.toml", help="the specification to write")],
+    frames: Annotated[Path | None, typer.Argument(help="folder of frames, video or recording")] = None,
+    camera: Annotated[str, typer.Option("--camera", metavar="C", help="a live camera instead: 0, /dev/videoN, http://...")] = "",
+    labels: Annotated[Path | None, typer.Option("--labels", metavar="TABLE", help="table of labels: also fit the contact")] = None,
+    experiment: Annotated[
+        str | None, typer.Option("--experiment", metavar="E", help="how the labelled contacts were made; told by the table if not given")
+    ] = None,
+    contacts: Annotated[int, typer.Option("--contacts", min=4, metavar="N", help="labelled frames to which the contact is fitted")] = 20,
+    optics: Annotated[bool, typer.Option("--optics", help="also fit light and colours")] = False,
+    workers: Workers = CORES,
+    across: Across = FINE,
     layout: Annotated[str | None, typer.Option("--layout", metavar="L", help="the layout, if it is known")] = None,
     no_contact: NoContact = None,
     table: Table = None,
@@ -69,14 +85,37 @@ def new(
     limit: Annotated[int, typer.Option("--limit", min=1, metavar="N", help="at most N frames, evenly spread")] = 40,
     force: Force = False,
 ) -> None:
+    from hardware.cameras.choose import open_camera
+    from hardware.gather import gather_frames
+    from scenes import load_experiment
     from scenes.pins import layout_from
     from twin.cli.progress import shown
-    from twin.fit.new_sensor import new_sensor
+    from twin.fit.go_on import whole_sensor
     from twin.store import overwriting
 
+    if (frames is None) == (not camera):
+        raise OptionError("give either a folder of frames or --camera")
     given = layout_from(layout) if layout else None
-    with overwriting(force), shown() as progress:
-        made = new_sensor(frames, out, layout=given, no_contact=no_contact, table=table, form=form, limit=limit, progress=progress)
+    with overwriting(force):
+        if frames is None:
+            frames = gather_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"), say=lambda line: say([line]))
+        with shown() as progress:
+            made = whole_sensor(
+                frames,
+                out,
+                labels=labels,
+                optics=optics,
+                experiment=if_given(load_experiment, experiment),
+                contacts=contacts,
+                workers=workers,
+                across=across,
+                layout=given,
+                no_contact=no_contact,
+                table=table,
+                form=form,
+                limit=limit,
+                progress=progress,
+            )
     tell(made)
 
 

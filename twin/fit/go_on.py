@@ -1,0 +1,152 @@
+"""From a folder of frames to a whole specification: after pins and camera also light from colour frames, and the contact from labels."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scenes.experiment import LABELS, ExperimentSpec
+from scenes.load import list_experiments, load_experiment
+from scenes.pins import PinsSpec
+from twin.errors import OptionError
+from twin.fit.contact.calibrate import LABELS as CONTACTS
+from twin.fit.contact.calibrate import ContactCalibration, calibrate_to_file
+from twin.fit.new_sensor import LIMIT, NewSensor, new_sensor
+from twin.fit.optics import OpticsCalibration, calibrate_optics
+from twin.frames import frames_at, open_recording
+from twin.frames.tables import numbers
+from twin.progress import Progress, silent
+from twin.types import FINE, Form
+
+ALIKE = 0.6
+"""Least share of labels that a table's and an experiment's contacts have in common, of those that vary in either of them."""
+VARIES = 1e-6
+"""A label varies if it changes by more than this, mm or deg."""
+
+
+@dataclass(frozen=True)
+class WholeSensor:
+    """A specification made from frames, and what was fitted to it afterwards.
+
+    Attributes
+    ----------
+    made : NewSensor
+        Layout, camera and pin detection.
+    experiment : ExperimentSpec or None
+        How the labelled contacts were taken to be made.
+    optics : OpticsCalibration or None
+    contact : ContactCalibration or None
+    """
+
+    made: NewSensor
+    experiment: ExperimentSpec | None
+    optics: OpticsCalibration | None
+    contact: ContactCalibration | None
+
+    @property
+    def written(self) -> list[Path]:
+        """The specification, then the pages."""
+        parts: Sequence[NewSensor | OpticsCalibration | ContactCalibration | None] = (self.made, self.optics, self.contact)
+        return list(dict.fromkeys(path for part in parts if part is not None for path in part.written))
+
+    def lines(self) -> list[str]:
+        """What was found, step by step."""
+        lines = [line for line in self.made.lines() if not line.startswith("next:")]
+        if self.optics is not None:
+            lines += ["light and colours:", *self.optics.lines()]
+        if self.contact is not None and self.experiment is not None:
+            lines += [f"contact, as the experiment {self.experiment.name} makes it:", *self.contact.lines()]
+        done = [kind for kind, part in (("optics", self.optics), ("contact", self.contact)) if part is not None]
+        left = [step for step in self.made.next_steps if not any(f"calibrate {kind}" in step for kind in done)]
+        return lines + [f"next: {step}" for step in left]
+
+
+def whole_sensor(
+    frames: Path,
+    out: Path,
+    *,
+    labels: Path | None = None,
+    optics: bool = False,
+    experiment: ExperimentSpec | None = None,
+    contacts: int = CONTACTS,
+    workers: int = 1,
+    across: int = FINE,
+    layout: PinsSpec | None = None,
+    no_contact: Path | None = None,
+    table: Path | None = None,
+    form: Form | None = None,
+    limit: int = LIMIT,
+    progress: Progress = silent,
+) -> WholeSensor:
+    """Make a specification as ``new_sensor`` does, and go on to what labels and colour frames tell; ``out`` then holds all of it.
+
+    Parameters
+    ----------
+    labels : Path, optional
+        Table of labels of the frames: the contact is fitted to ``contacts`` of them, see ``calibrate_to_file``.
+    optics : bool
+        Also fit light and colours, see ``calibrate_optics``. It needs raw frames.
+    experiment : ExperimentSpec, optional
+        How the labelled contacts were made. By default the one whose labels vary alike.
+    workers : int
+        Processes for the simulated contacts.
+    across : int
+        Elements along each side of the skin's grid.
+
+    Raises
+    ------
+    FrameError, OptionError
+        As ``new_sensor``, ``calibrate_optics`` and ``calibrate_to_file``; or no experiment has labels like the table's.
+    """
+    at = frames_at(frames, labels or table, no_contact)
+    if labels is not None and experiment is None:
+        experiment = experiment_like(open_recording(at, form=form).labels)
+    made = new_sensor(frames, out, layout=layout, no_contact=no_contact, table=labels or table, form=form, limit=limit, progress=progress)
+    sensor = made.sensor
+    light = calibrate_optics(frames, sensor, out, no_contact=no_contact, progress=progress) if optics else None
+    sensor = light.found.spec if light else sensor
+    contact = None
+    if labels is not None and experiment is not None:
+        contact = calibrate_to_file(
+            at, sensor, experiment, out, labels=contacts, workers=workers, across=across, form=form, progress=progress
+        )
+    return WholeSensor(made, experiment, light, contact)
+
+
+def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
+    """The experiment whose labels vary as those of a table do.
+
+    Parameters
+    ----------
+    labels : mapping of str to (M,) array
+        A table's columns by their names.
+
+    Raises
+    ------
+    OptionError
+        The table has no labels of contacts, or no experiment is like it.
+    """
+    varying = {name for name in LABELS if _varies(labels.get(name))}
+    if not varying:
+        raise OptionError(
+            "no label of a contact varies in the table; expected pose_1..6 and move_1..6, or pose_x..pose_Rz and shear_x..shear_Rz"
+        )
+    found: list[tuple[float, str]] = []
+    for name in list_experiments():
+        plan = load_experiment(name)
+        own = {label for label, (low, high) in plan.ranges().items() if high - low > VARIES}
+        found.append((len(own & varying) / len(own | varying), name))
+    share, name = max(found, key=lambda each: (each[0], -len(each[1])))
+    if share < ALIKE:
+        raise OptionError(
+            f"no experiment has contacts whose labels vary like the table's ({', '.join(sorted(varying))}); name one with --experiment "
+            f"('twin experiments' lists them)"
+        )
+    return load_experiment(name)
+
+
+def _varies(cells: np.ndarray | None) -> bool:
+    values = np.zeros(1) if cells is None else numbers(cells)
+    values = values[np.isfinite(values)]
+    return bool(len(values) and np.ptp(values) > VARIES)

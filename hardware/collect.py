@@ -258,6 +258,8 @@ def collect(
     StoreError
         Another run collects into the folder, or the folder can't be written to.
     """
+    if experiment.tap_frame != "work":
+        raise DeviceError(f"{experiment.name}: its tap follows the tool's axes; the arm taps along those of the work frame here")
     if not source.is_live:
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
     rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s, ArmWatch(arm))

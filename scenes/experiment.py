@@ -75,6 +75,9 @@ class ExperimentSpec(Section):
         Indentation of an unturned sensor at ``pose + clear + tap`` if the approach's coordinate of the pose is 0.
     clear, tap : six numbers
         ``clear`` is added to the pose before the tap, ``tap`` is the tap itself; mm and deg.
+    tap_frame : {"work", "tool"}
+        Axes that the tap follows: those of the work frame, or those of the tool, which is turned as the pose says. With "tool" a turned
+        sensor comes down along its own axis, and slides on the object's surface.
     targets : tuple of str
         The labels that a model learns.
     seed : int
@@ -95,6 +98,7 @@ class ExperimentSpec(Section):
     zero_mm: float
     clear: Six = (0.0,) * 6
     tap: Six
+    tap_frame: Literal["work", "tool"] = "work"
     targets: Annotated[tuple[str, ...], Field(min_length=1)]
     seed: Annotated[int, Field(ge=0)] = 0
     wider: str = ""

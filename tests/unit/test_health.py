@@ -36,7 +36,7 @@ def verdicts(shown):
 def test_an_undamaged_sensor_has_no_bad_finding():
     found = verdicts(frames("noise", 0.0))
     assert {f.verdict for f in found.values()} == {Grade.GOOD}, found
-    assert set(found) == {"brightness", "saturation", "focus", "glare", "layout", "pins", "specks", "shift", "turn", "scale"}
+    assert set(found) == {"brightness", "saturation", "focus", "glare", "stray light", "layout", "pins", "specks", "shift", "turn", "scale"}
 
 
 @pytest.mark.parametrize(
@@ -46,6 +46,7 @@ def test_an_undamaged_sensor_has_no_bad_finding():
         ("exposure-high", 0.4, "saturation"),
         ("defocus", 0.15, "focus"),
         ("glare", 0.4, "glare"),
+        ("room-light", 0.5, "stray light"),
         ("caps-missing", 0.1, "pins"),
         ("camera-shifted", 0.1, "shift"),
         ("camera-rolled", 0.08, "turn"),

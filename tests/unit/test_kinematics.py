@@ -6,6 +6,7 @@ import pytest
 from scenes import RigSpec, load_experiment, load_object, load_sensor
 from scenes.body import SkinSpec
 from twin.errors import ContactError
+from twin.objects import build_field
 from twin.objects.analytic import Plane
 from twin.rig.contact import contact_law
 from twin.rig.kinematics import TURNING, arm_path, object_pose, rig_of
@@ -156,3 +157,17 @@ def test_an_arm_that_turns_under_a_force_is_where_a_larger_angle_would_have_sent
     force_n = 2.0 * across + 5.0 * np.array([0.0, 0.0, 1.0]) + 3.0 * aside
     assert np.allclose(turning(sent, force_n), object_pose(rig, plan, further, 20.0), atol=1e-9)
     assert np.allclose(turning(sent, force_n - 2.0 * across), sent)
+
+
+def test_a_tap_of_the_tool_goes_along_the_sensor_s_own_axis_and_ends_where_another_does():
+    plan = load_experiment("surface-3d")
+    rig = PLAIN.model_copy(update={"turn_sign": -1, "image_turn_deg": 20.0, "tcp_to_dome_mm": 5.0})
+    field, pose = build_field(load_object("plane")), np.array([0, 0, 3.0, 8.0, -11.0, 0])
+    own, straight = (
+        arm_path(rig, each, SkinSpec(), field, ArmLabel(pose, np.zeros(6))).path.poses
+        for each in (plan.model_copy(update={"tap_frame": "tool"}), plan)
+    )
+    assert own[-1] == pytest.approx(straight[-1])
+    way, normal = own[1, :3, 3] - own[0, :3, 3], straight[1, :3, 3] - straight[0, :3, 3]
+    assert way / np.linalg.norm(way) == pytest.approx([0, 0, -1], abs=1e-9)
+    assert normal / np.linalg.norm(normal) == pytest.approx(-straight[0, :3, 2], abs=1e-9)

@@ -51,6 +51,8 @@ BRIGHT_PERCENTILE = 99
 """Percentile of the disc's gray levels that is taken as the caps' level if no pin is found."""
 USUAL_CAP_PX = 8.0
 """Assumed diameter of a cap, px, if none can be measured."""
+STRAY_PERCENTILE = 97
+"""Percentile of the skin's levels around the caps that is compared with their median: stray light falls on a part of the skin."""
 GLARE_CAPS = 2
 """Area in caps above which a white patch is glare."""
 
@@ -246,6 +248,8 @@ def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: M
     )
     promised, sharp = float(np.nanmedian(expected.contrast)), float(np.nanmedian(expected.edge_px))
     cap_px2 = np.pi / 4 * (diameter if np.isfinite(diameter) else USUAL_CAP_PX) ** 2
+    stray, where = _stray(caps, [o for _, o in looked if np.isfinite(o.pins_px).any()], contrast)
+    usual = _unevenness(expected) / promised
     glare = float(np.median([_glare(w, mask.disc, cap_px2) for w in windows]))
     dark = (
         f"caps {level:.0f} gray levels, {contrast:.0f} above the skin ({promised:.0f} expected)"
@@ -269,6 +273,13 @@ def _light(frames: list[Frame], seen: list[Observation], expected: Caps, mask: M
             f"{100 * glare:.2f} % of the disc in white patches larger than caps",
             "shade the sensor; move or dim the LED",
         ),
+        _finding(
+            "stray light",
+            stray - usual,
+            (0.2, 0.6),
+            f"skin brighter by {100 * stray:.0f} % of the caps' contrast{where} ({100 * usual:.0f} % expected)",
+            "keep room light off the tip there; look for a leak between skin and housing, or an LED that is bent",
+        ),
     ]
 
 
@@ -282,6 +293,23 @@ def promised_caps(spec: SensorSpec) -> Caps:
 def _white(caps: list[Caps]) -> float:
     """Share of the caps that are saturated."""
     return float(np.mean(np.concatenate([c.level for c in caps]) >= SATURATED_LEVEL)) if caps else 0.0
+
+
+def _unevenness(caps: Caps) -> float:
+    """How much brighter the skin is in its brightest part than in most of it, gray levels."""
+    return float(np.nanpercentile(caps.skin, STRAY_PERCENTILE) - np.nanmedian(caps.skin)) if np.isfinite(caps.skin).any() else 0.0
+
+
+def _stray(caps: list[Caps], seen: list[Observation], contrast: float) -> tuple[float, str]:
+    """Unevenness of the skin relative to the caps' contrast, median over frames, and in words where the skin is brightest."""
+    if not caps or not contrast > 0:
+        return 0.0, ""
+    brightest = int(np.argmax([_unevenness(each) for each in caps]))
+    skin = caps[brightest].skin
+    if not np.isfinite(skin).any():
+        return 0.0, ""
+    x, y = seen[brightest].pins_px[skin >= np.nanpercentile(skin, STRAY_PERCENTILE)].mean(axis=0)
+    return float(np.median([_unevenness(each) for each in caps])) / contrast, f" near ({x:.0f}, {y:.0f}) px"
 
 
 def _glare(window: np.ndarray, disc: np.ndarray, cap_px2: float) -> float:

@@ -76,7 +76,7 @@ def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex
     """``T_sensor_object`` (4, 4) with the arm at a pose (6,), mm and deg; ``apex_mm`` is that of the skin."""
     unturned = _UNTURNED[experiment.approach]
     approach = unturned[:, 2]
-    turn = Rotation.from_euler("xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True).as_matrix()
+    turn = tool_turn(rig, pose)
     centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm]
     surface = (apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * approach
     sensor = turn @ unturned
@@ -86,6 +86,14 @@ def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex
     in_image = np.eye(4)
     in_image[:3, :3] = Rotation.from_euler("z", rig.image_turn_deg, degrees=True).as_matrix()
     return in_image @ T
+
+
+def tool_turn(rig: RigSpec, pose: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) of the tool in the work frame with the arm at a pose (6,), mm and deg."""
+    turn: np.ndarray = Rotation.from_euler(
+        "xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True
+    ).as_matrix()
+    return turn
 
 
 def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: ObjectField, label: ArmLabel) -> ArmPath:
@@ -108,6 +116,8 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: Ob
 
     tap = np.asarray(experiment.tap) * (1 + CLEAR_MM / experiment.tap[experiment.axis])
     tapped = np.asarray(label.pose, float) - label.move
+    if experiment.tap_frame == "tool":
+        tap = np.concatenate([tool_turn(rig, tapped) @ tap[:3], tap[3:]])
     share, touches = _first_touch(field, at(tapped - tap), at(tapped), shape.outside(shape.even(TOUCH_POINTS)))
     still = np.zeros(6)
     labels = [ArmLabel(tapped - (1 - share) * tap, still), ArmLabel(tapped, still)]

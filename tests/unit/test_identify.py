@@ -10,6 +10,7 @@ from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins import tune
+from twin.pins.bumps import find_bumps
 from twin.pins.identify import identify, judge_layout, symmetries
 from twin.types import Form, Frame
 
@@ -128,3 +129,15 @@ def test_given_positions_are_seen_wherever_they_lie():
     shown = judge_layout(pins, frames_of(rest_of(pins, turn_deg=140.0)))
     assert shown is not None and shown.explained > 0.97
     assert len(symmetries(pins)) == 1
+
+
+def test_a_reflection_of_an_led_beside_a_cap_does_not_draw_it_away():
+    y, x = np.mgrid[:200, :240].astype(float)
+    caps = np.array([[60.0 + 24 * i, 52.0 + 24 * j] for i in range(6) for j in range(5)])
+    dark = 4 + 40 * sum(np.exp(-((((x - a) ** 2 + (y - b) ** 2) / (2 * 5.0**2)) ** 3)) for a, b in caps)
+    glint = 255.0 * (((x - 137) ** 2 + (y - 107) ** 2) < 9)  # 6.4 px beside the cap at (132, 100), as bright as reflections are
+    clean, lit = (find_bumps(np.clip(image, 0, 255).astype(np.uint8), 3.7) for image in (dark, np.maximum(dark, glint)))
+    nearest = lambda found: np.linalg.norm(found.px[:, None] - caps, axis=2).min(axis=0)  # noqa: E731
+    assert nearest(clean).max() < 0.3 and nearest(lit).max() < 1.0
+    white = np.where(dark > 24, 255, 0).astype(np.uint8)  # in a thresholded frame every cap is white, and none is a glint
+    assert nearest(find_bumps(white, 3.7)).max() < 0.5

@@ -32,6 +32,15 @@ NEAREST, USUAL, FAR_BELOW = 12, 75, 0.3
 APART = 1.3
 """Spots are at least this far apart, in sds of the narrower Gaussian."""
 
+WHITE_LEVEL = 250
+"""Least gray level of a glint: an LED's reflection is saturated."""
+MOST_GLINTS = 12
+"""With more saturated patches than this the caps themselves are white, and none is a glint."""
+GLINT_SIZE = 1.6
+"""Largest glint: the area of a disc of this many sds of the narrower Gaussian in radius."""
+GLINT_RIM = 0.6
+"""Width of a glint's blurred rim in these sds, which is taken away with it."""
+
 
 @dataclass(frozen=True)
 class Bumps:
@@ -59,7 +68,7 @@ def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
     """Spots of one size, ``sigma_px`` (px of the frame), in a frame (H, W) uint8."""
     low, high = WORKING_SIGMA_PX
     scale = float(np.ceil(low / sigma_px)) if sigma_px < low else min(high / sigma_px, 1.0)
-    level: np.ndarray = gray.astype(np.float32)
+    level: np.ndarray = without_glints(gray, sigma_px).astype(np.float32)
     if scale != 1:
         size = (max(round(gray.shape[1] * scale), 1), max(round(gray.shape[0] * scale), 1))
         level = cv2.resize(level, size, interpolation=cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA)
@@ -80,6 +89,23 @@ def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
     height: np.ndarray = response[rows, columns][round_enough].astype(float)
     kept = _not_far_below(px, height)
     return Bumps(px[kept], height[kept], sigma_px, (gray.shape[1], gray.shape[0]))
+
+
+def without_glints(gray: np.ndarray, sigma_px: float) -> np.ndarray:
+    """A frame (H, W) uint8 in which the few saturated patches of an LED's size are filled with what is around them.
+
+    A reflection in the window stands still while a cap moves beneath it; left there, it is taken for the cap.
+    """
+    white = (gray >= WHITE_LEVEL).astype(np.uint8)
+    if not white.any():
+        return gray
+    _, label, stats, _ = cv2.connectedComponentsWithStats(white)
+    glints = 1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] <= np.pi * (GLINT_SIZE * sigma_px) ** 2)
+    if not 0 < len(glints) <= MOST_GLINTS:
+        return gray
+    rim = 2 * max(round(GLINT_RIM * sigma_px), 1) + 1
+    cover = cv2.dilate(np.isin(label, glints).astype(np.uint8), np.ones((rim, rim), np.uint8))
+    return cv2.inpaint(gray, cover, 3, cv2.INPAINT_TELEA)
 
 
 def _not_far_below(px: np.ndarray, height: np.ndarray) -> np.ndarray:

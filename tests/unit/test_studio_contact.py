@@ -61,7 +61,7 @@ def test_a_straight_way_has_no_bend():
     ("wish", "why"),
     [
         (ObjectPose(depth_mm=20.0), "half the gel's depth"),
-        (ObjectPose(x_mm=20.0, depth_mm=20.0, tilt_y_deg=60.0), "beyond the dome's rim"),
+        (ObjectPose(x_mm=20.0, depth_mm=20.0, tilt_y_deg=60.0), "beyond the rim"),
         (ObjectPose(depth_mm=20.0, tilt_x_deg=60.0), "half the gel's depth"),
     ],
     ids=["too deep", "beyond the rim", "tilted inside"],

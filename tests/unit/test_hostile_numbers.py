@@ -21,8 +21,8 @@ from hardware.following import FollowPlan
 from hardware.safety import load_limits
 from hardware.servo_study import folder_name
 from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
-from scenes.load import SHIPPED
 from scenes.body import MOST_POISSON
+from scenes.load import SHIPPED
 from training.estimator import PoseEstimator
 from training.recipes import TrainingError
 from twin.errors import FrameError, TwinError

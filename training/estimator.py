@@ -46,6 +46,8 @@ class PoseEstimate:
         Why the estimate is not valid; empty if it is.
     ms : float
         Time from the frame to the estimate.
+    contact : str
+        The kind of contact that the frame was taken for; empty if the model does not tell kinds, or if it is none that it knows.
     """
 
     names: tuple[str, ...]
@@ -57,6 +59,7 @@ class PoseEstimate:
     valid: bool
     reason: str
     ms: float
+    contact: str = ""
 
 
 class PoseEstimator:
@@ -183,12 +186,34 @@ class PoseEstimator:
             The frame is not one of the model's sensor: wrong size, type or form.
         """
         started = perf_counter()
-        made = self.part.estimate_frame(self._trained, frame)
+        return self._as_estimate(self.part.estimate_frame(self._trained, frame), started)
+
+    def _as_estimate(self, made: Prediction | Unseen, started: float, contact: str = "") -> PoseEstimate:
         if isinstance(made, Unseen):
             none = np.full(len(self.names), np.nan)
-            return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started))
-        value, half = made.mean[0], made.half_width[0]
-        return PoseEstimate(self.names, self.units, value, value - half, value + half, float(made.executed[0]), True, "", _ms(started))
+            return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact)
+        value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
+        return PoseEstimate(self.names, self.units, value, value - half, value + half, executed, True, "", _ms(started), contact)
+
+    def pins_in(self, frame: Frame) -> PinTable | Unseen:
+        """A table of one frame's pins, or why they can't be used; raises as a call."""
+        return self._of_pins.pins_in(self._trained, frame)
+
+    def estimate_one(self, pins: PinTable, started: float, contact: str) -> PoseEstimate:
+        """Estimate the pose from the pins of one frame.
+
+        Parameters
+        ----------
+        started : float
+            When the frame came, by ``perf_counter``.
+        contact : str
+            The kind of contact that the frame was taken for.
+        """
+        return self._as_estimate(self._of_pins.estimate_one(self._trained, pins), started, contact)
+
+    def unseen(self, reason: str, started: float) -> PoseEstimate:
+        """The estimate of a frame that shows no pose that the model knows."""
+        return self._as_estimate(Unseen(reason), started)
 
     def predict_rows(self, data: Dataset, rows: np.ndarray) -> Prediction:
         """Estimate the labels of some rows (B,) of a data set whose frames are all of one camera.

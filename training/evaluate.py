@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 
+from training.assemble import conformal_quantile
 from training.dataset import Dataset, split_rows
 from training.estimator import PoseEstimator
 from training.identity import rows_named
@@ -105,6 +106,20 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
     return found
 
 
+def intervals_on(run: Path, data: Dataset, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Interval quantiles of a finished run, by their names in ``weights.pt``, with which 90 % of some rows' labels lie inside.
+
+    Give rows that the run did not learn from. ``widen_intervals`` stores them.
+    """
+    estimator = PoseEstimator.load(run)
+    made, targets = estimator.predict_rows(data, rows), data.targets.rows(rows)
+    found = {}
+    for name, key, half_width in (("quantile", estimator.config["labels"], made.half_width), ("raw_quantile", "raw", made.half_width_raw)):
+        ratio = np.abs(label_error(made.mean, getattr(targets, key), targets.units)) / half_width
+        found[name] = getattr(estimator.ensemble, name) * conformal_quantile(ratio)
+    return found
+
+
 @dataclass(frozen=True)
 class Leak:
     """Does a model estimate from the time at which a frame was taken instead of from the contact? Recordings are sorted by time.
@@ -161,7 +176,7 @@ def _bins(error: np.ndarray, targets: Targets) -> dict[str, list[dict]]:
     return found
 
 
-def time_frames(estimator: PoseEstimator, data: Dataset) -> float | None:
+def time_frames(estimator: Callable[[Frame], object], data: Dataset) -> float | None:
     """Median ms from frame to pose, one frame at a time on one thread.
 
     None if the data set has no pictures, or comes from several recordings.

@@ -118,7 +118,8 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
 
 
 def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
-    """All that depends on a recording's frames beside the code depends on: its files and the specification."""
+    """All that a recording's pins, or its pictures as a network sees them, depend on beside the code: its files, and of the specification
+    the layout, the view and how frames are made and read. A rig that is fitted anew changes none of them."""
     root = recording.path if recording.path.is_dir() else recording.path.parent
     states = sorted((str(file.relative_to(root)), *_state(file)) for file in root.rglob("*") if file.is_file())
     return {
@@ -127,7 +128,8 @@ def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
         "files": json.dumps(states),
         "reference": b"" if recording.reference is None else recording.reference.image.tobytes(),
         "form": str(recording.form),
-        "sensor": spec.model_dump(mode="json"),
+        "sensor": [spec.name]
+        + [part.model_dump(mode="json") for part in (spec.geometry, spec.view, spec.pipeline, spec.recording) if part],
     }
 
 

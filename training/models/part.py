@@ -295,10 +295,15 @@ class PinModel(Model):
 
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:
         """See ``Model``."""
+        pins = self.pins_in(trained, frame)
+        return pins if isinstance(pins, Unseen) else self.estimate_one(trained, pins)
+
+    def pins_in(self, trained: Trained, frame: Frame) -> PinTable | Unseen:
+        """A table of one frame's pins; raises as ``estimate_frame``."""
         seen = trained.pipeline(frame)
         if not seen.valid or seen.graph is None:
             return Unseen(seen.reason)
-        pins = PinTable(
+        return PinTable(
             trained.sensor,
             trained.pipeline.form,
             trained.pipeline.reference,
@@ -309,6 +314,9 @@ class PinModel(Model):
             np.ones(1, bool),
             measured=trained.pipeline.reference is not trained.reference,
         )
+
+    def estimate_one(self, trained: Trained, pins: PinTable) -> Prediction:
+        """Estimate the labels of the one frame of a table."""
         return self._estimated(trained, pins, together=False)
 
     def estimate_rows(self, trained: Trained, data: Dataset, rows: np.ndarray) -> Prediction:

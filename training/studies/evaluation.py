@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from training.contact_estimator import ContactEstimator, contacts_folder
 from training.dataset import joined, load_dataset
-from training.estimator import PoseEstimate, PoseEstimator
+from training.estimator import PoseEstimate, PoseEstimator, folder_of
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.identity import changed_since, learnt_before
 from training.recipes import TrainingError
@@ -29,11 +30,11 @@ class Predictions:
 
     Attributes
     ----------
-    estimator : PoseEstimator
+    estimator : PoseEstimator or ContactEstimator
     recording : Recording
     """
 
-    estimator: PoseEstimator = field(repr=False)
+    estimator: PoseEstimator | ContactEstimator = field(repr=False)
     recording: Recording = field(repr=False)
 
     def __iter__(self) -> Iterator[tuple[str, PoseEstimate]]:
@@ -68,6 +69,24 @@ class Predictions:
             raise FrameError(f"{self.recording.path}: none of {len(self.recording)} frames gave a pose ({reasons[0]}); give other frames")
 
 
+def models_of_kinds(run: str | Path, frames: str | Path) -> ContactEstimator | None:
+    """The models of several kinds of contact that a run holds, if the frames at a path are of their form; else None.
+
+    Raises
+    ------
+    TrainingError
+        The models can't be read.
+    FrameError
+        There are no such frames, or they are of another sensor.
+    """
+    folder = contacts_folder(run)
+    if folder is None:
+        return None
+    models = ContactEstimator.load(folder)
+    alone = folder == folder_of(run)  # no other model there that could take frames of another form
+    return models if alone or open_recording(frames, models.sensor).form == models.form else None
+
+
 def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
     """Estimate the poses in the frames at a path by a trained model.
 
@@ -87,7 +106,8 @@ def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
     FrameError
         There are no such frames, or they are of another sensor.
     """
-    estimator = PoseEstimator.load(run)
+    several = models_of_kinds(run, frames)
+    estimator = several or PoseEstimator.load(run)
     recording = open_recording(frames, estimator.sensor, estimator.form)
     if estimator.counts_from_rest:
         if recording.reference is not None:
@@ -104,7 +124,8 @@ def _said(made: PoseEstimate) -> str:
     rows = zip(made.names, made.units, made.value, made.low, made.high, strict=True)
     pose = ", ".join(f"{name} {value:.3f} {unit} [{low:.3f}, {high:.3f}]" for name, unit, value, low, high in rows)
     moved = "" if made.executed != made.executed else f", move executed {made.executed:.2f}"  # NaN: the model does not estimate it
-    return f"{pose}{moved} ({made.ms:.1f} ms)"
+    kind = f"{made.contact}: " if made.contact else ""
+    return f"{kind}{pose}{moved} ({made.ms:.1f} ms)"
 
 
 @dataclass(frozen=True)
@@ -114,7 +135,7 @@ class Evaluation:
     Attributes
     ----------
     metrics : dict
-        Content of ``metrics.json``.
+        Content of ``metrics.json``; with models of several kinds of contact also ``taken_for``, the share of frames taken for each.
     changes : list of dict
         Errors on changed images; empty if they were not asked for.
     units : dict of str to str
@@ -142,6 +163,8 @@ class Evaluation:
                 f"{name}: mean error {corrected['mae']:.4g} {unit} against corrected labels, {raw['mae']:.4g} against raw; "
                 f"{100 * corrected['coverage_90']:.1f} % and {100 * raw['coverage_90']:.1f} % inside the 90 % intervals for them"
             )
+        if taken := self.metrics.get("taken_for"):
+            lines.append("taken for " + ", ".join(f"{kind} {100 * share:.1f} %" for kind, share in taken.items()))
         if self.metrics["leak_slope"] is not None:
             lines.append(f"slope of the angle's error on move_6 where it was not executed: {self.metrics['leak_slope']:+.3f}")
         ms = self.metrics["ms_per_frame"]
@@ -181,14 +204,27 @@ def evaluate_run(
     Raises
     ------
     TrainingError
-        There is no such run, or ``rows`` or ``labels`` has another value.
+        There is no such run, or ``rows`` or ``labels`` has another value. Or the run holds models of several kinds of contact, and the
+        recording varies the labels of none, or ``rows`` is not ``"all"``.
     FrameError
         The recordings are not of the run's sensor, or have no labels.
+
+    Notes
+    -----
+    With models of several kinds of contact (``ContactEstimator``) each frame is judged by the likeliest of those kinds whose labels the
+    recording varies, whatever it is taken for among all kinds; ``taken_for`` of the metrics tells that.
     """
     for value, allowed, option in ((rows, ROWS, "--rows"), (labels, LABELS, "--labels")):
         if value not in allowed:
             raise TrainingError(f"{option} must be {' or '.join(allowed)}, got {value!r}")
-    estimator, parts = PoseEstimator.load(run), []
+    several, parts, kinds = models_of_kinds(run, recordings[0]), [], []
+    if several is None:
+        estimator = PoseEstimator.load(run)
+    elif rows == "validation":
+        raise TrainingError(f"{run}: models of several kinds of contact; which rows they kept out is not known; give --rows all")
+    else:
+        kinds = several.for_labels(open_recording(recordings[0], several.sensor, several.form))
+        estimator = several.parts[kinds[0]]
     for folder in recordings:
         with stage(progress, f"frames of {folder.name}") as step:
             parts.append(load_dataset(folder, estimator.recorded_sensor, estimator.names, form=estimator.form, progress=step))
@@ -198,8 +234,11 @@ def evaluate_run(
         found.problems.extend(changed_since(estimator.config, found, estimator.part))
     else:
         found.problems.extend(learnt_before(estimator.learnt_from, found))
-    made = estimator.predict_rows(found, chosen)
-    metrics = {"model": estimator.model, "rows": rows, **judge(made, found, chosen), "ms_per_frame": time_frames(estimator, found)}
+    made = several.predict_rows(found, chosen, kinds) if several else estimator.predict_rows(found, chosen)
+    metrics = {"model": estimator.model, "rows": rows, **judge(made, found, chosen)}
+    metrics["ms_per_frame"] = time_frames(several or estimator, found)
+    if several is not None:
+        metrics["taken_for"] = several.taken_for(found.pins.rows(chosen))
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []
     if robustness:
         with stage(progress, "changed frames") as step:

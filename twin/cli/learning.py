@@ -249,6 +249,9 @@ HELP_EVALUATE = """Judge a trained model on a labelled recording.
                    its training, by the frames' names
 --rows all         every row, for a recording that the model has not seen
 
+Weights for several kinds of contact, such as those of ur5-331 for its binary pictures, are judged with --rows all by the labels that the
+recording varies. The share of frames that they take for each kind is told.
+
 \b
 Writes:
   predictions.csv  image_name; <label>_true, _pred, _lo90, _hi90 of every

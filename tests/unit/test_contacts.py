@@ -1,0 +1,146 @@
+"""Kinds of contact: told apart, known again from a file, and none of them where a frame shows something else."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from drawn_frames import drawn_frame
+from drawn_recording import config_of
+
+from training.contact_estimator import contacts_folder, put_together
+from training.contacts import CONTACTS, fit_contacts, read_contacts, write_contacts
+from training.dataset import joined
+from training.estimator import PoseEstimator
+from training.evaluate import intervals_on, judge
+from training.recipes import TrainingError
+from training.run import train_run
+from training.studies.sim_to_real.steps import widen_intervals
+from training.targets import Targets
+from twin.camera.capture import record
+from twin.frames.forms import recording_to_raw
+from twin.types import Form, Frame
+
+FRAMES = 700
+
+
+def drawn_kind(data, kind, count, seed):
+    """Frames pressed by a bump or by a ridge, of changing size, place and direction."""
+    rng = np.random.default_rng(seed)
+    rest = data.pins.reference.pins_px
+    place = (rest - rest.mean(axis=0)) / np.abs(rest - rest.mean(axis=0)).max()
+    size, x, y = rng.uniform(2, 6, count), *rng.uniform(-0.3, 0.3, (2, count))
+    away = place - np.stack([x, y if kind == "bump" else 0 * y], axis=-1)[:, None]
+    pressed = np.exp(-4 * (away**2).sum(axis=2) if kind == "bump" else -4 * away[..., 0] ** 2)
+    moved = size[:, None, None] * pressed[..., None] * (away if kind == "bump" else np.stack([away[..., 0], 0 * away[..., 0]], axis=-1))
+    nodes = rest + moved + rng.normal(0, 0.15, moved.shape)
+    names = np.array([f"{kind}_{k}.png" for k in range(count)])
+    area = np.tile(data.pins.reference.area_px2, (count, 1))
+    none = np.zeros(nodes.shape[:2], bool)
+    pins = data.pins.with_columns({"image_name": names, "nodes_px": nodes, "area_px2": area, "lost": none, "valid": ~none[:, 0]})
+    labels, unknown = np.column_stack([size, x]), np.full(count, np.nan)
+    return replace(data, pins=pins, targets=Targets(("pose_2", "pose_6"), labels, labels, unknown, np.zeros((count, 2))))
+
+
+@pytest.fixture(scope="module")
+def contacts(data):
+    return fit_contacts({"ridge": [drawn_kind(data, "ridge", FRAMES, 0)], "bump": [drawn_kind(data, "bump", FRAMES, 1)]}, seed=0)
+
+
+@pytest.mark.parametrize("kind", ["bump", "ridge"])
+def test_frames_are_taken_for_what_they_show(data, contacts, kind):
+    told = contacts.tell(drawn_kind(data, kind, 200, 7).pins)
+    assert (told == kind).mean() > 0.95
+
+
+def test_what_no_kind_shows_is_none_of_them(data, contacts):
+    seen = drawn_kind(data, "bump", 50, 8)
+    rest = seen.pins.reference.pins_px
+    rng = np.random.default_rng(0)
+    for nodes in (
+        rest - 1.5 * (seen.pins.nodes_px - rest),  # pulled instead of pressed
+        seen.pins.nodes_px + rng.normal(0, 1.0, seen.pins.nodes_px.shape),  # pins that do not move together
+    ):
+        assert (contacts.tell(replace(seen.pins, nodes_px=nodes)) == "").mean() > 0.95
+
+
+def test_kinds_are_the_same_when_read_again(data, contacts, tmp_path):
+    write_contacts(tmp_path / CONTACTS, contacts)
+    again, pins = read_contacts(tmp_path / CONTACTS), drawn_kind(data, "ridge", 100, 9).pins
+    assert list(again.kinds) == ["bump", "ridge"]
+    assert (again.tell(pins) == contacts.tell(pins)).mean() > 0.97  # half precision
+    (tmp_path / "cut").write_bytes((tmp_path / CONTACTS).read_bytes()[:200])
+    with pytest.raises(TrainingError, match="no file of kinds of contact"):
+        read_contacts(tmp_path / "cut")
+
+
+def test_too_little_to_learn_kinds_from_is_refused(data):
+    few = drawn_kind(data, "bump", 60, 0)
+    with pytest.raises(TrainingError, match="60 frames are too few to know a kind"):
+        fit_contacts({"bump": [few], "ridge": [drawn_kind(data, "ridge", FRAMES, 0)]}, seed=0)
+    with pytest.raises(TrainingError, match="at least two"):
+        fit_contacts({"bump": [few]}, seed=0)
+
+
+def runs_of(folder, kinds):
+    for name, kind in kinds.items():
+        train_run(config_of("vgnn", epochs=3, batch=128, members=1, kernel=False), kind, folder / name)
+    return {name: folder / name for name in kinds}
+
+
+@pytest.fixture(scope="module")
+def models(data, tmp_path_factory):
+    kinds = {name: drawn_kind(data, name, FRAMES, k) for k, name in enumerate(("bump", "ridge"))}
+    folder = tmp_path_factory.mktemp("kinds")
+    made = put_together(runs_of(folder / "runs", kinds), {name: [kind] for name, kind in kinds.items()}, folder / "models")
+    assert contacts_folder(folder / "models") == folder / "models" and contacts_folder(folder / "runs" / "bump") is None
+    return made
+
+
+def test_several_models_are_one_that_says_the_kind(data, models):
+    shown = drawn_kind(data, "ridge", 30, 20)
+    shares = models.taken_for(shown.pins)
+    assert shares["ridge"] > 0.9 and sum(shares.values()) == pytest.approx(1.0)
+    spec, rest = data.pins.sensor, data.pins.reference.pins_px
+    made = models(drawn_frame(spec, Form.RECORDING, shown.pins.nodes_px[0]))
+    assert made.valid and made.contact == "ridge" and np.isfinite(made.value).all()
+    still = models(drawn_frame(spec, Form.RECORDING, rest - 2.0 * (shown.pins.nodes_px[1] - rest)))
+    assert not still.valid and still.contact == "" and "no contact that the weights know (bump, ridge)" in still.reason
+
+
+def test_a_raw_frame_is_recorded_before_its_kind_is_told(data, models):
+    spec = data.pins.sensor
+    raw_px = recording_to_raw(spec.recording, drawn_kind(data, "bump", 1, 21).pins.nodes_px[0])
+    raw = drawn_frame(spec, Form.RAW, raw_px)
+    recorded = Frame(record(raw.image, spec.recording), Form.RECORDING)
+    np.testing.assert_array_equal(models(raw).value, models(recorded).value)
+    assert models(raw).contact == "bump"
+
+
+def table_of(columns):
+    return SimpleNamespace(path="recording", labels={name: np.array(cells, float) for name, cells in columns.items()})
+
+
+def test_a_recording_is_judged_by_the_kinds_whose_labels_it_varies(data, models):
+    both = table_of({"pose_2": [0, 1], "pose_6": [3, 4], "pose_5": [1, 1]})
+    assert models.for_labels(both) == ["bump", "ridge"]
+    with pytest.raises(TrainingError, match="varies the labels of no kind"):
+        models.for_labels(table_of({"pose_2": [0, 1], "pose_6": [3, 3]}))
+    shown = joined([drawn_kind(replace(data, folders=(Path(name),)), name, 40, 30) for name in ("bump", "ridge")])
+    rows = np.arange(0, 80, 2)
+    made, told = models.predict_rows(shown, rows, ["bump", "ridge"]), models.contacts.likeliest(shown.pins.rows(rows), ["bump", "ridge"])
+    for name in ("bump", "ridge"):
+        own = models.parts[name].predict_rows(shown, rows[told == name])
+        np.testing.assert_array_equal(made.mean[told == name], own.mean)
+    assert set(told) == {"bump", "ridge"} and np.isfinite(made.half_width).all()
+
+
+def test_intervals_hold_nine_of_ten_of_the_rows_they_are_set_by(data, trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "run")
+    rows = np.arange(len(data))
+    widen_intervals(tmp_path / "run", intervals_on(tmp_path / "run", data, rows))
+    found = judge(PoseEstimator.load(tmp_path / "run").predict_rows(data, rows), data, rows)
+    for name in data.targets.names:
+        assert found["corrected"][name]["coverage_90"] == pytest.approx(0.9, abs=0.02), name

@@ -1,0 +1,182 @@
+"""One estimator for several kinds of contact of a sensor: it says which one a frame shows, and the pose by the model of that kind.
+
+Its folder holds a run, or the small copy of one, for each kind, and what tells the kinds apart (``training.contacts``). Weights that go
+with the package may have such a folder inside: ``contacts``.
+"""
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from scenes.sensor import SensorSpec
+from training.contacts import CONTACTS, Contacts, fit_contacts, read_contacts, write_contacts
+from training.dataset import Dataset
+from training.estimator import PoseEstimate, PoseEstimator, folder_of
+from training.models.part import Prediction, Unseen
+from training.packed import pack
+from training.pins import PinTable
+from training.recipes import TrainingError
+from training.run_files import CONFIG
+from twin.camera.capture import record
+from twin.frames import Recording
+from twin.frames.tables import numbers
+from twin.store import writes
+from twin.types import Form, Frame
+
+# Folder of the models of several kinds of contact inside that of a sensor's weights.
+INSIDE = "contacts"
+
+
+class ContactEstimator:
+    """Estimates kind and pose of the contact in frames of one sensor. A raw frame is first made the picture that its recorder would store.
+
+    Parameters
+    ----------
+    parts : dict of str to PoseEstimator
+        A model of each kind; all are of one sensor and form.
+    contacts : Contacts
+
+    Raises
+    ------
+    TrainingError
+        The models are of different kinds, sensors or forms.
+    """
+
+    def __init__(self, parts: Mapping[str, PoseEstimator], contacts: Contacts) -> None:
+        if set(parts) != set(contacts.kinds):
+            raise TrainingError(f"models of {', '.join(sorted(parts))}, but the kinds of contact are {', '.join(sorted(contacts.kinds))}")
+        self.parts, self.contacts = dict(parts), contacts
+        first = self._any
+        for part in self.parts.values():
+            part.check(first.sensor, first.form)
+        self.sensor, self.form = first.sensor, first.form
+
+    @property
+    def _any(self) -> PoseEstimator:
+        return next(iter(self.parts.values()))
+
+    @classmethod
+    def load(cls, folder: Path) -> "ContactEstimator":
+        """Load a folder that ``put_together`` wrote.
+
+        Raises
+        ------
+        TrainingError
+            A model, or what tells the kinds apart, can't be read.
+        """
+        parts = {path.parent.name: PoseEstimator.load(path.parent) for path in sorted(folder.glob(f"*/{CONFIG}"))}
+        if not parts:
+            raise TrainingError(f"{folder}: holds no models of kinds of contact; copy the folder anew")
+        return cls(parts, read_contacts(folder / CONTACTS))
+
+    @property
+    def counts_from_rest(self) -> bool:
+        """Whether all models can use a frame without contact of the sensor in use."""
+        return all(part.counts_from_rest for part in self.parts.values())
+
+    @property
+    def recorded_sensor(self) -> SensorSpec:
+        """As of ``PoseEstimator``."""
+        return self._any.recorded_sensor
+
+    def at_rest(self, frame: Frame) -> "ContactEstimator":
+        """The models for the sensor that took ``frame`` without contact; raises as ``PoseEstimator.at_rest``."""
+        return self._with({name: part.at_rest(frame) for name, part in self.parts.items()})
+
+    def at_known_rest(self) -> "ContactEstimator":
+        """As of ``PoseEstimator``."""
+        return self._with({name: part.at_known_rest() for name, part in self.parts.items()})
+
+    def _with(self, parts: dict[str, PoseEstimator]) -> "ContactEstimator":
+        found = copy(self)
+        found.parts = parts
+        return found
+
+    def __call__(self, frame: Frame) -> PoseEstimate:
+        """Estimate kind and pose of the contact in one frame.
+
+        It is not valid, and states the reason, if too few pins are found, or if the frame shows none of the known kinds.
+
+        Raises
+        ------
+        FrameError
+            The frame is not one of the sensor.
+        """
+        started = perf_counter()
+        if frame.form == Form.RAW and self.form == Form.RECORDING and self.sensor.recording is not None:
+            frame = replace(frame, image=record(frame.image, self.sensor.recording), form=Form.RECORDING)
+        pins = self._any.pins_in(frame)
+        if isinstance(pins, Unseen):
+            return self._any.unseen(pins.reason, started)
+        kind = str(self.contacts.tell(pins)[0])
+        if not kind:
+            return self._any.unseen(f"no contact that the weights know ({', '.join(self.parts)})", started)
+        return self.parts[kind].estimate_one(pins, started, kind)
+
+    def taken_for(self, pins: PinTable) -> dict[str, float]:
+        """Share of a table's valid frames that are taken for each kind, and for "none"."""
+        told = self.contacts.tell(pins)
+        return {name or "none": float(np.mean(told == name)) for name in (*self.parts, "")}
+
+    def for_labels(self, recording: Recording) -> list[str]:
+        """The kinds whose labels a recording varies: those with most labels, all of which have more than one value there.
+
+        Raises
+        ------
+        TrainingError
+            There is none.
+        """
+        known = {name: numbers(cells) for name, cells in recording.labels.items()}
+        varied = {name for name, values in known.items() if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)}
+        fitting = {name: len(part.names) for name, part in self.parts.items() if set(part.names) <= varied}
+        if not fitting:
+            needed = "; ".join(f"{name}: {', '.join(part.names)}" for name, part in self.parts.items())
+            raise TrainingError(f"{recording.path}: varies the labels of no kind of contact that the weights know ({needed}); give another")
+        first = max(fitting, key=lambda name: fitting[name])
+        return [name for name in fitting if self.parts[name].names == self.parts[first].names]
+
+    def predict_rows(self, data: Dataset, rows: np.ndarray, kinds: Sequence[str]) -> Prediction:
+        """Estimate the labels of some rows (B,) of a data set, each by the likeliest of some kinds that have the same labels."""
+        told = self.contacts.likeliest(data.pins.rows(rows), kinds)
+        shape = (len(rows), len(self.parts[kinds[0]].names))
+        made = Prediction(*(np.full(shape, np.nan) for _ in range(3)), np.full(len(rows), np.nan))
+        for name in kinds:
+            here = np.flatnonzero(told == name)
+            if len(here):
+                part = self.parts[name].predict_rows(data, rows[here])
+                for key in ("mean", "half_width", "half_width_raw", "executed"):
+                    getattr(made, key)[here] = getattr(part, key)
+        return made
+
+
+def contacts_folder(run: str | Path) -> Path | None:
+    """The folder of models of several kinds that a run's folder, or a sensor's name, stands for; None if it has none."""
+    folder = folder_of(run)
+    return next((place for place in (folder, folder / INSIDE) if (place / CONTACTS).is_file()), None)
+
+
+@writes(CONTACTS)
+def put_together(runs: Mapping[str, Path], frames: Mapping[str, Sequence[Dataset]], out: Path, *, seed: int = 0) -> ContactEstimator:
+    """Make one estimator of a finished run for each kind of contact, and write it to a folder as small copies.
+
+    Parameters
+    ----------
+    runs : dict of str to Path
+        A run of each kind that has a small copy (``training.packed.pack``).
+    frames : dict of str to sequence of Dataset
+        Frames of each kind, from which is learnt to tell the kinds apart. Give those that the runs learnt from.
+
+    Raises
+    ------
+    TrainingError
+        A run has no small copy, or there are too few frames or kinds.
+    """
+    contacts = fit_contacts(frames, seed=seed)
+    for name, run in runs.items():
+        pack(run, out / name)
+    write_contacts(out / CONTACTS, contacts)
+    return ContactEstimator.load(out)

@@ -367,7 +367,12 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--servo": "nowhere",
         "--at-rest": "nowhere.png",
     },
-    f"collect --camera twin --arm simulated {S} --out {{out}}": {"--count": "0 -1 2000000000", "--seed": "-1", "--object": "nowhere"},
+    f"collect --camera twin --arm simulated {S} --out {{out}}": {
+        "--count": "0 -1 2000000000",
+        "--seed": "-1",
+        "--object": "nowhere",
+        "--design": "best",
+    },
     "convert {session} --out {out}": {
         "--to": "cooked",
         "--to mcap --sensor": "nowhere",

@@ -233,3 +233,27 @@ def test_a_frame_at_rest_that_is_refused_is_kept_to_go_on_with(rig, tmp_path):
     again = SimulatedArm(axes=6, time_scale=FAST)
     with again, PoseCamera(again) as camera:
         assert collect(camera, again, experiment, placed, collection, 1, **options) == 1
+
+
+@pytest.mark.parametrize("count", [10, 20, 40])
+def test_even_contacts_fill_the_ranges_whatever_their_number(count):
+    """In each coordinate the places of n even contacts are nearer to (k + 1/2) / n than those of random ones: a fifth of the distance."""
+    experiment = load_experiment("surface-3d")
+    low, high = np.array(list(experiment.ranges().values())).T
+    varied = high > low
+
+    def unevenness(design, seed):
+        contacts = [draw_contact(experiment, seed, k, design) for k in range(count)]
+        drawn = np.stack([np.concatenate([contact.pose, contact.move]) for contact in contacts])
+        assert (drawn >= low).all() and (drawn <= high).all()
+        shares = np.sort((drawn - low)[:, varied] / (high - low)[varied], axis=0)
+        return np.abs(shares - (np.arange(count)[:, None] + 0.5) / count).mean()
+
+    even, random = (np.mean([unevenness(design, seed) for seed in range(6)]) for design in ("even", "random"))
+    assert even < 0.4 * random
+
+
+def test_an_even_contact_depends_on_its_number_and_the_seed_alone():
+    experiment = load_experiment("surface-3d")
+    one, again, other = (draw_contact(experiment, seed, 7, "even").pose for seed in (1, 1, 2))
+    assert np.array_equal(one, again) and not np.array_equal(one, other)

@@ -95,7 +95,8 @@ def tell_view(url: str) -> None:
 
 HELP_COLLECT = """Collect labelled frames with a camera and an arm.
 
-Each contact has a random pose and shear, a tap, and one frame. This frame was exposed after the arm reported that it stands at the
+Each contact has a random pose and shear, a tap, and one frame. With --design even the first contacts fill the experiment's ranges evenly,
+however many are made: choose it where each label costs time. This frame was exposed after the arm reported that it stands at the
 commanded pose. The label is the reported pose.
 
 The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
@@ -130,6 +131,7 @@ def collect_command(
     form: FormOrAuto = None,
     limits: Limits = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of the drawn contacts; the experiment's own if not given")] = None,
+    design: Annotated[str, typer.Option("--design", help="random, or even: the first contacts fill the ranges evenly")] = "random",
     plain_light: PlainLight = False,
     also: Also = None,
     force: Force = False,
@@ -150,6 +152,7 @@ def collect_command(
         arm=arm,
         count=count,
         seed=seed,
+        design=design,
         form=form,
         limits=limits,
         plain_light=plain_light,

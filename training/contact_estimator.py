@@ -1,12 +1,14 @@
 """One estimator for several kinds of contact of a sensor: it says which one a frame shows, and the pose by the model of that kind.
 
-Its folder holds a run, or the small copy of one, for each kind, and what tells the kinds apart (``training.contacts``). Weights that go
-with the package may have such a folder inside: ``contacts``.
+Its folder holds the small copies of runs, what tells the kinds apart (``training.contacts``), and ``contacts.json``: the run of each kind,
+with the intervals that hold for this kind. Several kinds may have one run, which learnt from both. Weights that go with the package may
+have such a folder inside: ``contacts``.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 
@@ -20,15 +22,20 @@ from training.models.part import Prediction, Unseen
 from training.packed import pack
 from training.pins import PinTable
 from training.recipes import TrainingError
-from training.run_files import CONFIG
+from training.run_files import damaged
 from twin.camera.capture import record
 from twin.frames import Recording
 from twin.frames.tables import numbers
-from twin.store import writes
+from twin.store import write_json, writes
 from twin.types import Form, Frame
 
 # Folder of the models of several kinds of contact inside that of a sensor's weights.
 INSIDE = "contacts"
+# File that tells the model and the intervals of each kind.
+KINDS = "contacts.json"
+# Names of intervals in that file.
+INTERVALS = ("quantile", "raw_quantile")
+AGAIN = "copy the model's folder anew"
 
 
 class ContactEstimator:
@@ -68,9 +75,16 @@ class ContactEstimator:
         TrainingError
             A model, or what tells the kinds apart, can't be read.
         """
-        parts = {path.parent.name: PoseEstimator.load(path.parent) for path in sorted(folder.glob(f"*/{CONFIG}"))}
-        if not parts:
-            raise TrainingError(f"{folder}: holds no models of kinds of contact; copy the folder anew")
+        path = folder / KINDS
+        try:
+            kinds = {name: (str(kind.pop("model")), kind) for name, kind in json.loads(path.read_text(encoding="utf-8")).items()}
+            unlike = [key for _, intervals in kinds.values() for key in intervals if key not in INTERVALS]
+        except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+            raise damaged(path, "it does not say which model is of which kind", AGAIN) from error
+        if unlike:
+            raise damaged(path, f"no intervals are called {unlike[0]}", AGAIN)
+        models = {model: PoseEstimator.load(folder / model) for model, _ in kinds.values()}
+        parts = {name: models[model].with_intervals(intervals) for name, (model, intervals) in kinds.items()}
         return cls(parts, read_contacts(folder / CONTACTS))
 
     @property
@@ -142,8 +156,8 @@ class ContactEstimator:
     def predict_rows(self, data: Dataset, rows: np.ndarray, kinds: Sequence[str]) -> Prediction:
         """Estimate the labels of some rows (B,) of a data set, each by the likeliest of some kinds that have the same labels."""
         told = self.contacts.likeliest(data.pins.rows(rows), kinds)
-        shape = (len(rows), len(self.parts[kinds[0]].names))
-        made = Prediction(*(np.full(shape, np.nan) for _ in range(3)), np.full(len(rows), np.nan))
+        none = np.full((len(rows), len(self.parts[kinds[0]].names)), np.nan)
+        made = Prediction(none.copy(), none.copy(), none.copy(), none[:, 0].copy())
         for name in kinds:
             here = np.flatnonzero(told == name)
             if len(here):
@@ -159,24 +173,47 @@ def contacts_folder(run: str | Path) -> Path | None:
     return next((place for place in (folder, folder / INSIDE) if (place / CONTACTS).is_file()), None)
 
 
-@writes(CONTACTS)
-def put_together(runs: Mapping[str, Path], frames: Mapping[str, Sequence[Dataset]], out: Path, *, seed: int = 0) -> ContactEstimator:
-    """Make one estimator of a finished run for each kind of contact, and write it to a folder as small copies.
+@dataclass(frozen=True)
+class KindOfContact:
+    """A kind of contact, as ``put_together`` takes it.
+
+    Attributes
+    ----------
+    model : str
+        Name of the run that estimates it.
+    frames : sequence of Dataset
+        Frames of this kind, from which is learnt to tell the kinds apart. Give those that the run learnt from.
+    intervals : dict of str to array
+        The run's interval quantiles for this kind, from frames that it did not learn from (``training.evaluate.intervals_on``); empty:
+        the run's own.
+    """
+
+    model: str
+    frames: Sequence[Dataset]
+    intervals: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@writes(CONTACTS, KINDS)
+def put_together(runs: Mapping[str, Path], kinds: Mapping[str, KindOfContact], out: Path, *, seed: int = 0) -> ContactEstimator:
+    """Make one estimator of several kinds of contact, and write it to a folder.
 
     Parameters
     ----------
     runs : dict of str to Path
-        A run of each kind that has a small copy (``training.packed.pack``).
-    frames : dict of str to sequence of Dataset
-        Frames of each kind, from which is learnt to tell the kinds apart. Give those that the runs learnt from.
+        Finished runs by name; each must have a small copy (``training.packed.pack``).
+    kinds : dict of str to KindOfContact
 
     Raises
     ------
     TrainingError
         A run has no small copy, or there are too few frames or kinds.
     """
-    contacts = fit_contacts(frames, seed=seed)
+    contacts = fit_contacts({name: kind.frames for name, kind in kinds.items()}, seed=seed)
     for name, run in runs.items():
         pack(run, out / name)
     write_contacts(out / CONTACTS, contacts)
+    said: dict[str, dict[str, object]] = {}
+    for name, kind in kinds.items():
+        said[name] = {"model": kind.model} | {key: np.asarray(value).tolist() for key, value in kind.intervals.items()}
+    write_json(out / KINDS, said)
     return ContactEstimator.load(out)

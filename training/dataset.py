@@ -125,7 +125,7 @@ def load_dataset(
     simulated = is_simulated(Path(folder))
     depth_per_move = plate_slope(spec.rig) if simulated else label_slope(spec.rig)
     if is_pins_only(Path(folder)):
-        recording, truth = open_simulated(Path(folder), spec)
+        recording, truth = open_simulated(Path(folder), spec, form)
         pins = simulated_table(recording, spec, truth, progress=progress)
     else:
         recording = open_recording(folder, spec, form)

@@ -1,7 +1,7 @@
 """A trained model with its sensor and its pipeline: a frame goes in, a pose comes out. This is what a live loop calls."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -157,6 +157,15 @@ class PoseEstimator:
     def at_known_rest(self) -> "PoseEstimator":
         """The same model for frames of the unit that its weights are for, where there is no frame without contact."""
         return self._counted_from(nominal_reference(self.recorded_sensor, self.form)) if self._known_rest_px is not None else self
+
+    def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
+        """The same model with other interval quantiles, as ``training.evaluate.intervals_on`` finds them for one kind of its frames."""
+        found = copy(self)
+        found.ensemble = copy(self.ensemble)
+        for name, values in intervals.items():
+            setattr(found.ensemble, name, np.asarray(values, float))
+        found._trained = replace(self._trained, ensemble=found.ensemble)
+        return found
 
     def _counted_from(self, reference: Reference) -> "PoseEstimator":
         found = copy(self)

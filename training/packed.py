@@ -29,6 +29,9 @@ LARGE = 1000  # numbers; a larger array is kept in half precision
 NETWORKS = "networks"  # the networks' weights, in ``weights.pt``
 BESIDE = "beside"  # the arrays of the Gaussian process beside the networks, in ``weights.pt``
 SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; the shipped copies were made before there was one
+RECORDINGS = (
+    "recordings"  # names of the folders that the run learnt from, in the small copy's configuration; ``rows`` tells how many frames
+)
 NOT_PACKED = ("kernels", "kernel_labels", "parameters", "learnt_from")  # entries of ``weights.pt`` that a small copy leaves out
 
 
@@ -63,6 +66,7 @@ def pack(run: Path, out: Path) -> int:
     weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})
     write_bytes(out / WEIGHTS, weights)
     about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
+    about |= {RECORDINGS: [Path(folder).name for folder in config.get("data", "").split(", ") if folder]}
     write_text(out / CONFIG, json.dumps(about) + "\n")
     return (out / WEIGHTS).stat().st_size
 

@@ -15,12 +15,13 @@ from training.generation.store import CONFIG, DRAWS, read_record
 from twin.errors import DatasetError, FrameError
 from twin.frames import Recording
 from twin.frames.folders import image_folders
-from twin.frames.forms import frame_size
+from twin.frames.forms import frame_size, from_raw, recording_to_raw
 from twin.frames.tables import LARGEST_BYTES, order_by_table, read_table
 from twin.frames.truth import AGAIN, TRUTH, arrays_of, open_truth, row_of
 from twin.rig.kinematics import object_pose, rig_of
 from twin.rig.mounting import Mounting
 from twin.rig.touch import Surface, surface_labels
+from twin.types import Form
 
 TABLE = "targets.csv"
 
@@ -35,15 +36,20 @@ def is_pins_only(folder: Path) -> bool:
     return is_simulated(folder) and not image_folders(folder, None)
 
 
-def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str, np.ndarray]]:
+def open_simulated(folder: Path, spec: SensorSpec, form: Form | None = None) -> tuple[Recording, dict[str, np.ndarray]]:
     """Read a data set without pictures: its table, and its arrays ``pins_px`` and ``rest_px`` (M, N, 2) and ``visible`` (M, N).
+
+    Parameters
+    ----------
+    form : Form, optional
+        Form of the frames in whose pixels the pins are to be given; by default that of the data set.
 
     Raises
     ------
     FrameError
         The data set was simulated for another sensor, or its table and its truth have different numbers of rows.
     """
-    truth, sensor, form = open_truth(folder)
+    truth, sensor, given = open_truth(folder)
     if sensor != spec.name:
         raise FrameError(f"{folder}: simulated for '{sensor}', not for '{spec.name}'; give the matching --sensor")
     problems: list[str] = []
@@ -61,6 +67,11 @@ def open_simulated(folder: Path, spec: SensorSpec) -> tuple[Recording, dict[str,
     arrays = {key: array[rows] for key, array in arrays_of(truth, ("pins_px", "rest_px", "visible")).items()}
     if arrays["pins_px"].shape[1] != spec.pins.count:
         raise FrameError(f"{folder}: pins {arrays['pins_px'].shape} in {TRUTH}, '{spec.name}' has {spec.pins.count}; {AGAIN}")
+    form = form or given
+    if form != given:
+        for key in ("pins_px", "rest_px"):
+            raw_px = recording_to_raw(spec.recording, arrays[key]) if given == Form.RECORDING else arrays[key]
+            arrays[key] = from_raw(spec.recording, form, raw_px)
     return Recording(folder, form, names, frame_size(spec, form), labels, problems=problems), arrays
 
 

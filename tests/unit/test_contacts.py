@@ -10,7 +10,7 @@ import pytest
 from drawn_frames import drawn_frame
 from drawn_recording import config_of
 
-from training.contact_estimator import contacts_folder, put_together
+from training.contact_estimator import KindOfContact, contacts_folder, put_together
 from training.contacts import CONTACTS, fit_contacts, read_contacts, write_contacts
 from training.dataset import joined
 from training.estimator import PoseEstimator
@@ -94,7 +94,11 @@ def runs_of(folder, kinds):
 def models(data, tmp_path_factory):
     kinds = {name: drawn_kind(data, name, FRAMES, k) for k, name in enumerate(("bump", "ridge"))}
     folder = tmp_path_factory.mktemp("kinds")
-    made = put_together(runs_of(folder / "runs", kinds), {name: [kind] for name, kind in kinds.items()}, folder / "models")
+    wide = {"quantile": np.full(2, 1e3)}
+    asked = {name: KindOfContact(name, [kind], wide if name == "ridge" else {}) for name, kind in kinds.items()}
+    made = put_together(runs_of(folder / "runs", kinds), asked, folder / "models")
+    own = PoseEstimator.load(folder / "models" / "ridge").ensemble.quantile
+    assert (made.parts["ridge"].ensemble.quantile == 1e3).all() and (own < 1e3).all(), "intervals of the kind, not of the run"
     assert contacts_folder(folder / "models") == folder / "models" and contacts_folder(folder / "runs" / "bump") is None
     return made
 

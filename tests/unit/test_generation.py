@@ -17,6 +17,7 @@ from training.dataset import load_dataset, split_rows
 from training.generation import DatasetError, generate
 from training.generation.config import draw_contact
 from training.run import fold_rows
+from training.simulated import open_simulated
 from training.studies.sim_to_real.steps import arm_labels, with_missing
 from training.targets import corrected
 from twin.camera.projection import project
@@ -375,3 +376,11 @@ def test_a_scheduler_that_does_not_answer_leaves_nothing_behind(tmp_path):
     with pytest.raises(DatasetError, match="--scheduler nowhere: no scheduler answers"):
         generate(tmp_path / "out", small_config(tmp_path), 1, scheduler="nowhere")
     assert not (tmp_path / "out").exists()
+
+
+def test_pins_of_a_data_set_are_given_in_either_form(made):
+    folder, config, _ = made
+    recorded, raw = (open_simulated(folder, config.sensor, form)[1] for form in (Form.RECORDING, Form.RAW))
+    for key in ("pins_px", "rest_px"):
+        np.testing.assert_allclose(raw_to_recording(config.sensor.recording, raw[key]), recorded[key], atol=SAME_PX)
+    assert load_dataset(folder, config.sensor, form=Form.RAW).pins.form == Form.RAW

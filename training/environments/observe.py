@@ -64,13 +64,6 @@ class Eye:
 
     def __init__(self, sensor: SensorSpec, count: int, kind: Kind, *, pictures: Pictures, pin_noise_px: float) -> None:
         self.sensor, self.kind, self.pictures, self._noise_px = sensor, kind, pictures, pin_noise_px
-        self.form = Form.RECORDING if sensor.recording else Form.RAW
-        self.reference = nominal_reference(sensor, self.form)
-        self._spacing = float(self.reference.spacing_px.mean())
-        self._views: list[View] = [View(sensor, caps_px(sensor, self.form, rest_pins(sensor.geometry).caps_mm))] * count
-        self._nominal = self._views[0]
-        self._painter: Callable[[PinState, np.random.Generator], Frame] | None = None
-        self._pipeline: Pipeline | None = None
         self._estimator: PoseEstimator | None = None
         if kind == "pose":
             if sensor.name not in shipped_names():
@@ -79,6 +72,13 @@ class Eye:
                     f"observation 'pose' needs weights that go with the package; {sensor.name} has none (those of {known} have)"
                 )
             self._estimator = PoseEstimator.load(sensor.name)
+        self.form = self._estimator.form if self._estimator else Form.RECORDING if sensor.recording else Form.RAW
+        self.reference = nominal_reference(sensor, self.form)
+        self._spacing = float(self.reference.spacing_px.mean())
+        self._views: list[View] = [View(sensor, caps_px(sensor, self.form, rest_pins(sensor.geometry).caps_mm))] * count
+        self._nominal = self._views[0]
+        self._painter: Callable[[PinState, np.random.Generator], Frame] | None = None
+        self._pipeline: Pipeline | None = None
         if pictures != "none":
             self._painter = _painter(sensor, self.form, pictures)
 

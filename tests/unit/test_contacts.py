@@ -10,16 +10,18 @@ import pytest
 from drawn_frames import drawn_frame
 from drawn_recording import config_of
 
-from training.contact_estimator import KindOfContact, contacts_folder, put_together
+from training.contact_estimator import ContactEstimator, KindOfContact, contacts_folder, put_together
 from training.contacts import CONTACTS, fit_contacts, read_contacts, write_contacts
 from training.dataset import joined
 from training.estimator import PoseEstimator
 from training.evaluate import intervals_on, judge
+from training.label_code import label_error
 from training.recipes import TrainingError
 from training.run import train_run
 from training.studies.sim_to_real.steps import widen_intervals
 from training.targets import Targets
 from twin.camera.capture import record
+from twin.frames import open_recording
 from twin.frames.forms import recording_to_raw
 from twin.types import Form, Frame
 
@@ -148,3 +150,43 @@ def test_intervals_hold_nine_of_ten_of_the_rows_they_are_set_by(data, trained, t
     found = judge(PoseEstimator.load(tmp_path / "run").predict_rows(data, rows), data, rows)
     for name in data.targets.names:
         assert found["corrected"][name]["coverage_90"] == pytest.approx(0.9, abs=0.02), name
+
+
+MOST_BYTES = 5_000_000  # of the shipped weights of one sensor
+# Kind, and mean errors of the kept-out frames as docs/recordings.md states them.
+UR5_SETS = {
+    "surface-3d-tap": ("plate", (0.039, 0.151, 0.106)),
+    "surface-3d-shear": ("plate-sheared", (0.056, 0.156, 0.121)),
+    "edge-2d-tap": ("edge", (0.115, 0.038, 1.57)),
+    "edge-2d-shear": ("edge-sheared", (0.170, 0.053, 2.10)),
+}
+
+
+def test_the_ur5s_weights_are_small_and_know_its_four_kinds_and_what_they_saw():
+    folder = contacts_folder("ur5-331")
+    assert folder is not None and sum(path.stat().st_size for path in folder.parent.rglob("*") if path.is_file()) < MOST_BYTES
+    models = ContactEstimator.load(folder)
+    assert set(models.parts) == {kind for kind, _ in UR5_SETS.values()} and models.form == Form.RECORDING
+    for kind, part in models.parts.items():
+        assert all(kind.split("-")[0] in {"plate", "edge"} and name.startswith("ur5-331-") for name in part.config["recordings"])
+        assert part.config["rows"]["train"] > 0 and part.config["rows"]["kept_out"]
+    black = models(Frame(np.zeros((128, 128), np.uint8), Form.RECORDING))
+    assert not black.valid and black.contact == ""
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", UR5_SETS)
+def test_the_ur5s_weights_tell_kind_and_pose_of_frames_that_they_did_not_see(real_dir, name):
+    models = ContactEstimator.load(contacts_folder("ur5-331"))
+    kind, stated = UR5_SETS[name]
+    recording = open_recording(real_dir / f"ur5-331-{name}", models.sensor)
+    kept = [each.split("/")[1] for each in models.parts[kind].config["rows"]["kept_out"] if each.startswith(f"ur5-331-{name}/")]
+    rows = [recording.names.index(each) for each in sorted(kept)[::20]]
+    made = [models(recording.read(row)) for row in rows]
+    assert np.mean([each.contact == kind for each in made]) > 0.85
+    right = [(each, row) for each, row in zip(made, rows, strict=True) if each.contact == kind]
+    truth = np.array([[recording.labels[label][row] for label in models.parts[kind].names] for _, row in right])
+    error = np.abs(label_error(np.array([each.value for each, _ in right]), truth, models.parts[kind].units))
+    inside = np.array([(each.high - each.value) for each, _ in right]) >= error
+    assert (error.mean(axis=0) < 1.6 * np.array(stated)).all(), error.mean(axis=0)  # the mean of some 48 frames
+    assert ((inside.mean(axis=0) > 0.75) & (inside.mean(axis=0) <= 1)).all(), inside.mean(axis=0)

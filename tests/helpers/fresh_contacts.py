@@ -10,9 +10,13 @@ from training.simulated import config_of
 from twin.rig.kinematics import rig_of
 
 
-def simulate_contacts(folder: Path, sensor: str, experiment: str, count: int, *, seed: int, across: int, states: str = "all") -> Path:
-    """A data set of pins alone, contacts randomised as 'contact'; goes on where it was."""
+def simulate_contacts(
+    folder: Path, sensor: str, experiment: str, count: int, *, seed: int, across: int, states: str = "all", raw: bool = False
+) -> Path:
+    """A data set of pins alone, contacts randomised as 'contact'; goes on where it was. ``raw``: in px of raw frames."""
     spec, plan = load_sensor(sensor), load_experiment(experiment)
+    if raw:
+        spec = spec.model_copy(update={"recording": None, "pipeline": spec.pipeline.model_copy(update={"recording": None})})
     config = GenerationConfig(
         sensor=spec,
         object=load_object(plan.object),

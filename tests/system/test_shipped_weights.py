@@ -14,6 +14,7 @@ from fresh_contacts import read_for, simulate_contacts
 from training.estimator import PoseEstimator
 from training.evaluate import judge
 from training.packed import shipped_names
+from twin.types import Form
 
 SEED = 5  # of contacts that no training drew
 RELATIVE = 0.1  # of an error
@@ -49,7 +50,9 @@ def test_all_shipped_weights_are_judged():
 def test_shipped_weights_predict_within_their_stated_error(name, size, tmp_path):
     contacts, across = size
     estimator = PoseEstimator.load(name)
-    data = read_for(estimator, simulate_contacts(tmp_path, name, EXPERIMENTS[name], contacts, seed=SEED, across=across))
+    raw = estimator.form == Form.RAW
+    folder = simulate_contacts(tmp_path, name, EXPERIMENTS[name], contacts, seed=SEED, across=across, raw=raw)
+    data = read_for(estimator, folder)
     rows = np.arange(len(data))
     found = judge(estimator.predict_rows(data, rows), data, rows)["corrected"]
     error, inside = ([found[label][key] for label in estimator.names] for key in ("mae", "coverage_90"))

@@ -1,19 +1,24 @@
 """Contact states obey the laws of statics, of friction and of symmetry."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from block import Watched, last, rotation, soft_sensor, usual_sensor
+from finer_mesh import shaped
 
 from scenes.load import load_object
 from twin.camera.projection import project
 from twin.geometry.solid import Resolution
-from twin.mechanics import ContactPath, ContactPose, Friction, SkinSolver
-from twin.mechanics.contact import STICK_CREEP_MM, contact_forces, spread_forces
+from twin.mechanics import ContactLaw, ContactPath, ContactPose, Friction, SkinSolver
+from twin.mechanics.balance import in_object
+from twin.mechanics.contact import STICK_CREEP_MM, contact_forces, contact_points, spread_forces
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import plan_path
 from twin.objects import build_field
 
 SOLVER_MM = 1e-4  # what the residual's tolerance leaves open in a position
+BETWEEN_MM = 0.02  # deepest place of the skin inside the object (measured 0.015; on a fillet of 0.1 mm 0.021)
 BALANCE = 1e-6  # relative to the force: rounding
 AREA_SHARE = 0.05  # relative: contact area against a finer mesh (measured 0.0003; edges of other fillets up to 0.058)
 TURNED = 1e-3  # relative: a turned scene; the grid turns with it, and the penalty may be raised at another time
@@ -216,6 +221,20 @@ def test_the_contact_area_grows_with_the_press_and_hardly_depends_on_the_mesh(se
     )
     assert (np.diff(usual) > 0).all()
     assert usual[-1] == pytest.approx(finer[-1], rel=AREA_SHARE)
+
+
+@pytest.mark.parametrize("name, shape", [("edge", {"fillet_mm": 0.5}), ("edge", {"fillet_mm": 0.2}), ("sphere", {"radius_mm": 2.0})])
+def test_between_the_contact_points_the_skin_is_hardly_deeper(sensor, monkeypatch, name, shape):
+    solver, field = SkinSolver(sensor), build_field(shaped(name, **shape))
+    plan = plan_path(sensor.geometry, field, ContactPose(1.5))
+    going = solver.begin(field, ContactLaw(), plan.at(0.0), focus=solver.focus(field, plan))
+    for start, stop in pairwise(np.linspace(0, 1, 5)):
+        for _ in going.advance(plan.at, start, stop, plan.time_s, "pressed"):
+            pass
+    monkeypatch.setattr("twin.mechanics.contact.POINTS_PER_ELEMENT", 16)
+    between = contact_points(going.setting.solid, solver.shape).positions(going.load.control_mm)
+    gap_mm = field.distance(in_object(between, going.load.T, going.load.border))
+    assert -gap_mm.min() < BETWEEN_MM
 
 
 def test_the_rim_of_a_patch_slides_first_and_in_the_end_all_of_it(solver, sheared):

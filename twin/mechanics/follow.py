@@ -13,8 +13,7 @@ from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
 from twin.types import ContactState
 
-STEP_MM = 1.2  # largest motion across the contact in one load step
-FINE_STEP_MM = 0.6  # the same beside wires: a longer step carries skin past a wire's middle, where it then hooks
+STEP_MM = 0.45  # largest motion across the contact in one load step: longer ones often fail, and are then tried again in halves
 LARGEST_MOVE_MM = 30.0  # largest motion between two poses in contact; beyond it the way between them is unknown
 SETTLED_MM = 0.005  # most that the object still has to move where the arm has given way: 0.02 px in the shipped cameras
 _MOST_SETTLING = 8  # load steps until an arm that gives way stands; one or two are usual
@@ -159,6 +158,5 @@ class Follower:
 
 
 def _step_of(touched: ObjectSpec) -> float:
-    if touched.texture is not None:
-        return FINE_STEP_MM * min(1.0, touched.texture.wire_diameter_mm)
-    return FINE_STEP_MM if touched.shape.kind == "mesh" else STEP_MM
+    """Beside wires a longer step would carry skin past a wire's middle, where it then hooks."""
+    return STEP_MM * min(1.0, touched.texture.wire_diameter_mm) if touched.texture is not None else STEP_MM

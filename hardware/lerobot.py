@@ -17,11 +17,13 @@ from hardware.errors import DeviceError, StaleDataError, leave
 from hardware.newest import NewestTarget
 from hardware.safe_arm import SafeArm
 from hardware.safety import load_limits
-from scenes.sensor import SensorSpec
+from scenes import SensorSpec, load_sensor
 from twin.frames.forms import frame_size
 from twin.types import Form, Frame
 
 _POSE = ("x", "y", "z", "rx", "ry", "rz")
+# Age in ms up to which LeRobot's cameras give a picture.
+MAX_AGE_MS = 500.0
 
 
 class LeRobotCamera:
@@ -73,7 +75,7 @@ class LeRobotCamera:
         """The newest image not read yet; ``TimeoutError``."""
         return self._picture(self._source.read(timeout_s=timeout_ms / 1e3))
 
-    def read_latest(self, max_age_ms: float = 500) -> np.ndarray:
+    def read_latest(self, max_age_ms: float = MAX_AGE_MS) -> np.ndarray:
         """The newest image; ``TimeoutError`` if it is older."""
         try:
             return self._picture(self._source.read_latest(max_age_s=max_age_ms / 1e3))
@@ -102,6 +104,11 @@ class LeRobotArmConfig:
         Safety limits, by name or file: actions are clipped to them. None: those of the arm's kind.
     cameras : dict of str to str
         Names, and what ``open_camera`` takes.
+    sensor : str or None
+        Name or file of the sensor behind the cameras. LeRobot asks for the size of the pictures before it connects a camera; the sensor
+        tells it.
+    max_age_ms : float
+        Age up to which a picture may be part of an observation. LeRobot's own limit is the default; slow cameras need more.
     linear_mm_s, angular_deg_s : float
         Speed of the arm. The limits may reduce it.
     id : str or None
@@ -113,6 +120,8 @@ class LeRobotArmConfig:
     arm: str = "simulated"
     limits: str | None = None
     cameras: dict[str, str] = field(default_factory=dict)
+    sensor: str | None = None
+    max_age_ms: float = MAX_AGE_MS
     linear_mm_s: float = 100.0
     angular_deg_s: float = 90.0
     id: str | None = None
@@ -150,10 +159,12 @@ class LeRobotArm:
         linear_mm_s: float = 100.0,
         angular_deg_s: float = 90.0,
     ) -> None:
+        self._max_age_ms = arm.max_age_ms if isinstance(arm, LeRobotArmConfig) else MAX_AGE_MS
         if isinstance(arm, LeRobotArmConfig):
             config, arm = arm, SafeArm(open_arm(arm.arm), load_limits(arm.limits or kind_of(arm.arm)))
             id, linear_mm_s, angular_deg_s = config.id, config.linear_mm_s, config.angular_deg_s
-            cameras = {name: LeRobotCamera(open_camera(text, form=Form.RAW)) for name, text in config.cameras.items()}
+            spec = None if config.sensor is None else load_sensor(config.sensor)
+            cameras = {name: LeRobotCamera(open_camera(text, spec, Form.RAW)) for name, text in config.cameras.items()}
         self.arm, self.id = arm, id
         self.name = self.robot_type = type(arm.arm if isinstance(arm, SafeArm) else arm).__name__.lower()
         self.cameras = dict(cameras or {})
@@ -220,7 +231,8 @@ class LeRobotArm:
         state = self.arm.state()
         pose = dict(zip(_POSE, state.pose.tolist(), strict=True))
         joints = {f"joint_{n}.pos": float(q) for n, q in enumerate(state.joints_deg, start=1)}
-        return {key: pose[key] for key in self._keys} | joints | {name: camera.read_latest() for name, camera in self.cameras.items()}
+        pictures = {name: camera.read_latest(self._max_age_ms) for name, camera in self.cameras.items()}
+        return {key: pose[key] for key in self._keys} | joints | pictures
 
     def send_action(self, action: Mapping[str, Any]) -> dict[str, float]:
         """Send the arm towards a pose and do not wait. A missing key keeps its present value; an observation is an action, too.
@@ -249,5 +261,7 @@ class LeRobotArm:
     def _shape(self, name: str) -> tuple[int, int, int]:
         camera = self.cameras[name]
         if camera.height is None or camera.width is None:
-            raise DeviceError(f"camera '{name}': its size is not known before it is connected; give LeRobotCamera its width and height")
+            raise DeviceError(
+                f"camera '{name}': its size is not known before it is connected; name its sensor, or give its width and height"
+            )
         return camera.height, camera.width, 3

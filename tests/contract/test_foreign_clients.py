@@ -109,11 +109,33 @@ def packages(tmp_path_factory):
     return folder
 
 
-PYDOBOT = """
+COUNTED = """
+import functools
+def counted(client):
+    left = {name for name, value in vars(client).items() if callable(value) and not name.startswith("__")}
+    for name in sorted(left):
+        def wrapped(*given, _name=name, _call=getattr(client, name), **named):
+            left.discard(_name)
+            return _call(*given, **named)
+        static = isinstance(vars(client)[name], staticmethod)
+        setattr(client, name, staticmethod(wrapped) if static else functools.wraps(getattr(client, name))(wrapped))
+    return left
+def refuses(error, call, *given, **named):
+    try:
+        call(*given, **named)
+    except error:
+        return
+    raise AssertionError(f"{call} {given} {named} is not refused")
+"""
+# Every method of the client is called, the errors that it raises included.
+PYDOBOT = f"""{COUNTED}
 import struct, sys, warnings
 import numpy as np
 from pydobot import Dobot
 from pydobot.enums import PTPMode
+import serial
+left = counted(Dobot)
+refuses(serial.SerialException, Dobot, port="/nowhere")
 arm = Dobot(port=sys.argv[1])
 def at(*place):
     assert np.allclose(arm.pose()[:4], place, atol=0.01), (arm.pose(), place)
@@ -137,13 +159,17 @@ at(220, 30, 20, 10)
 arm.move_to(100.0, 0.0, 50.0, 0.0)  # beyond a joint's range: an alarm, and the device goes on answering
 at(220, 30, 20, 10)
 arm.close()
+assert not left, left
 print("done")
 """
-PYDOBOTPLUS = """
+PYDOBOTPLUS = f"""{COUNTED}
 import sys
 import numpy as np
 from pydobotplus import Dobot
 from pydobotplus.dobotplus import MODE_PTP, CustomPosition, DobotException
+left = counted(Dobot)
+refuses(DobotException, Dobot, port="/nowhere")
+refuses(DobotException, Dobot)
 arm = Dobot(port=sys.argv[1])
 def at(*place):
     assert np.allclose(arm.get_pose().position, place, atol=0.01), (arm.get_pose(), place)
@@ -157,6 +183,9 @@ for mode in MODE_PTP:
     assert not arm.get_alarms(), mode
 arm.move_to(220.0, 30.0, 20.0, 10.0)
 arm.move_to(position=CustomPosition(220.0, 30.0, 20.0, 10.0))
+arm.move_to(y=30.0, r=10.0, mode=MODE_PTP.MOVL_XYZ)
+at(220, 30, 20, 10)
+refuses(ValueError, arm.move_to)
 arm.move_rel(x=5, y=-5, z=1, r=2)
 at(225, 25, 21, 12)
 assert len(arm.get_pose().joints.in_radians()) == 4
@@ -169,8 +198,12 @@ for call in (arm.suck, arm.grip):
     arm.wait_for_cmd(call(True)); arm.wait_for_cmd(call(False))
 arm.wait_for_cmd(arm.laze(100, True)); arm.wait_for_cmd(arm.laze(0, False))
 arm.set_io(5, True)
+refuses(DobotException, arm.set_io, 0, True)
+arm.wait_for_cmd(arm._extract_cmd_index(arm._set_cp_cmd(240.0, 25.0, 21.0)))
 arm.set_hht_trig_output(True); assert arm.get_hht_trig_output() in (True, False)
-arm.conveyor_belt(0.5); arm.conveyor_belt(0.0)
+arm.conveyor_belt(0.5); arm.conveyor_belt(0.5, direction=-1); arm.conveyor_belt(0.0)
+refuses(DobotException, arm.conveyor_belt, 0.5, direction=7)
+refuses(Exception, arm.conveyor_belt_distance, 150, 10)
 arm.wait_for_cmd(arm.conveyor_belt_distance(50, 10))
 arm.wait_for_cmd(arm.set_color()); assert arm.get_color() == [False, False, False]
 arm.wait_for_cmd(arm.set_ir()); assert arm.get_ir() is False
@@ -185,7 +218,7 @@ except Exception as full:
     assert taken == 32, (taken, full)
 arm._set_queued_cmd_clear(); arm._set_queued_cmd_start_exec()
 arm._set_ptp_cmd(900.0, 30.0, 20.0, 10.0, MODE_PTP.MOVL_XYZ, False)
-assert {int(alarm) for alarm in arm.get_alarms()} == {17}
+assert {{int(alarm) for alarm in arm.get_alarms()}} == {{17}}
 arm.clear_alarms()
 assert not arm.get_alarms()
 arm._set_queued_cmd_clear()
@@ -193,6 +226,7 @@ arm._set_ptp_cmd(100.0, 0.0, 50.0, 0.0, MODE_PTP.MOVJ_XYZ, False)
 assert 64 <= min(int(alarm) for alarm in arm.get_alarms()) <= 73
 arm.clear_alarms()
 arm.close()
+assert not left, left
 print("done")
 """
 

@@ -1,9 +1,9 @@
-"""A TacTip in MuJoCo: a ball falls onto the sensor, which feels it and carries it.
+"""A TacTip in MuJoCo: a plate is laid onto the sensor and pushed aside; the sensor feels it, carries it and rubs against it.
 
     pip install mujoco tactip-twin
     python in-mujoco.py
 
-At each step the ball's pose goes into the surrogate, and the force of the skin goes back onto the ball. Lengths in MuJoCo are m,
+At each step the plate's pose goes into the surrogate, and the force of the skin goes back onto the plate. Lengths in MuJoCo are m,
 in the twin mm.
 """
 
@@ -20,40 +20,36 @@ WORLD = """
 <mujoco>
   <option timestep="0.002" gravity="0 0 -9.81"/>
   <worldbody>
-    <body name="ball" pos="0 0 0.0415">
-      <freejoint/>
-      <geom type="sphere" size="0.02" mass="0.05" contype="0" conaffinity="0"/>
+    <body name="plate" pos="0 0 0.0205">
+      <joint type="slide" axis="0 0 1" damping="4"/>
+      <joint type="slide" axis="1 0 0" damping="4"/>
+      <geom type="box" size="0.05 0.05 0.005" pos="0 0 0.005" mass="0.1" contype="0" conaffinity="0"/>
     </body>
   </worldbody>
 </mujoco>
 """
 STEPS = 1500
-DAMPING_N_S_PER_M = 0.6  # of the gel, which the quasi-static skin does not have
+PUSH_FROM_S, PUSH_N = 1.0, 0.3  # sideways
 
-sensor, ball = load_sensor("mg400-331"), load_object("ball-40")
+sensor, plane = load_sensor("mg400-331"), load_object("plane")
 skin = SurrogateContacts(surrogate_of(sensor), sensor, 1)
-skin.begin(0, Contact(sensor, ball, ContactLaw.of_object(ball)))
+skin.begin(0, Contact(sensor, plane, ContactLaw.of_object(plane)))
 model = mujoco.MjModel.from_xml_string(WORLD)
 data = mujoco.MjData(model)
-body = model.body("ball").id
+body = model.body("plate").id
 mujoco.mj_forward(model, data)
 
 for step in range(STEPS):
-    # the sensor lies at the origin, its tip up; the object's origin is the ball's pole, which faces the sensor
-    turn, middle = data.xmat[body].reshape(3, 3), 1e3 * data.xpos[body]
-    T = np.eye(4)
-    T[:3, :3] = turn
-    T[:3, 3] = middle - 20.0 * turn[:, 2]
+    T = np.eye(4)  # the sensor lies at the world's origin with its tip up; the plate's frame has its origin on the face that is touched
+    T[:3, :3] = data.xmat[body].reshape(3, 3)
+    T[:3, 3] = 1e3 * data.xpos[body]
     skin.move(np.zeros(1, int), T[None], np.array([data.time]))
     felt = skin.felt
     if felt.lost[0]:
         raise SystemExit(felt.lost[0])
-    force, torque = felt.force_n[0], 1e-3 * felt.torque_nmm[0]
-    arm = 1e-3 * middle
-    pressing = bool(np.linalg.norm(force) > 0)
-    data.xfrc_applied[body, :3] = force - pressing * DAMPING_N_S_PER_M * data.qvel[:3]
-    data.xfrc_applied[body, 3:] = torque - np.cross(arm, force)
+    data.xfrc_applied[body, :3] = felt.force_n[0] + [PUSH_N * (data.time > PUSH_FROM_S), 0.0, 0.0]
     mujoco.mj_step(model, data)
-    if step % 300 == 299:
-        pins = np.linalg.norm(felt.caps_mm[0] - skin.caps_at_rest_mm, axis=1)
-        print(f"{data.time:.2f} s: ball at {middle[2]:.2f} mm, force {force[2]:.2f} N, largest motion of a pin {pins.max():.2f} mm")
+    if step % 250 == 249:
+        moved = np.linalg.norm(felt.caps_mm[0] - skin.caps_at_rest_mm, axis=1).max()
+        place = f"{20.0 - T[2, 3]:.2f} mm deep, {T[0, 3]:+.2f} mm aside"
+        print(f"{data.time:.1f} s: {place}, force {felt.force_n[0].round(2)} N, largest motion of a pin {moved:.2f} mm")

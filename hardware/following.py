@@ -123,8 +123,9 @@ class Followed:
         ]
         if np.isfinite(m.completed):
             out[0] += f", {m.completed:.0%} of the way, contact lost {m.lost_contacts:g} times"
+            told = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
             out[2:2] = [
-                f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
+                f"{told if np.isfinite(m.path_error_mm) else ''}"  # a policy estimates nothing
                 f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
             ]
         else:

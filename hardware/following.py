@@ -12,6 +12,7 @@ import numpy as np
 from hardware.errors import DeviceError
 from hardware.last_axis import LastAxis, turns_back_mm
 from hardware.loop import ServoLoop
+from hardware.policy_law import policy_law
 from hardware.rig import Rig, build_rig, counting_from_first, given_frame, servo_loop, steps_round
 from hardware.step import LoopSettings, StepRecord
 from hardware.timing import Timing
@@ -19,6 +20,7 @@ from hardware.trajectory import Measures, Trajectory, measure, trajectory_figure
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from twin.errors import OptionError, TwinError
 from twin.estimate import Estimate, SensorModel
+from twin.policy import PolicyModel
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
 from twin.records.session import SessionWriter, plain
@@ -121,8 +123,9 @@ class Followed:
         ]
         if np.isfinite(m.completed):
             out[0] += f", {m.completed:.0%} of the way, contact lost {m.lost_contacts:g} times"
+            told = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
             out[2:2] = [
-                f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
+                f"{told if np.isfinite(m.path_error_mm) else ''}"  # a policy estimates nothing
                 f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
             ]
         else:
@@ -162,7 +165,10 @@ def follow(
     with rig, stage(progress, f"following the {plan.stimulus.name}") as step, ExitStack() as stack:
         first = rig.await_frame()
         loop = servo_loop(rig, plan.servo, model, _settings(plan, rig, steps))
-        loop.require_labels(model(first).names)
+        if isinstance(model, PolicyModel):
+            loop.law = policy_law(model.policy, rig.mounting)
+        else:
+            loop.require_labels(model(first).names)
         session = stack.enter_context(SessionWriter(out / SESSION, told)) if plan.record else None
         if session is not None and rest is not None:
             session.keep_rest(rest)

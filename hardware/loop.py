@@ -104,6 +104,8 @@ class ServoLoop:
     way : callable, optional
         Gives the poses to pass from the arm's pose to the pose clear of the object, which is the last of them. By default the arm goes
         straight.
+    law : callable, optional
+        In place of the servo law: gives the next pose (6,) from the arm's pose (6,) and the estimate.
     take_rest : callable, optional
         Gets a frame without contact, taken clear of the object, and returns the estimator to use from then on.
     on_step : callable, optional
@@ -121,6 +123,7 @@ class ServoLoop:
     forget: Callable[[], object] | None = None
     retreat: Callable[[np.ndarray], object] | None = None
     way: Callable[[np.ndarray, np.ndarray], list[np.ndarray]] | None = None
+    law: Callable[[np.ndarray, Estimate], np.ndarray] | None = None
     take_rest: Callable[[Frame], Estimator] | None = None
     on_step: Callable[[StepRecord, Frame, Estimate], None] | None = None
 
@@ -235,11 +238,10 @@ class ServoLoop:
         if not fresh and _apart_mm(from_pose, self._view.exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
             self.decided.append((Decided.AWAIT_FRAME, age_s))
             return
-        assert self._view.tangent is not None  # a view without doubt has one
-        step = servo_step(self.servo, self.mounting, self._view.tangent, from_pose, self._memory, fresh=fresh)
-        pose, held_deg = self._axis.on_turn(step.pose, from_pose[5])
+        wanted, memory = self._next(from_pose, fresh)
+        pose, held_deg = self._axis.on_turn(wanted, from_pose[5])
         if held_deg > HOLD_DEG:
-            self._turn_back(step.pose)
+            self._turn_back(wanted)
             return
         try:
             self._sent = self._move(pose, wait=False)
@@ -250,12 +252,22 @@ class ServoLoop:
             return
         if self._held_since is not None:
             LOG.warning("%s: goes on after %.1f s", self.arm.name, time.monotonic() - self._held_since)
-        self._memory, self._held_since = step.memory, None
+        self._memory, self._held_since = memory, None
         self.decided.append((Decided.MOVE, age_s))
         self._record(state, from_pose, self._sent, fresh=fresh, taken_s=taken_s)
         if self.settings.blocking:
             with self._watch.doing(f"waiting for the end of step {len(self.records)}"):
                 self.arm.wait_settled(self._sent, timeout_s=MOVE_TIMEOUT_S)
+
+    def _next(self, from_pose: np.ndarray, fresh: bool) -> tuple[np.ndarray, Memory]:
+        """The pose (6,) that the law wants next, and the sums that it keeps."""
+        view = self._view
+        if self.law is not None:
+            assert view.estimate is not None  # a view without doubt has one
+            return self.law(from_pose, view.estimate), self._memory
+        assert view.tangent is not None
+        step = servo_step(self.servo, self.mounting, view.tangent, from_pose, self._memory, fresh=fresh)
+        return step.pose, step.memory
 
     def _look(self, frame: Frame, state: ArmState) -> bool:
         """Estimate the pose in a frame if it was not used before. Returns whether the frame is fresh."""
@@ -267,7 +279,8 @@ class ServoLoop:
         view.reading, view.doubt = self._reading(view.estimate)
         if not view.doubt:
             view.exposed_pose = self._watch.pose_at(frame.time_s) if self.source.is_live else state.pose
-            view.tangent = tangent_of(self.mounting, view.exposed_pose, view.reading)
+            if self.law is None:
+                view.tangent = tangent_of(self.mounting, view.exposed_pose, view.reading)
             if self.sense is not None:
                 self.sense(view.reading.depth_mm, frame.time_s)
         return True
@@ -336,6 +349,8 @@ class ServoLoop:
         """The depth and angle of an estimate, and why they can't be trusted ("" if they can)."""
         if not estimate.valid:
             return Reading(np.nan, np.nan), estimate.reason
+        if self.law is not None:  # which knows no depth and angle
+            return Reading(np.nan, np.nan), ""
         self.require_labels(estimate.names)
         value = dict(zip(estimate.names, np.asarray(estimate.value, float), strict=True))
         depth, angle = value[self.mounting.depth_label], value[self.mounting.angle_label]

@@ -132,6 +132,8 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
 
 def felt_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
     """The place (3,) of the surface by an estimate: the foot of the dome's centre on the tangent."""
+    if np.isnan(record.depth_mm):  # a policy tells no surface
+        return np.full(3, np.nan)
     tangent = tangent_of(mounting, record.exposed_pose, Reading(record.depth_mm, record.angle_deg))
     tool = matrix_of(record.exposed_pose)
     centre, inward = tool[:3, :3] @ mounting.centre_mm + tool[:3, 3], tangent[:3, :3] @ mounting.axis

@@ -32,6 +32,7 @@ from twin.pins import nominal_reference  # noqa: E402
 from twin.types import Form  # noqa: E402
 
 SENSOR, RAW_SENSOR = "mg400-127", "ur5-331"
+POLICIES = Path(__file__).parents[2] / "training" / "policies"
 ROWS = 24  # labelled frames of the harmless recording
 BAD = "f_3.png"  # the picture that is replaced by a hostile one
 GENTLE = """description = "gentle taps"
@@ -84,6 +85,11 @@ class Harmless:
         (path / "targets.csv").write_text("\n".join(table) + "\n")
         (path / "move_executed.csv").write_text("\n".join(moves) + "\n")
         return path
+
+    @cached_property
+    def policy(self) -> Path:
+        """A policy that goes along an object's outline."""
+        return Path(shutil.copy(POLICIES / "SurfaceFollow-mg400-331.safetensors", self.folder / "policy.safetensors"))
 
     @cached_property
     def frames(self) -> Path:

@@ -1,6 +1,7 @@
 """The whole rig over real sockets: an emulated MG400 and, beside it, the twin's camera that knows the arm by its feedback alone."""
 
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +16,7 @@ from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
+from hardware.policy_law import load_for_outlines, policy_law
 from hardware.rig import Rig, servo_loop
 from hardware.rig_geometry import PlacedObject
 from hardware.safe_arm import SafeArm
@@ -28,6 +30,7 @@ from twin.types import Form
 
 FIRST_S = 90.0  # kernels may have to be compiled
 STEPS = 12
+POLICY = Path(__file__).parents[2] / "training" / "policies" / "SurfaceFollow-mg400-331.safetensors"
 
 
 @pytest.fixture
@@ -73,6 +76,19 @@ def test_it_follows_the_can_and_the_frames_show_the_contact(emulated):
     assert measures.lost_contacts == 0 and measures.hold_depth_mm < 0.2 and measures.completed > 0.5
     assert_let_go(rig)
     assert camera.sent > STEPS
+
+
+def test_a_learnt_policy_follows_the_can(emulated):
+    """Trained on the surrogate, run on frames of the finite elements through the live pipeline and the safety layer."""
+    rig, servo, camera, _, _ = emulated
+    model = load_for_outlines(POLICY)
+    loop = servo_loop(rig, servo, model, LoopSettings(STEPS, frame_timeout_s=10.0, give_up_s=10.0))
+    loop.law = policy_law(model.policy, rig.mounting)
+    loop.take_rest = model.at_rest
+    loop.run(rig.placed.start_pose(servo.indent_mm))
+    measures = measure(trajectory_of(loop.records, rig.mounting, rig.placed), indent_mm=3.0, angle_deg=0.0, wanted_mm=STEPS)
+    assert measures.lost_contacts == 0 and measures.hold_depth_mm < 1.0 and measures.completed > 0.5
+    assert_let_go(rig)
 
 
 def test_a_frozen_camera_makes_the_arm_let_go(emulated):

@@ -40,6 +40,7 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "pins",
     "records",
     "estimate",
+    "policy",
     "simulator",
     "one_contact",
     "judge",

@@ -184,7 +184,7 @@ class Batch:
             self.objects = {name: thing for name, thing in self.objects.items() if self.backend.knows(thing)}
         self.eye = self._make_eye()
         self.axes = options.axes or self.task.axes
-        self._scale = self._action_scale()
+        self.action_scale = self._action_scale()
         self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
         self.contacts: list[Contact | None] = [None] * count
         self.T_work, self.T_object = np.tile(np.eye(4), (2, count, 1, 1))
@@ -252,7 +252,7 @@ class Batch:
             raise OptionError(f"an action is not a finite number: {actions[rows]}; look for NaN in the policy")
         self._action[rows] = np.clip(actions[rows], -1.0, 1.0)
         steps = np.zeros((self.count, 6))
-        steps[:, [AXES.index(axis) for axis in self.axes]] = self._action * self._scale
+        steps[:, [AXES.index(axis) for axis in self.axes]] = self._action * self.action_scale
         steps[:, :3] += self.task.feed_mm
         before = self.T_work.copy()
         self.T_work[rows] = before[rows] @ motions(steps)[rows]

@@ -43,7 +43,7 @@ class Tool:
 def work_frame(mounting: Mounting) -> FloatArray:
     """``T_tool_work`` (4, 4): the frame in which tasks and policies move a tool."""
     T = np.eye(4)
-    T[:3, :3] = np.column_stack([mounting.across, np.cross(mounting.axis, mounting.across), mounting.axis])
+    T[:3, :3] = mounting.work_axes
     return T
 
 

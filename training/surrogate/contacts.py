@@ -100,6 +100,11 @@ class SurrogateContacts:
         return PinRest(self._rest[:, 0] + moved[:, 0], axis, self.felt.caps_mm[row].copy())
 
     @property
+    def caps_at_rest_mm(self) -> FloatArray:
+        """(N, 3) centres of the pins' caps at rest."""
+        return self._caps_rest
+
+    @property
     def depth_mm(self) -> FloatArray:
         """(B,) how deep the objects are inside the undeformed domes."""
         return self._depth

@@ -6,6 +6,7 @@
 - ``twin predict``: the pose in each frame.
 - ``twin pack``: a small copy of a trained model.
 - ``twin surrogate``: a fast stand-in for a sensor's finite elements.
+- ``twin learn``: a policy of a task.
 """
 
 from enum import StrEnum
@@ -373,4 +374,47 @@ def surrogate(
 
     with overwriting(force), shown() as progress:
         made = distil(load_sensor(sensor), out, paths=paths, processes=workers, seed=seed, progress=progress)
+    tell(made)
+
+
+HELP_LEARN = """Learn a policy of a task, from nothing.
+
+The task's environments run together on the surrogate of the sensor's finite elements, and proximal policy optimisation
+(stable-baselines3; pip install 'tactip-twin[rl]') learns from them until 97 % of the newest 100 episodes are solved, or the time is over.
+The policy is then judged on 100 other episodes, and with --fem N on N episodes of finite elements, with drawn frames through the real
+pipeline.
+
+\b
+Writes:
+  policy.safetensors  for 'twin policy'
+  learning.csv, learning.png, result.json
+
+\b
+  twin learn --task SurfaceFollow --sensor mg400-331 --out out/learnt
+"""
+
+
+@app.command("learn", help=HELP_LEARN)
+def learn(
+    task: Annotated[str, typer.Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")],
+    sensor: Sensor,
+    out: Out,
+    observation: Annotated[str, typer.Option("--observation", help="pins, graph, pose or oracle")] = "pins",
+    randomise: Annotated[str | None, typer.Option("--randomise", metavar="R", help="what differs between episodes, e.g. moves")] = None,
+    memory: Annotated[bool, typer.Option("--memory/--no-memory", help="whether friction remembers; to see what that is worth")] = True,
+    minutes: Annotated[float, typer.Option("--minutes", min=0, callback=finite, help="most time")] = 30.0,
+    environments: Annotated[int, typer.Option("--environments", min=2, help="stepped together")] = 32,
+    fem: Annotated[int, typer.Option("--fem", min=0, metavar="N", help="episodes on finite elements in which the policy is judged")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=MOST_SEED, help="seed of weights and episodes")] = 0,
+    force: Force = False,
+) -> None:
+    from training.environments.batch import Options
+    from training.environments.learn import LearnPlan, learn_policy
+    from twin.cli.progress import shown
+    from twin.store import overwriting
+
+    asked = {"sensor": sensor, "observation": observation, "randomise": randomise, "friction_memory": memory}
+    plan = LearnPlan(task, Options.given(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed)
+    with overwriting(force), shown() as progress:
+        made = learn_policy(plan, out, progress=progress)
     tell(made)

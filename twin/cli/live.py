@@ -3,6 +3,7 @@
 - ``twin live``: a model's estimates on a camera's frames, shown as they come.
 - ``twin collect``: labelled frames from a camera and an arm.
 - ``twin servo``: follow an object's outline.
+- ``twin policy``: a trained policy on a camera and an arm.
 - ``twin emulate``: arms, and the sensor's camera, emulated on this machine for any client.
 """
 
@@ -243,6 +244,64 @@ def servo(
     )
     with overwriting(force), signals_as_ctrl_c(), shown() as progress:
         followed = follow(plan, PoseEstimator.load(model), out, about={"model": str(model)}, progress=progress)
+    tell(followed)
+    if followed.failure:
+        raise SystemExit(1)
+
+
+HELP_POLICY = """Run a trained policy on a camera and an arm.
+
+The policy of 'twin learn' sees the pins of each frame, found by the live pipeline, and moves the tool. The way to the object, the frame
+without contact, the safety layer, letting go and what is written are those of 'twin servo', and so are the options. By default it runs in
+the twin.
+
+\b
+  twin learn --task SurfaceFollow --sensor mg400-331 --out out/learnt
+  twin policy out/learnt/policy.safetensors --object can --out out/can
+  twin policy out/learnt/policy.safetensors --object can --out out/live \\
+      --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
+
+The exit code is 1 if it ended early.
+"""
+
+
+@app.command("policy", help=HELP_POLICY)
+def policy_command(
+    policy: Annotated[Path, typer.Argument(help="policy.safetensors of 'twin learn'")],
+    object_name: Annotated[str, typer.Option("--object", metavar="O", help="can, square, prism, tin-box, or another")],
+    out: Out,
+    camera: Camera = "twin",
+    arm: ArmOption = "simulated",
+    parameters: ServoName = "surface",
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")] = None,
+    limits: Limits = None,
+    record: Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
+    known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")] = False,
+    plain_light: PlainLight = False,
+    force: Force = False,
+) -> None:
+    from hardware.following import FollowPlan, follow
+    from hardware.policy_law import load_for_outlines
+    from hardware.rig import signals_as_ctrl_c
+    from scenes import load_object, load_servo
+    from twin.cli.progress import shown
+    from twin.store import overwriting
+
+    plan = FollowPlan(
+        stimulus=load_object(object_name),
+        servo=load_servo(parameters),
+        camera=camera,
+        arm=arm,
+        steps=steps,
+        limits=limits,
+        record=record,
+        seed=seed,
+        plain_light=plain_light,
+        known_place=known_place,
+    )
+    with overwriting(force), signals_as_ctrl_c(), shown() as progress:
+        followed = follow(plan, load_for_outlines(policy), out, about={"policy": str(policy)}, progress=progress)
     tell(followed)
     if followed.failure:
         raise SystemExit(1)

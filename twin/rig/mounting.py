@@ -79,6 +79,11 @@ class Mounting:
         return point
 
     @property
+    def work_axes(self) -> np.ndarray:
+        """(3, 3) axes of the frame in which tasks and policies move a tool, as columns in the tool frame: x ``across``, z ``axis``."""
+        return np.column_stack([self.across, np.cross(self.axis, self.across), self.axis])
+
+    @property
     def T_tool_sensor(self) -> np.ndarray:
         """(4, 4) pose of the sensor's frame in the tool's, mm."""
         turn = np.radians(self.image_turn_deg)

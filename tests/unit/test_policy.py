@@ -1,0 +1,135 @@
+"""A policy: its file, what it does with a frame, and the motion of an arm that it asks for; learning one, in small."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from hardware.policy_law import load_for_outlines, policy_law
+from hardware.rig_geometry import PlacedObject
+from scenes import load_experiment, load_object, load_sensor, load_servo
+from training.environments.batch import Options
+from training.environments.learn import LearnPlan, learn_policy
+from training.environments.world import Surfaces, standing_on
+from twin.errors import FrameError, OptionError
+from twin.geometry.pins import rest_pins
+from twin.policy import PolicyError, PolicyModel, load_policy, with_goal
+from twin.rig.mounting import Mounting
+from twin.types import Form, Frame
+
+SHIPPED = Path(__file__).parents[2] / "training" / "policies" / "SurfaceFollow-mg400-331.safetensors"
+SMALL = Options(sensor="mg400-127", steps=4)
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return load_policy(SHIPPED)
+
+
+def answer(policy, action):
+    class Answer:
+        names, value, valid, reason = policy.axes, np.array(action), True, ""
+
+    return Answer()
+
+
+def test_a_file_gives_back_what_was_saved(policy, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    assert policy.save(path) < 200_000
+    again = load_policy(path)
+    assert again.about == policy.about
+    seen, goal = np.random.default_rng(0).normal(size=(3, 1, 331, 2)), np.array([[3.0, 0.0]] * 3)
+    assert np.allclose(again.act(seen, goal), policy.act(seen, goal), atol=1e-6)
+
+
+@pytest.mark.parametrize(("content", "says"), [(b"", "damaged"), (b"no policy" * 50, "damaged"), (None, "no such file")])
+def test_a_file_that_is_no_policy_is_refused(content, says, tmp_path):
+    path = tmp_path / "mine.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(PolicyError, match=says):
+        load_policy(path)
+
+
+def test_policies_that_a_rig_cannot_run_are_refused(policy, tmp_path):
+    with pytest.raises(PolicyError, match="'oracle'"):
+        PolicyModel(replace(policy, about={**policy.about, "observation": "oracle"}))
+    path = tmp_path / "roll.safetensors"
+    replace(policy, about={**policy.about, "task": "ObjectRoll"}).save(path)
+    with pytest.raises(PolicyError, match="ObjectRoll"):
+        load_for_outlines(path)
+    with pytest.raises(FrameError, match="ur5-331"):
+        PolicyModel(policy).check(load_sensor("ur5-331"), Form.RECORDING)
+
+
+def test_an_arm_is_moved_as_the_environment_moves_its_tool(policy):
+    """z presses by so many mm, Ry turns by so many deg, and the feed goes along the surface."""
+    mounting = Mounting.of(load_sensor("mg400-331"), load_experiment("surface-2d"))
+    placed = PlacedObject(load_object("plane"), load_servo("surface").placement, mounting)
+    law, start = policy_law(policy, mounting), placed.start_pose(3.0)
+    mm, deg = policy.about["scale"]
+    fed, pressed, turned = (placed.touch(law(start, answer(policy, action))) for action in ([0, 0], [0.5, 0], [0, 1.0]))
+    assert fed.indent_mm == pytest.approx(3.0) and abs(fed.place_mm[0]) == pytest.approx(policy.about["feed_mm"][0])
+    assert pressed.indent_mm == pytest.approx(3.0 + 0.5 * mm)
+    assert abs(turned.angle_deg) == pytest.approx(deg)
+
+
+def test_a_frame_gives_the_action_that_its_observation_gives(policy):
+    """The live pipeline and the environment see the same: they count pins from frames of the same sensor at rest."""
+    env = gymnasium.make("tactip/SurfaceFollow-v0", pictures="preview", disable_env_checker=True).unwrapped
+    seen, _ = env.reset(seed=4)
+    eye = env.batch.eye
+    rest = eye.frame(rest_pins(eye.sensor.geometry), np.random.default_rng(0))
+    model = PolicyModel(with_goal(policy, seen["goal"])).at_rest(rest)
+    frame = eye.frame(env.batch.backend.attitude(0), np.random.default_rng(1))
+    told = model(frame)
+    assert told.valid and told.names == policy.axes
+    assert np.allclose(told.value, policy.act(seen["tactile"][None], seen["goal"][None])[0], atol=0.15)
+
+
+def test_a_frame_without_pins_gives_no_action(policy):
+    model = PolicyModel(policy)
+    told = model(Frame(np.zeros((360, 360), np.uint8), Form.RECORDING))
+    assert not told.valid and told.reason and np.isnan(told.value).all()
+
+
+def test_the_shipped_policy_presses_where_it_is_too_shallow_and_lifts_where_it_is_too_deep(policy):
+    pressed = {}
+    for depth in (1.8, 4.2):
+        env = gymnasium.make("tactip/SurfaceFollow-v0", objects=("plane",), disable_env_checker=True).unwrapped
+        env.reset(seed=0)
+        batch = env.batch
+        batch.T_work[0] = start_on(batch, depth)
+        batch.backend.begin(0, batch.contacts[0])
+        batch.goal[0] = [3.0, 0.0]
+        batch.settle(np.zeros(1, int))
+        seen = batch.observation()
+        pressed[depth] = policy.act(seen["tactile"], seen["goal"])[0, policy.axes.index("z")]
+    assert pressed[1.8] > 0 > pressed[4.2]
+
+
+def start_on(batch, depth_mm):
+    return standing_on(batch.tool, Surfaces()[load_object("plane")], 0.0, depth_mm, 0.0)
+
+
+def test_a_policy_is_learnt_in_small(tmp_path):
+    plan = LearnPlan("SurfaceFollow", SMALL, minutes=0.02, environments=2, episodes=2)
+    made = learn_policy(plan, tmp_path)
+    assert {path.name for path in made.written} == {"policy.safetensors", "learning.csv", "learning.png", "result.json"}
+    assert all(path.is_file() for path in made.written)
+    again = load_policy(tmp_path / "policy.safetensors")
+    assert again.about["sensor"]["name"] == "mg400-127" and again.axes == ("z", "Ry")
+    assert set(made.success) == {"surrogate"} and "solved" in made.lines()[0]
+
+
+@pytest.mark.parametrize(
+    ("task", "more", "says"),
+    [("Juggle", {}, "Juggle"), ("EdgeFollow", {"minutes": 0}, "minutes"), ("EdgeFollow", {"environments": 1}, "2 env")],
+)
+def test_a_plan_that_cannot_be_meant_is_refused(task, more, says):
+    with pytest.raises(OptionError, match=says):
+        LearnPlan(task, SMALL, **more)
+    with pytest.raises(OptionError, match="image"):
+        LearnPlan("EdgeFollow", Options(observation="image"))

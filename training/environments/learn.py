@@ -1,0 +1,288 @@
+"""Learning a policy by proximal policy optimisation (stable-baselines3), and judging it on either backend.
+
+The network does not see some hundred pins but the directions in which they move together most, found in random motions.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from training.environments.batch import Options
+from training.environments.environment import TactileVectorEnv
+from training.environments.tasks import TASKS
+from twin.errors import OptionError
+from twin.policy import VERSION, Policy
+from twin.progress import Progress, Step, silent, stage
+from twin.report.charts import new_figure, save_figure
+from twin.store import text_file, write_json, writes
+from twin.types import FloatArray
+
+COMPONENTS = 24
+"""Directions of the pins' motion that a network sees."""
+RANDOM_STEPS = 40
+"""Steps of random motion of each environment, in which those directions are found."""
+LEAST_SPREAD = 0.02
+"""Directions are scaled by no less than this share of the largest one's spread: the rest is noise."""
+LAYERS = (64, 64)
+"""Neurons of the hidden layers, with tanh."""
+ROLLOUT = 32
+"""Steps of each environment between two updates."""
+WINDOW = 100
+"""Newest episodes over which success is counted while learning."""
+ENOUGH = 0.97
+"""Share of them that ends the learning."""
+LEAST_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class LearnPlan:
+    """What is learnt, and how long.
+
+    Attributes
+    ----------
+    task : str
+        Name, of ``TASKS``.
+    options : Options
+    minutes : float
+        Most time.
+    environments : int
+        Stepped together.
+    seed : int
+    episodes : int
+        In which the policy is judged at the end, on the backend that it learnt on.
+    fem_episodes : int
+        The same on finite elements, with drawn frames through the real pipeline; 0: not.
+    """
+
+    task: str
+    options: Options = field(default_factory=Options)
+    minutes: float = 30.0
+    environments: int = 32
+    seed: int = 0
+    episodes: int = 100
+    fem_episodes: int = 0
+
+    def __post_init__(self) -> None:
+        if self.task not in TASKS:
+            raise OptionError(f"--task {self.task}: expected one of {', '.join(TASKS)}")
+        if self.options.observation not in ("pins", "oracle", "pose", "graph"):
+            raise OptionError(f"observation={self.options.observation!r}: this example learns from pins, graph, pose or oracle")
+        if self.environments < 2 or self.minutes <= 0 or self.episodes < 1:
+            raise OptionError("expected at least 2 environments, 1 episode and more than 0 minutes")
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What came of it. ``curve`` holds (steps, seconds, share of success, mean reward) after each update."""
+
+    policy: Policy
+    curve: list[tuple[int, float, float, float]]
+    success: dict[str, float]
+    written: list[Path]
+
+    def lines(self) -> list[str]:
+        """The result in words."""
+        steps, seconds = self.curve[-1][:2] if self.curve else (0, 0.0)
+        told = ", ".join(f"{share:.0%} of the episodes on {where}" for where, share in self.success.items())
+        return [f"{steps} steps in {seconds / 60:.1f} min; solved {told}"]
+
+
+class SteppedTogether(VecEnv):
+    """A ``TactileVectorEnv`` as stable-baselines3 wants it, its observations reduced to what the network sees."""
+
+    def __init__(self, vector: TactileVectorEnv, policy: Policy) -> None:
+        self.vector, self.policy = vector, policy
+        size = len(policy.basis) + len(vector.batch.task.goal_names)
+        super().__init__(vector.num_envs, spaces.Box(-np.inf, np.inf, (size,), np.float32), vector.single_action_space)
+        self._actions: FloatArray = np.zeros((vector.num_envs, *(vector.single_action_space.shape or ())))
+
+    def _reduced(self, seen: dict[str, Any]) -> FloatArray:
+        return self.policy.reduced(seen["tactile"], seen["goal"])
+
+    def reset(self) -> FloatArray:
+        """See ``VecEnv``."""
+        return self._reduced(self.vector.reset(seed=self._seeds[0])[0])
+
+    def step_async(self, actions: FloatArray) -> None:
+        """See ``VecEnv``."""
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        """See ``VecEnv``: rows that end begin anew in the same step."""
+        seen, reward, terminated, truncated, told = self.vector.step(self._actions)
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for row in np.flatnonzero(done):
+            last = told["final_obs"][row]
+            infos[row] = {
+                "terminal_observation": self.policy.reduced(last["tactile"][None], last["goal"][None])[0],
+                "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
+                "is_success": bool(told["is_success"][row]),
+            }
+        return self._reduced(seen), reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """See ``VecEnv``."""
+        self.vector.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """See ``VecEnv``."""
+        return [getattr(self.vector, attr_name)] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """The environments have nothing to set."""
+        raise OptionError(f"{attr_name} can't be set")
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """The environments have no methods of their own."""
+        raise OptionError(f"the environments have no method {method_name}")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """See ``VecEnv``."""
+        return [False] * self.num_envs
+
+
+class _Watch(BaseCallback):
+    """Keeps the learning curve, and ends the learning when it is good enough or takes too long."""
+
+    def __init__(self, plan: LearnPlan, step: Step) -> None:
+        super().__init__()
+        self._plan, self._step, self._begun = plan, step, time.monotonic()
+        self._ended: list[bool] = []
+        self._rewards: list[float] = []
+        self.curve: list[tuple[int, float, float, float]] = []
+
+    def _on_step(self) -> bool:
+        self._ended += [info["is_success"] for info in self.locals["infos"] if "is_success" in info]
+        self._rewards.append(float(np.mean(self.locals["rewards"])))
+        return time.monotonic() - self._begun < 60.0 * self._plan.minutes and not self._enough
+
+    @property
+    def _enough(self) -> bool:
+        newest = self._ended[-WINDOW:]
+        return len(self._ended) >= 2 * WINDOW and float(np.mean(newest)) >= ENOUGH
+
+    def _on_rollout_end(self) -> None:
+        seconds = time.monotonic() - self._begun
+        share = float(np.mean(self._ended[-WINDOW:])) if self._ended else 0.0
+        self.curve.append((self.num_timesteps, seconds, share, float(np.mean(self._rewards[-ROLLOUT:]))))
+        self._step(seconds, 60.0 * self._plan.minutes, f"{share:.0%} solved")
+
+
+@writes("policy.safetensors", "learning.csv", "learning.png", "result.json")
+def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> Learnt:
+    """Learn a policy and write it to ``out``, with its learning curve.
+
+    Raises
+    ------
+    OptionError
+        Something that is asked for can't be had.
+    """
+    torch.set_num_threads(1)
+    vector = TactileVectorEnv(plan.task, plan.environments, autoreset_mode=AutoresetMode.SAME_STEP, **_given(plan.options))
+    blank = _untrained(plan, vector)
+    env = SteppedTogether(vector, blank)
+    env.seed(plan.seed)
+    ppo = PPO(
+        "MlpPolicy",
+        env,
+        n_steps=ROLLOUT,
+        batch_size=max(plan.environments * ROLLOUT // 4, 2),
+        n_epochs=8,
+        learning_rate=7e-4,
+        gamma=0.95,
+        gae_lambda=0.9,
+        ent_coef=0.0,
+        policy_kwargs={"net_arch": list(LAYERS), "log_std_init": -0.7},
+        seed=plan.seed,
+        device="cpu",
+    )
+    with stage(progress, f"learning {plan.task}") as step:
+        watch = _Watch(plan, step)
+        ppo.learn(10**9, callback=watch)
+    made = replace(blank, layers=_layers_of(ppo))
+    success: dict[str, float] = {
+        str(plan.options.backend): judge_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
+    }
+    if plan.fem_episodes:
+        seen: Any = "preview" if plan.options.observation != "oracle" else "none"
+        true = replace(plan.options, backend="fem", surrogate=None, friction_memory=True, pictures=seen)
+        success["finite elements, drawn frames"] = judge_policy(made, plan.task, true, plan.fem_episodes, seed=20_000 + plan.seed)
+    written = [out / "policy.safetensors", out / "learning.csv", out / "learning.png", out / "result.json"]
+    made.save(written[0])
+    with text_file(written[1]) as file:
+        file.write("steps,seconds,success,reward\n")
+        file.writelines(f"{steps},{seconds:.1f},{share:.4f},{reward:.4f}\n" for steps, seconds, share, reward in watch.curve)
+    figure, axes = new_figure(2, 1)
+    for ax, column, name in zip(axes, (2, 3), ("episodes solved", "mean reward of a step"), strict=True):
+        ax.plot([row[0] for row in watch.curve], [row[column] for row in watch.curve])
+        ax.set(xlabel="steps", ylabel=name)
+    save_figure(written[2], figure)
+    write_json(written[3], {"task": plan.task, "options": asdict(plan.options), "success": success, "steps": ppo.num_timesteps})
+    return Learnt(made, watch.curve, success, written)
+
+
+def judge_policy(policy: Policy, task: str, options: Options, episodes: int, *, seed: int = 0) -> float:
+    """Share of episodes that a policy solves, with its mean action, eight at a time (one on finite elements)."""
+    vector = TactileVectorEnv(task, min(episodes, 8 if options.backend == "surrogate" else 1), autoreset_mode="SameStep", **_given(options))
+    seen, _ = vector.reset(seed=seed)
+    solved: list[bool] = []
+    while len(solved) < episodes:
+        seen, _, terminated, truncated, told = vector.step(policy.act(seen["tactile"], seen["goal"]))
+        solved += told["is_success"][terminated | truncated].tolist()
+    return float(np.mean(solved[:episodes]))
+
+
+def _given(options: Options) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in Options.__dataclass_fields__}
+
+
+def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
+    """What a network sees, from random motions; no network."""
+    rng = np.random.default_rng(plan.seed)
+    seen, _ = vector.reset(seed=plan.seed)
+    rows, goals = [], [seen["goal"]]
+    drift = np.zeros((vector.num_envs, *(vector.single_action_space.shape or ())))
+    for _ in range(RANDOM_STEPS):
+        drift = np.clip(0.8 * drift + 0.4 * rng.normal(size=drift.shape), -1, 1)
+        seen, *_ = vector.step(drift)
+        rows.append(seen["tactile"].reshape(vector.num_envs, -1))
+        goals.append(seen["goal"])
+    flat = np.concatenate(rows)
+    mean = flat.mean(axis=0)
+    _, sizes, basis = np.linalg.svd(flat - mean, full_matrices=False)
+    count = min(COMPONENTS, flat.shape[1])
+    spread = np.maximum(sizes[:count], LEAST_SPREAD * sizes[0]) / np.sqrt(len(flat))
+    batch, task = vector.batch, vector.batch.task
+    about = {
+        "version": VERSION,
+        "task": plan.task,
+        "experiment": task.experiment,
+        "sensor": batch.sensor.model_dump(mode="json"),
+        "observation": plan.options.observation,
+        "stack": plan.options.stack,
+        "axes": list(batch.axes),
+        "scale": batch.action_scale.tolist(),
+        "feed_mm": list(task.feed_mm),
+        "goal_names": list(task.goal_names),
+        "goal": np.median(np.concatenate(goals), axis=0).tolist(),
+        "trained": {**{key: value for key, value in asdict(plan.options).items()}, "seed": plan.seed},
+    }
+    return Policy(about, mean, basis[:count] / spread[:, None], ())
+
+
+def _layers_of(ppo: PPO) -> tuple[tuple[FloatArray, FloatArray], ...]:
+    """The network of the mean action."""
+    parts: Sequence[torch.nn.Module] = [*ppo.policy.mlp_extractor.policy_net, ppo.policy.action_net]
+    linear = [part for part in parts if isinstance(part, torch.nn.Linear)]
+    return tuple((layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()) for layer in linear)

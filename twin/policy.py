@@ -1,0 +1,195 @@
+"""A trained policy: what it sees of the pins, and the small network that turns it into a motion of the tool.
+
+A policy's file holds no code. It is run from frames through the real pipeline, on a real arm or in the twin alike.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError, TwinError
+from twin.pins import Pipeline, Reference, measure_reference, nominal_reference
+from twin.store import output_file, write_bytes
+from twin.types import FloatArray, Form, Frame
+
+VERSION = 1
+"""Of the file; another version is trained anew."""
+
+
+class PolicyError(TwinError):
+    """A policy's file can't be used, or can't be run so."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy of one task with one sensor.
+
+    Attributes
+    ----------
+    about : dict
+        Task, sensor, observation, axes, the motion that an action of 1 is, the task's own feed, goal, and how it was trained (JSON).
+    mean : (D,) float
+        Of the flat observations.
+    basis : (K, D) float
+        What the network sees of them, each about 1 in size.
+    layers : tuple of ((o, i), (o,)) float
+        Of a network with tanh between them; its inputs are the K numbers and the goal.
+    """
+
+    about: dict[str, Any]
+    mean: FloatArray
+    basis: FloatArray
+    layers: tuple[tuple[FloatArray, FloatArray], ...]
+
+    def reduced(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
+        """What the network sees, (B, K + G), of observations (B, ...) and goals (B, G)."""
+        seen = (tactile.reshape(len(tactile), -1) - self.mean) @ self.basis.T
+        return np.concatenate([seen, goal], axis=1).astype(np.float32)
+
+    def act(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
+        """Actions (B, A) in [-1, 1]."""
+        x = self.reduced(tactile, goal)
+        for number, (weights, offset) in enumerate(self.layers):
+            x = x @ weights.T + offset
+            if number < len(self.layers) - 1:
+                x = np.tanh(x)
+        return np.clip(x, -1.0, 1.0)
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Axes of the work frame that it moves."""
+        return tuple(self.about["axes"])
+
+    def step(self, action: FloatArray) -> FloatArray:
+        """The tool's motion (6,) in the work frame for an action (A,): mm and deg, the task's feed included."""
+        step = np.array([*self.about["feed_mm"], 0.0, 0.0, 0.0], float)
+        for axis, part, size in zip(self.axes, action, self.about["scale"], strict=True):
+            step[("x", "y", "z", "Rx", "Ry", "Rz").index(axis)] += part * size
+        return step
+
+    def save(self, path: Path) -> int:
+        """Write it to a file; its size in bytes."""
+        arrays = {"mean": self.mean, "basis": self.basis}
+        for number, (weights, offset) in enumerate(self.layers):
+            arrays[f"layers.{number}.weights"], arrays[f"layers.{number}.offset"] = weights, offset
+        content = save({key: np.ascontiguousarray(value, np.float32) for key, value in arrays.items()}, {"about": json.dumps(self.about)})
+        with output_file(path):
+            write_bytes(path, content)
+        return len(content)
+
+
+def load_policy(path: Path) -> Policy:
+    """Read a policy.
+
+    Raises
+    ------
+    PolicyError
+        There is no such file, or it holds no policy of this version.
+    """
+    try:
+        with safe_open(path, framework="numpy") as file:
+            about = json.loads((file.metadata() or {})["about"])
+            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no mapping)
+        if about["version"] != VERSION:
+            raise PolicyError(f"{path}: of another version of this program; train it anew with 'twin learn'")
+        SensorSpec.model_validate(about["sensor"])
+        count = sum(key.endswith(".weights") for key in arrays)
+        layers = tuple((arrays[f"layers.{number}.weights"], arrays[f"layers.{number}.offset"]) for number in range(count))
+        return Policy(about, arrays["mean"], arrays["basis"], layers)
+    except FileNotFoundError:
+        raise PolicyError(f"{path}: no such file; train a policy with 'twin learn'") from None
+    except OSError as error:
+        raise PolicyError(f"{path}: can't be read ({error.strerror or error}); give a file of 'twin learn'") from error
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise PolicyError(f"{path}: damaged, or no policy ({reason}); train it anew with 'twin learn'") from error
+
+
+@dataclass(frozen=True)
+class Action:
+    """A policy's answer to a frame, as a loop takes it: an ``Estimate`` whose labels are the axes and whose values are the action."""
+
+    names: tuple[str, ...]
+    value: FloatArray
+    valid: bool
+    reason: str
+
+    @property
+    def low(self) -> FloatArray:
+        """A policy states no interval."""
+        return np.full(len(self.names), np.nan)
+
+    @property
+    def high(self) -> FloatArray:
+        """A policy states no interval."""
+        return self.low
+
+
+class PolicyModel:
+    """A policy with its sensor and the live pipeline: frame in, action out; a ``SensorModel``.
+
+    Parameters
+    ----------
+    policy : Policy
+        That sees pins.
+    goal : (G,) float, optional
+        The policy's own by default.
+
+    Raises
+    ------
+    PolicyError
+        The policy does not see pins.
+    """
+
+    counts_from_rest = True
+
+    def __init__(self, policy: Policy, *, goal: FloatArray | None = None) -> None:
+        if policy.about["observation"] != "pins":
+            raise PolicyError(
+                f"a policy that sees {policy.about['observation']!r} can't be run on frames; train one with observation 'pins'"
+            )
+        self.policy = policy
+        self.sensor = SensorSpec.model_validate(policy.about["sensor"])
+        self.form = Form.RECORDING if self.sensor.recording else Form.RAW
+        self._nominal = nominal_reference(self.sensor, self.form)
+        self._goal = np.asarray(policy.about["goal"] if goal is None else goal, np.float32)
+        self._stack: list[FloatArray] = []
+        self.pipeline = Pipeline(self.sensor, self.form)
+
+    def at_rest(self, frame: Frame) -> "PolicyModel":
+        """The same policy, counting pins from a frame without contact."""
+        return self._counted_from(measure_reference(self.sensor, self.form, frame))
+
+    def _counted_from(self, reference: Reference) -> "PolicyModel":
+        found = PolicyModel(self.policy, goal=self._goal)
+        found.pipeline = Pipeline(self.sensor, self.form, reference)
+        return found
+
+    def check(self, sensor: SensorSpec, form: Form) -> None:
+        """Refuse frames of another sensor or form."""
+        if sensor.name != self.sensor.name or form != self.form:
+            raise FrameError(
+                f"the policy was trained for {self.form} frames of '{self.sensor.name}'; these are {form} frames of '{sensor.name}'"
+            )
+
+    def __call__(self, frame: Frame) -> Action:
+        """The action for a frame; not valid if too few pins are found."""
+        seen = self.pipeline(frame)
+        if seen.graph is None:
+            return Action(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, seen.reason)
+        moved = (seen.graph.nodes_px - self.pipeline.reference.pins_px) / float(self._nominal.spacing_px.mean())
+        count = int(self.policy.about["stack"])
+        self._stack = [*(self._stack or [moved] * count), moved][-count:]
+        action = self.policy.act(np.array(self._stack)[None], self._goal[None])[0]
+        return Action(self.policy.axes, action, True, "")
+
+
+def with_goal(policy: Policy, goal: FloatArray) -> Policy:
+    """The same policy with another goal."""
+    return replace(policy, about={**policy.about, "goal": np.asarray(goal, float).tolist()})

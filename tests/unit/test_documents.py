@@ -49,14 +49,15 @@ def anchors(path: Path) -> set[str]:
 
 
 def dead_links(path: Path, text: str) -> list[str]:
-    """Links of a document that lead nowhere in this folder."""
-    found = []
+    """Links of a document that lead nowhere, or from the built documentation to what is not built."""
+    found, built = [], ROOT / "docs"
     for target in re.findall(r"\]\(([^)\s]+)\)", prose(text)):
         place, _, anchor = target.partition("#")
         if "://" in target or target.startswith("mailto:"):
             continue
         file = (path.parent / place).resolve() if place else path
-        if not file.exists() or (anchor and anchor not in anchors(file)):
+        outside = path.is_relative_to(built) and not file.is_relative_to(built)
+        if outside or not file.exists() or (anchor and anchor not in anchors(file)):
             found.append(target)
     return found
 

@@ -3,6 +3,7 @@
 import ast
 import re
 import shlex
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -184,6 +185,12 @@ def test_python_is_python_and_what_it_imports_is_there(path):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in api.PACKAGES:
                 missing = {alias.name for alias in node.names} - names_of(node.module)
                 assert not missing, f"line {block.line}: {node.module} has no {missing}"
+
+
+def test_every_extra_is_told():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    text = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    assert not [extra for extra in extras if f"| `{extra}` |" not in text]
 
 
 def test_the_readme_is_short():

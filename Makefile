@@ -16,7 +16,7 @@ setup: $(VENV)/.installed ## install everything into .venv (as root also the sys
 $(VENV)/.installed: pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv: install python3-venv, remove $(VENV) and run make again"; exit 1; }
-	@echo "installing Python packages into $(VENV) (about 1.5 GB, a few minutes the first time)"
+	@echo "installing Python packages into $(VENV) (3 to 7 GB, a few minutes the first time; docs/install.md says how to have the smaller)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
 	@touch $@
 

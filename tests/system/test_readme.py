@@ -22,7 +22,7 @@ def test_the_example_runs_and_prints_what_is_stated(capsys):
     printed = capsys.readouterr().out.splitlines()
     stated = re.search(r"It prints `(.*?)` and `(.*?) px from the truth`", (ROOT / "README.md").read_text(encoding="utf-8"))
     assert stated is not None and printed[0] == stated[1]
-    assert f"{float(printed[1].split()[0]):.2f}" == stated[2]
+    assert f"{float(printed[1].split()[0]):.1f}" == stated[2]
 
 
 @pytest.mark.slow

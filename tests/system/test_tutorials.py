@@ -10,7 +10,7 @@ from generators.notebooks import Block, blocks, run_pages, tutorials
 
 from training.models import MODELS
 
-QUICK = {"first-contact", "arm", "camera", "object", "material-law"}
+QUICK = {"first-contact", "arm", "camera", "object", "sensor", "degradation", "material-law"}
 """Pages that take a few seconds at most."""
 
 

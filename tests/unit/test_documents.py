@@ -3,6 +3,7 @@
 import ast
 import re
 import shlex
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -49,14 +50,15 @@ def anchors(path: Path) -> set[str]:
 
 
 def dead_links(path: Path, text: str) -> list[str]:
-    """Links of a document that lead nowhere in this folder."""
-    found = []
+    """Links of a document that lead nowhere, or from the built documentation to what is not built."""
+    found, built = [], ROOT / "docs"
     for target in re.findall(r"\]\(([^)\s]+)\)", prose(text)):
         place, _, anchor = target.partition("#")
         if "://" in target or target.startswith("mailto:"):
             continue
         file = (path.parent / place).resolve() if place else path
-        if not file.exists() or (anchor and anchor not in anchors(file)):
+        outside = path.is_relative_to(built) and not file.is_relative_to(built)
+        if outside or not file.exists() or (anchor and anchor not in anchors(file)):
             found.append(target)
     return found
 
@@ -183,6 +185,12 @@ def test_python_is_python_and_what_it_imports_is_there(path):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in api.PACKAGES:
                 missing = {alias.name for alias in node.names} - names_of(node.module)
                 assert not missing, f"line {block.line}: {node.module} has no {missing}"
+
+
+def test_every_extra_is_told():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    text = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    assert not [extra for extra in extras if f"| `{extra}` |" not in text]
 
 
 def test_the_readme_is_short():

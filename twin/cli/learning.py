@@ -354,6 +354,7 @@ change. It takes about a thousandth of the time. Every fifth path is only judged
 Surrogates of the shipped sensors go with the package; the environments take others by surrogate=FILE.
 
 \b
+Example:
   twin surrogate --sensor mg400-331 --out mine.safetensors
 """
 

@@ -141,3 +141,9 @@ def test_a_reflection_of_an_led_beside_a_cap_does_not_draw_it_away():
     assert nearest(clean).max() < 0.3 and nearest(lit).max() < 1.0
     white = np.where(dark > 24, 255, 0).astype(np.uint8)  # in a thresholded frame every cap is white, and none is a glint
     assert nearest(find_bumps(white, 3.7)).max() < 0.5
+
+
+def test_frames_of_inverted_contrast_are_refused_as_such():
+    images = [255 - image for image in frames_of(rest_of(PinsSpec(rings=4)), 3)]
+    with pytest.raises(FrameError, match="contrast is inverted"):
+        identify(images)

@@ -169,8 +169,24 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
     Raises
     ------
     FrameError
-        No frame shows a layout.
+        No frame shows a layout, or the frames' contrast is inverted.
     """
+    try:
+        return _identified(images, progress)
+    except FrameError as error:
+        few = [255 - images[k] for k in spread(len(images), SIZED_ON)]
+        try:
+            _identified(few, None)
+        except FrameError:
+            raise error from None
+        raise FrameError(
+            f"the {len(images)} frames show pins that are darker than the skin: their contrast is inverted; give them as the camera takes "
+            "them, or turn bright and dark around first"
+        ) from error
+
+
+def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
+    """The layout that frames show whose caps are brighter than the skin."""
     looks: list[Look] = [partial(_family_look, family(name)) for name in FAMILIES]
     sizes = [_best_size(images[k], looks) for k in spread(len(images), SIZED_ON)]
     if not any(sizes):

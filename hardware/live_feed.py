@@ -1,5 +1,6 @@
 """What the studio's mode 'Live' takes: a camera with its estimates, and an arm that is read only until it is armed."""
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -14,7 +15,8 @@ from hardware.errors import DeviceError
 from hardware.live import LiveSession, estimate_line
 from hardware.safe_arm import SafeArm, try_each
 from hardware.safety import SHIPPED_LIMITS, load_limits
-from twin.errors import TwinError
+from scenes.sensor import SensorSpec
+from twin.errors import FrameError, TwinError
 from twin.estimate import Estimate, SensorModel
 from twin.records.session import SessionWriter
 from twin.studio.live_page import LiveShot
@@ -117,6 +119,22 @@ class WatchedArm:
             with suppress(DeviceError):
                 self.disarm()
         self._arm.disconnect()
+
+
+def require_feed(camera: str, arm: str, recording: str, sensor: SensorSpec) -> None:
+    """Refuse a camera, an arm or a recording, each "" for none, that can't be meant. Nothing is connected.
+
+    Raises
+    ------
+    DeviceError, FrameError
+        There is no such thing, or its frames are not the sensor's.
+    """
+    if camera:
+        open_camera(camera, sensor)
+    if arm:
+        WatchedArm(arm)
+    if recording and not os.path.exists(recording):  # what is in it is read when it is opened
+        raise FrameError(f"--recording {recording}: no such folder; give a recording")
 
 
 class CameraFeed:

@@ -97,6 +97,8 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
     ------
     StoreError
         A run can't be written.
+    TwinError
+        No run made a step.
     """
     found: dict[tuple[str, str], Followed | str] = {}
     for label, model in plan.models.items():
@@ -110,6 +112,9 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
             except TwinError as error:
                 found[label, thing.name] = str(error)
             progress("objects followed", len(found), len(plan.models) * len(plan.objects))
+    reasons = [said for said in found.values() if isinstance(said, str)]
+    if reasons and len(reasons) == len(found):
+        raise TwinError(f"none of {len(found)} runs made a step; the first: {reasons[0]}")
     made = ServoStudy(found, [])
     made.written.append(_write_rows(out / "study.csv", made.rows))
     pictures = [(*key, run.path, run.outline_mm) for key, run in found.items() if isinstance(run, Followed)]

@@ -283,17 +283,25 @@ def folder_of(run: str | Path) -> Path:
     return SHIPPED / run if not Path(run).exists() and str(run) in shipped_names() else Path(run)
 
 
-def models_by_sensor(run: str | Path | None = None) -> Callable[[str], PoseEstimator | None]:
+def models_by_sensor(run: str | Path | None = None, first: str = "") -> Callable[[str], PoseEstimator | None]:
     """A function from a sensor's name to a trained model of it: that of a run, else the weights that go with the package, else None.
 
     From the first model on the networks of this process run in one thread: at their size more threads cost more than they bring.
 
+    Parameters
+    ----------
+    run : path, optional
+    first : str
+        Name of the sensor that the run has to be of; "" for any.
+
     Raises
     ------
     TrainingError
-        The run holds no trained model.
+        The run holds no trained model, or one of another sensor than ``first``.
     """
     given = None if run is None else PoseEstimator.load(run)
+    if given is not None and first not in ("", given.sensor.name):
+        raise TrainingError(f"{run}: a model of '{given.sensor.name}', not of '{first}'; give its --sensor, or another --model")
 
     def model_of(sensor: str) -> PoseEstimator | None:
         torch.set_num_threads(1)

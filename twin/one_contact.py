@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Protocol
 
 from scenes import SensorSpec
 from scenes.object import ObjectSpec
+from twin.errors import ContactError
 from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
 from twin.objects import build_field
@@ -81,10 +82,12 @@ def render_contact(
     FrameError
         The sensor has no recordings' form.
     ContactError
-        The pose is out of reach, or the solver does not converge.
+        The pose is out of reach or above the sensor, or the solver does not converge.
     RenderError
         The renderer does not work on this machine.
     """
+    if pose.indent_mm < 0:
+        raise ContactError(f"--indent-mm {pose.indent_mm:g}: the object would not touch; give 0 for no contact, or more")
     simulator = Simulator(sensor, quality=quality)
     simulator.check_form(form)
     with stage(progress, f"press {touched.name}") as step:

@@ -322,7 +322,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     f"graph {{frames}} {S} --out {{out}}": {"--kind": "star", "--form": "cooked raw"},
     f"tune {S} --frames {{frames}} --out {{out}}/mine.toml": {"--limit": "0 -1", "--method": "magic"},
     f"render {S} --object plane --out {{out}} --quality preview": {
-        "--indent-mm": "nan inf 1e9 x",
+        "--indent-mm": "nan inf 1e9 x -1",
         "--indent-mm 1 --twist-deg": "nan inf",
         "--indent-mm 1 --seed": "-1 x",
         "--indent-mm 1 --tilt-deg 0": "nan 1e9",
@@ -358,6 +358,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     },
     "servo --object can --out {out}": {
         "--steps": "0 -1 2000000000",
+        "--seed": "-1",
         "--rate": "0 -1 x",
         "--stream --rate": "nan inf",
         "--model": "nowhere",
@@ -402,6 +403,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
     },
     f"study servo --model {SENSOR} --out {{out}}": {
         "--steps": "0 -1",
+        "--seed": "-1",
         "--objects": "nowhere ,",
         "--servo": "nowhere",
         "--model": "nowhere",

@@ -204,7 +204,9 @@ STUDIO_VALUES = {
     "--seconds": "nan -1",
     "--host": "999.1.1.1 nowhere.invalid",
     "--model": "nowhere",
-    "--arm": "nowhere mg400:999.1.1.1",
+    "--arm": "nowhere",
+    "--camera": "nowhere",
+    "--recording": "nowhere",
 }
 SERVERS = {  # a while of each: whether it listens beyond this machine
     "studio": f"{STUDIO} --seconds 4 --port 9101",
@@ -242,7 +244,7 @@ def _options() -> list[Entry]:
         found += [Entry("tables elsewhere", what, call, {"data": make}, (REFUSED,), ("table.csv",)) for what, make in TABLES.items()]
     for layout in LAYOUTS:
         call = f"new {{frames}} --layout {layout} --limit 2 --out {{out}}/mine.toml"
-        found.append(Entry("layouts", layout, call, {}, (REFUSED, USAGE), (layout.split(":")[0],)))
+        found.append(Entry("layouts", layout, call, {}, (REFUSED, USAGE), ("|".join(filter(None, layout.split(":"))),)))
     for what, content in PLACES.items():
         call = "new {frames} --layout positions:{data} --limit 2 --out {out}/mine.toml"
         found.append(Entry("layouts", f"places: {what}", call, {"data": written("places.csv", content)}, (REFUSED,), ("places.csv|pins",)))
@@ -258,7 +260,7 @@ def _options() -> list[Entry]:
     for option, values in STUDIO_VALUES.items():
         for value in values.split():
             call = f"{STUDIO} --seconds 1 {option} {value}".replace("--seconds 1 --seconds", "--seconds")
-            found.append(Entry("studio", f"{option} {value}", call, {}, (REFUSED, USAGE), (value.partition(":")[2] or value,), seconds=60))
+            found.append(Entry("studio", f"{option} {value}", call, {}, (REFUSED, USAGE), (f"{option}|{value}",), seconds=60))
     for call in SERVERS.values():
         end = (12.0, int(signal.SIGINT), 1)
         found.append(Entry("servers", "for a while", call, {}, (DONE, REFUSED, 130), leaves=("*",), end=end, seconds=60))

@@ -18,20 +18,22 @@ from hardware.emulators.running import emulate_magician, emulate_mg400
 from hardware.emulators.twin_camera import emulate_camera
 from hardware.errors import DeviceError
 from hardware.following import FollowPlan
+from hardware.live_feed import require_feed
 from hardware.safety import load_limits
-from hardware.servo_study import folder_name
+from hardware.servo_study import ServoStudyPlan, folder_name, study_servo
 from scenes import SpecError, load_experiment, load_object, load_sensor, load_servo
 from scenes.body import MOST_POISSON
 from scenes.load import SHIPPED
 from training.estimator import PoseEstimator
 from training.recipes import TrainingError
-from twin.errors import FrameError, TwinError
+from twin.errors import ContactError, FrameError, TwinError
 from twin.frames import open_recording
 from twin.frames.forms import form_of, known_frames
 from twin.geometry.solid import Resolution
 from twin.judge.degradation.plan import load_plan
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
+from twin.one_contact import render_contact
 from twin.pins import Pipeline, load_detector
 from twin.types import Form
 
@@ -141,6 +143,29 @@ def test_a_mistyped_run_gets_the_nearest_name(tmp_path):
     for name in (tmp_path / "nothing_like_it", tmp_path / "nowhere" / "mg400-127"):
         with pytest.raises(TrainingError, match="'twin train' writes one"):
             PoseEstimator.load(name)
+
+
+def test_an_object_above_the_sensor_is_refused_before_anything_is_made(tmp_path):
+    with pytest.raises(ContactError, match="--indent-mm -1: .*give 0 for no contact"):
+        render_contact(load_sensor("mg400-127"), load_object("plane"), ContactPose(indent_mm=-1.0), tmp_path / "out")
+
+
+def test_a_camera_an_arm_and_a_recording_of_the_studio_are_looked_at_before_its_page_opens(tmp_path):
+    spec = load_sensor("mg400-127")
+    for asked in (("nowhere", "", ""), ("", "nowhere", ""), ("", "", "nowhere")):
+        with pytest.raises(TwinError, match="nowhere"):
+            require_feed(*asked, spec)
+    require_feed("", "", str(tmp_path), spec)
+
+
+def test_a_study_of_servos_in_which_nothing_moved_fails_with_the_first_reason(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise ContactError("out of reach")
+
+    monkeypatch.setattr("hardware.servo_study.follow", fail)
+    plan = ServoStudyPlan({"a": None}, (load_object("can"), load_object("square")), load_servo("surface"))
+    with pytest.raises(TwinError, match="none of 2 runs made a step; the first: out of reach"):
+        study_servo(plan, tmp_path / "out")
 
 
 def test_frames_of_another_form_are_refused_without_the_name_of_an_option():

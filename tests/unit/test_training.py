@@ -13,7 +13,7 @@ from drawn_recording import FRAMES, config_of
 
 from scenes import load_sensor
 from training.dataset import Dataset, joined
-from training.estimator import PoseEstimator, digest_of, folder_of
+from training.estimator import PoseEstimator, digest_of, folder_of, models_by_sensor
 from training.evaluate import judge, leak_check, rows_to_judge, write_evaluation
 from training.identity import changed_since, learnt_before
 from training.models import recipe_of
@@ -218,6 +218,12 @@ def test_one_frame_at_a_time_says_what_the_table_says(data, trained):
     )  # fmt: skip
     assert one.valid and np.allclose(one.value, estimator.predict_table(table).mean[0], atol=1e-6)
     assert (one.low < one.value).all() and (one.value < one.high).all()
+
+
+def test_a_run_of_another_sensor_than_the_pages_is_refused(trained):
+    assert models_by_sensor(trained, "mg400-127")("mg400-127").sensor.name == "mg400-127"
+    with pytest.raises(TrainingError, match="a model of 'mg400-127', not of 'ur5-331'"):
+        models_by_sensor(trained, "ur5-331")
 
 
 def test_another_sensors_frames_are_refused(data, trained):

@@ -213,7 +213,7 @@ def servo(
     rate: Annotated[float, typer.Option("--rate", min=0.1, help="decisions a second with --stream")] = 10.0,
     limits: Limits = None,
     record: Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")] = 0,
     known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")] = False,
     plain_light: PlainLight = False,
     at_rest: AtRest = FIRST,

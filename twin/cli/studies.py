@@ -59,7 +59,7 @@ def servo_command(
     objects: Annotated[str, typer.Option("--objects", callback=each_once, help="names with commas between")] = OBJECTS,
     parameters: ServoName = "surface",
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="steps on each object, instead of once around it")] = None,
-    seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")] = 0,
     plain_light: PlainLight = False,
     force: Force = False,
 ) -> None:

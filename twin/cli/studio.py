@@ -54,16 +54,19 @@ def studio(
     plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay drawn")] = False,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="end after this time")] = None,
 ) -> None:
-    from hardware.live_feed import CameraFeed
+    from hardware.live_feed import CameraFeed, require_feed
     from hardware.rig import signals_as_ctrl_c
+    from scenes import load_sensor
     from twin.studio.state import first_state
     from twin.studio.studio import StudioPlan, run_studio
 
     first = first_state(state, sensor, object_name)
+    shown = load_sensor(first.sensor)
+    require_feed(camera, arm, recording, shown)
     plan = StudioPlan(first, saves, host=host, port=port, traces=not plain, recording=recording, camera=camera, arm=arm, seconds=seconds)
     say(plan.warnings)
     with signals_as_ctrl_c():
-        run_studio(plan, models_when_asked(model), CameraFeed, on_open=tell_page)
+        run_studio(plan, models_when_asked(model, shown.name), CameraFeed, on_open=tell_page)
 
 
 def tell_page(url: str) -> None:
@@ -71,12 +74,16 @@ def tell_page(url: str) -> None:
     print(f"open {url} in a browser; Ctrl-C ends it", flush=True)
 
 
-def models_when_asked(run: Path | None) -> Callable[[str], "PoseEstimator | None"]:
-    """``models_by_sensor`` of a run, loaded when the first model is asked for: the page does not wait for PyTorch."""
+def models_when_asked(run: Path | None, sensor: str) -> Callable[[str], "PoseEstimator | None"]:
+    """``models_by_sensor``; without a run loaded when the first model is asked for, so that the page does not wait for PyTorch."""
 
-    def model_of(sensor: str) -> "PoseEstimator | None":
+    def model_of(name: str) -> "PoseEstimator | None":
         from training.estimator import models_by_sensor
 
-        return models_by_sensor(run)(sensor)
+        return models_by_sensor()(name)
 
-    return model_of
+    if run is None:
+        return model_of
+    from training.estimator import models_by_sensor
+
+    return models_by_sensor(run, sensor)

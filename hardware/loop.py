@@ -19,7 +19,7 @@ from hardware.errors import DeviceError, StaleDataError
 from hardware.last_axis import HOLD_DEG, LastAxis
 from hardware.rig_geometry import matrix_of, moved
 from hardware.safe_arm import RefusedMoveError, try_each
-from hardware.safety import Code
+from hardware.safety import Code, Sensed
 from hardware.servo import Memory, Reading, servo_step, tangent_of
 from hardware.step import Guard, LoopSettings, StepRecord
 from hardware.timing import Spread, Timing
@@ -95,7 +95,7 @@ class ServoLoop:
     guards : list of Guard
         Called before every move, in this order. Each may change the target or refuse it.
     sense : callable, optional
-        Called before the move with the depth (mm) and the exposure (``time.monotonic()``) of each fresh estimate.
+        Called before the move with what each fresh estimate tells: depth, force, torque, slip, and when the frame was exposed.
     forget : callable, optional
         Called when the sensor leaves the object on purpose, to turn back the last axis of an arm of four axes.
     retreat : callable, optional
@@ -119,7 +119,7 @@ class ServoLoop:
     mounting: Mounting
     settings: LoopSettings
     guards: list[Guard] = field(default_factory=list)
-    sense: Callable[[float, float], None] | None = None
+    sense: Callable[[Sensed], None] | None = None
     forget: Callable[[], object] | None = None
     retreat: Callable[[np.ndarray], object] | None = None
     way: Callable[[np.ndarray, np.ndarray], list[np.ndarray]] | None = None
@@ -246,7 +246,7 @@ class ServoLoop:
         try:
             self._sent = self._move(pose, wait=False)
         except RefusedMoveError as refused:
-            if refused.decision.code is not Code.STALE_FRAME:
+            if refused.decision.code not in (Code.STALE_FRAME, Code.SLIPPING):
                 raise
             self._hold(str(refused), refused, age_s)
             return
@@ -282,7 +282,7 @@ class ServoLoop:
             if self.law is None:
                 view.tangent = tangent_of(self.mounting, view.exposed_pose, view.reading)
             if self.sense is not None:
-                self.sense(view.reading.depth_mm, frame.time_s)
+                self.sense(Sensed.of(view.reading.depth_mm, frame.time_s, view.estimate.names, view.estimate.value))
         return True
 
     def _lags(self, state: ArmState, from_pose: np.ndarray, now_s: float) -> bool:

@@ -229,7 +229,7 @@ def servo_loop(
     loop.way = lambda start, clear: way_around(rig.placed, start, clear)
     if isinstance(rig.arm, SafeArm):
         arm = rig.arm
-        loop.sense = lambda depth_mm, time_s: arm.sense(depth_mm=depth_mm, frame_time_s=time_s)
+        loop.sense = arm.sense
         loop.forget = arm.forget_contact
         loop.retreat = lambda away: _retreat(arm, away)
     return loop

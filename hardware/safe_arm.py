@@ -108,9 +108,9 @@ class SafeArm:
         self._log = log
         self._sensed: Sensed | None = None
 
-    def sense(self, *, depth_mm: float, frame_time_s: float) -> None:
-        """Report what the sensor shows. After the first call a move needs a frame that is new enough. A depth of NaN means not known."""
-        self._sensed = Sensed(depth_mm, frame_time_s)
+    def sense(self, sensed: Sensed) -> None:
+        """Report what the sensor shows. After the first call a move needs a frame that is new enough. A NaN means not known."""
+        self._sensed = sensed
 
     def forget_contact(self) -> None:
         """Forget what ``sense`` told: the sensor leaves the object. No move needs a frame until ``sense`` is called again."""

@@ -1,5 +1,6 @@
 """Safety limits of an arm, and the decision, made before every move, whether it is allowed. A decision has a code and no side effects."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -12,7 +13,7 @@ from hardware.arms.arm import FEEDBACK_AGE_S, ArmState
 from hardware.arms.kinematics import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError
 from hardware.arms.motion import check_line, turn_between_deg
 from hardware.errors import DeviceError
-from scenes.base import NonNegative, Positive, Section, SpecError
+from scenes.base import Fraction, NonNegative, Positive, Section, SpecError
 from scenes.load import read_section
 
 # Halvings of a way in the search for its last allowed place: 100 mm are divided to 0.01 mm.
@@ -51,6 +52,10 @@ class SafetyLimits(Section):
         Largest speeds.
     contact_mm : float
         Deepest contact that the sensor may report.
+    force_n, torque_nmm : float, optional
+        Largest force, and largest torque about the sensor's axis, that the sensor may report; the arm retreats from larger ones.
+    slip_share : float, optional
+        Largest share of the contact that may slide; the arm holds still where more does.
     frame_age_s : float
         Largest age of the frame that a move is decided on.
     feedback_age_s : float
@@ -70,6 +75,9 @@ class SafetyLimits(Section):
     linear_mm_s: Positive = 100.0
     angular_deg_s: Positive = 90.0
     contact_mm: Positive = 6.0
+    force_n: Positive | None = None
+    torque_nmm: Positive | None = None
+    slip_share: Fraction | None = None
     frame_age_s: Positive = 0.5
     feedback_age_s: Positive = FEEDBACK_AGE_S
     retreat_mm: Positive = 50.0
@@ -105,6 +113,9 @@ class Code(StrEnum):
     STALE_FEEDBACK = "stale-feedback"
     STALE_FRAME = "stale-frame"
     TOO_DEEP = "too-deep"
+    TOO_STRONG = "too-strong"
+    TOO_TWISTED = "too-twisted"
+    SLIPPING = "slipping"
     OUTSIDE_BOX = "outside-box"
     OUTSIDE_ANNULUS = "outside-annulus"
     OUT_OF_REACH = "out-of-reach"
@@ -145,10 +156,35 @@ class Decision:
 
 @dataclass(frozen=True)
 class Sensed:
-    """The sensor's estimate of the contact: depth (mm, NaN if unknown), and time of the frame's exposure (``time.monotonic()``)."""
+    """The sensor's estimate of the contact. What the model does not tell is NaN, and no limit applies to it.
+
+    Attributes
+    ----------
+    depth_mm : float
+    frame_time_s : float
+        Time of the frame's exposure (``time.monotonic()``).
+    force_n : float
+        Size of the force.
+    torque_nmm : float
+        Torque about the sensor's axis, of either sign.
+    slip_share : float
+        Share of the contact that slides, 0 to 1.
+    """
 
     depth_mm: float
     frame_time_s: float
+    force_n: float = float("nan")
+    torque_nmm: float = float("nan")
+    slip_share: float = float("nan")
+
+    @classmethod
+    def of(cls, depth_mm: float, frame_time_s: float, names: Sequence[str], value: np.ndarray) -> "Sensed":
+        """From the labels (K,) of an estimate: ``force_x, force_y, force_z`` or ``Fx, Fy, Fz``, ``torque_z`` or ``Tz``, ``slip_share``."""
+        told = dict(zip(names, np.asarray(value, float).tolist(), strict=True))
+        missing = float("nan")
+        force = [told.get(f"force_{axis}", told.get(f"F{axis}", missing)) for axis in "xyz"]
+        torque = told.get("torque_z", told.get("Tz", missing))
+        return cls(depth_mm, frame_time_s, float(np.linalg.norm(force)), torque, told.get("slip_share", missing))
 
 
 def decide(
@@ -268,6 +304,15 @@ def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed
         return Decision(Action.HOLD, Code.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)")
     if sensed.depth_mm > limits.contact_mm:
         return Decision(Action.RETRACT, Code.TOO_DEEP, f"{sensed.depth_mm:.1f} mm deep in contact (allowed {limits.contact_mm:g} mm)")
+    if limits.force_n is not None and sensed.force_n > limits.force_n:
+        return Decision(Action.RETRACT, Code.TOO_STRONG, f"the sensor feels {sensed.force_n:.1f} N (allowed {limits.force_n:g} N)")
+    if limits.torque_nmm is not None and abs(sensed.torque_nmm) > limits.torque_nmm:
+        felt = f"{abs(sensed.torque_nmm):.0f} N mm about its axis"
+        return Decision(Action.RETRACT, Code.TOO_TWISTED, f"the sensor feels {felt} (allowed {limits.torque_nmm:g} N mm)")
+    if limits.slip_share is not None and sensed.slip_share > limits.slip_share:
+        return Decision(
+            Action.HOLD, Code.SLIPPING, f"{sensed.slip_share:.0%} of the contact slides (allowed {limits.slip_share:.0%}); press harder"
+        )
     return None
 
 

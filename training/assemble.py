@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from training.dataset import Dataset
-from training.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points, Processes, fit_processes
+from training.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points, Processes, fit_processes, fit_smooth_processes
 from training.label_code import LabelCode, label_error
 from training.models.part import Inputs, Model, Modes, Prediction, Prepared
 from training.networks import predict_rows
@@ -165,7 +165,10 @@ def calibrate(
     if kernel:
         for view in range(prepared.views):
             modes = single[0].modes(prepared.inputs, torch.from_numpy(view * len(data) + train))
-            processes, left = fit_processes(modes.inputs, y[np.ix_(train, main)], seed=seed)
+            known = y[np.ix_(train, main)]
+            processes, left = (
+                fit_smooth_processes(modes.inputs, known) if model.modes_scaled else fit_processes(modes.inputs, known, seed=seed)
+            )
             content["kernels"].append(processes.arrays())
             if view == 0:
                 left_out[np.ix_(train, main)] = left

@@ -7,8 +7,8 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.pins import PIN_COLUMNS, PinTable, pin_table, voronoi_areas
-from training.simulated import is_pins_only, is_simulated, open_simulated, touched_labels
-from training.targets import Targets, choose_targets, joined_targets
+from training.simulated import contact_labels, is_pins_only, is_simulated, open_simulated, touched_labels
+from training.targets import CONTACT, CONTACT_UNITS, Targets, choose_targets, joined_targets
 from twin.errors import FrameError
 from twin.frames import Recording, natural_key, open_recording
 from twin.pins import nominal_reference
@@ -130,6 +130,8 @@ def load_dataset(
     else:
         recording = open_recording(folder, spec, form)
         pins = pin_table(recording, spec, problems=problems, progress=progress)
+    if simulated and (columns == CONTACT or set(CONTACT_UNITS) & set(columns)):
+        recording.labels.update(contact_labels(Path(folder), recording.names))
     row_of = {name: k for k, name in enumerate(recording.names)}
     rows = np.array([row_of[name] for name in pins.image_name], int)
     targets = choose_targets(recording, columns, rows, depth_per_move, problems)

@@ -20,6 +20,8 @@ from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.pins import PinTable
 from training.recipes import TrainingError
 from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
+from training.targets import BOUNDS
+from training.touched import TouchAnswer
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec
 from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
@@ -48,6 +50,8 @@ class PoseEstimate:
         Time from the frame to the estimate.
     contact : str
         The kind of contact that the frame was taken for; empty if the model does not tell kinds, or if it is none that it knows.
+    touched : float
+        Probability that anything is touched; NaN where no frame without contact was given (``PoseEstimator.at_rest``).
     """
 
     names: tuple[str, ...]
@@ -60,6 +64,7 @@ class PoseEstimate:
     reason: str
     ms: float
     contact: str = ""
+    touched: float = float("nan")
 
 
 class PoseEstimator:
@@ -88,6 +93,7 @@ class PoseEstimator:
         self.sensor = SensorSpec.model_validate(config["sensor"])
         self.form = Form(config["pipeline"]["form"])
         self.names, self.units = tuple(config["columns"]), tuple(config["units"])
+        self._bounds = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
         reference = make_reference(content["reference_px"].numpy(), self.sensor.pins)
         self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
         self.ensemble = Ensemble(self.part, reference, content, config["size"])
@@ -138,10 +144,17 @@ class PoseEstimator:
         ------
         FrameError
             The layout can't be found in the frame, or the model does not count pins from rest.
+
+        Notes
+        -----
+        From then on a frame that shows no contact gives no estimate.
         """
         if not self.counts_from_rest:
             raise FrameError(f"a no-contact frame serves only a model that counts pins from rest, {self.model} does not; leave it out")
-        return self._counted_from(measure_reference(self.sensor, self.form, frame))
+        reference = measure_reference(self.sensor, self.form, frame)
+        found = self._counted_from(reference)
+        found._trained = replace(found._trained, touched=TouchAnswer(reference))
+        return found
 
     @property
     def recorded_sensor(self) -> SensorSpec:
@@ -200,9 +213,10 @@ class PoseEstimator:
     def _as_estimate(self, made: Prediction | Unseen, started: float, contact: str = "") -> PoseEstimate:
         if isinstance(made, Unseen):
             none = np.full(len(self.names), np.nan)
-            return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact)
+            return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched)
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
-        return PoseEstimate(self.names, self.units, value, value - half, value + half, executed, True, "", _ms(started), contact)
+        value, low, high = (np.clip(each, *self._bounds) for each in (value, value - half, value + half))
+        return PoseEstimate(self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched)
 
     def pins_in(self, frame: Frame) -> PinTable | Unseen:
         """A table of one frame's pins, or why they can't be used; raises as a call."""

@@ -25,14 +25,17 @@ from twin.store import write_bytes, write_text, writes
 
 WEIGHTS = "weights.safetensors"
 SHIPPED = Path(__file__).parent / "weights"
+MOST_ROWS = 2000  # rows of a Gaussian process that a small copy holds: 1 MB
 LARGE = 1000  # numbers; a larger array is kept in half precision
 NETWORKS = "networks"  # the networks' weights, in ``weights.pt``
+KERNELS = "kernels"  # the arrays of the Gaussian processes of the modes, one for each view, in ``weights.pt``
+KERNEL_LABELS = "kernel_labels"  # the labels that they estimate
 BESIDE = "beside"  # the arrays of the Gaussian process beside the networks, in ``weights.pt``
 SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; the shipped copies were made before there was one
 RECORDINGS = (
     "recordings"  # names of the folders that the run learnt from, in the small copy's configuration; ``rows`` tells how many frames
 )
-NOT_PACKED = ("kernels", "kernel_labels", "parameters", "learnt_from")  # entries of ``weights.pt`` that a small copy leaves out
+NOT_PACKED = (KERNELS, KERNEL_LABELS, "parameters", "learnt_from")  # entries of ``weights.pt`` that are not packed as they are
 
 
 def shipped_names() -> list[str]:
@@ -42,25 +45,33 @@ def shipped_names() -> list[str]:
 
 @writes(WEIGHTS, "config.json")
 def pack(run: Path, out: Path) -> int:
-    """Write the small copy of a finished run that has no Gaussian processes of its modes, and return its size in bytes.
+    """Write the small copy of a finished run, and return its size in bytes.
 
     Raises
     ------
     TrainingError
-        The run is a small copy already, has such processes, or is of a model that has no small copy.
+        The run is a small copy already, has Gaussian processes of more than ``MOST_ROWS`` rows, or is of a model that has no small copy.
     """
     if not (run / TENSORS).is_file():
         raise TrainingError(f"{run}: a small copy already; give the run that it was made of")
     config, content = read_config(run), read_tensors(run / TENSORS)
-    if content["kernels"]:
+    rows = max((len(arrays["inputs"]) for arrays in content[KERNELS]), default=0)
+    if rows > MOST_ROWS:
         raise TrainingError(
-            f"{run}: has Gaussian processes beside its networks, which a small copy does not hold; only runs with --no-kernel can be packed"
+            f"{run}: has Gaussian processes of {rows} frames beside its networks, and a small copy holds {MOST_ROWS} at most; "
+            "train with --no-kernel"
         )
     model = model_named(config["model"])
     kept = {key: value for key, value in content.items() if key not in NOT_PACKED}
     kept[NETWORKS] = [model.pack(weights) for weights in content[NETWORKS]]
+    if rows:
+        kept |= {KERNELS: content[KERNELS], KERNEL_LABELS: torch.tensor(content[KERNEL_LABELS])}
     arrays = _flat(kept)
-    whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith(f"{BESIDE}.")}
+    whole = {
+        key
+        for key, value in arrays.items()
+        if value.size <= LARGE or value.dtype == np.int64 or key.startswith((f"{BESIDE}.", f"{KERNELS}."))
+    }
     small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
     small["reference_px"] = content["reference_px"].numpy()  # in full precision, because the graph is made from it
     weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})
@@ -86,7 +97,7 @@ def unpack(config: dict, path: Path) -> dict:
         arrays = load(weights)
     except SafetensorError as error:
         raise ValueError(f"{path.name}: {error}") from error
-    content: dict = {"kernels": [], "kernel_labels": [], "aside": {}, NETWORKS: {}}
+    content: dict = {KERNELS: {}, KERNEL_LABELS: torch.zeros(0), "aside": {}, NETWORKS: {}}
     for key, array in arrays.items():
         of_network = key.startswith(f"{NETWORKS}.")
         *above, last = key.split(".", 2) if of_network else key.split(".")
@@ -94,6 +105,8 @@ def unpack(config: dict, path: Path) -> dict:
         for part in above:
             place = place.setdefault(part, {})
         place[last] = torch.from_numpy(array.astype(np.float32 if of_network else np.float64))
+    content[KERNELS] = [arrays for _, arrays in sorted(content[KERNELS].items())]
+    content[KERNEL_LABELS] = content[KERNEL_LABELS].long().tolist()
     reference = make_reference(content["reference_px"].numpy(), SensorSpec.model_validate(config["sensor"]).pins)
     model = model_named(config["model"])
     blank = model.build(reference, len(content["shift"]), config["size"]).state_dict()

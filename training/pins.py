@@ -6,23 +6,27 @@ recordings stay valid if only the simulation changes.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames import Recording
+from twin.frames.forms import gray_levels
 from twin.pins import Pipeline, make_graph, make_reference
 from twin.pins.batch import UNMEASURED, recording_reference
 from twin.pins.reference import Reference
 from twin.progress import Step
 from twin.store import cached_arrays
-from twin.types import Form
+from twin.types import Form, Frame
 
+LIGHT_SIGMA = 0.12  # sd of the Gaussian over which a cap's light is averaged, in mean rest spacings: about a third of a cap
+LEAST_LEVEL = 0.5  # gray levels, added before the logarithm is taken: half a step of the camera
 # Fields of a PinTable that hold a row for each frame.
-PIN_COLUMNS = ("image_name", "nodes_px", "area_px2", "lost", "valid")
+PIN_COLUMNS = ("image_name", "nodes_px", "area_px2", "lost", "valid", "light")
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,8 @@ class PinTable:
     valid : (M,) bool
     measured : bool
         Whether the reference was measured with the camera of these frames. Otherwise it is computed from the specification.
+    light : (M, N) float, optional
+        Logarithm of the gray level at each pin (``cap_light``); 0 where there are no pictures.
     """
 
     sensor: SensorSpec
@@ -56,6 +62,11 @@ class PinTable:
     lost: np.ndarray
     valid: np.ndarray
     measured: bool = False
+    light: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if self.light.shape != self.lost.shape:
+            object.__setattr__(self, "light", np.zeros(self.lost.shape))
 
     def __len__(self) -> int:
         return len(self.image_name)
@@ -86,7 +97,7 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
         reference, named = recording_reference(spec, recording, notes)
         pipeline = Pipeline(spec, recording.form, reference)
         n = spec.pins.count
-        names, nodes, areas, lost, valid = [], [], [], [], []
+        names, nodes, areas, lost, valid, light = [], [], [], [], [], []
         for frame in recording:
             try:
                 seen = pipeline(frame)
@@ -99,6 +110,7 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
             nodes.append(np.full((n, 2), np.nan) if graph is None else graph.nodes_px)
             areas.append(np.full(n, np.nan) if graph is None else graph.area_px2)
             lost.append(np.isnan(seen.pins_px[:, 0]))
+            light.append(np.zeros(n) if graph is None else cap_light(frame, graph.nodes_px, reference))
             if progress:
                 progress(frame.sequence + 1, len(recording))
         notes += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
@@ -107,6 +119,7 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
             "area_px2": np.reshape(areas, (-1, n)),
             "lost": np.reshape(lost, (-1, n)).astype(bool),
             "valid": np.array(valid, bool),
+            "light": np.reshape(light, (-1, n)),
         }
         about = {"rest_px": reference.pins_px, "measured": np.array(named != UNMEASURED), "notes": np.array(notes, str)}
         return {"image_name": np.array(names, str)} | about | arrays
@@ -115,6 +128,16 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
     problems += found.pop("notes").tolist()
     reference = make_reference(found.pop("rest_px"), spec.pins)
     return PinTable(spec, recording.form, reference, measured=bool(found.pop("measured")), **found)
+
+
+def cap_light(frame: Frame, nodes_px: np.ndarray, reference: Reference) -> np.ndarray:
+    """Logarithm (N,) of the gray level at the pins (N, 2) of a frame, averaged over the middle of a cap."""
+    gray = gray_levels(frame.image)
+    sigma_px = LIGHT_SIGMA * float(reference.spacing_px.mean())
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
+    at = nodes_px.astype(np.float32).reshape(-1, 1, 2)
+    level = cv2.remap(smooth, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
+    return np.log(level.astype(float) + LEAST_LEVEL)
 
 
 def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:

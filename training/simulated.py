@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scenes.load import explained
 from scenes.sensor import SensorSpec
 from training.generation.config import GenerationConfig
 from training.generation.store import CONFIG, DRAWS, read_record
+from training.targets import CONTACT_UNITS
 from twin.errors import DatasetError, FrameError
 from twin.frames import Recording
 from twin.frames.folders import image_folders
@@ -24,6 +26,7 @@ from twin.rig.touch import Surface, surface_labels
 from twin.types import Form
 
 TABLE = "targets.csv"
+LEAST_AREA_MM2 = 1e-6  # where nothing touches, no share of the area slides
 
 
 def is_simulated(folder: Path) -> bool:
@@ -129,6 +132,24 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         for label, values in surface_labels(config.experiment, Mounting.of(sensor, config.experiment), surface, sent).items():
             found.setdefault(label, np.full(len(rows), np.nan))[mine] = values
     return found
+
+
+def contact_labels(folder: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Force, torque, area, share that slides and touch of simulated frames: values (M,) by the names of ``CONTACT_UNITS``.
+
+    Parameters
+    ----------
+    names : M str
+        Names of frames; NaN for those that are not in the data set.
+    """
+    truth, _, _ = open_truth(folder)
+    rows_by_name = row_of(truth)
+    rows = np.array([rows_by_name.get(name, -1) for name in names], int)
+    arrays = arrays_of(truth, ("force_n", "torque_nmm", "area_mm2", "slipping_mm2", "map_touched_mm2"))
+    area, pressed = arrays["area_mm2"], np.maximum(arrays["map_touched_mm2"].sum(axis=1), LEAST_AREA_MM2)
+    slips = np.minimum(arrays["slipping_mm2"] / pressed, 1.0)
+    values = (*arrays["force_n"].T, arrays["torque_nmm"][:, 2], area, slips, area > 0)
+    return {name: np.where(rows < 0, np.nan, each[rows]) for name, each in zip(CONTACT_UNITS, values, strict=True)}
 
 
 def _draws(path: Path) -> dict[int, dict[str, float]]:

@@ -26,6 +26,23 @@ PRESETS = {
     "edge-3d": ("pose_1", "pose_3", "pose_6"),
     "edge-circle": ("pose_2", "pose_3", "pose_6"),
 }
+# Preset whose columns depend on the recording: everything that its table tells about a contact (``contact_columns``).
+CONTACT = "contact"
+# What is known of a simulated contact beside the arm's pose: name of the label and its unit. Forces are of the skin on the object, in the
+# sensor frame (z out of the tip); the torque is about the sensor's axis; the area is of the skin at rest.
+CONTACT_UNITS = {
+    "force_x": "N",
+    "force_y": "N",
+    "force_z": "N",
+    "torque_z": "Nmm",
+    "contact_area": "mm2",
+    "slip_share": "",
+    "contact": "",
+}
+# Least and greatest value that a label can have.
+BOUNDS = {"contact_area": (0.0, np.inf), "slip_share": (0.0, 1.0), "contact": (0.0, 1.0)}
+# Columns of measured forces and torques in recordings (N, N mm), as published ones call them.
+MEASURED_UNITS = {"Fx": "N", "Fy": "N", "Fz": "N", "Tx": "Nmm", "Ty": "Nmm", "Tz": "Nmm"}
 # Fields of Targets that hold a row for each frame.
 TARGET_COLUMNS = ("raw", "corrected", "executed", "move")
 # Units of pose_1 to pose_6, and of move_1 to move_6.
@@ -79,6 +96,8 @@ def joined_targets(parts: Sequence[Targets]) -> Targets:
 
 def unit_of(name: str) -> str:
     """Unit of a column: mm for ``pose_1..3``, ``move_1..3`` and tactile_data's ``pose_x``; deg for ``..4..6`` and ``pose_Rx``."""
+    if name in CONTACT_UNITS or name in MEASURED_UNITS:
+        return (CONTACT_UNITS | MEASURED_UNITS)[name]
     kind, _, axis = name.partition("_")
     if kind in ("pose", "move", "shear"):
         if axis in "123456" and len(axis) == 1:
@@ -100,7 +119,10 @@ def choose_targets(
     FrameError
         The recording has no table, or a column is missing.
     """
-    names = PRESETS.get(columns, (columns,)) if isinstance(columns, str) else tuple(columns)
+    if columns == CONTACT:
+        names = contact_columns(recording)
+    else:
+        names = PRESETS.get(columns, (columns,)) if isinstance(columns, str) else tuple(columns)
     if not recording.labels:
         raise FrameError(
             f"{recording.path}: no labels ({recording.labels_found()}); targets.csv with {', '.join(names)} is expected beside the frames"
@@ -111,7 +133,7 @@ def choose_targets(
         nearest = f"nearest: {', '.join(dict.fromkeys(near))}; " if near else ""
         raise FrameError(
             f"{recording.path}: column {', '.join(missing)} is missing; {recording.labels_found()}; {nearest}"
-            f"choose columns of these, or one of {', '.join(PRESETS)}"
+            f"choose columns of these, or one of {', '.join((*PRESETS, CONTACT))}"
         )
     raw = np.column_stack([_numbers(recording.labels[name], name, problems) for name in names])[rows]
     both = all(name in recording.labels for name in ("move_1", "move_6"))
@@ -124,6 +146,27 @@ def choose_targets(
         executed = np.array([known.get(recording.names[row], np.nan) for row in rows])
     x_mm = _numbers(recording.labels["pose_1"], "pose_1", [])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))
     return Targets(names, raw, corrected(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm)), executed, move)
+
+
+def contact_columns(recording: Recording) -> tuple[str, ...]:
+    """Columns of a recording's table that tell about its contacts: poses, moves and shears that vary, forces, torques, areas and slip.
+
+    Raises
+    ------
+    FrameError
+        The table has no such column.
+    """
+    kinds = ("pose", "move", "shear")
+    names: list[str] = []
+    for name, cells in recording.labels.items():
+        if name in CONTACT_UNITS or name in MEASURED_UNITS or (name.partition("_")[0] in kinds and unit_of(name)):
+            values = np.nan_to_num(numbers(cells))
+            twice = any(np.array_equal(values, np.nan_to_num(numbers(recording.labels[other]))) for other in names)
+            if np.ptp(values) > 0 and not twice:  # tables of other makers are read under both makers' names
+                names.append(name)
+    if not names:
+        raise FrameError(f"{recording.path}: no column that varies tells about the contacts; {recording.labels_found()}")
+    return tuple(names)
 
 
 def corrected(

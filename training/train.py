@@ -13,7 +13,7 @@ from training.models import recipe_of
 from training.networks import choose_device
 from training.run import RUN_FILES, RunConfig, train_run
 from training.run_files import CHECKPOINT, CONFIG, TENSORS
-from training.targets import PRESETS
+from training.targets import CONTACT, PRESETS
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
 from twin.store import writes
@@ -145,4 +145,4 @@ def columns_of(target: str) -> str | tuple[str, ...]:
     names = tuple(name.strip() for name in target.split(",") if name.strip())
     if not names or len(set(names)) < len(names):
         raise OptionError(f"--target {target}: give a preset, or label columns with commas between, each once")
-    return target if target in PRESETS else names
+    return target if target in (*PRESETS, CONTACT) else names

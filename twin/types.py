@@ -94,6 +94,8 @@ class ContactState:
         Area of the outer skin in contact, at rest: skin that is nearer to the object than 0.05 mm. Zero where nothing presses.
     contact_mm : (c, 3) float
         Places of the outer skin that the object presses. Each represents an area ``point_area_mm2 (c,)`` of the skin at rest.
+    contact_place : (c,) complex
+        The same places on the skin (see ``twin.geometry.shapes``).
     normal : (c, 3) float
         The object's outward unit normal at each place.
     normal_n : (c,) float
@@ -121,6 +123,7 @@ class ContactState:
     torque_nmm: FloatArray
     area_mm2: float
     contact_mm: FloatArray
+    contact_place: ComplexArray
     point_area_mm2: FloatArray
     normal: FloatArray
     normal_n: FloatArray
@@ -161,6 +164,7 @@ class ContactState:
             torque_nmm=np.zeros(3),
             area_mm2=0.0,
             contact_mm=no_vectors,
+            contact_place=np.zeros(0, complex),
             point_area_mm2=no_numbers,
             normal=no_vectors,
             normal_n=no_numbers,

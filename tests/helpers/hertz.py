@@ -54,6 +54,7 @@ def contact_points(block, reach_mm: float) -> ContactPoints:
         lift_mm=np.zeros((count**2, 3)),
         area_mm2=np.multiply.outer(width, width).ravel(),
         element=(first[:, None] * block.basis.elements + first).ravel(),
+        place=np.zeros(count**2, complex),
     )
 
 

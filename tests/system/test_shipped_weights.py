@@ -6,6 +6,7 @@ that is much better than stated fails, too: the twin has changed, and what docum
 """
 
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from fresh_contacts import read_for, simulate_contacts
 from training.estimator import PoseEstimator
 from training.evaluate import judge
 from training.packed import shipped_names
+from twin.frames import open_recording
 from twin.types import Form
 
 SEED = 5  # of contacts that no training drew
@@ -29,6 +31,8 @@ class Stated:
     inside: tuple[float, ...]
 
 
+TACPAD = "ur5-tacpad"  # learnt from real frames alone, and judged on them
+LOOKED_AT = 30  # of its frames
 EXPERIMENTS = {"mg400-331": "surface-2d", "mg400-127": "surface-2d", "ur5-331": "surface-3d"}
 QUICK, FULL = (5, 12), (40, 16)  # contacts, elements across
 STATED = {
@@ -42,7 +46,21 @@ STATED = {
 
 
 def test_all_shipped_weights_are_judged():
-    assert set(EXPERIMENTS) == set(shipped_names())
+    assert set(EXPERIMENTS) | {TACPAD} == set(shipped_names())
+
+
+def test_the_tacpads_weights_tell_the_forces_of_its_frames(real_dir):
+    """A few of the frames that they learnt: this says that weights, pins and light still belong together, not how good they are."""
+    estimator = PoseEstimator.load(TACPAD)
+    recording = open_recording(real_dir / "tacpad-force", estimator.sensor, None)
+    found, told = [], []
+    for frame in islice(recording, LOOKED_AT):
+        estimate = estimator(frame)
+        assert estimate.valid, estimate.reason
+        found.append(estimate.value)
+        told.append([float(recording.labels[name][frame.sequence]) for name in estimator.names])
+    error = dict(zip(estimator.names, np.abs(np.array(found) - told).mean(axis=0), strict=True))
+    assert error["pose_z"] < 0.08 and max(error["Fx"], error["Fy"]) < 0.4 and error["Fz"] < 0.7
 
 
 @pytest.mark.parametrize("size", [QUICK, pytest.param(FULL, marks=pytest.mark.slow)], ids=["quick", "full"])

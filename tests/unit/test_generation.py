@@ -96,6 +96,19 @@ def test_the_table_and_the_truth_agree(made):
     assert pressed.mean() > 0.9 and (truth["slipping_mm2"][:] <= truth["area_mm2"][:] + 1e-9).all()
 
 
+def test_the_labels_of_a_contact_are_the_truths(made):
+    folder, config, _ = made
+    data = load_dataset(folder, config.sensor, "contact")
+    names, units = data.targets.names, data.targets.units
+    told = dict(zip(names, data.targets.corrected.T, strict=True))
+    truth = zarr.open_group(folder / "truth.zarr")
+    np.testing.assert_allclose(told["force_z"], truth["force_n"][:, 2])
+    np.testing.assert_allclose(told["contact_area"], truth["area_mm2"][:])
+    assert ((told["slip_share"] >= 0) & (told["slip_share"] <= 1)).all()
+    assert dict(zip(names, units, strict=True))["torque_z"] == "Nmm"
+    assert {"pose_2", "pose_6", "move_1", "move_6"} <= set(names)
+
+
 def test_a_state_on_the_way_is_the_end_of_its_own_label(tmp_path):
     """The state at a part of tap or move, against a contact that ends there; without friction load steps leave no trace."""
     config = small_config(tmp_path, states="all", randomisation=None, friction=0.0)

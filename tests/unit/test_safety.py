@@ -18,6 +18,7 @@ NOW_S = 1000.0
 HOME = np.array([300.0, 0, 0, 0, 0, 0])
 LIMITS = load_limits("mg400").model_copy(update={"step_mm": 5.0, "step_deg": 3.0})
 FREE = LIMITS.model_copy(update={"step_mm": None, "step_deg": None})
+FELT = FREE.model_copy(update={"force_n": 10.0, "torque_nmm": 300.0, "slip_share": 0.5})
 WIDE = SafetyLimits(box_mm=((-500, 500),) * 3)
 RING = SafetyLimits(box_mm=((-500, 500),) * 3, annulus_mm=(200, 440))
 
@@ -44,6 +45,10 @@ def decided(target, limits=FREE, *, at=HOME, sensed=None, **told):
         (decided(HOME, sensed=Sensed(1.0, np.nan)), Action.HOLD, Code.STALE_FRAME),
         (decided(HOME, sensed=Sensed(6.1, NOW_S)), Action.RETRACT, Code.TOO_DEEP),
         (decided(HOME, sensed=Sensed(np.nan, NOW_S)), Action.MOVE, Code.OK),
+        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, force_n=9.9)), Action.MOVE, Code.OK),
+        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, force_n=10.1)), Action.RETRACT, Code.TOO_STRONG),
+        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, torque_nmm=-301.0)), Action.RETRACT, Code.TOO_TWISTED),
+        (decided(HOME, FELT, sensed=Sensed(1.0, NOW_S, slip_share=0.6)), Action.HOLD, Code.SLIPPING),
         (decided(HOME + [0, 0, 160, 0, 0, 0]), Action.REFUSE, Code.OUTSIDE_BOX),
         (decided([400, 290, 0, 0, 0, 0]), Action.REFUSE, Code.OUTSIDE_ANNULUS),
         (decided([30, 300, 0, 0, 0, 90], RING, at=[0, -300, 0, 0, 0, -90]), Action.REFUSE, Code.OUTSIDE_ANNULUS),
@@ -149,7 +154,7 @@ def test_a_safe_arm_sends_what_is_allowed_and_logs_it(arm):
 
 def test_too_deep_a_contact_makes_it_retreat_along_the_normal(arm):
     safe = SafeArm(arm, FREE, normal=(0, 1, 0))
-    safe.sense(depth_mm=7.0, frame_time_s=time.monotonic())
+    safe.sense(Sensed(7.0, time.monotonic()))
     with pytest.raises(RefusedMoveError, match="too-deep"):
         safe.move_linear(HOME)
     assert np.allclose(arm.state().pose, HOME + [0, FREE.retreat_mm, 0, 0, 0, 0])
@@ -157,7 +162,7 @@ def test_too_deep_a_contact_makes_it_retreat_along_the_normal(arm):
 
 def test_a_frame_that_grows_old_stops_it(arm):
     safe = SafeArm(arm, FREE.model_copy(update={"frame_age_s": 0.05}))
-    safe.sense(depth_mm=1.0, frame_time_s=time.monotonic())
+    safe.sense(Sensed(1.0, time.monotonic()))
     safe.set_speed(1.0, 1.0)
     safe.move_linear(HOME + [0, 100, 0, 0, 0, 0], wait=False)
     time.sleep(0.06)
@@ -201,7 +206,7 @@ def test_a_retreat_stays_within_the_box():
 
 def test_stop_and_its_like_are_never_refused(arm):
     safe = SafeArm(arm, FREE)
-    safe.sense(depth_mm=99.0, frame_time_s=-np.inf)
+    safe.sense(Sensed(99.0, -np.inf))
     for call in (safe.stop, safe.emergency_stop, safe.clear_error, safe.disable, safe.disconnect):
         call()
     assert {entry.decision.code for entry in safe.decisions} == {Code.UNGATED} and not arm.is_connected
@@ -219,3 +224,14 @@ def test_a_failed_stop_does_not_keep_it_from_disabling(arm, monkeypatch):
 def test_limits_of_another_arm_are_refused():
     with pytest.raises(DeviceError, match="6 joints"):
         SafeArm(SimulatedArm(axes=6), LIMITS)
+
+
+def test_what_a_model_tells_of_force_torque_and_slip_is_sensed_and_what_it_does_not_tell_limits_nothing():
+    ours = Sensed.of(1.0, NOW_S, ("pose_2", "force_x", "force_y", "force_z", "torque_z", "slip_share"), np.array([0, 3, 0, 4, -7, 0.2]))
+    assert (ours.force_n, ours.torque_nmm, ours.slip_share) == (5.0, -7.0, 0.2)
+    assert Sensed.of(1.0, NOW_S, ("Fx", "Fy", "Fz"), np.array([0, 6.0, 8.0])).force_n == 10.0
+    nothing = Sensed.of(1.0, NOW_S, ("pose_2",), np.zeros(1))
+    tight = FREE.model_copy(update={"force_n": 1e-9, "torque_nmm": 1e-9, "slip_share": 0.0})
+    assert decided(HOME, tight, sensed=nothing).code is Code.OK
+    for name in ("mg400", "magician", "simulated"):
+        assert load_limits(name).force_n is not None  # on by default

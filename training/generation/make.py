@@ -12,6 +12,7 @@ from twin.camera.truth import cap_truth
 from twin.errors import ContactError, MeshError
 from twin.frames.forms import gray_levels
 from twin.geometry.solid import Resolution
+from twin.mechanics.skin_map import skin_map
 from twin.mechanics.solver import SkinSolver
 from twin.optics.variant import one_thread
 from twin.rig.contact import RigContact
@@ -96,6 +97,7 @@ def _simulated(config: GenerationConfig, text: str, draw: Draw, index: int, fail
 def _row(config: GenerationConfig, draw: Draw, simulator: Simulator, state: ContactState, label: ArmLabel) -> dict:
     """Truth of one state; the keys are the arrays of the data set's ``truth.zarr`` (see ``training.generation.store``)."""
     truth = cap_truth(draw.sensor, simulator.rest, state, config.form)
+    grid = skin_map(draw.sensor.geometry, state)
     noise_px = config.randomisation.pin_noise_px if config.randomisation else 0.0
     return {
         "caps_mm": truth.caps_mm.astype(np.float32),
@@ -107,6 +109,11 @@ def _row(config: GenerationConfig, draw: Draw, simulator: Simulator, state: Cont
         "torque_nmm": state.torque_nmm,
         "area_mm2": state.area_mm2,
         "slipping_mm2": float(state.point_area_mm2[state.slipping].sum()),
+        "skin_mm": state.nodes_mm[: simulator.solver.mesh.outer_count].astype(np.float32),
+        "map_force_n": grid.force_n.astype(np.float32),
+        "map_normal_n": grid.normal_n.astype(np.float32),
+        "map_touched_mm2": grid.touched_mm2.astype(np.float32),
+        "map_slipping_mm2": grid.slipping_mm2.astype(np.float32),
         "T_sensor_object": state.T_sensor_object,
         "pose": label.pose,
         "move": label.move,

@@ -62,6 +62,11 @@ UNITS = {  # unit and meaning of each array in this group
     "torque_nmm": "N mm about the sensor's origin",
     "area_mm2": "mm2 of skin in contact: nearer to the object than 0.05 mm",
     "slipping_mm2": "mm2 of skin that is pressed and slides",
+    "skin_mm": "mm, sensor frame: the outer skin's nodes (the first ones of SensorMesh)",
+    "map_force_n": "N, of the skin on the object at each node of the sensor's skin grid (twin.mechanics.skin_map), sensor frame",
+    "map_normal_n": "N, magnitude of the part of it that presses",
+    "map_touched_mm2": "mm2 of skin that is pressed, at each of these nodes",
+    "map_slipping_mm2": "mm2 of it that slides",
     "T_sensor_object": "the object's pose, mm",
     "pose": "pose_1..6 as in targets.csv: mm, deg",
     "move": "move_1..6 as in targets.csv: mm, deg",
@@ -136,7 +141,7 @@ class Store:
         for state, image in enumerate(outcome.images):
             write_bytes(self.pictures / image_name(outcome.index, state), image)
         notes = json.dumps({"draw": outcome.draw, "failures": outcome.failures})
-        write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", {"notes": np.array(notes), **outcome.arrays})
+        write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", {"notes": np.array(notes), **outcome.arrays}, compressed=True)
 
     def finish(self, count: int) -> int:
         """Write tables and truth of the contacts 0 to ``count`` - 1, and return the number of frames."""

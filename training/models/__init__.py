@@ -6,6 +6,7 @@ from training.models.cnn.model import CNN_V1, CNN_V2
 from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
 from training.models.part import Model, Variant
 from training.models.steered.model import STEERED
+from training.models.touch.model import TOUCH
 from training.models.vgnn.model import VGNN
 from training.recipes import Recipe, TrainingError
 
@@ -29,6 +30,7 @@ def register(model: Model) -> None:
 
 register(VGNN)
 register(STEERED)
+register(TOUCH)
 register(GNN)
 register(TAC_VGNN)
 register(TAC_VGNN_RELEASE)

@@ -9,7 +9,7 @@ for all models (``training.assemble``).
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -19,12 +19,13 @@ from torch import nn
 from scenes.sensor import SensorSpec
 from training.dataset import Dataset
 from training.label_code import LabelCode
-from training.pins import PinTable
+from training.pins import PinTable, cap_light
 from training.recipes import Recipe, TrainingError
 from twin.pins import Pipeline
 from twin.pins.reference import Reference
 from twin.types import Frame
 
+LIKELY = 0.5  # probability of a contact below which a frame gives no estimate
 SEEN_DECIMALS = 3  # of pins (px) and areas (px^2) that tell frames apart: the last bits of a centroid may differ between machines
 Learnt = Mapping[str, Mapping[str, np.ndarray]]  # groups of named arrays that a model learnt before its networks did
 Weights = dict[str, torch.Tensor]  # a network's state
@@ -71,19 +72,23 @@ class Prediction:
         Half of the 90 % interval for raw labels, whose moves may not have been executed.
     executed : (B,) float
         Probability that the shear move was executed; NaN if the model does not estimate it.
+    touched : float
+        Of a single frame, the probability that anything is touched; NaN if there is no frame without contact to tell it by.
     """
 
     mean: np.ndarray
     half_width: np.ndarray
     half_width_raw: np.ndarray
     executed: np.ndarray
+    touched: float = float("nan")
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """A frame that shows too little for an estimate, and the reason."""
+    """A frame that shows too little for an estimate, and the reason; ``touched`` as in ``Prediction``."""
 
     reason: str
+    touched: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -116,6 +121,9 @@ class Trained:
         As in ``Prepared``.
     ensemble : callable
         ``ensemble(inputs, rows)`` gives the labels of rows (B,) of inputs.
+    touched : callable, optional
+        ``touched(nodes_px, lost)`` gives the probability that a frame's pins (N, 2) show a contact (``training.touched``). It is there
+        where the pins at rest were measured in a frame without contact.
     """
 
     sensor: SensorSpec
@@ -123,6 +131,11 @@ class Trained:
     reference: Reference
     learnt: Learnt
     ensemble: Callable[[Inputs, torch.Tensor], Prediction]
+    touched: Callable[[np.ndarray, np.ndarray], float] | None = None
+
+    def likely_touched(self, nodes_px: np.ndarray, lost: np.ndarray) -> float:
+        """Probability that pins (N, 2), of which some are ``lost`` (N,), show a contact; NaN where nothing tells it."""
+        return float("nan") if self.touched is None else self.touched(nodes_px, lost)
 
 
 @dataclass(frozen=True)
@@ -163,6 +176,8 @@ class Model(ABC):
         Whether its inputs are displacements from the pins at rest, so that a frame without contact of the sensor in use improves them.
     has_modes : bool
         Whether it has ``modes``, so that a Gaussian process can be averaged with its networks.
+    modes_scaled : bool
+        Whether the scales of its modes say how much they matter, so that the process needs one common length only.
     """
 
     name: str
@@ -174,6 +189,7 @@ class Model(ABC):
 
     counts_from_rest: ClassVar[bool] = False
     has_modes: ClassVar[bool] = False
+    modes_scaled: ClassVar[bool] = False
 
     @abstractmethod
     def prepare(self, data: Dataset, train: np.ndarray) -> Prepared:
@@ -303,6 +319,10 @@ class PinModel(Model):
         seen = trained.pipeline(frame)
         if not seen.valid or seen.graph is None:
             return Unseen(seen.reason)
+        lost = np.isnan(seen.pins_px[:, 0])
+        touched = trained.likely_touched(seen.graph.nodes_px, lost)
+        if touched < LIKELY:
+            return Unseen(f"nothing is touched (probability of a contact {touched:.0%})", touched)
         return PinTable(
             trained.sensor,
             trained.pipeline.form,
@@ -310,14 +330,16 @@ class PinModel(Model):
             np.array([frame.name]),
             seen.graph.nodes_px[None],
             seen.graph.area_px2[None],
-            np.isnan(seen.pins_px[None, :, 0]),
+            lost[None],
             np.ones(1, bool),
             measured=trained.pipeline.reference is not trained.reference,
+            light=cap_light(frame, seen.graph.nodes_px, trained.pipeline.reference)[None],
         )
 
     def estimate_one(self, trained: Trained, pins: PinTable) -> Prediction:
         """Estimate the labels of the one frame of a table."""
-        return self._estimated(trained, pins, together=False)
+        touched = trained.likely_touched(pins.nodes_px[0], pins.lost[0])
+        return replace(self._estimated(trained, pins, together=False), touched=touched)
 
     def estimate_rows(self, trained: Trained, data: Dataset, rows: np.ndarray) -> Prediction:
         """See ``Model``."""

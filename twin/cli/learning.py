@@ -157,6 +157,8 @@ HELP_TRAIN = """Train a model that tells the pose from a frame.
 vgnn              ours: Voronoi graph network on matched pins, ensemble,
                   calibrated 90 % intervals
 steered           ours for an edge whose direction goes round the whole circle
+touch             ours for forces: modes of the pins and light of the caps,
+                  ensemble and Gaussian process; needs a few hundred frames
 tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense
                   layers 96, 64
 tac-vgnn-release  the same with the published code's dense layers: 128, 96
@@ -165,8 +167,12 @@ cnn-v1, cnn-v2    convolutional networks of 5 x 256 and 5 x 48 filters, on
                   128 x 128 px
 
 --target selects the labels, which are columns of the recording's table. It is a preset (surface-2d: pose_2 pose_6; surface-2d-shear:
-also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d; edge-circle) or names with commas between. With --labels
+also move_1 move_6; surface-3d: pose_3 pose_4 pose_5; edge-2d; edge-3d; edge-circle; contact) or names with commas between. With --labels
 corrected, a move that was not executed is taken out of the labels, if move_executed.csv or labels_corrected.csv beside the table says so.
+
+contact is everything that the table tells of a contact: poses and moves that vary, measured forces (Fx, Fy, Fz in N). Of simulated
+contacts it is also force_x, force_y, force_z (N, of the skin on the object, sensor frame), torque_z (N mm, about the sensor's axis),
+contact_area (mm2), slip_share (0 to 1) and contact (0 or 1).
 
 Depth and angle of simulated contacts are relative to the touched surface, whatever its shape: the indentation along the normal at
 the nearest place, and the angle from this normal. So data sets of several objects can be joined: give --data once for each.
@@ -190,7 +196,7 @@ Example:
 
 @app.command("train", help=HELP_TRAIN)
 def train(
-    model: Annotated[str, typer.Option("--model", help="vgnn, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
+    model: Annotated[str, typer.Option("--model", help="vgnn, touch, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
     sensor: Sensor,
     data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give it once for each of several")],
     out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
@@ -332,9 +338,7 @@ Example:
 
 
 @app.command("pack", help=HELP_PACK)
-def pack(
-    run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, trained with --no-kernel")], out: Out, force: Force = False
-) -> None:
+def pack(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn or touch")], out: Out, force: Force = False) -> None:
     from training.estimator import PoseEstimator
     from training.packed import WEIGHTS, pack
     from twin.store import overwriting

@@ -11,7 +11,7 @@ import numpy as np
 import pyvista as pv
 
 from scenes.sensor import GeometrySpec
-from twin.geometry.chart import Focus
+from twin.geometry.chart import Chart, Focus, RectangleChart
 from twin.geometry.shapes import shape_of
 from twin.geometry.solid import Solid, body_points, surface_operators
 from twin.types import ComplexArray, FloatArray, IntArray
@@ -63,13 +63,17 @@ class SensorMesh:
     grid: tuple[int, int, int]
     skin_layers: int
 
+    @property
+    def outer_count(self) -> int:
+        """Number of nodes on the outer surface; they are the first ones."""
+        return self.grid[1] * self.grid[2]
+
 
 def build_mesh(geometry: GeometrySpec) -> SensorMesh:
     """Mesh a sensor at rest: 21x21 columns, one layer of skin, four of gel."""
     side, layers = _ACROSS, _SKIN_LAYERS + _GEL_LAYERS
     v, u = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side), indexing="ij")
-    shape = shape_of(geometry.skin)
-    disc = shape.chart(Focus(radius_rad=_FOCUS_SHARE * shape.largest_rad)).disc(np.stack([u.ravel(), v.ravel()], axis=1))
+    disc = outer_chart(geometry).disc(np.stack([u.ravel(), v.ravel()], axis=1))
     depths = np.concatenate([np.linspace(0, 1, _SKIN_LAYERS + 1), 1 + np.linspace(0, 1, _GEL_LAYERS + 1)[1:]])
     grid = (layers + 1, side, side)
     index = np.arange(np.prod(grid)).reshape(grid)
@@ -85,6 +89,12 @@ def build_mesh(geometry: GeometrySpec) -> SensorMesh:
         grid=grid,
         skin_layers=_SKIN_LAYERS,
     )
+
+
+def outer_chart(geometry: GeometrySpec) -> Chart | RectangleChart:
+    """The chart whose even places are the mesh's columns."""
+    shape = shape_of(geometry.skin)
+    return shape.chart(Focus(radius_rad=_FOCUS_SHARE * shape.largest_rad))
 
 
 def to_pyvista(

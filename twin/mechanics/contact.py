@@ -20,7 +20,7 @@ from twin.compiled import compiled
 from twin.geometry.shapes import SkinShape
 from twin.geometry.solid import Solid
 from twin.objects import ObjectField
-from twin.types import BoolArray, FloatArray, IntArray
+from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SMOOTH_GAP_MM = 0.006
 """eps: penetration below which the pressure rises with its square, so that touching is smooth."""
@@ -47,6 +47,8 @@ class ContactPoints:
         Rest area; together they tile the skin.
     element : (p,) int
         Element below the point.
+    place : (p,) complex
+        Place on the skin (see ``twin.geometry.shapes``).
     """
 
     controls: IntArray
@@ -54,6 +56,7 @@ class ContactPoints:
     lift_mm: FloatArray
     area_mm2: FloatArray
     element: IntArray
+    place: ComplexArray
 
     def positions(self, control_mm: FloatArray) -> FloatArray:
         """(p, 3) in mm."""
@@ -83,6 +86,7 @@ def contact_points(solid: Solid, shape: SkinShape) -> ContactPoints:
         lift_mm=shape.on_outside(flat) - flat,
         area_mm2=np.linalg.norm(growth, axis=1) * step**2,
         element=element,
+        place=solid.chart.disc(np.stack([np.tile(at, count), np.repeat(at, count)], axis=1)),
     )
 
 

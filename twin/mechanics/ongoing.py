@@ -154,6 +154,7 @@ def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: 
         torque_nmm=np.cross(at, force).sum(axis=0),
         area_mm2=touching_mm2 if len(where) else 0.0,
         contact_mm=at,
+        contact_place=points.place[where],
         normal=normal,
         normal_n=normal_n,
         tangential_n=force + normal_n[:, None] * normal,

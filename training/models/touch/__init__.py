@@ -1,0 +1,1 @@
+"""Our model of contacts with forces: see ``training.models.touch.model``."""

@@ -1,0 +1,138 @@
+"""``touch``, our model of contacts with forces: modes of the pins, relative modes, light of the caps; an ensemble and a Gaussian process.
+
+It needs a few hundred labelled frames and trains in minutes. Where ``vgnn`` looks at depth and angles of a surface, ``touch`` also tells
+light contacts apart, in which all pins move little, and uses the caps' brightness where there are pictures.
+"""
+
+from collections.abc import Mapping
+from typing import cast
+
+import numpy as np
+import torch
+
+from training.dataset import Dataset
+from training.label_code import LabelCode
+from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Weights, refuse_sizes
+from training.models.touch.features import Bases
+from training.models.touch.network import TouchNetwork
+from training.models.vgnn.registration import Registration, align, fit_registration
+from training.pins import PinTable
+from training.recipes import Recipe
+from twin.pins.reference import Reference
+
+SIZES = {"modes": 40, "light_modes": 20, "width": 256, "depth": 3}
+"""Modes of displacements (and as many relative ones), modes of light, and the network's layers."""
+GAIN = 3.0
+"""Factor on all features: with it the network learns fastest from their small modes."""
+
+
+HEADROOM = 1.2
+"""A feature may be this much larger than in training before intervals grow."""
+LEAST_FEATURE = 1e-3
+"""Size of a feature that is the same in all training frames."""
+FAR = 0.08
+"""Distance of a pin from where the modes of all pins put it, in rest spacings, from which on it is not a pin."""
+ROUNDS = 2
+"""Rounds in which the modes are learnt; pins that the round before did not trust are filled in."""
+LIGHT_WEIGHT = 0.2
+"""Weight of the light among the inputs of the Gaussian process: it tells little but the state of the lamps."""
+LIGHT_DECIMALS = 4
+"""Decimals of the caps' light, logarithms of levels, that tell frames apart."""
+
+
+class TouchInputs:
+    """Features (M, D) of every frame."""
+
+    def __init__(self, features: np.ndarray) -> None:
+        self.x = torch.from_numpy((GAIN * features).astype(np.float32))
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Arguments of the network for some rows."""
+        return (self.x[rows],)
+
+
+class TouchModel(PinModel):
+    """See the module."""
+
+    counts_from_rest = True
+    has_modes = True
+    modes_scaled = True
+
+    def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> TouchNetwork:
+        """See ``Model``; sizes are those of ``SIZES``."""
+        refuse_sizes(self, size, tuple(SIZES))
+        sizes = SIZES | dict(size)
+        features = 2 * sizes["modes"] + sizes["light_modes"]
+        return TouchNetwork(features, outputs, width=sizes["width"], depth=sizes["depth"])
+
+    def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:
+        """See ``Model``. The modes are learnt from the training rows, and how a contact changes the similarity to the layout at rest."""
+        nodes_px, lost = pins.nodes_px, pins.lost
+        for _ in range(ROUNDS):
+            registration, _ = fit_registration(nodes_px[train], pins.reference.pins_px)
+            lost = _untrusted(registration, pins, pins.reference)
+            nodes_px = np.stack(
+                [registration.fill(each, gone) if gone.any() else each for each, gone in zip(pins.nodes_px, lost, strict=True)]
+            )
+        moved = _moved(registration, pins, pins.reference, lost, together=False)
+        bases = Bases.learnt(moved[train], pins.light[train], lost[train], modes=SIZES["modes"], light_modes=SIZES["light_modes"])
+        learnt = {"registration": registration.arrays(), "bases": bases.arrays()}
+        return Prepared(TouchInputs(bases(moved, pins.light)), learnt)
+
+    def seen(self, data: Dataset) -> object:
+        """See ``Model``: the pins, where they are at rest, and the light of the caps."""
+        return [super().seen(data), np.round(data.pins.light, LIGHT_DECIMALS) + 0.0]
+
+    def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> TouchInputs:
+        """See ``PinModel``. If a frame without contact shows where the camera sits, no displacement of the camera is estimated."""
+        pins = pins.seen_from(reference) if pins.measured else pins
+        registration = Registration(**learnt["registration"])
+        moved = _moved(registration, pins, reference, _untrusted(registration, pins, reference), together=together)
+        return TouchInputs(Bases(**learnt["bases"])(moved, pins.light))
+
+    def initialise(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
+        """See ``Model``. Sets how large the features may be."""
+        cast(TouchNetwork, network).limit.copy_(HEADROOM * inputs.batch(rows)[0].abs().amax(dim=0).clamp(min=LEAST_FEATURE))
+
+    def modes(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:
+        """See ``Model``. The inputs are all features, the light with less weight."""
+        x = inputs.batch(rows)[0].double().numpy() / GAIN
+        weight = np.repeat([1.0, LIGHT_WEIGHT], [2 * SIZES["modes"], SIZES["light_modes"]])
+        return Modes(x * weight, np.zeros(len(x)))
+
+    def pack(self, weights: Weights) -> Weights:
+        """See ``Model``: all of them."""
+        return weights
+
+    def unpack(self, packed: Weights, blank: Weights) -> Weights:
+        """See ``Model``."""
+        return packed
+
+
+def _moved(registration: Registration, pins: PinTable, reference: Reference, lost: np.ndarray, *, together: bool) -> np.ndarray:
+    """Displacements (M, 2 N) in rest spacings, lost pins filled in, without the displacement of a camera that sits elsewhere."""
+    nodes_px = pins.nodes_px.copy()
+    for k in np.flatnonzero(lost.any(axis=1)):
+        nodes_px[k] = registration.fill(nodes_px[k], lost[k])
+    if not pins.measured:
+        nodes_px = registration(nodes_px, pins.area_px2, together=together)[0]
+    return ((nodes_px - reference.pins_px) / reference.spacing_px.mean()).reshape(len(nodes_px), -1)
+
+
+def _untrusted(registration: Registration, pins: PinTable, reference: Reference) -> np.ndarray:
+    """Pins (M, N) that are lost, or so far from where the modes of all pins put them that they are something else: a reflection."""
+    aligned, _ = align(pins.nodes_px, reference.pins_px)
+    away = aligned.reshape(len(aligned), -1) - registration.mean
+    directions = registration.components / np.maximum(np.linalg.norm(registration.components, axis=0), 1e-12)
+    left = (away - away @ directions @ directions.T).reshape(len(away), -1, 2)
+    return pins.lost | (np.linalg.norm(left, axis=2) > FAR * reference.spacing_px.mean())
+
+
+TOUCH = TouchModel(
+    name="touch",
+    description="ours for forces: modes of pins and light of caps, ensemble and Gaussian process, calibrated intervals",
+    recipe=Recipe(epochs=150, batch=128, decay=0.05, members=6, kernel=True),
+)

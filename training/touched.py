@@ -1,0 +1,52 @@
+"""Is anything touched? The answer from the pins alone, where the pins at rest were measured.
+
+Without contact a frame differs from the frame at rest by the noise of the pins, and by a shift, turn and scale of the whole view where the
+camera moved a little. A touch moves neighbouring pins together. So the similarity is taken out, each pin's displacement is averaged with
+its neighbours', and the largest of these averages, a (px), tells the probability (at the rim averages of fewer pins count less)
+
+    P(contact) = 1 / (1 + exp(-(a - MIDDLE_PX) / WIDTH_PX))
+"""
+
+import numpy as np
+
+from training.models.vgnn.registration import align
+from twin.pins.reference import Reference
+from twin.types import BoolArray, FloatArray
+
+MIDDLE_PX = 0.28
+"""Average displacement at which contact is as likely as not. Noise of 0.1 px makes 0.23 px at most in 2,000 frames of the shipped sensors;
+a plate or a ball that presses a soft tip with 0.2 N makes 0.3 px at least."""
+USUAL = 7.0
+"""Pins in an average: one and its six neighbours. At the rim they are fewer, and their noise counts less."""
+WIDTH_PX = 0.02
+"""Change of this average by which the odds grow e-fold."""
+
+
+class TouchAnswer:
+    """Tells whether a frame's pins show a contact.
+
+    Parameters
+    ----------
+    reference : Reference
+        The pins at rest, measured with the camera of the frames.
+    """
+
+    def __init__(self, reference: Reference) -> None:
+        count = len(reference.pins_px)
+        around = np.eye(count)
+        for first, second in ((0, 1), (1, 2), (2, 0)):
+            around[reference.triangles[:, first], reference.triangles[:, second]] = 1.0
+            around[reference.triangles[:, second], reference.triangles[:, first]] = 1.0
+        self._reference, self._around = reference, around
+
+    def __call__(self, nodes_px: FloatArray, lost: BoolArray) -> float:
+        """Probability of a contact, from pins (N, 2); those that are ``lost`` (N,) do not count. NaN if all are."""
+        seen = ~lost
+        if not seen.any():
+            return float("nan")
+        apart, _ = align(nodes_px[None, seen], self._reference.pins_px[seen])
+        around = self._around[np.ix_(seen, seen)]
+        count = around.sum(axis=1, keepdims=True)
+        mean = around @ apart[0] / count * np.sqrt(count / USUAL)
+        largest_px = float(np.linalg.norm(mean, axis=1).max())
+        return float(1 / (1 + np.exp(-np.clip((largest_px - MIDDLE_PX) / WIDTH_PX, -50, 50))))

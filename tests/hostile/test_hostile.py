@@ -24,7 +24,7 @@ from twin.store.output import WRITTEN
 SLOW_MACHINE = 4.0  # times the seconds of an entry, where other work shares the machine
 HANGS_S = 10.0  # for entries that are known not to end, which are not waited for longer
 PROGRESS = re.compile(  # what only progress prints: bars, or a line every ten seconds
-    r"[━╸╺⠀-⣿]|\d/\d+ .*(\d:\d\d:\d\d|-:--:--)|^(?!twin: )(at work|.+: (begun|\d+%|\d+ of \d+)(, .*)?)$"
+    r"[━╸╺⠀-⣿]|\d/\d+ .*(\d:\d\d:\d\d|-:--:--)|^waiting for a frame, \d+ s so far|^(?!twin: )(at work|.+: (begun|\d+%|\d+ of \d+)(, .*)?)$"
 )
 ERROR = "twin: error: "
 NOTED = re.compile(r"^twin: warning: .*(results|functions) can't be kept|^jit_kernel_write\(\)")  # a full disk may be that of caches, too

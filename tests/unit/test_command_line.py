@@ -98,7 +98,7 @@ def test_a_command_that_writes_overwrites_nothing_foreign_unless_it_is_forced(co
         entered = [ast.unparse(item.context_expr) for part in ast.walk(command) if isinstance(part, ast.With) for item in part.items]
         assert entered[0] == "overwriting(force)"
         behind = [_behind(source, name) for source, name in imported(command) if _is_ours(source)]
-        opens = ("@writes", " generate(")  # the second opens the folder of a data set
+        opens = ("@writes", " generate(", " new_sensor(")  # the second and third open what they write themselves
         assert [each for each in behind if inspect.isfunction(each) and any(word in inspect.getsource(each) for word in opens)]
 
 

@@ -95,10 +95,9 @@ def new(
 
     if (frames is None) == (not camera):
         raise OptionError("give either a folder of frames or --camera")
-    given = layout_from(layout) if layout else None
     with overwriting(force):
         if frames is None:
-            frames = gather_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"), say=lambda line: say([line]))
+            frames = gather_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"))
         with shown() as progress:
             made = whole_sensor(
                 frames,
@@ -109,7 +108,7 @@ def new(
                 contacts=contacts,
                 workers=workers,
                 across=across,
-                layout=given,
+                layout=if_given(layout_from, layout),
                 no_contact=no_contact,
                 table=table,
                 form=form,

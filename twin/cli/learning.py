@@ -395,6 +395,7 @@ Writes:
   learning.csv, learning.png, result.json
 
 \b
+Example:
   twin learn --task SurfaceFollow --sensor mg400-331 --out out/learnt
 """
 

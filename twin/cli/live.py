@@ -253,15 +253,14 @@ HELP_POLICY = """Run a trained policy on a camera and an arm.
 
 The policy of 'twin learn' sees the pins of each frame, found by the live pipeline, and moves the tool. The way to the object, the frame
 without contact, the safety layer, letting go and what is written are those of 'twin servo', and so are the options. By default it runs in
-the twin.
+the twin. The exit code is 1 if it ended early.
 
 \b
+Example:
   twin learn --task SurfaceFollow --sensor mg400-331 --out out/learnt
   twin policy out/learnt/policy.safetensors --object can --out out/can
   twin policy out/learnt/policy.safetensors --object can --out out/live \\
       --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
-
-The exit code is 1 if it ended early.
 """
 
 

@@ -144,6 +144,8 @@ class LiveMode:
         self._page.show_nothing("Give a camera and press 'Connect'.")
         if self._feed is None and self._camera.value:
             self._page.guarded(self.connect)(self)
+        elif self._last is not None:  # it came before the mode was entered, or since the mode was left
+            self._newest.give(self._last)
 
     def leave(self) -> None:
         """Leave the pictures to another mode. The camera goes on, and a recording too."""
@@ -171,7 +173,7 @@ class LiveMode:
 
     def disconnect(self) -> None:
         """Let go of camera and arm."""
-        feed, self._feed = self._feed, None
+        feed, self._feed, self._last = self._feed, None, None
         if feed is not None:
             if self._record.value:
                 self._page.say(feed.end_record())

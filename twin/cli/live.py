@@ -275,7 +275,7 @@ def policy_command(
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")] = None,
     limits: Limits = None,
     record: Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="seed of the twin's noise")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")] = 0,
     known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")] = False,
     plain_light: PlainLight = False,
     force: Force = False,

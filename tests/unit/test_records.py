@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -30,6 +31,8 @@ def forever():
 with open_writer(Path(sys.argv[2]), sys.argv[1], ABOUT, 10, at_once=True) as writer:
     writer.write(forever())
 """
+TESTS = Path(__file__).parents[1]
+WITH_HELPERS = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS / "helpers")])}
 EPISODES = [made_episode(seed, 2 + seed) for seed in range(3)]
 
 
@@ -80,7 +83,7 @@ def test_it_is_gone_on_with_and_no_episode_is_written_twice(tmp_path, to):
 def test_killed_at_any_moment_every_finished_episode_is_there(tmp_path, to):
     for number, after_s in enumerate((0.0, 0.07)):
         folder = tmp_path / str(number)
-        with subprocess.Popen([sys.executable, "-c", KILLED, to, str(folder)], stdout=subprocess.PIPE, env=os.environ) as process:
+        with subprocess.Popen([sys.executable, "-c", KILLED, to, str(folder)], stdout=subprocess.PIPE, env=WITH_HELPERS) as process:
             assert process.stdout.readline() == b"ready\n"
             time.sleep(after_s)
             process.send_signal(signal.SIGKILL)

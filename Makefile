@@ -39,6 +39,7 @@ bench: setup     ## speed, as ratios to named baselines in the same run
 validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts, Rerun (670 MB)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,rerun]'
 	@$(BIN)/python -m pytest -n 0 tests/unit/test_rerun_view.py
+	@$(BIN)/python -m pytest -m hypothesis --hypothesis-profile=anew tests  # other draws than those of make test
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests
 
 figures: setup   ## every figure that a document states, into figures.json; goes on where it was; ONLY=pins,render for some of them

@@ -15,6 +15,7 @@ from hardware.errors import DeviceError
 from hardware.live import LiveSession, estimate_line
 from hardware.safe_arm import SafeArm, try_each
 from hardware.safety import SHIPPED_LIMITS, load_limits
+from scenes.files import shown
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.estimate import Estimate, SensorModel
@@ -45,7 +46,9 @@ class WatchedArm:
     def __init__(self, text: str) -> None:
         kind = text.partition(":")[0]
         if not (SHIPPED_LIMITS / f"{kind}.toml").is_file():
-            raise DeviceError(f"--arm {text}: no limits are known for '{kind}', so the page may not move it; write {kind}.toml")
+            raise DeviceError(
+                f"--arm {shown(text)}: no limits are known for '{shown(kind)}', so the page may not move it; write {shown(kind)}.toml"
+            )
         self._arm = SafeArm(open_arm(text), load_limits(kind))
         self.name = self._arm.name
         self._armed = False

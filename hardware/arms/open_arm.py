@@ -7,6 +7,7 @@ from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DASHBOARD_PORT, DEFAULT_HOSTS
 from hardware.arms.simulated import SimulatedArm
 from hardware.errors import DeviceError
+from scenes.files import shown
 
 ARM_SPECS = (
     "mg400 or mg400:ADDRESS[:DASHBOARD_PORT] (an arm, or 127.0.0.1 with 'twin emulate mg400'), mg400-lenient:ADDRESS[:DASHBOARD_PORT] "
@@ -40,7 +41,7 @@ def open_arm(spec: str) -> Arm:
         return MG400(host or DEFAULT_HOSTS["LAN1"], ports=ports, lenient=kind == "mg400-lenient")
     if kind == "magician":
         return Magician(rest or _attached_magician())
-    raise DeviceError(f"no arm '{spec}'; there are: {ARM_SPECS}")
+    raise DeviceError(f"no arm '{shown(spec)}'; there are: {ARM_SPECS}")
 
 
 def kind_of(spec: str) -> str:

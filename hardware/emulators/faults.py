@@ -2,6 +2,7 @@
 
 from difflib import get_close_matches
 
+from scenes.files import shown
 from twin.errors import TwinError
 
 
@@ -31,7 +32,9 @@ class Faults:
         name, _, value = text.partition("=")
         if name not in self.known:
             close = get_close_matches(name, self.known, n=1)
-            raise TwinError(f"no fault '{name}'{f' (did you mean {close[0]}?)' if close else ''}; there are: {', '.join(self.known)}")
+            raise TwinError(
+                f"no fault '{shown(name)}'{f' (did you mean {close[0]}?)' if close else ''}; there are: {', '.join(self.known)}"
+            )
         default = self.known[name][0]
         try:
             self._on[name] = float(value) if value else (1.0 if default is None else default)

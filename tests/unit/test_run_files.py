@@ -21,6 +21,8 @@ from twin.errors import FrameError
 
 CONFIGS = {
     "a list": lambda config: [1],
+    "a model with a name of two lines": lambda config: config | {"model": "vg\nnn"},
+    "a model with a name without end": lambda config: config | {"model": "v" * 5000},
     "nothing": lambda config: None,
     "no sensor": lambda config: config | {"sensor": None},
     "a sensor without a section": lambda config: config | {"sensor": {k: v for k, v in config["sensor"].items() if k != "pins"}},

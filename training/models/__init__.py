@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, fields
 
+from scenes.files import shown
 from training.models.cnn.model import CNN_V1, CNN_V2
 from training.models.graphs.model import GNN, TAC_VGNN, TAC_VGNN_RELEASE
 from training.models.part import Model, Variant
@@ -47,7 +48,7 @@ def model_named(name: str) -> Model:
         There is no such model.
     """
     if name not in MODELS:
-        raise TrainingError(f"no model '{name}'; choose one of {', '.join(MODELS)}")
+        raise TrainingError(f"no model '{shown(name)}'; choose one of {', '.join(MODELS)}")
     return MODELS[name]
 
 
@@ -65,7 +66,7 @@ def variant_named(name: str) -> tuple[Model, Variant]:
         return model, Variant()
     if part not in model.variants:
         can_be = f"can be trained without {', '.join(model.variants)}" if model.variants else "has no part that can be left out"
-        raise TrainingError(f"no model '{name}'; {model.name} {can_be}")
+        raise TrainingError(f"no model '{shown(name)}'; {model.name} {can_be}")
     return model, model.variants[part]
 
 

@@ -2,6 +2,7 @@
 
 import difflib
 
+from scenes.files import shown
 from twin.errors import TwinError
 from twin.judge.degradation.condition import Condition
 from twin.judge.degradation.conditions import electronics, gel, lighting, optics, placement, settings, skin
@@ -22,7 +23,7 @@ def condition(name: str) -> Condition:
         return CONDITIONS[name]
     near = difflib.get_close_matches(name, CONDITIONS, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(CONDITIONS)}"
-    raise TwinError(f"no condition named '{name}': {hint}")
+    raise TwinError(f"no condition named '{shown(name)}': {hint}")
 
 
 def condition_lines() -> list[str]:

@@ -124,6 +124,12 @@ def test_of_a_cut_table_each_label_is_right_or_unknown_but_the_last_number(tmp_p
     assert not lost or problems, "what was lost is told"
 
 
+def test_a_table_cut_before_its_last_number_is_told(tmp_path):
+    (tmp_path / "targets.csv").write_text("image_name,pose_6,pose_2\nf_0.png,1,2\nf_1.png,1,")
+    found, problems = read(tmp_path)
+    assert np.isnan(found["f_1.png"]["pose_2"]) and any("may be cut" in each for each in problems)
+
+
 @pytest.mark.parametrize("form", DECIMAL_COMMA)
 def test_a_decimal_comma_is_read_only_where_commas_separate_nothing(tmp_path, form):
     table = Written([(name, (f"{k}.25", "-0.5")) for k, name in enumerate(FRAMES)], LABELS, form)

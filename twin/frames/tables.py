@@ -65,15 +65,15 @@ class Table:
     name_lists: list[list[str]]
 
 
-def _cells(path: Path) -> list[list[str]]:
+def _cells(text: str) -> list[list[str]]:
     """The rows' cells, without empty rows.
 
     Raises
     ------
-    OSError, csv.Error
-        The file can't be read, a cell is too long, or a row has more cells than a table has.
+    csv.Error
+        A cell is too long, or a row has more cells than a table has.
     """
-    lines = [line for line in _text(path).splitlines() if line.strip()]
+    lines = [line for line in text.splitlines() if line.strip()]
     separator = max(SEPARATORS, key=lines[0].count) if lines else ","
     rows = []
     for number, line in enumerate(lines, 1):
@@ -113,7 +113,8 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
     The reason and its consequence, ``otherwise``, are then added to ``problems``.
     """
     try:
-        rows = _cells(path)
+        text = _text(path)
+        rows = _cells(text)
     except OSError as error:
         problems.append(f"{path.name}: can't be read ({error.strerror}); {otherwise}")
         return None
@@ -128,6 +129,8 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
     ragged = sum(len(row) != len(header) for row in rows[1:])
     if ragged:
         problems.append(f"{path.name}: {ragged} rows don't have the header's {len(header)} cells and are left out")
+    if not rows[-1][-1] and text.splitlines(keepends=True)[-1] == text.splitlines()[-1]:
+        problems.append(f"{path.name}: its last row ends before its last cell; the table may be cut, copy it anew")
     distinct = _distinct(header)
     if renamed := [new for new, old in zip(distinct, header, strict=True) if new != old]:
         problems.append(f"{path.name}: {counted(len(renamed), 'columns have the name of another', renamed)}")

@@ -124,10 +124,11 @@ def test_of_a_cut_table_each_label_is_right_or_unknown_but_the_last_number(tmp_p
     assert not lost or problems, "what was lost is told"
 
 
-def test_a_table_cut_before_its_last_number_is_told(tmp_path):
-    (tmp_path / "targets.csv").write_text("image_name,pose_6,pose_2\nf_0.png,1,2\nf_1.png,1,")
+@pytest.mark.parametrize("last", ["", "-", "+", "\x00"])
+def test_a_table_cut_before_its_last_number_is_told(tmp_path, last):
+    (tmp_path / "targets.csv").write_text(f"image_name,pose_6,pose_2\nf_0.png,1,2\nf_1.png,1,{last}")
     found, problems = read(tmp_path)
-    assert np.isnan(found["f_1.png"]["pose_2"]) and any("may be cut" in each for each in problems)
+    assert np.isnan(found["f_1.png"]["pose_2"]) and any("ends within its last row" in each for each in problems)
 
 
 @pytest.mark.parametrize("form", DECIMAL_COMMA)

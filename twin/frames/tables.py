@@ -129,14 +129,21 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
     ragged = sum(len(row) != len(header) for row in rows[1:])
     if ragged:
         problems.append(f"{path.name}: {ragged} rows don't have the header's {len(header)} cells and are left out")
-    if not rows[-1][-1] and text.splitlines(keepends=True)[-1] == text.splitlines()[-1]:
-        problems.append(f"{path.name}: its last row ends before its last cell; the table may be cut, copy it anew")
+    if _cut(text, rows[1:]):
+        problems.append(f"{path.name}: it ends within its last row, before the last number; copy it anew")
     distinct = _distinct(header)
     if renamed := [new for new, old in zip(distinct, header, strict=True) if new != old]:
         problems.append(f"{path.name}: {counted(len(renamed), 'columns have the name of another', renamed)}")
     rows = [row for row in rows[1:] if len(row) == len(header)]
     columns = {column: [row[k] for row in rows] for k, column in enumerate(distinct) if column}
     return Table(path.name, columns, [[base_name(row[k]) for row in rows] for k in name_columns])
+
+
+def _cut(text: str, rows: list[list[str]]) -> bool:
+    """Whether the text ends within the last row, and its last cell is no number though those above are."""
+    ended = text.splitlines(keepends=True)[-1] != text.splitlines()[-1]
+    *above, last = (np.isnan(_number(row[-1])) for row in rows or [["0"]])
+    return not ended and last and not all(above or [False])
 
 
 def counted(count: int, things: str, names: list[str]) -> str:

@@ -3,27 +3,24 @@
 A policy's file holds no code. It is run from frames through the real pipeline, on a real arm or in the twin alike.
 """
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.pins import Pipeline, Reference, measure_reference, nominal_reference
-from twin.store import output_file, write_bytes
+from twin.store import ArrayFile, Layers, layers_from, layers_to
 from twin.types import FloatArray, Form, Frame
-
-VERSION = 1
-"""Of the file; another version is trained anew."""
 
 
 class PolicyError(TwinError):
     """A policy's file can't be used, or can't be run so."""
+
+
+FILE = ArrayFile("policy", "twin learn", version=1, error=PolicyError)
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class Policy:
     about: dict[str, Any]
     mean: FloatArray
     basis: FloatArray
-    layers: tuple[tuple[FloatArray, FloatArray], ...]
+    layers: Layers
 
     def reduced(self, tactile: FloatArray, goal: FloatArray) -> FloatArray:
         """What the network sees, (B, K + G), of observations (B, ...) and goals (B, G)."""
@@ -75,13 +72,8 @@ class Policy:
 
     def save(self, path: Path) -> int:
         """Write it to a file; its size in bytes."""
-        arrays = {"mean": self.mean, "basis": self.basis}
-        for number, (weights, offset) in enumerate(self.layers):
-            arrays[f"layers.{number}.weights"], arrays[f"layers.{number}.offset"] = weights, offset
-        content = save({key: np.ascontiguousarray(value, np.float32) for key, value in arrays.items()}, {"about": json.dumps(self.about)})
-        with output_file(path):
-            write_bytes(path, content)
-        return len(content)
+        arrays = {"mean": self.mean, "basis": self.basis, **layers_to(self.layers)}
+        return FILE.write(path, {key: value.astype(np.float32) for key, value in arrays.items()}, self.about)
 
 
 def load_policy(path: Path) -> Policy:
@@ -92,23 +84,9 @@ def load_policy(path: Path) -> Policy:
     PolicyError
         There is no such file, or it holds no policy of this version.
     """
-    try:
-        with safe_open(path, framework="numpy") as file:
-            about = json.loads((file.metadata() or {})["about"])
-            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no mapping)
-        if about["version"] != VERSION:
-            raise PolicyError(f"{path}: of another version of this program; train it anew with 'twin learn'")
+    with FILE.opened(path) as (about, arrays):
         SensorSpec.model_validate(about["sensor"])
-        count = sum(key.endswith(".weights") for key in arrays)
-        layers = tuple((arrays[f"layers.{number}.weights"], arrays[f"layers.{number}.offset"]) for number in range(count))
-        return Policy(about, arrays["mean"], arrays["basis"], layers)
-    except FileNotFoundError:
-        raise PolicyError(f"{path}: no such file; train a policy with 'twin learn'") from None
-    except OSError as error:
-        raise PolicyError(f"{path}: can't be read ({error.strerror or error}); give a file of 'twin learn'") from error
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise PolicyError(f"{path}: damaged, or no policy ({reason}); train it anew with 'twin learn'") from error
+        return Policy(about, arrays["mean"], arrays["basis"], layers_from(arrays))
 
 
 @dataclass(frozen=True)

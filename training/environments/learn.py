@@ -21,7 +21,7 @@ from training.environments.batch import Options
 from training.environments.environment import TactileVectorEnv
 from training.environments.tasks import TASKS
 from twin.errors import OptionError
-from twin.policy import VERSION, Policy
+from twin.policy import Policy
 from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import new_figure, save_figure
 from twin.store import text_file, write_json, writes
@@ -265,7 +265,6 @@ def _untrained(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
     spread = np.maximum(sizes[:count], LEAST_SPREAD * sizes[0]) / np.sqrt(len(flat))
     batch, task = vector.batch, vector.batch.task
     about = {
-        "version": VERSION,
         "task": plan.task,
         "experiment": task.experiment,
         "sensor": batch.sensor.model_dump(mode="json"),

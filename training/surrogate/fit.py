@@ -15,7 +15,7 @@ from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Contact
-from training.surrogate.model import VERSION, Surrogate, features, gate, mechanics_of
+from training.surrogate.model import Surrogate, features, gate, mechanics_of
 from training.surrogate.paths import DEEPEST_MM, FRICTION
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
 from training.surrogate.symmetry import ring_directions, symmetries
@@ -178,7 +178,6 @@ def fit(
     onto = _interpolation(sensor)
     on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(MODES, 2, -1, 3) / weights[None], optimize=True)
     about = {
-        "version": VERSION,
         "sensor": sensor.name,
         "mechanics": mechanics_of(sensor),
         "domain": {"depth_mm": DEEPEST_MM + 0.5, "polar_deg": POLAR_DEG, "friction": 3.0},

@@ -9,27 +9,22 @@ rest. The features are depth, friction, nodes that press and slide, force and to
 alone, so the network has no memory of its own that could drift.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from scenes.sensor import SensorSpec
 from training.surrogate.compliance import NODE_RINGS, POLAR_DEG
 from training.surrogate.symmetry import ring_directions, symmetries
 from twin.errors import ContactError, TwinError
 from twin.geometry.pins import rest_pins
-from twin.store import output_file, write_bytes
+from twin.store import ArrayFile, Layers, layers_from, layers_to
 from twin.types import FloatArray
 
 SHIPPED = Path(__file__).parents[1] / "surrogates"
 SUFFIX = ".safetensors"
-VERSION = 1
-"""Of the file; another version is made anew."""
 GATE_MM = 0.3
 """Depth at which the network has three quarters of its say."""
 MECHANICS = ("skin", "gel", "lens", "pins")
@@ -44,6 +39,9 @@ BESIDE = 7
 
 class SurrogateError(TwinError):
     """A surrogate's file can't be used, or no surrogate is known for a sensor."""
+
+
+FILE = ArrayFile("surrogate", "twin surrogate", version=1, error=SurrogateError)
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class Surrogate:
     stiffness: float
     mean: FloatArray
     scale: FloatArray
-    layers: tuple[tuple[FloatArray, FloatArray], ...]
+    layers: Layers
     out_scale: FloatArray
 
     @property
@@ -107,14 +105,10 @@ class Surrogate:
         """Write it to a file; its size in bytes. Large arrays have half precision, and the answers of symmetric nodes are left out."""
         whole = {"stiffness": np.array([self.stiffness]), "mean": self.mean, "scale": self.scale, "out_scale": self.out_scale}
         half = {"modes": self.modes, "read": self.read, "answer": self.answer[representatives(self.phase_deg)]}
-        for number, (weights, offset) in enumerate(self.layers):
-            half[f"layers.{number}.weights"], whole[f"layers.{number}.offset"] = weights, offset
-        arrays = {key: np.ascontiguousarray(value, np.float32) for key, value in whole.items()}
-        arrays |= {key: np.ascontiguousarray(value, np.float16) for key, value in half.items()}
-        content = save(arrays, {"about": json.dumps(self.about, sort_keys=True)})
-        with output_file(path):
-            write_bytes(path, content)
-        return len(content)
+        for key, value in layers_to(self.layers).items():
+            (half if key.endswith("weights") else whole)[key] = value
+        arrays = {key: value.astype(np.float32) for key, value in whole.items()}
+        return FILE.write(path, arrays | {key: value.astype(np.float16) for key, value in half.items()}, self.about)
 
 
 def features(depth_mm: FloatArray, friction: FloatArray, held: FloatArray, slip: FloatArray, wrench: FloatArray) -> FloatArray:
@@ -154,15 +148,9 @@ def load_surrogate(path: Path) -> Surrogate:
     SurrogateError
         There is no such file, or it is no surrogate of this version.
     """
-    try:
-        with safe_open(path, framework="numpy") as file:
-            about = json.loads((file.metadata() or {})["about"])
-            arrays = {key: file.get_tensor(key).astype(np.float32) for key in file.keys()}  # noqa: SIM118 (no mapping)
-        if about["version"] != VERSION:
-            raise SurrogateError(f"{path}: made by another version of this program; make it anew with 'twin surrogate'")
+    with FILE.opened(path) as (about, arrays):
         radius = float(about["mechanics"]["skin"]["outer_radius_mm"])
         phase = float(about["mechanics"]["pins"]["phase_deg"])
-        count = sum(key.endswith(".weights") for key in arrays)
         return Surrogate(
             about,
             radius * ring_directions(NODE_RINGS, POLAR_DEG, phase),
@@ -172,15 +160,9 @@ def load_surrogate(path: Path) -> Surrogate:
             float(arrays["stiffness"][0]),
             arrays["mean"],
             arrays["scale"],
-            tuple((arrays[f"layers.{number}.weights"], arrays[f"layers.{number}.offset"]) for number in range(count)),
+            layers_from(arrays),
             arrays["out_scale"],
         )
-    except FileNotFoundError:
-        raise SurrogateError(f"{path}: no such file; make one with 'twin surrogate'") from None
-    except OSError as error:
-        raise SurrogateError(f"{path}: can't be read ({error.strerror or error}); give a file of 'twin surrogate'") from error
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise SurrogateError(f"{path}: damaged, or no surrogate ({error}); make it anew with 'twin surrogate'") from error
 
 
 def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:
@@ -210,9 +192,8 @@ def surrogate_of(sensor: SensorSpec, file: str | Path | None = None) -> Surrogat
             )
         return found
     for path in sorted(SHIPPED.glob(f"*{SUFFIX}")):
-        found = load_surrogate(path)
-        if found.about["mechanics"] == wanted:
-            return found
+        if FILE.about(path)["mechanics"] == wanted:
+            return load_surrogate(path)
     raise SurrogateError(
         f"no surrogate of {sensor.name} goes with the package; make one: twin surrogate --sensor {sensor.name} --out FILE, "
         "and give it as surrogate=FILE, or use backend='fem'"

@@ -1,5 +1,6 @@
 """Storage of results: files written whole or not at all, safe outputs, a cache, resumable work, and records of the code that made them."""
 
+from twin.store.arrays import ArrayFile, Layers, layers_from, layers_to
 from twin.store.atomic import (
     locked,
     remove_parts,
@@ -21,7 +22,9 @@ from twin.store.resume import KEPT, Item, find_arrays, find_json, keep_arrays, k
 
 __all__ = [
     "KEPT",
+    "ArrayFile",
     "Item",
+    "Layers",
     "cache_folder",
     "cached_arrays",
     "code_of",
@@ -34,6 +37,8 @@ __all__ = [
     "keep_json",
     "kept_arrays",
     "kept_json",
+    "layers_from",
+    "layers_to",
     "locked",
     "made_by",
     "output",

@@ -1,0 +1,134 @@
+"""Files that hold arrays and what is to be said of them, in the safetensors format, which holds no code.
+
+See https://github.com/huggingface/safetensors. The format has no checksums, so a digest of the arrays is kept with the metadata.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from scenes.files import require_regular
+from twin.errors import TwinError
+from twin.store.atomic import write_bytes
+from twin.store.output import output_file
+from twin.types import FloatArray
+
+ABOUT = "about"
+"""Name of what is said of the arrays (JSON), in the metadata."""
+DIGEST = "sha256"
+"""Name of the arrays' digest in the metadata. Files of version 0.1 have none."""
+
+Layers = tuple[tuple[FloatArray, FloatArray], ...]
+"""Weights (o, i) and offsets (o,) of a network's layers."""
+
+
+@dataclass(frozen=True)
+class ArrayFile:
+    """A kind of file: what it holds, and what a user is told where it can't be used.
+
+    Attributes
+    ----------
+    thing : str
+        What it holds.
+    command : str
+        What makes it.
+    version : int
+        Of what it holds; a file of another version is refused.
+    error : type of TwinError
+        Raised where a file can't be used.
+    """
+
+    thing: str
+    command: str
+    version: int
+    error: type[TwinError]
+
+    def write(self, path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> int:
+        """Write arrays, and what is said of them; the file's size in bytes."""
+        whole = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
+        content = save(whole, {ABOUT: json.dumps({**about, "version": self.version}, sort_keys=True), DIGEST: _digest(whole)})
+        with output_file(path):
+            write_bytes(path, content)
+        return len(content)
+
+    def about(self, path: Path) -> dict[str, Any]:
+        """What is said of a file's arrays; the arrays are not read.
+
+        Raises
+        ------
+        TwinError
+            Of the kind ``error``: there is no such file, or it is none of this kind and version.
+        """
+        with self._told(path), safe_open(path, framework="numpy") as file:
+            return self._about(path, file.metadata() or {})
+
+    @contextmanager
+    def opened(self, path: Path) -> Iterator[tuple[dict[str, Any], dict[str, FloatArray]]]:
+        """What is said of a file's arrays, and the arrays as float32. What the body misses in them is told as damage.
+
+        Raises
+        ------
+        TwinError
+            Of the kind ``error``: as of ``about``, or the file is damaged.
+        """
+        with self._told(path):
+            with safe_open(path, framework="numpy") as file:
+                metadata = file.metadata() or {}
+                about = self._about(path, metadata)
+                arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no mapping)
+            if metadata.get(DIGEST, digest := _digest(arrays)) != digest:
+                raise ValueError("changed since it was written")
+            yield about, {key: array.astype(np.float32) for key, array in arrays.items()}
+
+    def _about(self, path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+        about: dict[str, Any] = dict(json.loads(metadata[ABOUT]))
+        if about.pop("version") != self.version:
+            raise self.error(f"{path}: of another version of this program; make it anew with '{self.command}'")
+        return about
+
+    @contextmanager
+    def _told(self, path: Path) -> Iterator[None]:
+        """Tell what goes wrong with a file on one line, with the remedy."""
+        try:
+            require_regular(path)
+            yield
+        except FileNotFoundError:
+            raise self.error(f"{path}: no such file; make one with '{self.command}'") from None
+        except OSError as error:
+            raise self.error(f"{path}: can't be read ({error.strerror or error}); give a file of '{self.command}'") from error
+        except (SafetensorError, KeyError, IndexError, ValueError, TypeError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise self.error(f"{path}: damaged, or no {self.thing} ({reason}); make it anew with '{self.command}'") from error
+
+
+def layers_to(layers: Layers) -> dict[str, np.ndarray]:
+    """A network's layers as arrays by name."""
+    return {f"layers.{n}.{part}": array for n, layer in enumerate(layers) for part, array in zip(("weights", "offset"), layer, strict=True)}
+
+
+def layers_from(arrays: Mapping[str, FloatArray]) -> Layers:
+    """The layers that ``layers_to`` put among arrays.
+
+    Raises
+    ------
+    KeyError
+        A layer is missing.
+    """
+    count = sum(key.startswith("layers.") and key.endswith(".weights") for key in arrays)
+    return tuple((arrays[f"layers.{n}.weights"], arrays[f"layers.{n}.offset"]) for n in range(count))
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    found = hashlib.sha256()
+    for key in sorted(arrays):
+        found.update(f"{key} {arrays[key].dtype.str} {arrays[key].shape} ".encode())
+        found.update(np.ascontiguousarray(arrays[key]).tobytes())
+    return found.hexdigest()

@@ -21,13 +21,17 @@ from twin.cli.options import (
     Camera,
     Force,
     FormOrAuto,
+    KnownPlace,
     Limits,
     Model,
+    NoiseSeed,
     Object,
     Out,
     PlainLight,
+    Record,
     Sensor,
     ServoName,
+    Steps,
     say,
     tell,
 )
@@ -208,13 +212,13 @@ def servo(
     camera: Camera = "twin",
     arm: ArmOption = "simulated",
     parameters: ServoName = "surface",
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")] = None,
+    steps: Steps = None,
     stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
     rate: Annotated[float, typer.Option("--rate", min=0.1, help="decisions a second with --stream")] = 10.0,
     limits: Limits = None,
-    record: Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")] = 0,
-    known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")] = False,
+    record: Record = False,
+    seed: NoiseSeed = 0,
+    known_place: KnownPlace = False,
     plain_light: PlainLight = False,
     at_rest: AtRest = FIRST,
     also: Also = None,
@@ -252,8 +256,9 @@ def servo(
 HELP_POLICY = """Run a trained policy on a camera and an arm.
 
 The policy of 'twin learn' sees the pins of each frame, found by the live pipeline, and moves the tool. The way to the object, the frame
-without contact, the safety layer, letting go and what is written are those of 'twin servo', and so are the options. By default it runs in
-the twin. The exit code is 1 if it ended early.
+without contact, the safety layer, letting go and what is written are those of 'twin servo', and so are the options. It always waits for
+the end of a move (it has no --stream), and counts the pins from its own first frame (it has no --at-rest). By default it runs in the
+twin. The exit code is 1 if it ended early.
 
 \b
 Example:
@@ -272,12 +277,13 @@ def policy_command(
     camera: Camera = "twin",
     arm: ArmOption = "simulated",
     parameters: ServoName = "surface",
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")] = None,
+    steps: Steps = None,
     limits: Limits = None,
-    record: Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")] = 0,
-    known_place: Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")] = False,
+    record: Record = False,
+    seed: NoiseSeed = 0,
+    known_place: KnownPlace = False,
     plain_light: PlainLight = False,
+    also: Also = None,
     force: Force = False,
 ) -> None:
     from hardware.following import FollowPlan, follow
@@ -298,6 +304,7 @@ def policy_command(
         seed=seed,
         plain_light=plain_light,
         known_place=known_place,
+        also=tuple(also or ()),
     )
     with overwriting(force), signals_as_ctrl_c(), shown() as progress:
         followed = follow(plan, load_for_outlines(policy), out, about={"policy": str(policy)}, progress=progress)

@@ -72,6 +72,10 @@ Tuning = Annotated[
 # Sensor whose trained weights are shipped with the package.
 SHIPPED_MODEL = Path("mg400-331")
 Camera = Annotated[str, typer.Option("--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., a folder or a video")]
+Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")]
+Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
+NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
+KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands where --servo says, so measure against it")]
 ArmOption = Annotated[str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS, magician:PORT")]
 
 

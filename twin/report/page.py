@@ -168,9 +168,11 @@ class Page:
         """The page as HTML, for a file in ``folder``."""
         blocks = [{**vars(block), "pictures": [_source(picture, folder, embed) for picture in block.pictures]} for block in self._blocks]
         sections = [block for block in self._blocks if block.kind == "section"]
-        return _render(
-            "page.html.j2",
-            PackageLoader("twin.report", "."),
+        environment = Environment(
+            loader=PackageLoader("twin.report", "."), undefined=StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
+        )
+        return environment.get_template("page.html.j2").render(
+            stylesheet=stylesheet(),
             title=self.title,
             topic=self.topic,
             lead=self.lead,
@@ -223,11 +225,6 @@ def slug(title: str) -> str:
 def link_to(anchor: str) -> str:
     """Address of an anchor in the same page."""
     return f"#{quote(anchor, safe='')}"
-
-
-def _render(template: str, loader: PackageLoader, **content: object) -> str:
-    environment = Environment(loader=loader, undefined=StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.get_template(template).render(stylesheet=stylesheet(), **content)
 
 
 def _source(picture: Picture, folder: Path, embed: bool) -> _Source:

@@ -123,13 +123,13 @@ class ContactEstimator:
         started = perf_counter()
         if frame.form == Form.RAW and self.form == Form.RECORDING and self.sensor.recording is not None:
             frame = replace(frame, image=record(frame.image, self.sensor.recording), form=Form.RECORDING)
-        pins = self._any.pins_in(frame)
-        if isinstance(pins, Unseen):
-            return self._any.unseen(pins.reason, started)
-        kind = str(self.contacts.tell(pins)[0])
+        seen = self._any.pins_in(frame)
+        if isinstance(seen, Unseen):
+            return self._any.unseen(seen, started)
+        kind = str(self.contacts.tell(seen.pins)[0])
         if not kind:
-            return self._any.unseen(f"no contact that the weights know ({', '.join(self.parts)})", started)
-        return self.parts[kind].estimate_one(pins, started, kind)
+            return self._any.unseen(Unseen(f"no contact that the weights know ({', '.join(self.parts)})", seen.touched), started)
+        return self.parts[kind].estimate_one(seen, started, kind)
 
     def taken_for(self, pins: PinTable) -> dict[str, float]:
         """Share of a table's valid frames that are taken for each kind, and for "none"."""

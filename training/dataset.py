@@ -1,5 +1,6 @@
 """Labelled recordings, real and simulated, as data sets: the pins of every usable frame, and its labels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -178,7 +179,7 @@ def joined(parts: list[Dataset]) -> Dataset:
                 raise FrameError(f"{part.folder}: its {what} ({mine}) differs from that of {first.folder} ({others}); train on one kind")
     tables = [part.pins.seen_from(first.pins.reference) for part in parts]
     columns = {key: np.concatenate([getattr(table, key) for table in tables]) for key in PIN_COLUMNS}
-    called = _told_apart([part.folder.resolve() for part in parts])
+    called = told_apart([part.folder.resolve() for part in parts])
     columns["image_name"] = np.concatenate(
         [np.char.add(f"{name}/", part.pins.image_name) for name, part in zip(called, parts, strict=True)]
     )
@@ -194,7 +195,22 @@ def joined(parts: list[Dataset]) -> Dataset:
     return Dataset(pins, targets, tuple(part.folder for part in parts), np.concatenate(groups), problems)
 
 
-def _told_apart(folders: list[Path]) -> list[str]:
+def with_common_labels(parts: Sequence[Dataset]) -> list[Dataset]:
+    """Data sets with those labels that all of them have: what varies in one may be the same throughout another.
+
+    Raises
+    ------
+    FrameError
+        They have none in common.
+    """
+    common = tuple(name for name in parts[0].targets.names if all(name in part.targets.names for part in parts))
+    if not common:
+        folders = ", ".join(str(part.folder) for part in parts)
+        raise FrameError(f"{folders}: no label varies in all of them; train on each alone")
+    return [replace(part, targets=part.targets.only(common)) for part in parts]
+
+
+def told_apart(folders: list[Path]) -> list[str]:
     """The ends of paths, as short as all can be while no two are the same: mostly the folders' names."""
     longest = max(len(folder.parts) for folder in folders)
     ends = (["/".join(folder.parts[-count:]) for folder in folders] for count in range(1, longest + 1))

@@ -13,9 +13,10 @@ import torch
 
 from scenes.sensor import SensorSpec
 from training.assemble import Ensemble
+from training.contact_maps import MAPS, MapModel, read_maps
 from training.dataset import Dataset
 from training.models import model_named
-from training.models.part import Inputs, PinModel, Prediction, Trained, Unseen
+from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
 from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.pins import PinTable
 from training.recipes import TrainingError
@@ -24,6 +25,7 @@ from training.targets import BOUNDS
 from training.touched import TouchAnswer
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec
+from twin.mechanics.skin_map import ContactMaps
 from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
 from twin.store import fingerprint
 from twin.types import Form, Frame
@@ -79,6 +81,8 @@ class PoseEstimator:
     ----------
     learnt_from : (m, 2) int64 or None
         Marks of the frames that the model learnt from (``training.identity.frame_marks``); None if the run does not hold them.
+    maps : MapModel or None
+        What makes contact maps; None unless the run learnt them.
 
     Raises
     ------
@@ -102,6 +106,7 @@ class PoseEstimator:
         learnt = {group: {key: value.numpy() for key, value in arrays.items()} for group, arrays in content["aside"].items()}
         self.learnt_from: np.ndarray | None = content["learnt_from"].numpy() if "learnt_from" in content else None
         self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
+        self.maps: MapModel | None = None
 
     @classmethod
     def load(cls, run: str | Path) -> "PoseEstimator":
@@ -128,9 +133,12 @@ class PoseEstimator:
             require_together(run, config, content)
             if "correction" in content:
                 raise TrainingError(f"{run}: corrected by a regression, which this version does not know; train again")
-            return cls(config, content)
+            found = cls(config, content)
         except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, IndexError) as error:
             raise damaged(run / (WEIGHTS if packed else TENSORS), f"its weights do not fit {CONFIG}") from error
+        if (run / MAPS).is_file():
+            found.maps = read_maps(run / MAPS, found.sensor.geometry)
+        return found
 
     @property
     def counts_from_rest(self) -> bool:
@@ -210,6 +218,47 @@ class PoseEstimator:
         started = perf_counter()
         return self._as_estimate(self.part.estimate_frame(self._trained, frame), started)
 
+    def contact_maps(self, frame: Frame) -> tuple[PoseEstimate, ContactMaps | None]:
+        """The estimate of one frame, and the pressure and shear over the skin that go with it; no maps if the estimate is not valid.
+
+        Raises
+        ------
+        FrameError
+            The frame is not one of the model's sensor: wrong size, type or form.
+        TrainingError
+            The run has no maps.
+        """
+        started, seen = perf_counter(), self.pins_in(frame)
+        if isinstance(seen, Unseen):
+            return self.unseen(seen, started), None
+        made = self.estimate_one(seen, started, "")
+        return made, self.maps_of(seen.pins, made.value[None])[0]
+
+    def maps_of(self, pins: PinTable, values: np.ndarray) -> list[ContactMaps]:
+        """Contact maps of many frames, from their pins and what the model tells of them (M, K).
+
+        Raises
+        ------
+        TrainingError
+            The run has no maps.
+        """
+        model = self.require_maps()
+        return [model(modes, dict(zip(self.names, said, strict=True))) for modes, said in zip(self.modes_of(pins), values, strict=True)]
+
+    def require_maps(self) -> MapModel:
+        """What makes contact maps; ``TrainingError`` if the run has none."""
+        if self.maps is None:
+            raise TrainingError(
+                f"the model of '{self.sensor.name}' makes no contact maps: recordings do not tell what acts on the skin; "
+                "train touch on simulated contacts ('twin dataset', 'twin train --model touch --target contact')"
+            )
+        return self.maps
+
+    def modes_of(self, pins: PinTable) -> np.ndarray:
+        """Modes (M, D) that the model sees in a table's frames; raises as ``inputs_of``."""
+        inputs, rows = self.inputs_of(pins, together=not pins.measured)
+        return self.ensemble.modes(inputs, rows).inputs
+
     def _as_estimate(self, made: Prediction | Unseen, started: float, contact: str = "") -> PoseEstimate:
         if isinstance(made, Unseen):
             none = np.full(len(self.names), np.nan)
@@ -218,11 +267,11 @@ class PoseEstimator:
         value, low, high = (np.clip(each, *self._bounds) for each in (value, value - half, value + half))
         return PoseEstimate(self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched)
 
-    def pins_in(self, frame: Frame) -> PinTable | Unseen:
-        """A table of one frame's pins, or why they can't be used; raises as a call."""
+    def pins_in(self, frame: Frame) -> OneFrame | Unseen:
+        """The pins of one frame, or why they can't be used; raises as a call."""
         return self._of_pins.pins_in(self._trained, frame)
 
-    def estimate_one(self, pins: PinTable, started: float, contact: str) -> PoseEstimate:
+    def estimate_one(self, seen: OneFrame, started: float, contact: str) -> PoseEstimate:
         """Estimate the pose from the pins of one frame.
 
         Parameters
@@ -232,11 +281,11 @@ class PoseEstimator:
         contact : str
             The kind of contact that the frame was taken for.
         """
-        return self._as_estimate(self._of_pins.estimate_one(self._trained, pins), started, contact)
+        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact)
 
-    def unseen(self, reason: str, started: float) -> PoseEstimate:
+    def unseen(self, seen: Unseen, started: float) -> PoseEstimate:
         """The estimate of a frame that shows no pose that the model knows."""
-        return self._as_estimate(Unseen(reason), started)
+        return self._as_estimate(seen, started)
 
     def predict_rows(self, data: Dataset, rows: np.ndarray) -> Prediction:
         """Estimate the labels of some rows (B,) of a data set whose frames are all of one camera.

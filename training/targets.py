@@ -78,6 +78,11 @@ class Targets:
         """The labels of the rows with these indices."""
         return Targets(self.names, **{key: getattr(self, key)[index] for key in TARGET_COLUMNS})
 
+    def only(self, names: tuple[str, ...]) -> "Targets":
+        """The same frames with fewer labels, in the order of ``names``."""
+        chosen = [self.names.index(name) for name in names]
+        return replace(self, names=names, raw=self.raw[:, chosen], corrected=self.corrected[:, chosen])
+
     def instead(self, known: Mapping[str, np.ndarray]) -> "Targets":
         """These targets with other corrected labels: ``known`` holds values (M,) by the names of label columns."""
         columns = [known.get(name, self.corrected[:, k]) for k, name in enumerate(self.names)]

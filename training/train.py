@@ -7,12 +7,16 @@ from pathlib import Path
 import torch
 
 from scenes import SensorSpec
-from training.dataset import joined, load_dataset
+from training.contact_maps import FEWEST_STATES, MAPS, learn_maps, write_maps
+from training.dataset import Dataset, joined, load_dataset, with_common_labels
+from training.estimator import PoseEstimator
 from training.loop import epoch_step
 from training.models import recipe_of
+from training.models.touch.model import TOUCH
 from training.networks import choose_device
-from training.run import RUN_FILES, RunConfig, train_run
+from training.run import RUN_FILES, RunConfig, train_run, training_rows
 from training.run_files import CHECKPOINT, CONFIG, TENSORS
+from training.simulated import is_simulated
 from training.targets import CONTACT, PRESETS
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
@@ -21,7 +25,7 @@ from twin.types import Form
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helpers of its other labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = (CONFIG, "curves.csv", TENSORS)  # of a finished run
+FILES = (CONFIG, "curves.csv", TENSORS, MAPS)  # of a finished run
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class Trained:
     @property
     def written(self) -> list[Path]:
         """The run's files."""
-        return [self.out / name for name in FILES]
+        return [self.out / name for name in FILES if (self.out / name).is_file()]
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
@@ -65,7 +69,7 @@ class Trained:
         return lines
 
 
-@writes(*RUN_FILES, gone_on=(CHECKPOINT,))
+@writes(*RUN_FILES, MAPS, gone_on=(CHECKPOINT,))
 def train_model(
     model: str,
     sensor: SensorSpec,
@@ -127,11 +131,30 @@ def train_model(
     for folder in recordings:
         with stage(progress, f"frames of {folder.name}") as step:
             parts.append(load_dataset(folder, sensor, columns_of(target), form=form, progress=step))
-    found = joined(parts)
+    found = joined(with_common_labels(parts) if target == CONTACT else parts)
     config = RunConfig(model, recipe, labels, seed, split, SHEAR_HELPERS if target == SHEAR_PRESET else ())
     with stage(progress, model) as step:
         finished = train_run(config, found, out, max_minutes=max_minutes, device=chosen, progress=epoch_step(step))
+    if finished and config.model == TOUCH.name and all(is_simulated(folder) for folder in found.folders):
+        with stage(progress, "contact maps"):
+            found.problems.extend(add_maps(out, config, found))
     return Trained(out, finished, len(found), found.targets.names, labels, found.problems)
+
+
+def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
+    """Learn contact maps from the simulated contacts that a finished run learnt from, and write them beside its weights.
+
+    Returns
+    -------
+    list of str
+        Why there are none, a line at most.
+    """
+    data = data.in_order()
+    rows, estimator = training_rows(config, data), PoseEstimator.load(run)
+    if len(rows) < FEWEST_STATES:
+        return [f"{len(rows)} contact states are too few to learn contact maps from ({FEWEST_STATES} are needed): the run has none"]
+    write_maps(run / MAPS, learn_maps(estimator.modes_of(data.pins), data, rows, seed=config.seed))
+    return []
 
 
 def columns_of(target: str) -> str | tuple[str, ...]:

@@ -8,7 +8,7 @@ import pytest
 from small_generation import small_config
 
 from scenes import RandomisationSpec, load_object
-from training.dataset import joined, split_rows
+from training.dataset import joined, split_rows, with_common_labels
 from training.recipes import TrainingError
 from training.run import fold_rows
 from training.studies.objects import Plan, rows_in_range, verdicts
@@ -62,6 +62,16 @@ def test_pins_are_counted_from_one_layout(data):
     other = named(data, "sim/b", 45, 45)
     both = joined([named(data, "sim/a", 0, 45), replace(other, pins=other.pins.seen_from(moved))])
     assert np.allclose(both.pins.nodes_px[45:], other.pins.nodes_px)
+
+
+def test_contacts_of_several_objects_keep_the_labels_that_vary_with_all(data):
+    first, second = named(data, "sim/a", 0, 45), named(data, "sim/b", 45, 45)
+    less = replace(second, targets=second.targets.only(("pose_6",)))
+    both = joined(with_common_labels([first, less]))
+    assert both.targets.names == ("pose_6",)
+    np.testing.assert_array_equal(both.targets.raw[:, 0], data.targets.raw[:90, 1])
+    with pytest.raises(FrameError, match="no label varies in all of them"):
+        with_common_labels([less, replace(first, targets=first.targets.only(("pose_2",)))])
 
 
 def test_what_can_not_be_joined_is_named(data):

@@ -8,7 +8,9 @@ import pytest
 
 from scenes import load_object, load_sensor
 from training.estimator import PoseEstimator
+from training.models import part
 from training.models.part import Unseen
+from training.models.touch.model import TOUCH
 from training.touched import TouchAnswer
 from twin.camera.truth import cap_truth
 from twin.geometry.solid import Resolution
@@ -89,3 +91,22 @@ def test_a_frame_without_contact_gives_no_pose_and_says_why():
     assert "nothing is touched" in found.reason
     unsure = estimator.part.estimate_frame(replace(trained, touched=None), frame)
     assert np.isfinite(unsure.mean).all() and np.isnan(unsure.touched)
+
+
+def test_what_only_some_models_use_is_computed_for_them_alone_and_once(monkeypatch):
+    estimator = PoseEstimator.load("mg400-127")
+    reference, _, _ = answer_of("mg400-127")
+    graph = SimpleNamespace(nodes_px=reference.pins_px, area_px2=reference.area_px2)
+    seen = SimpleNamespace(valid=True, graph=graph, pins_px=reference.pins_px, reason="")
+    asked = []
+    monkeypatch.setattr(part, "cap_light", lambda frame, nodes_px, reference: asked.append("light") or np.zeros(len(nodes_px)))
+    trained = replace(
+        estimator._trained,
+        pipeline=Seeing(seen, form=Form.RECORDING, reference=reference),
+        touched=lambda nodes_px, lost: asked.append("touched") or 0.9,
+    )
+    frame = Frame(np.zeros((256, 256), np.uint8), Form.RECORDING, "f")
+    assert estimator.part.estimate_frame(trained, frame).touched == 0.9
+    assert asked == ["touched"]
+    TOUCH.pins_in(trained, frame)
+    assert asked == ["touched", "touched", "light"]

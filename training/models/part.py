@@ -84,6 +84,14 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class OneFrame:
+    """The pins of one frame, a table of one row, and the probability that they show a contact; ``touched`` as in ``Prediction``."""
+
+    pins: PinTable
+    touched: float = float("nan")
+
+
+@dataclass(frozen=True)
 class Unseen:
     """A frame that shows too little for an estimate, and the reason; ``touched`` as in ``Prediction``."""
 
@@ -278,7 +286,15 @@ class Model(ABC):
 
 
 class PinModel(Model):
-    """A model whose only inputs are the pins that the pipeline finds."""
+    """A model whose only inputs are the pins that the pipeline finds.
+
+    Attributes
+    ----------
+    sees_light : bool
+        Whether it also uses the gray level at each pin.
+    """
+
+    sees_light: ClassVar[bool] = False
 
     @abstractmethod
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> Inputs:
@@ -311,11 +327,11 @@ class PinModel(Model):
 
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction | Unseen:
         """See ``Model``."""
-        pins = self.pins_in(trained, frame)
-        return pins if isinstance(pins, Unseen) else self.estimate_one(trained, pins)
+        seen = self.pins_in(trained, frame)
+        return seen if isinstance(seen, Unseen) else self.estimate_one(trained, seen)
 
-    def pins_in(self, trained: Trained, frame: Frame) -> PinTable | Unseen:
-        """A table of one frame's pins; raises as ``estimate_frame``."""
+    def pins_in(self, trained: Trained, frame: Frame) -> OneFrame | Unseen:
+        """The pins of one frame; raises as ``estimate_frame``."""
         seen = trained.pipeline(frame)
         if not seen.valid or seen.graph is None:
             return Unseen(seen.reason)
@@ -323,23 +339,24 @@ class PinModel(Model):
         touched = trained.likely_touched(seen.graph.nodes_px, lost)
         if touched < LIKELY:
             return Unseen(f"nothing is touched (probability of a contact {touched:.0%})", touched)
-        return PinTable(
+        reference = trained.pipeline.reference
+        pins = PinTable(
             trained.sensor,
             trained.pipeline.form,
-            trained.pipeline.reference,
+            reference,
             np.array([frame.name]),
             seen.graph.nodes_px[None],
             seen.graph.area_px2[None],
             lost[None],
             np.ones(1, bool),
-            measured=trained.pipeline.reference is not trained.reference,
-            light=cap_light(frame, seen.graph.nodes_px, trained.pipeline.reference)[None],
+            measured=reference is not trained.reference,
+            light=cap_light(frame, seen.graph.nodes_px, reference)[None] if self.sees_light else np.zeros((1, len(lost))),
         )
+        return OneFrame(pins, touched)
 
-    def estimate_one(self, trained: Trained, pins: PinTable) -> Prediction:
-        """Estimate the labels of the one frame of a table."""
-        touched = trained.likely_touched(pins.nodes_px[0], pins.lost[0])
-        return replace(self._estimated(trained, pins, together=False), touched=touched)
+    def estimate_one(self, trained: Trained, seen: OneFrame) -> Prediction:
+        """Estimate the labels of one frame."""
+        return replace(self._estimated(trained, seen.pins, together=False), touched=seen.touched)
 
     def estimate_rows(self, trained: Trained, data: Dataset, rows: np.ndarray) -> Prediction:
         """See ``Model``."""

@@ -1,27 +1,39 @@
 """Use of trained models on recordings: estimates of the pose in every frame, and a model's errors on labelled frames."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from training.contact_estimator import ContactEstimator, contacts_folder
+from training.contact_maps import judge_maps
 from training.dataset import joined, load_dataset
 from training.estimator import PoseEstimate, PoseEstimator, folder_of
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.identity import changed_since, learnt_before
 from training.recipes import TrainingError
+from training.simulated import is_simulated
+from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.frames import Recording, open_recording
+from twin.frames.forms import from_raw
+from twin.mechanics.skin_map import ContactMaps
 from twin.pins.batch import MEASURED_BEFORE, recording_reference
 from twin.progress import Progress, silent, stage
+from twin.report.contact_maps import SkinPicture, draw_contact_maps
 from twin.report.table import write_table
-from twin.store import writes
+from twin.store import output, write_npz, writes
+from twin.types import Frame
 
 # Choices of the rows to judge.
 ROWS = ("validation", "all")
 # Choices of the labels that count as truth.
 LABELS = ("corrected", "raw")
+# Length along which the direction of a shear traction is seen in the frame.
+ARROW_MM = 1e-3
 
 
 @dataclass(frozen=True)
@@ -32,19 +44,29 @@ class Predictions:
     ----------
     estimator : PoseEstimator or ContactEstimator
     recording : Recording
+    maps : Path or None
+        Folder into which the contact maps of each frame are written (see ``write_frame_maps``), if they are wanted.
     """
 
     estimator: PoseEstimator | ContactEstimator = field(repr=False)
     recording: Recording = field(repr=False)
+    maps: Path | None = None
 
     def __iter__(self) -> Iterator[tuple[str, PoseEstimate]]:
         """The name of each frame and its estimate."""
-        warm = False
-        for frame in self.recording:
-            if not warm:
-                self.estimator(frame)  # loads or compiles code, which is no part of a frame's time
-                warm = True
-            yield frame.name, self.estimator(frame)
+        with nullcontext() if self.maps is None else output(self.maps, "*.npz", "*.png"):
+            warm = False
+            for frame in self.recording:
+                if not warm:
+                    self.estimator(frame)  # loads or compiles code, which is no part of a frame's time
+                    warm = True
+                if self.maps is None or not isinstance(self.estimator, PoseEstimator):
+                    yield frame.name, self.estimator(frame)
+                    continue
+                made, maps = self.estimator.contact_maps(frame)
+                if maps is not None:
+                    write_frame_maps(self.maps, self.estimator, frame, maps)
+                yield frame.name, made
 
     def lines(self) -> Iterator[str]:
         """Lines for people: what is odd in the recording, each frame's pose once it is estimated, and the frames that can't be read.
@@ -87,7 +109,28 @@ def models_of_kinds(run: str | Path, frames: str | Path) -> ContactEstimator | N
     return models if alone or open_recording(frames, models.sensor).form == models.form else None
 
 
-def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
+def write_frame_maps(folder: Path, estimator: PoseEstimator, frame: Frame, maps: ContactMaps) -> list[Path]:
+    """Write the contact maps of one frame: arrays as ``NAME.npz``, a picture as ``NAME.png``; NAME is the frame's without its ending.
+
+    The arrays are ``nodes_mm`` (G, 3), ``nodes_px`` (G, 2) in the frame, ``area_mm2`` (G,), ``force_n`` (G, 3), ``pressure_mpa`` (G,),
+    ``traction_mpa`` (G, 3) and ``patch`` (G,), of the grid's nodes, and ``resultant_n`` (3,) and ``torque_z_nmm``.
+    """
+    spec, name = estimator.sensor, Path(frame.name).stem
+    along = maps.traction_mpa / np.maximum(np.linalg.norm(maps.traction_mpa, axis=1, keepdims=True), 1e-12)
+    nodes_px, ends_px = (
+        from_raw(spec.recording, estimator.form, project(spec.view, places)) for places in (maps.nodes_mm, maps.nodes_mm + ARROW_MM * along)
+    )
+    arrays = {key: getattr(maps, key) for key in ("nodes_mm", "area_mm2", "force_n", "pressure_mpa", "traction_mpa", "patch")}
+    totals = {"resultant_n": maps.resultant_n, "torque_z_nmm": np.array(maps.torque_z_nmm)}
+    write_npz(folder / f"{name}.npz", arrays | totals | {"nodes_px": nodes_px})
+    shear = np.linalg.norm(maps.traction_mpa, axis=1)
+    shown = SkinPicture(frame.image, nodes_px, ends_px, maps.nodes_mm, maps.pressure_mpa, shear, maps.least_mpa)
+    force = ", ".join(f"{axis} {value:.2f}" for axis, value in zip("xyz", maps.resultant_n, strict=True))
+    draw_contact_maps(folder / f"{name}.png", shown, f"{frame.name}: force {force} N")
+    return [folder / f"{name}.npz", folder / f"{name}.png"]
+
+
+def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = None) -> Predictions:
     """Estimate the poses in the frames at a path by a trained model.
 
     If the model uses displacements from rest and the recording has a frame without contact, displacements are counted from that frame.
@@ -98,11 +141,13 @@ def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
         As ``PoseEstimator.load`` takes it.
     frames : path
         As ``open_recording`` takes it.
+    maps : path, optional
+        Folder for the contact maps of each frame.
 
     Raises
     ------
     TrainingError
-        There is no such run.
+        There is no such run, or it has no contact maps and they are wanted.
     FrameError
         There are no such frames, or they are of another sensor.
     """
@@ -115,7 +160,11 @@ def predict_frames(run: str | Path, frames: str | Path) -> Predictions:
         else:
             _, named = recording_reference(estimator.recorded_sensor, recording, recording.problems)
             estimator = estimator.at_known_rest() if named == MEASURED_BEFORE else estimator
-    return Predictions(estimator, recording)
+    if maps is not None:
+        if not isinstance(estimator, PoseEstimator):
+            raise TrainingError(f"{run}: models of several kinds of contact have no contact maps; leave --maps out")
+        estimator.require_maps()
+    return Predictions(estimator, recording, maps)
 
 
 def _said(made: PoseEstimate) -> str:
@@ -135,7 +184,8 @@ class Evaluation:
     Attributes
     ----------
     metrics : dict
-        Content of ``metrics.json``; with models of several kinds of contact also ``taken_for``, the share of frames taken for each.
+        Content of ``metrics.json``; with models of several kinds of contact also ``taken_for``, the share of frames taken for each; of
+        simulated contacts and a run with contact maps also ``maps`` (see ``MapErrors``).
     changes : list of dict
         Errors on changed images; empty if they were not asked for.
     units : dict of str to str
@@ -165,6 +215,12 @@ class Evaluation:
             )
         if taken := self.metrics.get("taken_for"):
             lines.append("taken for " + ", ".join(f"{kind} {100 * share:.1f} %" for kind, share in taken.items()))
+        if maps := self.metrics.get("maps"):
+            lines.append(
+                f"contact maps of {maps['states']} states: patch's intersection over union {maps['patch_iou']:.2f}, correlation of the "
+                f"pressure {maps['pressure_correlation']:.2f} and of the shear {maps['shear_correlation']:.2f}, "
+                f"total force wrong by {100 * maps['resultant']:.1f} %"
+            )
         if self.metrics["leak_slope"] is not None:
             lines.append(f"slope of the angle's error on move_6 where it was not executed: {self.metrics['leak_slope']:+.3f}")
         ms = self.metrics["ms_per_frame"]
@@ -239,6 +295,9 @@ def evaluate_run(
     metrics["ms_per_frame"] = time_frames(several or estimator, found)
     if several is not None:
         metrics["taken_for"] = several.taken_for(found.pins.rows(chosen))
+    if estimator.maps is not None and several is None and all(is_simulated(folder) for folder in found.folders):
+        rated = judge_maps(estimator.maps_of(found.pins.rows(chosen), made.mean), found, chosen)
+        metrics["maps"] = None if rated is None else asdict(rated)
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []
     if robustness:
         with stage(progress, "changed frames") as step:

@@ -158,7 +158,8 @@ vgnn              ours: Voronoi graph network on matched pins, ensemble,
                   calibrated 90 % intervals
 steered           ours for an edge whose direction goes round the whole circle
 touch             ours for forces: modes of the pins and light of the caps,
-                  ensemble and Gaussian process; needs a few hundred frames
+                  ensemble and Gaussian process; needs a few hundred frames.
+                  Of simulated contacts it also learns contact maps
 tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense
                   layers 96, 64
 tac-vgnn-release  the same with the published code's dense layers: 128, 96
@@ -183,7 +184,8 @@ order of the table does not matter.
 
 \b
 Writes to --out: config.json (resolved, with the sensor and the parameters of
-the pipeline), curves.csv, weights.pt, and checkpoint.pt while it runs. The
+the pipeline), curves.csv, weights.pt, maps.safetensors (touch, simulated
+contacts), and checkpoint.pt while it runs. The
 same command continues a run that was interrupted, if frames and labels are
 still the same.
 
@@ -305,9 +307,13 @@ HELP_PREDICT = """Tell the pose in every frame, with its 90 % interval.
 The model contains its sensor and pipeline, and a frame of another sensor is refused. If a recording has a frame without contact
 (init_0.png), the pins are counted from that frame. The exit code is 0 if at least one frame gave a pose.
 
+With --maps DIR it also writes, for each frame, the pressure and the shear over the skin, the contact patch and the deformed skin: arrays
+(NAME.npz) and a picture (NAME.png). The model must be touch and have learnt from simulated contacts.
+
 \b
-Example:
+Examples:
   twin predict runs/mine frame.png
+  twin predict runs/forces recordings/mine --maps out/maps
 """
 
 
@@ -315,13 +321,17 @@ Example:
 def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
+    maps: Annotated[Path | None, typer.Option("--maps", metavar="DIR", help="folder for the contact maps of each frame")] = None,
     table: Table = None,
     no_contact: NoContact = None,
+    force: Force = False,
 ) -> None:
     from training.studies.evaluation import predict_frames
     from twin.frames import frames_at
+    from twin.store import overwriting
 
-    say(predict_frames(run, frames_at(frame, table, no_contact)).lines())
+    with overwriting(force):
+        say(predict_frames(run, frames_at(frame, table, no_contact), maps=maps).lines())
 
 
 HELP_PACK = """Write a small copy of a finished training run.

@@ -60,6 +60,7 @@ class TouchModel(PinModel):
     counts_from_rest = True
     has_modes = True
     modes_scaled = True
+    sees_light = True
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> TouchNetwork:
         """See ``Model``; sizes are those of ``SIZES``."""

@@ -246,7 +246,7 @@ class ServoLoop:
         try:
             self._sent = self._move(pose, wait=False)
         except RefusedMoveError as refused:
-            if refused.decision.code not in (Code.STALE_FRAME, Code.SLIPPING):
+            if refused.decision.code not in (Code.STALE_FRAME, Code.SLIPPING, Code.HELD_FORCE):
                 raise
             self._hold(str(refused), refused, age_s)
             return

@@ -54,8 +54,12 @@ class SafetyLimits(Section):
         Deepest contact that the sensor may report.
     force_n, torque_nmm : float, optional
         Largest force, and largest torque about the sensor's axis, that the sensor may report; the arm retreats from larger ones.
+    hold_force_n, hold_torque_nmm : float, optional
+        Force and torque beyond which the arm holds still, and does not retreat.
     slip_share : float, optional
         Largest share of the contact that may slide; the arm holds still where more does.
+    slip_begins : float, optional
+        Largest probability that the contact has begun to slide, of a model that remembers the frames before; beyond it the arm holds still.
     frame_age_s : float
         Largest age of the frame that a move is decided on.
     feedback_age_s : float
@@ -77,7 +81,10 @@ class SafetyLimits(Section):
     contact_mm: Positive = 6.0
     force_n: Positive | None = None
     torque_nmm: Positive | None = None
+    hold_force_n: Positive | None = None
+    hold_torque_nmm: Positive | None = None
     slip_share: Fraction | None = None
+    slip_begins: Fraction | None = None
     frame_age_s: Positive = 0.5
     feedback_age_s: Positive = FEEDBACK_AGE_S
     retreat_mm: Positive = 50.0
@@ -115,6 +122,7 @@ class Code(StrEnum):
     TOO_DEEP = "too-deep"
     TOO_STRONG = "too-strong"
     TOO_TWISTED = "too-twisted"
+    HELD_FORCE = "held-force"
     SLIPPING = "slipping"
     OUTSIDE_BOX = "outside-box"
     OUTSIDE_ANNULUS = "outside-annulus"
@@ -169,6 +177,8 @@ class Sensed:
         Torque about the sensor's axis, of either sign.
     slip_share : float
         Share of the contact that slides, 0 to 1.
+    slip_begins : float
+        Probability that the contact has begun to slide.
     """
 
     depth_mm: float
@@ -176,15 +186,21 @@ class Sensed:
     force_n: float = float("nan")
     torque_nmm: float = float("nan")
     slip_share: float = float("nan")
+    slip_begins: float = float("nan")
 
     @classmethod
     def of(cls, depth_mm: float, frame_time_s: float, names: Sequence[str], value: np.ndarray) -> "Sensed":
-        """From the labels (K,) of an estimate: ``force_x, force_y, force_z`` or ``Fx, Fy, Fz``, ``torque_z`` or ``Tz``, ``slip_share``."""
+        """From the labels (K,) of an estimate.
+
+        They are ``force_x, force_y, force_z`` or ``Fx, Fy, Fz``, ``torque_z`` or ``Tz``, ``slip_share`` and ``slip_begins``.
+        """
         told = dict(zip(names, np.asarray(value, float).tolist(), strict=True))
         missing = float("nan")
         force = [told.get(f"force_{axis}", told.get(f"F{axis}", missing)) for axis in "xyz"]
         torque = told.get("torque_z", told.get("Tz", missing))
-        return cls(depth_mm, frame_time_s, float(np.linalg.norm(force)), torque, told.get("slip_share", missing))
+        return cls(
+            depth_mm, frame_time_s, float(np.linalg.norm(force)), torque, told.get("slip_share", missing), told.get("slip_begins", missing)
+        )
 
 
 def decide(
@@ -309,6 +325,15 @@ def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed
     if limits.torque_nmm is not None and abs(sensed.torque_nmm) > limits.torque_nmm:
         felt = f"{abs(sensed.torque_nmm):.0f} N mm about its axis"
         return Decision(Action.RETRACT, Code.TOO_TWISTED, f"the sensor feels {felt} (allowed {limits.torque_nmm:g} N mm)")
+    if limits.hold_force_n is not None and sensed.force_n > limits.hold_force_n:
+        felt = f"the sensor feels {sensed.force_n:.1f} N (the arm holds still beyond {limits.hold_force_n:g} N)"
+        return Decision(Action.HOLD, Code.HELD_FORCE, felt)
+    if limits.hold_torque_nmm is not None and abs(sensed.torque_nmm) > limits.hold_torque_nmm:
+        felt = f"the sensor feels {abs(sensed.torque_nmm):.0f} N mm about its axis"
+        return Decision(Action.HOLD, Code.HELD_FORCE, f"{felt} (the arm holds still beyond {limits.hold_torque_nmm:g} N mm)")
+    if limits.slip_begins is not None and sensed.slip_begins > limits.slip_begins:
+        said = f"the contact begins to slide (probability {sensed.slip_begins:.0%}, allowed {limits.slip_begins:.0%}); press harder"
+        return Decision(Action.HOLD, Code.SLIPPING, said)
     if limits.slip_share is not None and sensed.slip_share > limits.slip_share:
         return Decision(
             Action.HOLD, Code.SLIPPING, f"{sensed.slip_share:.0%} of the contact slides (allowed {limits.slip_share:.0%}); press harder"

@@ -101,6 +101,10 @@ class ContactEstimator:
         """The models for the sensor that took ``frame`` without contact; raises as ``PoseEstimator.at_rest``."""
         return self._with({name: part.at_rest(frame) for name, part in self.parts.items()})
 
+    def remembering(self) -> "ContactEstimator":
+        """Itself: models of several kinds of contact do not tell slip."""
+        return self
+
     def at_known_rest(self) -> "ContactEstimator":
         """As of ``PoseEstimator``."""
         return self._with({name: part.at_known_rest() for name, part in self.parts.items()})

@@ -21,6 +21,8 @@ from training.packed import SHIPPED, WEIGHTS, shipped_names, unpack
 from training.pins import PinTable
 from training.recipes import TrainingError
 from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
+from training.slip import NAMES as SLIP_NAMES
+from training.slip import SLIP, SLIP_UNITS, Slip, SlipModel, SlipTracker, read_slip
 from training.targets import BOUNDS
 from training.touched import TouchAnswer
 from twin.errors import FrameError
@@ -83,6 +85,8 @@ class PoseEstimator:
         Marks of the frames that the model learnt from (``training.identity.frame_marks``); None if the run does not hold them.
     maps : MapModel or None
         What makes contact maps; None unless the run learnt them.
+    slip : SlipModel or None
+        What tells slip from a sequence of frames; None unless the run learnt it.
 
     Raises
     ------
@@ -107,6 +111,8 @@ class PoseEstimator:
         self.learnt_from: np.ndarray | None = content["learnt_from"].numpy() if "learnt_from" in content else None
         self._trained = Trained(self.sensor, self.pipeline, reference, learnt, self.ensemble)
         self.maps: MapModel | None = None
+        self.slip: SlipModel | None = None
+        self._tracker: SlipTracker | None = None
 
     @classmethod
     def load(cls, run: str | Path) -> "PoseEstimator":
@@ -138,6 +144,8 @@ class PoseEstimator:
             raise damaged(run / (WEIGHTS if packed else TENSORS), f"its weights do not fit {CONFIG}") from error
         if (run / MAPS).is_file():
             found.maps = read_maps(run / MAPS, found.sensor.geometry)
+        if (run / SLIP).is_file():
+            found.slip = read_slip(run / SLIP)
         return found
 
     @property
@@ -162,6 +170,21 @@ class PoseEstimator:
         reference = measure_reference(self.sensor, self.form, frame)
         found = self._counted_from(reference)
         found._trained = replace(found._trained, touched=TouchAnswer(reference))
+        return found
+
+    def remembering(self) -> "PoseEstimator":
+        """The model for frames that follow each other in time, which remembers those before; itself if the run did not learn slip.
+
+        Its estimates have the labels ``training.slip.NAMES`` besides: the probabilities that the contact has begun to slide and that all
+        of it slides, the drag that is left until then (mm), and the direction in which the object moves over the skin (deg, sensor
+        frame, from x towards y). A frame that gives no estimate ends the contact: what comes after it is a new one.
+        """
+        if self.slip is None:
+            return self
+        found = copy(self)
+        found._tracker = SlipTracker(self.slip)
+        if self._tracker is None:
+            found.names, found.units = (*self.names, *SLIP_NAMES), (*self.units, *SLIP_UNITS)
         return found
 
     @property
@@ -192,7 +215,7 @@ class PoseEstimator:
         found = copy(self)
         found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
         found._trained = replace(self._trained, pipeline=found.pipeline)
-        return found
+        return found if self._tracker is None else found.remembering()
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Refuse another sensor or form than the model was trained for.
@@ -216,7 +239,13 @@ class PoseEstimator:
             The frame is not one of the model's sensor: wrong size, type or form.
         """
         started = perf_counter()
-        return self._as_estimate(self.part.estimate_frame(self._trained, frame), started)
+        if self._tracker is None:
+            return self._as_estimate(self.part.estimate_frame(self._trained, frame), started)
+        seen = self.pins_in(frame)
+        if isinstance(seen, Unseen):
+            self._tracker.forget()
+            return self._as_estimate(seen, started)
+        return self.estimate_one(seen, started, "")
 
     def contact_maps(self, frame: Frame) -> tuple[PoseEstimate, ContactMaps | None]:
         """The estimate of one frame, and the pressure and shear over the skin that go with it; no maps if the estimate is not valid.
@@ -259,12 +288,14 @@ class PoseEstimator:
         inputs, rows = self.inputs_of(pins, together=not pins.measured)
         return self.ensemble.modes(inputs, rows).inputs
 
-    def _as_estimate(self, made: Prediction | Unseen, started: float, contact: str = "") -> PoseEstimate:
+    def _as_estimate(self, made: Prediction | Unseen, started: float, contact: str = "", slip: Slip | None = None) -> PoseEstimate:
         if isinstance(made, Unseen):
             none = np.full(len(self.names), np.nan)
             return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched)
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
         value, low, high = (np.clip(each, *self._bounds) for each in (value, value - half, value + half))
+        if slip is not None:
+            value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
         return PoseEstimate(self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched)
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
@@ -281,7 +312,8 @@ class PoseEstimator:
         contact : str
             The kind of contact that the frame was taken for.
         """
-        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact)
+        slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
+        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip)
 
     def unseen(self, seen: Unseen, started: float) -> PoseEstimate:
         """The estimate of a frame that shows no pose that the model knows."""

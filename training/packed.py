@@ -21,6 +21,7 @@ from training.identity import ASIDE
 from training.models import model_named
 from training.recipes import TrainingError
 from training.run_files import CONFIG, TENSORS, read_config, read_tensors
+from training.slip import SLIP
 from twin.pins import make_reference
 from twin.store import write_bytes, write_text, writes
 
@@ -44,7 +45,7 @@ def shipped_names() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob(f"*/{WEIGHTS}"))
 
 
-@writes(WEIGHTS, "config.json", MAPS)
+@writes(WEIGHTS, "config.json", MAPS, SLIP)
 def pack(run: Path, out: Path) -> int:
     """Write the small copy of a finished run, and return its size in bytes.
 
@@ -80,8 +81,9 @@ def pack(run: Path, out: Path) -> int:
     about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
     about |= {RECORDINGS: [Path(folder).name for folder in config.get("data", "").split(", ") if folder]}
     write_text(out / CONFIG, json.dumps(about) + "\n")
-    if (run / MAPS).is_file():
-        write_bytes(out / MAPS, (run / MAPS).read_bytes())
+    for name in (MAPS, SLIP):
+        if (run / name).is_file():
+            write_bytes(out / name, (run / name).read_bytes())
     return (out / WEIGHTS).stat().st_size
 
 

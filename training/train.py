@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from scenes import SensorSpec
 from training.contact_maps import FEWEST_STATES, MAPS, learn_maps, write_maps
-from training.dataset import Dataset, joined, load_dataset, with_common_labels
+from training.dataset import Dataset, joined, load_dataset, told_apart, with_common_labels
 from training.estimator import PoseEstimator
 from training.loop import epoch_step
 from training.models import recipe_of
@@ -17,6 +18,7 @@ from training.networks import choose_device
 from training.run import RUN_FILES, RunConfig, train_run, training_rows
 from training.run_files import CHECKPOINT, CONFIG, TENSORS
 from training.simulated import is_simulated
+from training.slip import FEWEST_DRAGS, SLIP, Eyes, drags_of, learn_slip, write_slip
 from training.targets import CONTACT, PRESETS
 from twin.errors import OptionError
 from twin.progress import Progress, silent, stage
@@ -25,7 +27,7 @@ from twin.types import Form
 
 SHEAR_PRESET = "surface-2d-shear"  # the preset whose moves are learnt as helpers of its other labels
 SHEAR_HELPERS = ("move_1", "move_6")  # these moves
-FILES = (CONFIG, "curves.csv", TENSORS, MAPS)  # of a finished run
+FILES = (CONFIG, "curves.csv", TENSORS, MAPS, SLIP)  # of a finished run
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Trained:
         return lines
 
 
-@writes(*RUN_FILES, MAPS, gone_on=(CHECKPOINT,))
+@writes(*RUN_FILES, MAPS, SLIP, gone_on=(CHECKPOINT,))
 def train_model(
     model: str,
     sensor: SensorSpec,
@@ -138,6 +140,8 @@ def train_model(
     if finished and config.model == TOUCH.name and all(is_simulated(folder) for folder in found.folders):
         with stage(progress, "contact maps"):
             found.problems.extend(add_maps(out, config, found))
+        with stage(progress, "slip"):
+            found.problems.extend(add_slip(out, config, parts))
     return Trained(out, finished, len(found), found.targets.names, labels, found.problems)
 
 
@@ -154,6 +158,38 @@ def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
     if len(rows) < FEWEST_STATES:
         return [f"{len(rows)} contact states are too few to learn contact maps from ({FEWEST_STATES} are needed): the run has none"]
     write_maps(run / MAPS, learn_maps(estimator.modes_of(data.pins), data, rows, seed=config.seed))
+    return []
+
+
+def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str]:
+    """Learn slip from the drags among the simulated contacts that a finished run learnt from, and write it beside the weights.
+
+    Parameters
+    ----------
+    parts : sequence of Dataset
+        As they were read, before they were joined.
+
+    Returns
+    -------
+    list of str
+        Why slip is not told, a line at most.
+    """
+    estimator, drags = PoseEstimator.load(run), []
+    kept_out = set(estimator.config["rows"]["kept_out"])
+    called = told_apart([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
+    for part, prefix in zip(parts, called, strict=True):
+        for rows, drag in drags_of(part):
+            names = [f"{prefix}/{name}" if prefix else name for name in part.pins.image_name[rows].tolist()]
+            if kept_out.isdisjoint(names):
+                drags.append(drag)
+    slide = sum(np.isfinite(drag.whole_mm) for drag in drags)
+    if slide < FEWEST_DRAGS:
+        return [
+            f"{slide} contacts are dragged until they slide ({FEWEST_DRAGS} are needed to learn slip from): slip is not told over time; "
+            "'twin dataset --experiment drag --randomise drag --states all' makes such contacts"
+        ]
+    sensor = parts[0].pins.sensor
+    write_slip(run / SLIP, learn_slip(drags, Eyes(estimator.modes_of, parts[0].pins), sensor, seed=config.seed))
     return []
 
 

@@ -4,16 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_generation import small_config
 
-from scenes import load_experiment
 from training.contact_maps import MAPS, judge_maps, read_maps, write_maps
+from training.dataset import load_dataset
 from training.estimator import PoseEstimator
-from training.generation import generate
 from training.packed import pack
 from training.recipes import TrainingError
 from training.studies.evaluation import write_frame_maps
-from training.train import train_model
 from twin.geometry.mesh import build_mesh
 from twin.mechanics.skin_map import SIDE, ContactMaps, between_nodes, skin_grid
 from twin.types import Form, Frame
@@ -22,34 +19,6 @@ ALMOST = 1e-9  # N and N mm: rounding
 ON_A_SPHERE = 0.999  # cosine between a normal of the grid and the dome's own
 EXACT_MM = 1e-9  # rounding
 FACET_MM = 0.3  # by which the middle of a facet lies below the sphere at the rim, where facets are largest
-
-PRESSES = """
-description = "gentle presses and short drags"
-object = "plane"
-approach = "z"
-zero_mm = 0.0
-clear = [0, 0, -3, 0, 0, 0]
-tap = [0, 0, 3, 0, 0, 0]
-targets = ["pose_3", "pose_4"]
-[pose]
-pose_3 = [1.0, 1.8]
-pose_4 = [-10, 10]
-pose_5 = [-10, 10]
-[move]
-move_1 = [-1.2, 1.2]
-move_2 = [-1.2, 1.2]
-"""
-
-
-@pytest.fixture(scope="module")
-def contacts(tmp_path_factory):
-    """Folder of a simulated data set, and of a run of ``touch`` that learnt from it."""
-    home = tmp_path_factory.mktemp("maps")
-    (home / "presses.toml").write_text(PRESSES)
-    config = small_config(home, experiment=load_experiment(home / "presses.toml"), states="all", randomisation=None)
-    generate(home / "set", config, 10)
-    train_model("touch", config.sensor, [home / "set"], home / "run", target="contact", members=1, kernel=False, epochs=20, split=None)
-    return home / "set", home / "run", config.sensor
 
 
 def pressed_maps(geometry):
@@ -95,8 +64,6 @@ def test_every_second_node_of_the_grid_is_one_of_the_mesh_and_averaging_keeps_th
 
 
 def test_maps_of_simulated_contacts_are_learnt_and_agree_with_the_forces_told(contacts):
-    from training.dataset import load_dataset
-
     folder, run, sensor = contacts
     estimator = PoseEstimator.load(run)
     data = load_dataset(folder, sensor, estimator.names)

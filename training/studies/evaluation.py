@@ -10,12 +10,13 @@ import numpy as np
 
 from training.contact_estimator import ContactEstimator, contacts_folder
 from training.contact_maps import judge_maps
-from training.dataset import joined, load_dataset
+from training.dataset import Dataset, joined, load_dataset, told_apart
 from training.estimator import PoseEstimate, PoseEstimator, folder_of
 from training.evaluate import judge, judge_changes, rows_to_judge, time_frames, write_evaluation
 from training.identity import changed_since, learnt_before
 from training.recipes import TrainingError
 from training.simulated import is_simulated
+from training.slip import Eyes, drags_of, gone_through, judge_slip, random_places
 from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.frames import Recording, open_recording
@@ -58,7 +59,8 @@ class Predictions:
             warm = False
             for frame in self.recording:
                 if not warm:
-                    self.estimator(frame)  # loads or compiles code, which is no part of a frame's time
+                    # loads or compiles code, which is no part of a frame's time, by a copy whose memory nobody uses
+                    self.estimator.remembering()(frame)
                     warm = True
                 if self.maps is None or not isinstance(self.estimator, PoseEstimator):
                     yield frame.name, self.estimator(frame)
@@ -109,6 +111,20 @@ def models_of_kinds(run: str | Path, frames: str | Path) -> ContactEstimator | N
     return models if alone or open_recording(frames, models.sensor).form == models.form else None
 
 
+def _slip_errors(estimator: PoseEstimator, parts: Sequence[Dataset], chosen: set[str]) -> dict[str, Any] | None:
+    """How well slip is told on the drags all of whose frames are ``chosen``, each gone through once at a random speed; None without one."""
+    assert estimator.slip is not None
+    rng, ways = np.random.default_rng(0), []
+    called = told_apart([part.folder.resolve() for part in parts]) if len(parts) > 1 else [""]
+    for part, prefix in zip(parts, called, strict=True):
+        eyes = Eyes(estimator.modes_of, part.pins)
+        for rows, drag in drags_of(part):
+            names = {f"{prefix}/{name}" if prefix else name for name in part.pins.image_name[rows].tolist()}
+            if names <= chosen:
+                ways.append(gone_through(drag, random_places(len(rows), rng), eyes, rng))
+    return asdict(judge_slip(estimator.slip, ways)) if ways else None
+
+
 def write_frame_maps(folder: Path, estimator: PoseEstimator, frame: Frame, maps: ContactMaps) -> list[Path]:
     """Write the contact maps of one frame: arrays as ``NAME.npz``, a picture as ``NAME.png``; NAME is the frame's without its ending.
 
@@ -130,7 +146,7 @@ def write_frame_maps(folder: Path, estimator: PoseEstimator, frame: Frame, maps:
     return [folder / f"{name}.npz", folder / f"{name}.png"]
 
 
-def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = None) -> Predictions:
+def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = None, sequence: bool = False) -> Predictions:
     """Estimate the poses in the frames at a path by a trained model.
 
     If the model uses displacements from rest and the recording has a frame without contact, displacements are counted from that frame.
@@ -143,11 +159,13 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
         As ``open_recording`` takes it.
     maps : path, optional
         Folder for the contact maps of each frame.
+    sequence : bool
+        The frames follow each other in time: slip is told, too (``PoseEstimator.remembering``).
 
     Raises
     ------
     TrainingError
-        There is no such run, or it has no contact maps and they are wanted.
+        There is no such run, or it has no contact maps, or does not tell slip, and that is wanted.
     FrameError
         There are no such frames, or they are of another sensor.
     """
@@ -164,6 +182,13 @@ def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = N
         if not isinstance(estimator, PoseEstimator):
             raise TrainingError(f"{run}: models of several kinds of contact have no contact maps; leave --maps out")
         estimator.require_maps()
+    if sequence:
+        if not isinstance(estimator, PoseEstimator) or estimator.slip is None:
+            raise TrainingError(
+                f"{run}: does not tell slip; train touch on simulated drags ('twin dataset --experiment drag --randomise drag "
+                "--states all'), or leave --sequence out"
+            )
+        estimator = estimator.remembering()
     return Predictions(estimator, recording, maps)
 
 
@@ -185,7 +210,8 @@ class Evaluation:
     ----------
     metrics : dict
         Content of ``metrics.json``; with models of several kinds of contact also ``taken_for``, the share of frames taken for each; of
-        simulated contacts and a run with contact maps also ``maps`` (see ``MapErrors``).
+        simulated contacts and a run with contact maps also ``maps`` (see ``MapErrors``), and of a run that tells slip ``slip`` (see
+        ``SlipErrors``).
     changes : list of dict
         Errors on changed images; empty if they were not asked for.
     units : dict of str to str
@@ -220,6 +246,12 @@ class Evaluation:
                 f"contact maps of {maps['states']} states: patch's intersection over union {maps['patch_iou']:.2f}, correlation of the "
                 f"pressure {maps['pressure_correlation']:.2f} and of the shear {maps['shear_correlation']:.2f}, "
                 f"total force wrong by {100 * maps['resultant']:.1f} %"
+            )
+        if slip := self.metrics.get("slip"):
+            lines.append(
+                f"slip of {slip['contacts']} contacts: slip of all of it told in {100 * slip['whole_accuracy']:.1f} % of the frames, "
+                f"alarm {slip['lead_mm']:.2f} mm of drag before it, in {100 * slip['false_alarms']:.1f} % of the frames without slip; "
+                f"way left wrong by {slip['left_mm']:.2f} mm"
             )
         if self.metrics["leak_slope"] is not None:
             lines.append(f"slope of the angle's error on move_6 where it was not executed: {self.metrics['leak_slope']:+.3f}")
@@ -298,6 +330,8 @@ def evaluate_run(
     if estimator.maps is not None and several is None and all(is_simulated(folder) for folder in found.folders):
         rated = judge_maps(estimator.maps_of(found.pins.rows(chosen), made.mean), found, chosen)
         metrics["maps"] = None if rated is None else asdict(rated)
+    if estimator.slip is not None and several is None and all(is_simulated(folder) for folder in found.folders):
+        metrics["slip"] = _slip_errors(estimator, parts, set(found.pins.image_name[chosen].tolist()))
     written, changes = write_evaluation(out, made, found, chosen, metrics, labels), []
     if robustness:
         with stage(progress, "changed frames") as step:

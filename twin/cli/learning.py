@@ -159,7 +159,8 @@ vgnn              ours: Voronoi graph network on matched pins, ensemble,
 steered           ours for an edge whose direction goes round the whole circle
 touch             ours for forces: modes of the pins and light of the caps,
                   ensemble and Gaussian process; needs a few hundred frames.
-                  Of simulated contacts it also learns contact maps
+                  Of simulated contacts it also learns contact maps,
+                  and slip over time of simulated drags
 tac-vgnn          the paper's network: Delaunay graph, Voronoi areas; dense
                   layers 96, 64
 tac-vgnn-release  the same with the published code's dense layers: 128, 96
@@ -184,8 +185,8 @@ order of the table does not matter.
 
 \b
 Writes to --out: config.json (resolved, with the sensor and the parameters of
-the pipeline), curves.csv, weights.pt, maps.safetensors (touch, simulated
-contacts), and checkpoint.pt while it runs. The
+the pipeline), curves.csv, weights.pt, maps.safetensors and slip.safetensors
+(touch, simulated contacts and drags), and checkpoint.pt while it runs. The
 same command continues a run that was interrupted, if frames and labels are
 still the same.
 
@@ -310,10 +311,15 @@ The model contains its sensor and pipeline, and a frame of another sensor is ref
 With --maps DIR it also writes, for each frame, the pressure and the shear over the skin, the contact patch and the deformed skin: arrays
 (NAME.npz) and a picture (NAME.png). The model must be touch and have learnt from simulated contacts.
 
+With --sequence the frames follow each other in time, as those of a video, and a model that learnt from simulated drags also tells slip:
+slip_begins and slip_whole (probabilities that a tenth of the contact, and that all of it, slides), slip_left (drag in mm until all slides)
+and slip_direction (deg, sensor frame, of the object over the skin).
+
 \b
 Examples:
   twin predict runs/mine frame.png
   twin predict runs/forces recordings/mine --maps out/maps
+  twin predict runs/forces drag.mp4 --sequence
 """
 
 
@@ -322,6 +328,7 @@ def predict(
     run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
     frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
     maps: Annotated[Path | None, typer.Option("--maps", metavar="DIR", help="folder for the contact maps of each frame")] = None,
+    sequence: Annotated[bool, typer.Option("--sequence", help="the frames follow each other in time: tell slip, too")] = False,
     table: Table = None,
     no_contact: NoContact = None,
     force: Force = False,
@@ -331,7 +338,7 @@ def predict(
     from twin.store import overwriting
 
     with overwriting(force):
-        say(predict_frames(run, frames_at(frame, table, no_contact), maps=maps).lines())
+        say(predict_frames(run, frames_at(frame, table, no_contact), maps=maps, sequence=sequence).lines())
 
 
 HELP_PACK = """Write a small copy of a finished training run.

@@ -47,6 +47,8 @@ With --record DIR every frame is kept, lossless, with its estimate. The folder c
 DIR runs the model on the same frames again, and says whether the estimates are the same. With --at-rest first there must be no
 contact at the start; the first frame is then kept with the session. --also keeps the session in further formats when it ends.
 
+A model that learnt from simulated drags remembers the frames and tells slip: see 'twin predict --help', --sequence.
+
 \b
 Example:
   twin live --camera /dev/video0 --model RUN
@@ -89,7 +91,7 @@ def live(
         also=tuple(also or ()),
     )
     with signals_as_ctrl_c():
-        watched = watch(plan, PoseEstimator.load(model), name=str(model), on_shown=tell_view)
+        watched = watch(plan, PoseEstimator.load(model).remembering(), name=str(model), on_shown=tell_view)
     say(watched.lines())
 
 
@@ -247,7 +249,7 @@ def servo(
         also=tuple(also or ()),
     )
     with overwriting(force), signals_as_ctrl_c(), shown() as progress:
-        followed = follow(plan, PoseEstimator.load(model), out, about={"model": str(model)}, progress=progress)
+        followed = follow(plan, PoseEstimator.load(model).remembering(), out, about={"model": str(model)}, progress=progress)
     tell(followed)
     if followed.failure:
         raise SystemExit(1)

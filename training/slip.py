@@ -1,0 +1,519 @@
+"""Slip from a sequence of frames, learnt from simulated drags: has the contact begun to slide, does all of it slide, how far is it to that.
+
+Friction depends on the past, so one frame does not tell it. A small recurrent network sees the model's modes of the pins in each frame and
+their change since the frame before, and remembers. It learns from contacts that are pressed and then dragged: finite elements know which
+part of the skin slides, and with it
+
+- the beginning of slip: at least a tenth of the pressed skin slides under a drag;
+- slip of the whole contact: nineteen twentieths of it slide;
+- the way that is left to it: how far the object must still be dragged.
+
+A press alone is no drag, though skin that spreads over a smooth object slides on it. The states of a contact are gone through at random
+speeds with random stops, and every frame has its own noise of the pins, so that the network depends on no rate.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import nn
+
+from scenes.sensor import SensorSpec
+from training.assemble import COVERAGE, conformal_quantile
+from training.contact_maps import HEADROOM
+from training.dataset import Dataset
+from training.pins import PinTable
+from training.run_files import damaged
+from training.surrogate.symmetry import Symmetry, symmetries
+from twin.camera.projection import project
+from twin.frames.forms import from_raw
+from twin.frames.truth import arrays_of, open_truth
+from twin.geometry.pins import rest_pins
+from twin.mechanics.path import carried
+from twin.mechanics.skin_map import skin_grid
+from twin.store import write_bytes
+
+SLIP = "slip.safetensors"
+"""File of a run that holds its network for slip."""
+BEGINS, WHOLE = 0.1, 0.95
+"""Share of the pressed skin that slides when slip begins, and when the whole contact slides."""
+FEWEST_DRAGS = 30
+"""Contacts that are dragged until they slide, with fewer of which slip is not learnt."""
+HELD_OUT = 6
+"""One contact in this many is kept out to set thresholds and intervals."""
+WAYS = 2400
+"""Ways that are learnt from: each contact is gone through several times, at another speed each time."""
+SLOWEST, FASTEST = 0.15, 1.0
+"""Load steps (0.4 mm at most) from one frame to the next."""
+STOP_SHARE, LONGEST_STOP = 0.04, 8
+"""Share of frames at which the object stops, and the most frames for which it does."""
+NOISE_PX = 0.1
+"""Noise of a pin in a frame."""
+GAIN, CHANGE = 3.0, 5.0
+"""Deviation of the largest mode at the network's input, and by how much more its change counts."""
+JITTER = 0.02
+"""Noise of the network's inputs in training."""
+UNITS, EPOCHS, BATCH, RATE, DECAY = 64, 12, 24, 5e-3, 0.02
+"""Training: units of both layers, epochs, sequences of a step, highest learning rate, weight decay."""
+LEAST_LEFT_MM = 0.1
+"""Added to the way that is left before its logarithm is taken."""
+LEFT_WEIGHT = 0.3
+"""Weight in the loss of the way that is left, and of the direction."""
+SEEN_DRAG_MM = 0.3
+"""Drag from which on its direction is learnt."""
+FALSE_ALARMS = 0.01
+"""Share of the kept-out frames without slip of which an alarm may speak: it sets the alarm's threshold."""
+NAMES = ("slip_begins", "slip_whole", "slip_left", "slip_direction")
+"""Labels of an estimate that remembers: probabilities of slip's beginning and of slip of the whole contact, way left, direction."""
+SLIP_UNITS = ("", "", "mm", "deg")
+
+
+@dataclass(frozen=True)
+class Drag:
+    """A simulated contact that is pressed, and dragged from some state on; S states.
+
+    Attributes
+    ----------
+    caps_mm : (S, N, 3) float
+        Places of the pins' caps.
+    lost : (S, N) bool
+        Pins that are hidden.
+    share : (S,) float
+        Share of the pressed skin that slides; 0 before the drag.
+    drag_mm : (S,) float
+        How far the object was dragged.
+    direction : (2,) float
+        Unit vector of the drag in the image plane of the sensor frame; (0, 0) if there was none.
+    """
+
+    caps_mm: np.ndarray
+    lost: np.ndarray
+    share: np.ndarray
+    drag_mm: np.ndarray
+    direction: np.ndarray
+
+    def turned(self, symmetry: Symmetry, rings: int) -> "Drag":
+        """The same drag of the turned or mirrored object over a sensor whose pins stand in rings."""
+        lost = np.empty_like(self.lost)
+        lost[:, symmetry.places(rings)] = self.lost
+        direction = symmetry.matrix[:2, :2] @ self.direction
+        return replace(self, caps_mm=symmetry.moved(self.caps_mm, rings), lost=lost, direction=direction)
+
+    @property
+    def whole_mm(self) -> float:
+        """Drag at which the whole contact slides first; NaN if it never does."""
+        sliding = np.flatnonzero(self.share >= WHOLE)
+        if not len(sliding):
+            return float("nan")
+        k = int(sliding[0])
+        before, after = (self.share[k - 1], self.share[k]) if k else (WHOLE, WHOLE)
+        part = (WHOLE - before) / (after - before) if after > before else 1.0
+        return float(self.drag_mm[k] if not k else self.drag_mm[k - 1] + part * (self.drag_mm[k] - self.drag_mm[k - 1]))
+
+
+@dataclass(frozen=True)
+class Way:
+    """A drag as a sequence of frames sees it; T frames.
+
+    Attributes
+    ----------
+    modes : (T, D) float
+        What the model sees of the pins.
+    begins, whole : (T,) bool
+        Whether slip has begun, and whether the whole contact slides.
+    left_mm : (T,) float
+        Drag that is left until the whole contact slides; NaN where it never does.
+    drag_mm : (T,) float
+    direction : (2,) float
+    """
+
+    modes: np.ndarray
+    begins: np.ndarray
+    whole: np.ndarray
+    left_mm: np.ndarray
+    drag_mm: np.ndarray
+    direction: np.ndarray
+
+
+@dataclass(frozen=True)
+class Slip:
+    """What is told of a contact's slip after a frame.
+
+    Attributes
+    ----------
+    begins, whole : float
+        Probability that slip has begun, and that the whole contact slides.
+    left_mm, left_low_mm, left_high_mm : float
+        Drag that is left until the whole contact slides, and the ends of its 90 % interval.
+    direction_deg : float
+        Direction in which the object moves over the skin, in the sensor frame from x towards y.
+    alarm : bool
+        Whether ``begins`` is beyond the threshold that was set for few false alarms.
+    """
+
+    begins: float
+    whole: float
+    left_mm: float
+    left_low_mm: float
+    left_high_mm: float
+    direction_deg: float
+    alarm: bool
+
+    @property
+    def values(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values, and low and high ends of the 90 % intervals (4,), of the labels ``NAMES``; a probability has no interval."""
+        value = np.array([self.begins, self.whole, self.left_mm, self.direction_deg])
+        low, high = value.copy(), value.copy()
+        low[2], high[2] = self.left_low_mm, self.left_high_mm
+        return value, low, high
+
+
+class SlipNetwork(nn.Module):
+    """Six numbers of every frame of sequences (B, T, D): two logits, log of the way left and of its error, direction (2)."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.enter = nn.Linear(inputs, UNITS)
+        self.memory = nn.GRU(UNITS, UNITS, batch_first=True)
+        self.head = nn.Linear(2 * UNITS, 6)
+
+    def forward(self, x: torch.Tensor, before: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """The numbers (B, T, 6), and the memory (1, B, units) after the last frame."""
+        h = nn.functional.silu(self.enter(x))
+        remembered, after = self.memory(h, before)
+        return self.head(torch.cat([h, remembered], dim=2)), after
+
+
+@dataclass(frozen=True)
+class SlipModel:
+    """A trained network, the gain on its modes, the alarm's threshold, and the factor (1,) on the error of the way left."""
+
+    network: SlipNetwork = field(repr=False)
+    gain: float
+    limit: np.ndarray
+    alarm_at: float
+    quantile: float
+
+    def inputs(self, modes: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Inputs of the network from modes (..., D) and those of the frame before."""
+        now, last = (self.gain * np.clip(each, -self.limit, self.limit) for each in (modes, before))
+        return np.concatenate([now, CHANGE * (now - last)], axis=-1).astype(np.float32)
+
+    def told(self, out: np.ndarray) -> Slip:
+        """What the network's numbers (6,) say."""
+        begins, whole = (1 / (1 + np.exp(-np.clip(out[:2].astype(float), -50, 50)))).tolist()
+        middle, wide = float(out[2]), self.quantile * float(np.exp(np.clip(out[3], -4, 2)))
+        left, low, high = (max(float(np.exp(np.clip(at, -9, 5))) - LEAST_LEFT_MM, 0.0) for at in (middle, middle - wide, middle + wide))
+        return Slip(begins, whole, left, low, high, float(np.degrees(np.arctan2(out[5], out[4]))), begins > self.alarm_at)
+
+
+class SlipTracker:
+    """Follows the slip of one contact from frame to frame.
+
+    Parameters
+    ----------
+    model : SlipModel
+    """
+
+    def __init__(self, model: SlipModel) -> None:
+        self._model = model
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the contact: the next frame is the first of another one."""
+        self._memory: torch.Tensor | None = None
+        self._before: np.ndarray | None = None
+
+    def __call__(self, modes: np.ndarray) -> Slip:
+        """What is told after a frame with these modes (D,)."""
+        before = modes if self._before is None else self._before
+        x = torch.from_numpy(self._model.inputs(modes, before))[None, None]
+        with torch.no_grad():
+            out, self._memory = self._model.network(x, self._memory)
+        self._before = modes
+        return self._model.told(out[0, 0].numpy())
+
+
+def drags_of(data: Dataset) -> list[tuple[np.ndarray, Drag]]:
+    """Drags of the contacts of a simulated data set with all their states, each with its rows (S,); contacts that are only pressed, too."""
+    truth, _, _ = open_truth(data.folder)
+    names = ("caps_mm", "visible", "path_id", "move", "T_sensor_object", "map_force_n", "map_touched_mm2", "map_slipping_mm2")
+    arrays = arrays_of(truth, names)
+    nodes_mm = skin_grid(data.pins.sensor.geometry).nodes_mm
+    order = {name: row for row, name in enumerate(data.pins.image_name.tolist())}
+    found: list[tuple[np.ndarray, Drag]] = []
+    counted: dict[int, int] = {}
+    for contact in arrays["path_id"].tolist():
+        counted[contact] = counted.get(contact, 0) + 1
+    start = 0
+    for contact, states in counted.items():
+        mine = slice(start, start + states)
+        start += states
+        rows = np.array([order.get(f"frame_{contact}_{state}.png", -1) for state in range(states)])
+        if (rows < 0).any() or states < 2:
+            continue
+        found.append((rows, _drag({key: array[mine] for key, array in arrays.items()}, nodes_mm)))
+    return found
+
+
+def _drag(arrays: dict[str, np.ndarray], nodes_mm: np.ndarray) -> Drag:
+    """The drag of one contact, from its rows of the truth."""
+    weight = np.linalg.norm(arrays["map_force_n"], axis=2)
+    middle = weight @ nodes_mm / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
+    T = arrays["T_sensor_object"]
+    dragged = np.abs(arrays["move"]).max(axis=1) > 0
+    steps = np.zeros((len(T), 3))
+    for k in range(1, len(T)):
+        if dragged[k]:
+            steps[k] = carried(middle[k - 1 : k], T[k - 1], T[k])[0]
+    whole = steps.sum(axis=0)[:2]
+    size = float(np.linalg.norm(whole))
+    slides = arrays["map_slipping_mm2"].sum(axis=1) / np.maximum(arrays["map_touched_mm2"].sum(axis=1), 1e-6)
+    return Drag(
+        arrays["caps_mm"].astype(float),
+        ~arrays["visible"],
+        np.where(dragged, np.minimum(slides, 1.0), 0.0),
+        np.cumsum(np.linalg.norm(steps, axis=1)),
+        whole / size if size > 0 else np.zeros(2),
+    )
+
+
+class Eyes:
+    """What a model sees of the caps of its sensor: their places in the frame with noise, and then the model's modes.
+
+    Parameters
+    ----------
+    modes_of : callable
+        Modes (T, D) of a table of T frames (``PoseEstimator.modes_of``).
+    pins : PinTable
+        Of the sensor and the form, counted from its own pins at rest.
+    """
+
+    def __init__(self, modes_of: Callable[[PinTable], np.ndarray], pins: PinTable) -> None:
+        self._modes_of, self._pins = modes_of, pins
+        self._rest_px = self._px(rest_pins(pins.sensor.geometry).caps_mm)
+
+    def _px(self, caps_mm: np.ndarray) -> np.ndarray:
+        spec = self._pins.sensor
+        return from_raw(spec.recording, self._pins.form, project(spec.view, caps_mm))
+
+    def __call__(self, caps_mm: np.ndarray, lost: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Modes (T, D) of caps (T, N, 3), of which some are ``lost`` (T, N)."""
+        count, reference = len(caps_mm), self._pins.reference
+        moved_px = self._px(caps_mm) - self._rest_px
+        columns = {
+            "image_name": np.full(count, ""),
+            "nodes_px": reference.pins_px + moved_px + NOISE_PX * rng.normal(size=moved_px.shape),
+            "area_px2": np.tile(reference.area_px2, (count, 1)),
+            "lost": lost,
+            "valid": np.ones(count, bool),
+            "light": np.zeros(lost.shape),
+        }
+        return self._modes_of(self._pins.with_columns(columns))
+
+
+def gone_through(drag: Drag, at: np.ndarray, eyes: Eyes, rng: np.random.Generator) -> Way:
+    """A drag as frames show it that are taken at places ``at`` (T,) of its states, 0 to S - 1; between two states all is linear."""
+    low = np.minimum(at.astype(int), len(drag.share) - 2)
+    part = at - low
+
+    def between(values: np.ndarray) -> np.ndarray:
+        mixed: np.ndarray = (values[low].T * (1 - part) + values[low + 1].T * part).T
+        return mixed
+
+    drag_mm, share, limit = between(drag.drag_mm), between(drag.share), drag.whole_mm
+    whole = drag_mm >= limit if np.isfinite(limit) else np.zeros(len(at), bool)
+    modes = eyes(between(drag.caps_mm), drag.lost[low], rng)
+    return Way(modes, (share >= BEGINS) | whole, whole, np.maximum(limit - drag_mm, 0.0), drag_mm, drag.direction)
+
+
+def random_places(states: int, rng: np.random.Generator) -> np.ndarray:
+    """Places (T,) from the first to the last of a contact's states, at a random speed with random stops."""
+    stride, found = np.exp(rng.uniform(np.log(SLOWEST), np.log(FASTEST))), [0.0]
+    while found[-1] < states - 1:
+        if rng.random() < STOP_SHARE:
+            found += [found[-1]] * int(rng.integers(1, LONGEST_STOP))
+        found.append(min(found[-1] + stride * np.exp(0.3 * rng.normal()), states - 1.0))
+    return np.array(found)
+
+
+def learn_slip(drags: Sequence[Drag], eyes: Eyes, sensor: SensorSpec, *, seed: int = 0) -> SlipModel:
+    """Learn slip from drags, ``FEWEST_DRAGS`` of which slide in the end. Where pins stand in rings, each is also turned and mirrored."""
+    rings = sensor.pins.rings if sensor.pins.layout == "rings" else None
+    turns = [] if rings is None else symmetries(sensor.pins.phase_deg)
+    rng = np.random.default_rng([seed, 5])
+    held = set(rng.permutation(len(drags))[::HELD_OUT].tolist())
+    ways: tuple[list[Way], list[Way]] = ([], [])
+    versions = max(1, round(WAYS / len(drags)))
+    for k, drag in enumerate(drags):
+        for _ in range(1 if k in held else versions):
+            seen = drag if rings is None else drag.turned(turns[rng.integers(len(turns))], rings)
+            ways[k in held].append(gone_through(seen, random_places(len(drag.share), rng), eyes, rng))
+    known = np.concatenate([way.modes for way in ways[0]])
+    gain = GAIN / max(float(known.std(axis=0).max()), 1e-12)
+    torch.manual_seed(seed)
+    model = SlipModel(SlipNetwork(2 * known.shape[1]), gain, HEADROOM * np.abs(known).max(axis=0), 0.5, 1.0)
+    _fit(model, ways[0], seed)
+    return _calibrated(model, ways[1])
+
+
+def _fit(model: SlipModel, ways: list[Way], seed: int) -> None:
+    """Train the network of a model; sequences of like lengths are learnt from together."""
+    generator = torch.Generator().manual_seed(seed)
+    ways = sorted(ways, key=lambda way: len(way.modes))
+    groups = [_padded(model, ways[k : k + BATCH]) for k in range(0, len(ways), BATCH)]
+    optimiser = torch.optim.AdamW(model.network.parameters(), lr=RATE, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=EPOCHS * len(groups))
+    for _ in range(EPOCHS):
+        for k in torch.randperm(len(groups), generator=generator).tolist():
+            x, there, wanted = groups[k]
+            out, _ = model.network(x + JITTER * torch.randn(x.shape, generator=generator))
+            loss = _loss(out[there], wanted[there])
+            optimiser.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(model.network.parameters(), 1.0)
+            optimiser.step()
+            schedule.step()
+    model.network.eval()
+
+
+def _padded(model: SlipModel, ways: list[Way]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Inputs (B, T, 2 D), which frames there are (B, T), and what is wanted of them (B, T, 7), of ways one of which has T frames."""
+    longest = max(len(way.modes) for way in ways)
+    x = np.zeros((len(ways), longest, 2 * ways[0].modes.shape[1]), np.float32)
+    there = np.zeros((len(ways), longest), bool)
+    wanted = np.zeros((len(ways), longest, 7), np.float32)
+    for k, way in enumerate(ways):
+        count = len(way.modes)
+        x[k, :count] = model.inputs(way.modes, np.concatenate([way.modes[:1], way.modes[:-1]]))
+        there[k, :count] = True
+        known = np.isfinite(way.left_mm) & ~way.whole
+        way_left = np.log(np.where(known, way.left_mm, 1.0) + LEAST_LEFT_MM)
+        shown = way.drag_mm > SEEN_DRAG_MM
+        wanted[k, :count] = np.column_stack([way.begins, way.whole, known, way_left, shown, np.tile(way.direction, (count, 1))])
+    return torch.from_numpy(x), torch.from_numpy(there), torch.from_numpy(wanted)
+
+
+def _loss(out: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+    """Mean loss of frames: numbers (M, 6) against what is wanted (M, 7)."""
+    loss = nn.functional.binary_cross_entropy_with_logits(out[:, :2], wanted[:, :2], reduction="none").sum(dim=1).mean()
+    known, shown = wanted[:, 2] > 0, wanted[:, 4] > 0
+    scale = out[:, 3].clamp(-4, 2)
+    left = ((out[:, 2] - wanted[:, 3]) / scale.exp()) ** 2 / 2 + scale
+    apart = ((out[:, 4:] - wanted[:, 5:]) ** 2).sum(dim=1)
+    for part, chosen in ((left, known), (apart, shown)):
+        if chosen.any():
+            loss = loss + LEFT_WEIGHT * part[chosen].mean()
+    return loss
+
+
+def _calibrated(model: SlipModel, ways: list[Way]) -> SlipModel:
+    """The model with threshold and intervals from ways that it did not learn from."""
+    x, there, wanted = _padded(model, ways)
+    with torch.no_grad():
+        out, _ = model.network(x)
+    said, true = out[there].numpy(), wanted[there].numpy()
+    known, none = true[:, 2] > 0, true[:, 0] < 0.5
+    quantile, alarm_at = model.quantile, model.alarm_at
+    if known.any():
+        scores = np.abs(said[known, 2] - true[known, 3]) / np.exp(np.clip(said[known, 3], -4, 2))
+        quantile = float(conformal_quantile(scores[:, None], COVERAGE)[0])
+    if none.any():
+        logits = np.quantile(said[none, 0].astype(float), 1 - FALSE_ALARMS)
+        alarm_at = max(0.5, float(1 / (1 + np.exp(-np.clip(logits, -50, 50)))))
+    return SlipModel(model.network, model.gain, model.limit, min(alarm_at, 0.99), quantile)
+
+
+def write_slip(path: Path, model: SlipModel) -> None:
+    """Write what ``read_slip`` reads."""
+    numbers = {"gain": model.gain, "alarm_at": model.alarm_at, "quantile": model.quantile}
+    arrays = {key: torch.tensor([value]) for key, value in numbers.items()} | {"limit": torch.from_numpy(np.array(model.limit, np.float32))}
+    weights = {f"network.{key}": value.contiguous() for key, value in model.network.state_dict().items()}
+    write_bytes(path, save(arrays | weights))
+
+
+def read_slip(path: Path) -> SlipModel:
+    """What ``write_slip`` wrote.
+
+    Raises
+    ------
+    TrainingError
+        The file can't be read, or is damaged.
+    """
+    try:
+        found = load(path.read_bytes())
+        gain, alarm_at, quantile = (float(found.pop(key)[0]) for key in ("gain", "alarm_at", "quantile"))
+        limit = found.pop("limit").numpy().astype(float)
+        network = SlipNetwork(2 * len(limit))
+        network.load_state_dict({key.removeprefix("network."): value for key, value in found.items()})
+        return SlipModel(network.eval(), gain, limit, alarm_at, quantile)
+    except (OSError, SafetensorError, ValueError, KeyError, IndexError, RuntimeError, TypeError) as error:
+        raise damaged(path, getattr(error, "strerror", None) or "no network for slip") from error
+
+
+@dataclass(frozen=True)
+class SlipErrors:
+    """How well slip is told on simulated drags.
+
+    Attributes
+    ----------
+    contacts, frames : int
+    whole_accuracy : float
+        Share of the frames in which slip of the whole contact is told rightly.
+    false_alarms : float
+        Share of the frames without slip that raise the alarm.
+    lead_mm : float
+        Mean drag between the first alarm under the drag and slip of the whole contact; an alarm that comes later counts as negative, a
+        missing one as the drag's end.
+    late : float
+        Share of the contacts whose alarm came after the whole contact slid.
+    left_mm, left_covered : float
+        Mean absolute error of the way left, and the share inside the 90 % intervals.
+    direction_deg : float
+        Median error of the direction.
+    """
+
+    contacts: int
+    frames: int
+    whole_accuracy: float
+    false_alarms: float
+    lead_mm: float
+    late: float
+    left_mm: float
+    left_covered: float
+    direction_deg: float
+
+
+def judge_slip(model: SlipModel, ways: Sequence[Way]) -> SlipErrors:
+    """Compare what is told of ways with what is true."""
+    right: list[bool] = []
+    alarms: list[bool] = []
+    inside: list[bool] = []
+    leads: list[float] = []
+    left: list[float] = []
+    turned: list[float] = []
+    for way in ways:
+        tracker = SlipTracker(model)
+        told = [tracker(modes) for modes in way.modes]
+        right += [(slip.whole > 0.5) == whole for slip, whole in zip(told, way.whole.tolist(), strict=True)]
+        alarms += [slip.alarm for slip, begins in zip(told, way.begins.tolist(), strict=True) if not begins]
+        if way.whole.any():
+            at = next((k for k, slip in enumerate(told) if slip.alarm and way.drag_mm[k] > 0), len(told) - 1)
+            slides_mm = float(way.drag_mm[0] + way.left_mm[0])
+            leads.append(slides_mm - float(way.drag_mm[at]))
+        for k in np.flatnonzero(np.isfinite(way.left_mm) & ~way.whole).tolist():
+            left.append(abs(told[k].left_mm - float(way.left_mm[k])))
+            inside.append(told[k].left_low_mm <= way.left_mm[k] <= told[k].left_high_mm)
+        true_deg = float(np.degrees(np.arctan2(way.direction[1], way.direction[0])))
+        turned += [abs((told[k].direction_deg - true_deg + 180) % 360 - 180) for k in np.flatnonzero(way.drag_mm > SEEN_DRAG_MM).tolist()]
+    numbers = (_mean(right), _mean(alarms), _mean(leads), _mean([lead < 0 for lead in leads]))
+    more = (_mean(left), _mean(inside), np.median(turned) if turned else np.nan)
+    return SlipErrors(len(ways), len(right), *(float(value) for value in (*numbers, *more)))
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")

@@ -19,10 +19,13 @@ from training.gaussian_process import SMOOTH_AND_LINEAR, TWO_FIDELITIES, Points,
 from training.label_code import LabelCode, label_error
 from training.models.part import Inputs, Model, Modes, Prediction, Prepared
 from training.networks import predict_rows
+from twin.errors import warn_once
 from twin.pins.reference import Reference
 
 # Share of the labels that should lie inside their intervals.
 COVERAGE = 0.9
+# Frames without which no error is so large that this share of all errors is smaller: with n frames the largest is n / (n + 1) of them.
+LEAST_HELD = 9
 # Rows of a group below which the quantile of all rows is used, because so few rows give no reliable quantile of their own.
 SMALL_GROUP = 30
 # Weights of the Gaussian process in its average with the networks that are tried; the one with the smallest error is used.
@@ -163,11 +166,14 @@ def calibrate(
     single = [Ensemble(model, data.pins.reference, content | {"networks": [weights]}, size) for weights in content["networks"]]
     left_out = np.full(y.shape, np.nan)
     if kernel:
+        group = None if data.group is None else data.group[train]
         for view in range(prepared.views):
             modes = single[0].modes(prepared.inputs, torch.from_numpy(view * len(data) + train))
             known = y[np.ix_(train, main)]
             processes, left = (
-                fit_smooth_processes(modes.inputs, known) if model.modes_scaled else fit_processes(modes.inputs, known, seed=seed)
+                fit_smooth_processes(modes.inputs, known, group=group)
+                if model.modes_scaled
+                else fit_processes(modes.inputs, known, seed=seed, group=group)
             )
             content["kernels"].append(processes.arrays())
             if view == 0:
@@ -179,6 +185,8 @@ def calibrate(
     mean, spread, executed, truth, said, known, published = (np.concatenate(part) for part in zip(*parts, strict=True))
     if not len(mean):
         return content
+    if len(mean) < LEAST_HELD:
+        warn_once(f"90 % intervals from {len(mean)} frames that training did not see are too narrow; {LEAST_HELD} or more are needed")
     if kernel:
         errors = [np.abs(b * said + (1 - b) * mean - truth).mean(axis=0) for b in BLENDS]
         content["blend"][main] = BLENDS[np.argmin(errors, axis=0)][main]

@@ -100,19 +100,31 @@ class Kind:
         return np.column_stack([np.sqrt((left**2).mean(axis=1)), np.sqrt(np.maximum(square.min(axis=1), 0))])
 
     @classmethod
-    def fit(cls, moved: np.ndarray, seed: int) -> "Kind":
+    def fit(cls, moved: np.ndarray, seed: int, group: np.ndarray | None = None) -> "Kind":
         """The kind of displacements (M, N, 2). A fifth of them is not fitted: it sets the limits.
+
+        Parameters
+        ----------
+        group : (M,) int, optional
+            Frames that belong together, such as the states of one contact; they are fitted or not together.
 
         Raises
         ------
         TrainingError
-            There are too few frames.
+            There are too few frames, or too few pins.
         """
-        fitted, held = split_rows(len(moved), seed)
+        if 2 * moved.shape[1] <= FREE_MODES:
+            raise TrainingError(f"{moved.shape[1]} pins are too few to know a kind of contact by; {FREE_MODES // 2 + 1} are needed")
+        fitted, held = split_rows(len(moved), seed, group)
         terms = _terms(np.zeros((1, FREE_MODES))).shape[1]
         if len(fitted) < 2 * terms:
             raise TrainingError(f"{len(moved)} frames are too few to know a kind of contact by; {2 * terms * 5 // 4} are needed")
         modes = Modes.fit(moved[fitted], KIND_MODES)
+        if modes.components.shape[1] <= FREE_MODES:
+            raise TrainingError(
+                f"the frames of a kind of contact differ in {modes.components.shape[1]} ways, more than {FREE_MODES} are needed to know it "
+                "by; give frames of more places, depths and moves"
+            )
         seen = modes(moved[fitted])
         inputs = _terms(seen[:, :FREE_MODES])
         weight = np.linalg.solve(inputs.T @ inputs + RIDGE * len(inputs) * np.eye(terms), inputs.T @ seen[:, FREE_MODES:])
@@ -187,11 +199,23 @@ def fit_contacts(frames: Mapping[str, Sequence[Dataset]], *, seed: int) -> Conta
     if len(frames) < 2:
         raise TrainingError("to tell kinds of contact apart, frames of at least two are needed")
     moved = {name: np.concatenate([moved_of(each.pins) for each in frames[name]]) for name in sorted(frames)}
-    kinds = {name: Kind.fit(each, seed) for name, each in moved.items()}
+    kinds = {name: Kind.fit(each, seed, groups_of(frames[name])) for name, each in moved.items()}
     together = np.concatenate(list(moved.values()))
     modes = Modes.fit(together, COMMON_MODES)
     right = np.repeat(np.arange(len(moved)), [len(each) for each in moved.values()])
     return Contacts(kinds, modes, _layers(modes(together), right, seed))
+
+
+def groups_of(parts: Sequence[Dataset]) -> np.ndarray | None:
+    """The group of each row of several data sets, one after the other; None if no data set has groups. A row without one is alone."""
+    if all(part.group is None for part in parts):
+        return None
+    found, first = [], 0
+    for part in parts:
+        own = np.arange(len(part)) if part.group is None else np.unique(part.group, return_inverse=True)[1]
+        found.append(first + own)
+        first += int(own.max()) + 1
+    return np.concatenate(found)
 
 
 def _layers(seen: np.ndarray, right: np.ndarray, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:

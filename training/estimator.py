@@ -23,7 +23,7 @@ from training.recipes import TrainingError
 from training.run_files import CHECKPOINT, CONFIG, TENSORS, damaged, read_config, read_tensors, require_together
 from training.slip import NAMES as SLIP_NAMES
 from training.slip import SLIP, SLIP_UNITS, Slip, SlipModel, SlipTracker, read_slip
-from training.targets import BOUNDS
+from training.targets import limits_of
 from training.touched import TouchAnswer
 from twin.errors import FrameError
 from twin.frames.forms import blob_spec
@@ -101,7 +101,7 @@ class PoseEstimator:
         self.sensor = SensorSpec.model_validate(config["sensor"])
         self.form = Form(config["pipeline"]["form"])
         self.names, self.units = tuple(config["columns"]), tuple(config["units"])
-        self._bounds = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
+        self._bounds = limits_of(self.names)
         reference = make_reference(content["reference_px"].numpy(), self.sensor.pins)
         self.pipeline = Pipeline(self.sensor, self.form, reference, graph=config["pipeline"]["graph"])
         self.ensemble = Ensemble(self.part, reference, content, config["size"])

@@ -23,7 +23,7 @@ from training.label_code import label_error
 from training.models.part import Prediction
 from training.recipes import TrainingError
 from training.simulated import is_pins_only
-from training.targets import Targets
+from training.targets import Targets, limits_of
 from twin.frames import open_recording
 from twin.progress import Step
 from twin.report.charts import new_figure, save_figure
@@ -85,9 +85,10 @@ def judge(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
     targets = data.targets.rows(rows)
     found: dict = {"frames": len(rows), "without_prediction": int((~np.isfinite(made.mean)).any(axis=1).sum())}
     for kind in ("raw", "corrected"):
-        error = np.abs(label_error(made.mean, getattr(targets, kind), targets.units))
+        truth = getattr(targets, kind)
+        error = np.abs(label_error(np.clip(made.mean, *limits_of(targets.names)), truth, targets.units))
         half_width = made.half_width_raw if kind == "raw" else made.half_width
-        inside = error <= half_width
+        inside = np.abs(label_error(made.mean, truth, targets.units)) <= half_width
         found[kind] = {
             name: {
                 "mae": float(error[:, k].mean()),
@@ -204,17 +205,14 @@ def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarra
     targets = data.targets.rows(rows)
     truth = getattr(targets, labels)
     half_width = made.half_width_raw if labels == "raw" else made.half_width
+    told = [np.clip(each, *limits_of(targets.names)) for each in (made.mean, made.mean - half_width, made.mean + half_width)]
     path = out / "predictions.csv"
     with text_file(path) as file:
         writer = csv.writer(file)
         parts = [f"{name}_{part}" for name in targets.names for part in ("true", "pred", "lo90", "hi90")]
         writer.writerow(["image_name", *parts, "executed_probability", "valid"])
         for m, row in enumerate(rows):
-            cells = [
-                f"{v:.6g}"
-                for k in range(len(targets.names))
-                for v in (truth[m, k], made.mean[m, k], made.mean[m, k] - half_width[m, k], made.mean[m, k] + half_width[m, k])
-            ]
+            cells = [f"{v:.6g}" for k in range(len(targets.names)) for v in (truth[m, k], *(each[m, k] for each in told))]
             writer.writerow([data.pins.image_name[row], *cells, f"{made.executed[m]:.4g}", int(np.isfinite(made.mean[m]).all())])
     write_json(out / "metrics.json", metrics | {"made_by": made_by(__name__)})
     return [path, out / "metrics.json", _draw(out / "errors.png", made, truth, targets, labels)]
@@ -225,7 +223,7 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
     count = len(targets.names)
     figure, axes = new_figure(count, 2, panel_inch=3.6)
     undone = np.nan_to_num(targets.executed, nan=1.0) < 0.5
-    errors = label_error(made.mean, truth, targets.units)
+    errors = label_error(np.clip(made.mean, *limits_of(targets.names)), truth, targets.units)
     for k, (name, unit) in enumerate(zip(targets.names, targets.units, strict=True)):
         error = errors[:, k]
         for chosen, colour, label in ((~undone, "#1f77b4", "move executed"), (undone, "#ff7f0e", "not executed")):

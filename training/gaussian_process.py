@@ -268,21 +268,29 @@ class Posterior:
         The M known rows.
     label : (M,) float
         Their labels; the mean is 0.
+    group : (M,) int, optional
+        Rows that belong together, such as the states of one contact; they are left out together. By default each row is alone.
 
     Attributes
     ----------
     weight : (M,) float
         Weight of each known row in a prediction.
     left_out : (M,) float
-        Prediction of each known row from all others.
+        Prediction of each known row from all rows of other groups.
     """
 
-    def __init__(self, kernel: Kernel, points: Points, label: np.ndarray) -> None:
+    def __init__(self, kernel: Kernel, points: Points, label: np.ndarray, group: np.ndarray | None = None) -> None:
         self.kernel, self.points = kernel, points
         self._factor = cholesky(kernel.noisy(points), lower=True)
         self.weight = cho_solve((self._factor, True), label)
         columns = solve_triangular(self._factor, np.eye(len(points)), lower=True)
-        self.left_out = label - self.weight / (columns**2).sum(axis=0)
+        if group is None:
+            self.left_out = label - self.weight / (columns**2).sum(axis=0)
+        else:  # with K the covariance of the known rows, the part K^-1 of a group is the inverse of its covariance given all others
+            self.left_out = np.empty(len(label))
+            for rows in (np.flatnonzero(group == name) for name in np.unique(group)):
+                part = columns[:, rows].T @ columns[:, rows]
+                self.left_out[rows] = label[rows] - np.linalg.solve(part, self.weight[rows])
 
     def mean(self, asked: Points) -> np.ndarray:
         """(B,) the expected label of other rows."""
@@ -343,13 +351,17 @@ class Processes:
         return cls(kernels, Points(found["inputs"], found["second"]), found["weight"])
 
 
-def fit_processes(inputs: np.ndarray, labels: np.ndarray, *, seed: int, progress: Callable | None = None) -> tuple[Processes, np.ndarray]:
+def fit_processes(
+    inputs: np.ndarray, labels: np.ndarray, *, seed: int, group: np.ndarray | None = None, progress: Callable | None = None
+) -> tuple[Processes, np.ndarray]:
     """Processes with a smooth and a linear term, for K standardised labels (M, K) on inputs (M, D).
 
     Parameters
     ----------
     seed : int
         Chooses the rows on which the likelihood is maximised. The predictions then use all rows.
+    group : (M,) int, optional
+        As in ``Posterior``.
     progress : callable, optional
         Called with (labels done, K).
 
@@ -357,15 +369,15 @@ def fit_processes(inputs: np.ndarray, labels: np.ndarray, *, seed: int, progress
     -------
     Processes
     left_out : (M, K) float
-        Prediction of each row from all others. The row itself was used to find lengths, sizes and noises.
+        Prediction of each row from all rows of other groups. The row itself was used to find lengths, sizes and noises.
     """
     points = Points.of(inputs)
     start = Kernel(SMOOTH_AND_LINEAR, 5.0 * _spread(inputs), np.array([1.0, 0.3]), np.array([0.05]))
-    return _fitted(start, points, labels, drawn_rows(len(points), seed), progress)
+    return _fitted(start, points, labels, drawn_rows(len(points), seed), group, progress)
 
 
-def fit_smooth_processes(inputs: np.ndarray, labels: np.ndarray) -> tuple[Processes, np.ndarray]:
-    """As ``fit_processes``, but all inputs have one common length, and only the noise is chosen: by the leave-one-out error.
+def fit_smooth_processes(inputs: np.ndarray, labels: np.ndarray, *, group: np.ndarray | None = None) -> tuple[Processes, np.ndarray]:
+    """As ``fit_processes``, but all inputs have one common length, and only the noise is chosen: by the error of rows that are left out.
 
     For inputs whose scales already say how much they matter. It takes seconds, and with many inputs and few rows it overfits nothing.
     """
@@ -376,7 +388,8 @@ def fit_smooth_processes(inputs: np.ndarray, labels: np.ndarray) -> tuple[Proces
     lengths = np.full(inputs.shape[1], max(SMOOTH_LENGTHS * np.sqrt(middle), LEAST_SPREAD))
     kernels, weights, left_out = [], [], []
     for label in labels.T:
-        tried = [Posterior(Kernel(SMOOTH_AND_LINEAR, lengths, SMOOTH_SIZES, np.array([noise])), points, label) for noise in SMOOTH_NOISES]
+        kernel_of = [Kernel(SMOOTH_AND_LINEAR, lengths, SMOOTH_SIZES, np.array([noise])) for noise in SMOOTH_NOISES]
+        tried = [Posterior(kernel, points, label, group) for kernel in kernel_of]
         best = tried[int(np.argmin([np.abs(posterior.left_out - label).mean() for posterior in tried]))]
         kernels.append(best.kernel)
         weights.append(best.weight)
@@ -411,7 +424,7 @@ def fit_two_fidelities(
     inputs, labels = np.concatenate([simulated[chosen], real]), np.concatenate([simulated_labels[chosen], real_labels])
     points = Points(inputs, np.repeat([0.0, 1.0], [len(chosen), len(real)]))
     start = Kernel(TWO_FIDELITIES, 5.0 * _spread(inputs), np.array([1.0, 0.3, 0.1, 0.1, 0.1]), np.array([0.05, 0.05]), 2.0)
-    processes, left_out = _fitted(start, points, labels, np.arange(len(points)), None)
+    processes, left_out = _fitted(start, points, labels, np.arange(len(points)), None, None)
     return processes, left_out[len(chosen) :]
 
 
@@ -423,10 +436,12 @@ def drawn_rows(count: int, seed: int) -> np.ndarray:
     return torch.randperm(count, generator=torch.Generator().manual_seed(seed))[:FIT_ROWS].numpy()
 
 
-def _fitted(start: Kernel, points: Points, labels: np.ndarray, rows: np.ndarray, progress: Callable | None) -> tuple[Processes, np.ndarray]:
+def _fitted(
+    start: Kernel, points: Points, labels: np.ndarray, rows: np.ndarray, group: np.ndarray | None, progress: Callable | None
+) -> tuple[Processes, np.ndarray]:
     kernels, weights, left_out = [], [], []
     for k, label in enumerate(labels.T):
-        posterior = Posterior(climbed(start, points.rows(rows), label[rows]), points, label)
+        posterior = Posterior(climbed(start, points.rows(rows), label[rows]), points, label, group)
         kernels.append(posterior.kernel)
         weights.append(posterior.weight)
         left_out.append(posterior.left_out)

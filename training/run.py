@@ -139,7 +139,7 @@ def train_run(
         loop = _member(config, data, prepared, scaled, code, train, member, device)
         if state and state["loop"] is not None:
             loop.load(state["loop"])
-        state, kept = None, monotonic()
+        state, kept, out_of_time = None, monotonic(), False
         while not loop.finished:
             point = loop.epoch()
             if progress:
@@ -154,6 +154,9 @@ def train_run(
                 return False
         done.append(_finished(loop))
         _keep(out, resolved, done, None)
+        if out_of_time and len(done) < config.recipe.members:
+            _assemble(out, resolved, config, data, prepared, train, done, code, (shift, scale))
+            return False
     _assemble(out, resolved, config, data, prepared, train, done, code, (shift, scale))
     (out / CHECKPOINT).unlink(missing_ok=True)
     return True

@@ -49,6 +49,11 @@ TARGET_COLUMNS = ("raw", "corrected", "executed", "move")
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 
 
+def limits_of(names: Sequence[str]) -> np.ndarray:
+    """Least and greatest values (2, K) that labels can have; infinite where there is no limit."""
+    return np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in names]).T
+
+
 @dataclass(frozen=True)
 class Targets:
     """Labels of M frames, K of them.

@@ -11,7 +11,7 @@ from drawn_frames import drawn_frame
 from drawn_recording import config_of
 
 from training.contact_estimator import ContactEstimator, KindOfContact, contacts_folder, put_together
-from training.contacts import CONTACTS, fit_contacts, read_contacts, write_contacts
+from training.contacts import CONTACTS, Kind, fit_contacts, groups_of, moved_of, read_contacts, write_contacts
 from training.dataset import joined
 from training.estimator import PoseEstimator
 from training.evaluate import intervals_on, judge
@@ -66,6 +66,29 @@ def test_what_no_kind_shows_is_none_of_them(data, contacts):
         seen.pins.nodes_px + rng.normal(0, 1.0, seen.pins.nodes_px.shape),  # pins that do not move together
     ):
         assert (contacts.tell(replace(seen.pins, nodes_px=nodes)) == "").mean() > 0.95
+
+
+def test_limits_are_from_contacts_none_of_whose_states_was_fitted(data):
+    """States of one contact are alike. Were they divided, its own other states would say how strange an unseen one may be."""
+    seen = drawn_kind(data, "bump", 200, 3)
+    moved = np.repeat(moved_of(seen.pins), 4, axis=0)
+    alike = moved + np.random.default_rng(4).normal(0, 1e-3, moved.shape)
+    together, apart = (Kind.fit(alike, 0, group).limits for group in (np.repeat(np.arange(200), 4), None))
+    assert (together > apart).all()
+
+
+def test_groups_of_several_sets_stay_apart(data):
+    first, second = replace(data.rows(np.arange(4)), group=np.array([5, 5, 9, 9])), data.rows(np.arange(3))
+    assert groups_of([first, second]).tolist() == [0, 0, 1, 1, 2, 3, 4]
+    assert groups_of([second, second]) is None
+
+
+def test_too_few_pins_or_ways_of_moving_make_no_kind():
+    rng = np.random.default_rng(0)
+    with pytest.raises(TrainingError, match="5 pins are too few"):
+        Kind.fit(rng.normal(size=(FRAMES, 5, 2)), 0)
+    with pytest.raises(TrainingError, match="differ in 2 ways"):
+        Kind.fit((rng.normal(size=(FRAMES, 2)) @ rng.normal(size=(2, 60))).reshape(FRAMES, 30, 2), 0)
 
 
 def test_kinds_are_the_same_when_read_again(data, contacts, tmp_path):

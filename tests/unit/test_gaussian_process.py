@@ -93,6 +93,16 @@ def test_a_row_is_left_out_as_if_it_had_never_been_there(case):
         assert without.mean(points.rows(np.array([k])))[0] == pytest.approx(left_out[k], abs=ROUNDING)
 
 
+def test_a_group_is_left_out_as_if_it_had_never_been_there(case):
+    kernel, points, label, _ = case
+    group = np.arange(ROWS) // 3
+    left_out = Posterior(kernel, points, label, group).left_out
+    for name in np.unique(group):
+        rows, others = np.flatnonzero(group == name), np.flatnonzero(group != name)
+        without = Posterior(kernel, points.rows(others), label[others])
+        assert without.mean(points.rows(rows)) == pytest.approx(left_out[rows], abs=ROUNDING)
+
+
 def test_the_likelihood_is_that_of_a_normal_distribution(case):
     kernel, points, label, _ = case
     expected = multivariate_normal(np.zeros(ROWS), noisy_written_out(kernel, points)).logpdf(label)

@@ -11,6 +11,7 @@ from training.estimator import PoseEstimator
 from training.gaussian_process import fit_smooth_processes
 from training.models.touch.features import Bases
 from training.models.touch.model import TOUCH
+from training.recipes import TrainingError
 from training.run import train_run
 
 PINS, MODES = 40, 6
@@ -66,6 +67,11 @@ def test_a_reflection_in_place_of_a_pin_is_found_out_and_strange_pins_widen_the_
     assert (error < 0.1 * np.ptp(data.targets.corrected, axis=0)).all()
 
 
+def test_modes_are_no_size_that_can_be_chosen(data):
+    with pytest.raises(TrainingError, match="no size modes; there are width, depth"):
+        TOUCH.build(data.pins.reference, 2, {"modes": 20})
+
+
 def test_light_tells_what_pins_do_not(tmp_path):
     data = drawn_dataset(tmp_path)
     told = np.random.default_rng(1).normal(size=len(data))
@@ -76,3 +82,5 @@ def test_light_tells_what_pins_do_not(tmp_path):
     _, left_out = fit_smooth_processes(modes, told[:, None])
     assert np.abs(left_out[:, 0] - told).mean() < 0.1
     assert not np.array_equal(TOUCH.seen(lit)[1], TOUCH.seen(data)[1])
+    with pytest.raises(TrainingError, match="come without it; give it frames"):
+        TOUCH.inputs(data.pins, prepared.learnt, data.pins.reference, together=False)

@@ -45,6 +45,12 @@ def test_a_run_taken_up_again_ends_as_if_never_ended(data, tmp_path, model):
     assert rows[0].startswith("network,epoch,loss") and len(rows) == 1 + 2 * 3
 
 
+def test_time_that_is_up_after_a_networks_last_epoch_ends_the_run(data, tmp_path):
+    config = config_of("vgnn", epochs=1, batch=32, members=3, kernel=False)
+    assert not train_run(config, data, tmp_path, max_minutes=0)
+    assert len((tmp_path / "curves.csv").read_text().splitlines()) == 1 + 1
+
+
 def test_another_run_in_the_same_folder_is_refused(data, trained, tmp_path):
     with pytest.raises(TrainingError, match="finished run"):
         train_run(config_of("vgnn", epochs=30, batch=16), data, trained)
@@ -205,6 +211,25 @@ def test_a_trained_model_tells_the_pose(data, trained, tmp_path):
     written = write_evaluation(tmp_path, made, data, rows, metrics, "corrected")
     head = written[0].read_text().splitlines()[0].split(",")
     assert head[:5] == ["image_name", "pose_2_true", "pose_2_pred", "pose_2_lo90", "pose_2_hi90"] and head[-1] == "valid"
+
+
+def test_no_share_above_one_and_no_area_below_zero_is_judged_or_written(data, tmp_path):
+    """An interval stays that around the unbounded estimate, as it was calibrated."""
+    labels = np.column_stack([np.full(len(data), 1.0), np.full(len(data), 3.0)])
+    told = replace(data, targets=replace(data.targets, names=("slip_share", "contact_area"), raw=labels, corrected=labels))
+    mean, half = np.tile([1.5, -2.0], (len(data), 1)), np.tile([0.6, 1.0], (len(data), 1))
+    rows = np.arange(5)
+    made = Prediction(mean[rows], half[rows], half[rows], np.full(5, np.nan))
+    found = judge(made, told, rows)["corrected"]
+    assert found["slip_share"]["mae"] == 0.0 and found["slip_share"]["coverage_90"] == 1.0
+    assert found["contact_area"]["mae"] == 3.0 and found["contact_area"]["coverage_90"] == 0.0
+    table = write_evaluation(tmp_path, made, told, rows, {}, "corrected")[0].read_text().splitlines()
+    assert table[1].split(",")[1:9] == ["1", "1", "0.9", "1", "3", "0", "0", "0"]
+
+
+def test_intervals_from_too_few_frames_are_said_to_be_too_narrow(data, tmp_path):
+    with pytest.warns(RuntimeWarning, match="frames that training did not see are too narrow; 9 or more"):
+        train_run(config_of("vgnn", epochs=1, members=1, kernel=False), data.rows(np.arange(8)), tmp_path)
 
 
 def test_one_frame_at_a_time_says_what_the_table_says(data, trained):

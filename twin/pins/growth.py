@@ -58,10 +58,10 @@ def predict_place(i: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndar
     c11, c12 = m[0, 0] * m[2, 2] - m[0, 2] * m[2, 0], m[0, 1] * m[2, 0] - m[0, 0] * m[2, 1]
     c22 = m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
     fx, fy = np.empty(3), np.empty(3)
-    for f, b in ((fx, bx), (fy, by)):  # the inverse of the symmetric matrix m by its cofactors: LAPACK takes longer for so small a matrix
-        f[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / det
-        f[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / det
-        f[2] = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / det
+    for to, of in ((fx, bx), (fy, by)):  # the inverse of the symmetric matrix m by its cofactors: LAPACK takes longer for so small a matrix
+        to[0] = (c00 * of[0] + c01 * of[1] + c02 * of[2]) / det
+        to[1] = (c01 * of[0] + c11 * of[1] + c12 * of[2]) / det
+        to[2] = (c02 * of[0] + c12 * of[1] + c22 * of[2]) / det
     area = fx[1] * fy[2] - fx[2] * fy[1]
     size2 = fx[1] ** 2 + fx[2] ** 2 + fy[1] ** 2 + fy[2] ** 2
     if area <= 0:

@@ -17,7 +17,7 @@ from training.models.touch.features import Bases
 from training.models.touch.network import TouchNetwork
 from training.models.vgnn.registration import Registration, align, fit_registration
 from training.pins import PinTable
-from training.recipes import Recipe
+from training.recipes import Recipe, TrainingError
 from twin.pins.reference import Reference
 
 SIZES = {"modes": 40, "light_modes": 20, "width": 256, "depth": 3}
@@ -63,8 +63,8 @@ class TouchModel(PinModel):
     sees_light = True
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> TouchNetwork:
-        """See ``Model``; sizes are those of ``SIZES``."""
-        refuse_sizes(self, size, tuple(SIZES))
+        """See ``Model``; width and depth can be chosen. The modes are learnt before, with the numbers in ``SIZES``."""
+        refuse_sizes(self, size, ("width", "depth"))
         sizes = SIZES | dict(size)
         features = 2 * sizes["modes"] + sizes["light_modes"]
         return TouchNetwork(features, outputs, width=sizes["width"], depth=sizes["depth"])
@@ -90,9 +90,11 @@ class TouchModel(PinModel):
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> TouchInputs:
         """See ``PinModel``. If a frame without contact shows where the camera sits, no displacement of the camera is estimated."""
         pins = pins.seen_from(reference) if pins.measured else pins
-        registration = Registration(**learnt["registration"])
+        registration, bases = Registration(**learnt["registration"]), Bases(**learnt["bases"])
+        if bases.light_mean.any() and not pins.light.any():
+            raise TrainingError("the model learnt from the light on the caps as well, and these pins come without it; give it frames")
         moved = _moved(registration, pins, reference, _untrusted(registration, pins, reference), together=together)
-        return TouchInputs(Bases(**learnt["bases"])(moved, pins.light))
+        return TouchInputs(bases(moved, pins.light))
 
     def initialise(self, network: torch.nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets how large the features may be."""

@@ -78,6 +78,36 @@ def test_a_rim_that_the_frame_cuts_is_told_from_what_is_in_view():
     assert same(found.best.pins, pins), found.best.line()
 
 
+@pytest.mark.parametrize(
+    ("pins", "part"),
+    [
+        (PinsSpec(rings=6), np.s_[110:310, 130:390]),
+        (PinsSpec(layout="hexagon", rings=6), np.s_[110:310, 130:390]),
+        (PinsSpec(layout="grid", columns=9, rows=9), np.s_[:, 150:350]),
+    ],
+    ids=lambda p: p.in_words() if isinstance(p, PinsSpec) else "",
+)
+def test_a_layout_whose_end_is_cut_off_is_never_sure(pins, part):
+    turn_deg = 0.0 if pins.layout == "grid" else 11.0
+    cut = [np.ascontiguousarray(image[part]) for image in frames_of(rest_of(pins, turn_deg=turn_deg), ring=False, contact_px=3.0)]
+    found = identify(cut)
+    assert found.best.pins.count < pins.count and not found.sure, found.best.line()
+    assert any("may be cut off" in doubt for doubt in found.doubts)
+    if pins.rings:
+        assert found.candidates[1].pins.rings == found.best.pins.rings + 1, "the next larger layout is shown"
+
+
+def test_frames_turned_and_filled_show_the_layout():
+    """A turned frame's corners are filled, and its cut pins are not in view: they count neither for the layout nor against it."""
+    pins = PinsSpec(rings=6)
+    images = frames_of(rest_of(pins, radius=205.0), ring=False)
+    turn = cv2.getRotationMatrix2D((249.5, 209.5), 37, 1.0)
+    turn[:, 2] += 50
+    turned = [cv2.warpAffine(image[22:398], turn, (600, 560)) for image in images]
+    found = identify(turned)
+    assert same(found.best.pins, pins) and found.best.explained > 0.97, found.best.line()
+
+
 def test_stray_light_and_specks_do_not_change_the_layout():
     pins = PinsSpec(rings=6)
     images = frames_of(rest_of(pins))

@@ -56,12 +56,15 @@ class Bumps:
         Size that was looked for: sd of the narrower Gaussian, px of the frame.
     size_px : (int, int)
         Width and height of the frame.
+    hidden : (H, W) bool, optional
+        Pixels in which frames show nothing (see ``twin.pins.extent``).
     """
 
     px: np.ndarray
     response: np.ndarray
     sigma_px: float
     size_px: tuple[int, int]
+    hidden: np.ndarray | None = None
 
 
 def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:

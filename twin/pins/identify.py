@@ -17,6 +17,7 @@ from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins.bumps import Bumps, find_bumps
+from twin.pins.extent import filled_area, in_view, open_sides, with_view
 from twin.pins.families import Family, family, family_of_positions, label_spots
 from twin.pins.growth import seen_places
 from twin.pins.matching import match
@@ -34,8 +35,6 @@ LIKE_ITS_NEIGHBOURS = 0.45
 """A spot is pin-like if it is at least this share as high as the pins around it."""
 BEYOND = 1.25
 """Spots count as left over up to this many spacings from the nearest pin."""
-IN_VIEW = 1.0
-"""A pin is in view if it is at least this many sds of its spot inside the frame."""
 STEADY = 0.5
 """A pin is in the rest layout if it was seen in this share of the frames."""
 NEVER_SEEN = 0.1
@@ -171,18 +170,27 @@ def identify(images: list[np.ndarray], *, progress: Step | None = None) -> Ident
     FrameError
         No frame shows a layout, or the frames' contrast is inverted.
     """
+    found, refused = None, None
     try:
-        return _identified(images, progress)
+        found = _identified(images, progress)
     except FrameError as error:
-        few = [255 - images[k] for k in spread(len(images), SIZED_ON)]
-        try:
-            _identified(few, None)
-        except FrameError:
-            raise error from None
+        refused = error
+    if found is not None and (found.sure or found.best.explained >= SHOWN):
+        return found
+    few = [255 - images[k] for k in spread(len(images), SIZED_ON)]
+    try:
+        inverted = _identified(few, None)
+    except FrameError:
+        inverted = None
+    if inverted is not None and (found is None or (inverted.best.explained >= SHOWN and inverted.best.pins.count > found.best.pins.count)):
         raise FrameError(
             f"the {len(images)} frames show pins that are darker than the skin: their contrast is inverted; give them as the camera takes "
             "them, or turn bright and dark around first"
-        ) from error
+        ) from refused
+    if found is None:
+        assert refused is not None
+        raise refused
+    return found
 
 
 def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
@@ -192,7 +200,7 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
     if not any(sizes):
         raise FrameError(f"none of {len(images)} frames shows pins in rings, a hexagon or a grid; {NO_LAYOUT}")
     sigma = float(np.median([size for size in sizes if size]))
-    spots = [find_bumps(image, sigma) for image in images]
+    spots = _spots(images, sigma)
     found: list[tuple[PinsSpec, list[Seen]]] = []
     for k, name in enumerate(FAMILIES):
         found += _first_guesses(family(name), spots)
@@ -209,7 +217,30 @@ def _identified(images: list[np.ndarray], progress: Step | None) -> Identified:
     if not candidates:
         raise FrameError(f"none of {len(images)} frames shows a whole layout of pins; {NO_LAYOUT}")
     doubts = _doubts(candidates)
+    if open_sides(candidates[0].pins, candidates[0].rest_px, spots[0]):
+        doubts.append(_end_not_seen(candidates[0].pins))
+        candidates = _with_larger(candidates, spots)
     return Identified(tuple(candidates), not doubts, tuple(doubts), sigma)
+
+
+def _end_not_seen(pins: PinsSpec) -> str:
+    """Why a layout that explains everything may yet be too small."""
+    lines = "rows or columns" if pins.layout == "grid" else "rings"
+    return (
+        f"the frames end where {pins.in_words()} end: more {lines} may be cut off; frames that show the sensor's rim decide, or count the "
+        f"{lines} of the sensor and give the layout"
+    )
+
+
+def _with_larger(candidates: list[Candidate], spots: list[Bumps]) -> list[Candidate]:
+    """The candidates, and behind the first the layout that has one ring more than it."""
+    first = candidates[0].pins
+    if first.rings is None or any((c.pins.layout, c.pins.rings) == (first.layout, first.rings + 1) for c in candidates[1:2]):
+        return candidates
+    pins = PinsSpec(layout=first.layout, rings=first.rings + 1)
+    seen = [shown for one in spots if (shown := _layout_look(pins, family(pins.layout), one)) is not None]
+    larger = [_candidate(pins, seen, spots, may_miss=False)] if seen else []
+    return [candidates[0], *larger, *candidates[1:]]
 
 
 def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
@@ -219,9 +250,17 @@ def judge_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
     sizes = [size for k in spread(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
     if not sizes:
         return None
-    spots = [find_bumps(image, float(np.median(sizes))) for image in images]
+    spots = _spots(images, float(np.median(sizes)))
     seen = [shown for one in spots if (shown := look(one)) is not None]
     return _candidate(pins, seen, spots, may_miss=False) if seen else None
+
+
+def _spots(images: list[np.ndarray], sigma_px: float) -> list[Bumps]:
+    """Each frame's spots of one size, and where the frames show a sensor at all."""
+    filled = filled_area(images)
+    found = [find_bumps(image, sigma_px) for image in images]
+    hidden = with_view(found[0], filled).hidden
+    return [replace(one, hidden=hidden) for one in found]
 
 
 def spread(count: int, wanted: int) -> list[int]:
@@ -274,16 +313,8 @@ def _told(spots: Bumps, spot: np.ndarray, places: np.ndarray) -> Seen:
         near = distance[:, 0] < BEYOND * spacing[nearest[:, 0]]
         high = spots.response[others] > LIKE_ITS_NEIGHBOURS * np.median(spots.response[taken][nearest], axis=1)
         left_over = others[near & high]
-    not_seen = int((_in_frame(places, spots) & ~there).sum())
+    not_seen = int((in_view(places, spots) & ~there).sum())
     return Seen(np.where(there[:, None], places, np.nan), places, not_seen, spots.px[left_over])
-
-
-def _in_frame(places: np.ndarray, spots: Bumps) -> np.ndarray:
-    """Which places (n, 2), NaN where unknown, lie in the frame as a whole."""
-    margin = IN_VIEW * spots.sigma_px
-    with np.errstate(invalid="ignore"):
-        inside: np.ndarray = np.all((places >= margin) & (places <= np.array(spots.size_px) - 1 - margin), axis=1)
-    return inside
 
 
 def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[Seen]]]:
@@ -326,19 +357,19 @@ def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> Se
     return None if nodes is None else _seen(spots, spot, by, nodes)
 
 
-def _in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:
+def _family_in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:
     """Which places (M,) of a lattice lie in the frame, as far as that can be told."""
-    return _in_frame(seen_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)
+    return in_view(seen_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)
 
 
 def _rings(by: Family, spots: Bumps, spot: np.ndarray) -> int:
     """Number of rings that are seen, from the middle outwards."""
-    in_view = _in_view(by, spots, spot)
+    shown = _family_in_view(by, spots, spot)
     rings = 0
     for ring in range(1, int(by.ring.max()) + 1):
         here = by.ring == ring
         there = (spot >= 0) & here
-        if there.sum() < FULL_RING * max((in_view & here).sum(), 1) or there.sum() < 2:
+        if there.sum() < FULL_RING * max((shown & here).sum(), 1) or there.sum() < 2:
             break
         rings = ring
     return rings
@@ -347,7 +378,7 @@ def _rings(by: Family, spots: Bumps, spot: np.ndarray) -> int:
 def _hexagon(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[int, int]:
     """Middle place and number of rings of the hexagon that holds most labels and fewest empty places in view."""
     taken = np.flatnonzero(spot >= 0)
-    empty = np.flatnonzero((spot < 0) & _in_view(by, spots, spot))
+    empty = np.flatnonzero((spot < 0) & _family_in_view(by, spots, spot))
     q, labelled, bare = _axial(by.lattice), _axial(by.lattice[taken]), _axial(by.lattice[empty])
     best, most, rings = 0, -np.inf, 0
     for middle in taken:
@@ -395,7 +426,7 @@ def _rectangle(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[tuple[int, i
     """Columns and rows of the rectangle that holds most labels and fewest empty places, and its places."""
     side = int(round(np.sqrt(len(by.lattice))))
     there = (spot >= 0).reshape(side, side)
-    gain = np.where(there, 1, np.where(_in_view(by, spots, spot).reshape(side, side), -1, 0))
+    gain = np.where(there, 1, np.where(_family_in_view(by, spots, spot).reshape(side, side), -1, 0))
     sums = np.pad(gain.cumsum(axis=0), ((1, 0), (0, 0)))
     best, most = None, 0
     rows = np.flatnonzero(there.any(axis=1))
@@ -437,8 +468,8 @@ def _candidate(pins: PinsSpec, seen: list[Seen], spots: list[Bumps], *, may_miss
         rest = _rest(pins, [again[k] for k in good])
         again = [_matched(pins, rest, one) for one in spots]
     there = np.mean([np.isfinite(one.pins_px[:, 0]) for one in again], axis=0)
-    in_view = np.mean([_in_frame(one.places_px, a) for one, a in zip(again, spots, strict=True)], axis=0) > STEADY
-    never = np.flatnonzero((there < NEVER_SEEN) & in_view)
+    shown = np.mean([in_view(one.places_px, a) for one, a in zip(again, spots, strict=True)], axis=0) > STEADY
+    never = np.flatnonzero((there < NEVER_SEEN) & shown)
     if may_miss and not pins.missing and len(spots) > 1 and 0 < len(never) <= MOST_MISSING * pins.count:
         kept = np.setdiff1d(np.arange(pins.count), never)
         less = PinsSpec.model_validate(pins.model_dump() | {"missing": tuple(never.tolist())})

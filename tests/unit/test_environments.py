@@ -46,6 +46,17 @@ def test_a_tool_stands_as_deep_and_as_turned_as_it_is_put(thing, sensor):
     assert abs(touch.angle_deg[0]) == pytest.approx(7.0, abs=PLACE_TOLERANCE_MM)
 
 
+def test_objects_of_one_name_have_each_their_own_surface(tmp_path):
+    told = []
+    for folder, radius_mm in (("a", 8), ("b", 40)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "ball.toml").write_text(f'description = "ball"\nshape = {{ kind = "sphere", radius_mm = {radius_mm} }}\n')
+        told.append(load_object(str(tmp_path / folder / "ball.toml")))
+    surfaces = Surfaces()
+    beside = np.array([[20.0, 0.0, 8.0]])
+    assert surfaces[told[0]].field.distance(beside)[0] > 0 > surfaces[told[1]].field.distance(beside)[0]
+
+
 def test_z_goes_towards_the_object_and_ry_turns_the_tool():
     tool, surface = tool_of(), Surfaces()[load_object("plane")]
     T = standing_on(tool, surface, 0.0, 2.0, 0.0)[None]

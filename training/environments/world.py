@@ -113,9 +113,9 @@ class Surfaces:
     """The surfaces of the objects that a task uses, each built once."""
 
     def __init__(self) -> None:
-        self._built: dict[str, Surface] = {}
+        self._built: dict[ObjectSpec, Surface] = {}
 
     def __getitem__(self, touched: ObjectSpec) -> Surface:
-        if touched.name not in self._built:
-            self._built[touched.name] = Surface(touched)
-        return self._built[touched.name]
+        if touched not in self._built:  # by all that it is: two files in different folders may have one name
+            self._built[touched] = Surface(touched)
+        return self._built[touched]

@@ -82,7 +82,10 @@ def test_a_ball_rolls_without_sliding():
     start = task.begin(0, tool, load_object("sphere"), Surfaces(), np.random.default_rng(1))
     before, T_object = start.T_work[None], start.T_object[None]
     moved = before @ motions(np.array([[0.2, -0.1, 0, 0, 0, 0]]))
-    after = task.carried(moved, before, T_object, tool)
+    felt = Felt.at_rest(1, 331)
+    assert np.array_equal(task.carried(felt, moved, before, T_object), T_object)  # nothing holds it
+    felt.force_n[0, 2] = 0.5
+    after = task.carried(felt, moved, before, T_object)
     middle = [T[0, :3, 3] + task.kept[0, 0] * T[0, :3, 2] for T in (T_object, after)]
     assert middle[1] - middle[0] == pytest.approx([0.1, -0.05, 0.0])
     bottom = np.append(middle[0] + [0, 0, task.kept[0, 0]], 1.0)  # of the ball, on the table
@@ -113,6 +116,20 @@ def test_reward_is_largest_where_the_task_wants_the_sensor():
         batch.T_work[0] = standing_on(batch.tool, surface, 0.0, batch.goal[0, 0] + off_mm, 0.0)
         rewards.append(float(batch.task.judge(batch._seen_now()).reward[0]))
     assert rewards[0] == pytest.approx(1.0) and rewards == sorted(rewards, reverse=True)
+
+
+@pytest.mark.parametrize("task", ["EdgeFollow", "ObjectRoll"])
+@pytest.mark.parametrize(
+    ("indent_mm", "fails", "good"), [(2.0, False, True), (-0.5, False, False), (-1.5, True, False), (5.8, True, False)]
+)
+def test_a_state_without_touch_is_not_good_and_a_lost_object_ends_the_episode(task, indent_mm, fails, good):
+    """The sensor where the task wants it but for its height: over the edge, and over the ball."""
+    batch = Batch(task, 1, Options(**FAST))
+    batch.begin(0, np.random.default_rng(0))
+    batch.T_work[0], batch.T_object[0], batch.goal[0] = np.eye(4), np.eye(4), 0.0
+    batch.T_work[0, :3, 3] = -batch.tool.T_work_sensor[:3, 3] + [0.0, 0.0, indent_mm - batch.tool.mounting.skin_apex_mm]
+    judged = batch.task.judge(batch._seen_now())
+    assert judged.failed[0] == fails and (judged.good & ~judged.failed)[0] == good
 
 
 @pytest.mark.parametrize(

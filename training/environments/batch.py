@@ -256,7 +256,7 @@ class Batch:
         steps[:, :3] += self.task.feed_mm
         before = self.T_work.copy()
         self.T_work[rows] = before[rows] @ motions(steps)[rows]
-        carried = self.task.carried(self.T_work, before, self.T_object, self.tool)
+        carried = self.task.carried(self.backend.felt, self.T_work, before, self.T_object)
         self.T_object[rows] = carried[rows]
         self.steps_done[rows] += 1
         self._move(rows)

@@ -139,8 +139,8 @@ class Task(ABC):
         """How the object's pose answers to what the skin feels: poses (B, 4, 4) to try next, or None where the object is held."""
         return None
 
-    def carried(self, T_work: FloatArray, before: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray:
-        """The object's poses (B, 4, 4) after the tools moved from ``before`` to ``T_work``; held objects stay."""
+    def carried(self, felt: Felt, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
+        """The object's poses (B, 4, 4) after the tools, that felt ``felt``, moved from ``before`` to ``T_work``; held objects stay."""
         return T_object
 
     def oracle(self, seen: Seen) -> FloatArray:
@@ -150,9 +150,14 @@ class Task(ABC):
         return np.column_stack(columns)
 
 
+def lost_or_deep(touch: Touch) -> BoolArray:
+    """Rows (B,) where the object is lost, or the sensor too deep."""
+    return (touch.indent_mm < LOST_MM) | (touch.indent_mm > DEEPEST_MM)
+
+
 def out_of_touch(touch: Touch) -> BoolArray:
     """Rows (B,) where the object is lost, or the sensor too deep or too steep."""
-    return (touch.indent_mm < LOST_MM) | (touch.indent_mm > DEEPEST_MM) | (np.abs(touch.angle_deg) > STEEPEST_DEG)
+    return lost_or_deep(touch) | (np.abs(touch.angle_deg) > STEEPEST_DEG)
 
 
 class SurfaceFollow(Task):
@@ -245,8 +250,8 @@ class EdgeFollow(Task):
     def judge(self, seen: Seen) -> Judged:
         across, turn = self.place(seen)
         off_mm, off_turn = np.abs(across - seen.goal[:, 0]), np.abs(turn / TURN_DEG - seen.goal[:, 1])
-        failed = (off_mm > self.farthest_mm) | (np.abs(turn) > STEEPEST_DEG + self.off_deg) | (seen.touch.indent_mm > DEEPEST_MM)
-        good = (off_mm <= self.good_mm) & (off_turn <= self.good_deg / TURN_DEG)
+        failed = (off_mm > self.farthest_mm) | (np.abs(turn) > STEEPEST_DEG + self.off_deg) | lost_or_deep(seen.touch)
+        good = (off_mm <= self.good_mm) & (off_turn <= self.good_deg / TURN_DEG) & (seen.touch.indent_mm > 0)
         reward = np.maximum(1.0 - off_mm / 2 - off_turn / 2, -1.0)
         return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), good)
 
@@ -275,7 +280,7 @@ class GentlePress(Task):
         T = standing_on(tool, surfaces[touched], 0.0, -0.5, rng.uniform(-self.off_deg, self.off_deg))
         return Start(T, (float(rng.uniform(*self.forces_n)),), np.eye(4))
 
-    def carried(self, T_work: FloatArray, before: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray:
+    def carried(self, felt: Felt, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
         drifted = T_object.copy()
         drifted[:, 0, 3] += self.kept[:, 0]
         return drifted
@@ -300,6 +305,8 @@ class ObjectRoll(Task):
     steps = 40
     farthest_mm = 6.0
     near_mm = 0.6
+    holds_n = 1e-3
+    """Least force of the skin on a ball that rolls with it."""
     columns = 1  # radius of the ball
 
     def require(self, touched: ObjectSpec) -> None:
@@ -318,8 +325,9 @@ class ObjectRoll(Task):
         T_object[:2, 3] = start
         return Start(T, tuple(map(float, goal)), T_object)
 
-    def carried(self, T_work: FloatArray, before: FloatArray, T_object: FloatArray, tool: Tool) -> FloatArray:
-        moved = 0.5 * (T_work[:, :3, 3] - before[:, :3, 3])  # a ball between two plates moves half as far as the upper one
+    def carried(self, felt: Felt, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:
+        held = np.linalg.norm(felt.force_n, axis=1, keepdims=True) > self.holds_n
+        moved = 0.5 * held * (T_work[:, :3, 3] - before[:, :3, 3])  # a ball between two plates moves half as far as the upper one
         turn = np.cross([0.0, 0.0, -1.0], moved)  # about its middle, which lies a radius along z from its pole
         step = np.concatenate([np.zeros_like(moved), np.degrees(turn / self.kept)], axis=1)
         out = T_object.copy()
@@ -337,9 +345,10 @@ class ObjectRoll(Task):
     def judge(self, seen: Seen) -> Judged:
         place = self.place(seen)
         off = np.linalg.norm(place - seen.goal, axis=1)
-        failed = np.linalg.norm(place, axis=1) > self.farthest_mm
+        failed = (np.linalg.norm(place, axis=1) > self.farthest_mm) | lost_or_deep(seen.touch)
+        good = (off <= self.near_mm) & (seen.touch.indent_mm > 0)
         reward = np.maximum(1.0 - off / 2, -1.0)
-        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), off <= self.near_mm)
+        return Judged(np.where(failed, -5.0, reward), failed, np.zeros(len(failed), bool), good)
 
     def oracle(self, seen: Seen) -> FloatArray:
         return np.column_stack([self.place(seen), super().oracle(seen)[:, 2:]])

@@ -82,7 +82,7 @@ def test_a_ball_rolls_without_sliding():
     start = task.begin(0, tool, load_object("sphere"), Surfaces(), np.random.default_rng(1))
     before, T_object = start.T_work[None], start.T_object[None]
     moved = before @ motions(np.array([[0.2, -0.1, 0, 0, 0, 0]]))
-    felt = Felt.at_rest(1, 331)
+    felt = Felt.at_rest(1, np.zeros((331, 3)))
     assert np.array_equal(task.carried(felt, moved, before, T_object), T_object)  # nothing holds it
     felt.force_n[0, 2] = 0.5
     after = task.carried(felt, moved, before, T_object)
@@ -97,7 +97,7 @@ def test_a_block_rests_while_the_push_is_within_its_friction_and_slides_beyond()
     task, tool = ObjectPush(), tool_of()
     task.prepare(1)
     start = task.begin(0, tool, load_object("square"), Surfaces(), np.random.default_rng(0))
-    felt = Felt.at_rest(1, 331)
+    felt = Felt.at_rest(1, np.zeros((331, 3)))
     T_work, T_object = start.T_work[None], start.T_object[None]
     forward = (T_work @ tool.T_work_sensor)[0, :3, :3].T @ [0.0, 0.0, 1.0]
     felt.force_n[0] = 0.9 * task.kept[0, 0] * forward * 0.5

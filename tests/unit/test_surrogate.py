@@ -102,6 +102,44 @@ def test_clear_of_the_object_the_sensor_is_exactly_at_rest(surrogate, sensor):
     assert not made.felt.force_n[0].any() and made.felt.area_mm2[0] == 0 and made.felt.slip[0] == 0
 
 
+def test_a_contact_that_is_lost_keeps_the_last_state_and_the_next_begins_at_rest(surrogate, sensor):
+    """The same of both backends, as ``Felt`` and ``Backend`` promise it."""
+    made = contacts(surrogate, sensor)
+    go(made, pose(0.0), pose(2.5))
+    caps, force, attitude = made.felt.caps_mm.copy(), made.felt.force_n.copy(), made.attitude(0)
+    made.move(ROW, pose(8.0)[None], np.zeros(1))
+    assert "8.0 mm inside" in made.felt.lost[0] and np.linalg.norm(force) > 0.5
+    assert np.array_equal(made.felt.caps_mm, caps) and np.array_equal(made.felt.force_n, force)
+    assert np.array_equal(made.attitude(0).base_mm, attitude.base_mm)
+    contact = Contact(sensor, load_object("plane"), ContactLaw(Friction(0.5, 0.5)))
+    made.begin(0, contact)
+    true = FiniteElements(sensor, 1)
+    true.begin(0, contact)
+    true.move(ROW, pose(1.0)[None], np.zeros(1))
+    assert np.abs(true.felt.force_n).max() > 0.1
+    true.begin(0, contact)
+    for backend in (made, true):
+        assert np.array_equal(backend.felt.caps_mm[0], made.caps_at_rest_mm) and not backend.felt.force_n.any()
+        assert np.array_equal(backend.attitude(0).caps_mm, made.caps_at_rest_mm) and backend.felt.lost == [""]
+
+
+@pytest.mark.parametrize("gone_mm", [0.1, 8.0])
+def test_what_is_left_is_not_outside_the_domain(surrogate, sensor, gone_mm):
+    """A ball at 47 deg from the apex is pressed, and then stands clear of the dome at 52 deg."""
+
+    def beside(polar_deg, depth_mm):
+        angle = np.radians(polar_deg)
+        T = np.eye(4)
+        T[:3, 3] = (40.0 - depth_mm) * np.array([np.sin(angle), 0.0, np.cos(angle)]) - [0.0, 0.0, 20.0]
+        return T
+
+    made = contacts(surrogate, sensor, "ball-40")
+    go(made, beside(47.0, 1.0))
+    assert made.felt.force_n.any()
+    go(made, beside(52.0, -gone_mm))
+    assert not made.felt.force_n.any()
+
+
 def test_a_thousand_steps_do_not_drift(surrogate, sensor):
     """Held still nothing creeps, and a cycle of shear comes back to itself each time."""
     made = contacts(surrogate, sensor)

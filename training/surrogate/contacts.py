@@ -57,8 +57,7 @@ class SurrogateContacts:
         self._parts = np.zeros((count, len(modes)), np.float32)
         self._radius = float(np.linalg.norm(surrogate.node_mm[0]))
         self._domain = surrogate.domain
-        self.felt = Felt.at_rest(count, sensor.pins.count)
-        self.felt.caps_mm[:] = self._caps_rest
+        self.felt = Felt.at_rest(count, self._caps_rest)
 
     def knows(self, touched: ObjectSpec) -> bool:
         """Whether an object is of a kind that the surrogate was trained on."""
@@ -79,18 +78,23 @@ class SurrogateContacts:
         self._friction[row] = friction.static
         self._compliance[row] = contact.law.compliance_mm_per_n * self._surrogate.stiffness
         self._forget(row)
-        self.felt.lost[row] = ""
+        self._depth[row] = 0.0
+        self._parts[row] = 0.0
+        self.felt.rest(row, self._caps_rest)
 
     def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
         """See ``Backend``."""
+        known = []
         for row, T in zip(rows.tolist(), T_sensor_object, strict=True):
             try:
                 self._bring(row, T)
                 self.felt.lost[row] = ""
+                known.append(row)
             except ContactError as error:
                 self.felt.lost[row] = str(error)
                 self._forget(row)
-        self._answer(rows)
+        if known:
+            self._answer(np.array(known))
 
     def attitude(self, row: int) -> PinRest:
         """See ``Backend``."""
@@ -112,7 +116,6 @@ class SurrogateContacts:
     def _forget(self, row: int) -> None:
         self._linear.free(row)
         self._before[row] = None
-        self._depth[row] = 0.0
 
     def _bring(self, row: int, T: FloatArray) -> None:
         """Solve the way to a commanded pose."""
@@ -125,7 +128,8 @@ class SurrogateContacts:
             self._linear.free(row)
             self._before[row], self._depth[row] = T.copy(), 0.0
             return
-        self._require_inside(depth, self._surrogate.node_mm[deepest], field, T)
+        if depth > 0:
+            self._require_inside(depth, self._surrogate.node_mm[deepest], field, T)
         before = self._before[row] if self._memory else None
         if before is not None and np.array_equal(before, T):
             return

@@ -56,10 +56,17 @@ class Felt:
     lost: list[str] = field(default_factory=list)
 
     @classmethod
-    def at_rest(cls, count: int, pins: int) -> "Felt":
-        """``count`` rows to be filled."""
+    def at_rest(cls, count: int, caps_mm: FloatArray) -> "Felt":
+        """``count`` sensors that touch nothing, with caps (N, 3)."""
         force, torque = np.zeros((2, count, 3))
-        return cls(np.zeros((count, pins, 3)), force, torque, np.zeros(count), np.zeros(count), [""] * count)
+        return cls(np.tile(caps_mm, (count, 1, 1)), force, torque, np.zeros(count), np.zeros(count), [""] * count)
+
+    def rest(self, row: int, caps_mm: FloatArray) -> None:
+        """Let one sensor touch nothing."""
+        self.caps_mm[row] = caps_mm
+        for values in (self.force_n, self.torque_nmm, self.area_mm2, self.slip):
+            values[row] = 0.0
+        self.lost[row] = ""
 
 
 class Backend(Protocol):
@@ -91,10 +98,10 @@ class FiniteElements:
     """The skin's finite elements, one ``Follower`` for each environment."""
 
     def __init__(self, sensor: SensorSpec, count: int) -> None:
-        self.felt = Felt.at_rest(count, sensor.pins.count)
-        rest = rest_pins(sensor.geometry)
-        self.felt.caps_mm[:] = rest.caps_mm
-        self._pins = [rest] * count
+        self._sensor = sensor
+        self._rest = rest_pins(sensor.geometry)
+        self.felt = Felt.at_rest(count, self._rest.caps_mm)
+        self._pins = [self._rest] * count
         self._followers: list[Follower | None] = [None] * count
         self._solver = lru_cache(maxsize=_KEPT_SOLVERS)(SkinSolver)
 
@@ -105,7 +112,8 @@ class FiniteElements:
     def begin(self, row: int, contact: Contact) -> None:
         """See ``Backend``; a sensor that was drawn anew needs a solver of its own, which takes about a second."""
         self._followers[row] = Follower(self._solver(contact.sensor), contact.touched, contact.law)
-        self.felt.lost[row] = ""
+        self._pins[row] = self._rest if contact.sensor is self._sensor else rest_pins(contact.sensor.geometry)
+        self.felt.rest(row, self._pins[row].caps_mm)
 
     def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
         """See ``Backend``."""

@@ -10,8 +10,9 @@ import pytest
 from hardware.policy_law import load_for_outlines, policy_law
 from hardware.rig_geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
+from training.environments import learn
 from training.environments.batch import Options
-from training.environments.learn import LearnPlan, learn_policy
+from training.environments.learn import LearnPlan, judge_policy, learn_policy
 from training.environments.world import Surfaces, standing_on
 from twin.errors import FrameError, OptionError
 from twin.geometry.pins import rest_pins
@@ -135,6 +136,29 @@ def test_a_policy_is_learnt_in_small(tmp_path):
     again = load_policy(tmp_path / "policy.safetensors")
     assert again.about["sensor"]["name"] == "mg400-127" and again.axes == ("z", "Ry")
     assert set(made.success) == {"surrogate"} and "solved" in made.lines()[0]
+
+
+def test_judging_counts_long_episodes_as_well_as_short_ones(policy, monkeypatch):
+    """Every second row fails in its first step, the others are solved in ten: half of the episodes are solved."""
+
+    class Rows:
+        def __init__(self, task, count, **options):
+            self.lasts = np.where(np.arange(count) % 2, 10, 1)
+            self.steps = 0
+
+        def seen(self):
+            return {"tactile": np.zeros((len(self.lasts), 1, 331, 2)), "goal": np.zeros((len(self.lasts), 2))}
+
+        def reset(self, seed):
+            return self.seen(), {}
+
+        def step(self, actions):
+            self.steps += 1
+            ended = self.steps % self.lasts == 0
+            return self.seen(), 0.0, ended, np.zeros_like(ended), {"is_success": ended & (self.lasts > 1)}
+
+    monkeypatch.setattr(learn, "TactileVectorEnv", Rows)
+    assert [judge_policy(policy, "SurfaceFollow", SMALL, episodes) for episodes in (2, 8, 24)] == [0.5] * 3
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes import load_object, load_sensor
+from scenes import ObjectSpec, load_object, load_sensor
+from scenes.object import CylinderShape, EdgeShape, MeshShape, PrismShape, SphereShape
 from training.surrogate.compliance import NODE_RINGS, compliance_of
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
@@ -49,9 +50,17 @@ def pose(depth_mm, radius_mm=20.0, across=(0.0, 0.0)):
     return T
 
 
+def beside(polar_deg, depth_mm, ball_mm):
+    """A ball of this radius that is ``depth_mm`` inside the dome at an angle from its apex."""
+    angle = np.radians(polar_deg)
+    T = np.eye(4)
+    T[:3, 3] = (20.0 + ball_mm - depth_mm) * np.array([np.sin(angle), 0.0, np.cos(angle)]) - [0.0, 0.0, ball_mm]
+    return T
+
+
 def contacts(surrogate, sensor, thing="plane", friction=0.5, **options):
     made = SurrogateContacts(surrogate, sensor, 1, **options)
-    touched = load_object(thing)
+    touched = load_object(thing) if isinstance(thing, str) else ObjectSpec(name="mine", description="", shape=thing)
     made.begin(0, Contact(sensor, touched, ContactLaw(Friction(friction, friction))))
     return made
 
@@ -126,17 +135,10 @@ def test_a_contact_that_is_lost_keeps_the_last_state_and_the_next_begins_at_rest
 @pytest.mark.parametrize("gone_mm", [0.1, 8.0])
 def test_what_is_left_is_not_outside_the_domain(surrogate, sensor, gone_mm):
     """A ball at 47 deg from the apex is pressed, and then stands clear of the dome at 52 deg."""
-
-    def beside(polar_deg, depth_mm):
-        angle = np.radians(polar_deg)
-        T = np.eye(4)
-        T[:3, 3] = (40.0 - depth_mm) * np.array([np.sin(angle), 0.0, np.cos(angle)]) - [0.0, 0.0, 20.0]
-        return T
-
     made = contacts(surrogate, sensor, "ball-40")
-    go(made, beside(47.0, 1.0))
+    go(made, beside(47.0, 1.0, 20.0))
     assert made.felt.force_n.any()
-    go(made, beside(52.0, -gone_mm))
+    go(made, beside(52.0, -gone_mm, 20.0))
     assert not made.felt.force_n.any()
 
 
@@ -248,6 +250,14 @@ def test_a_surrogate_of_another_skin_is_refused(surrogate, sensor, tmp_path):
         ("mesh-can", 0.5, [], "texture"),
         ("plane", 4.0, [], "friction of 4"),
         ("plane", 0.5, [pose(0.0), pose(7.0)], "7.0 mm inside"),
+        (SphereShape(kind="sphere", radius_mm=1.0), 0.5, [], "radius of 1 mm, at least 4"),
+        (CylinderShape(kind="cylinder", radius_mm=2.0), 0.5, [], "radius of 2 mm, at least 5"),
+        (EdgeShape(kind="edge", fillet_mm=0.1), 0.5, [], "rounded by 0.1 mm"),
+        (PrismShape(kind="prism", sides=4, inradius_mm=2.0, fillet_mm=1.0), 0.5, [], "inradius of 2 mm"),
+        (MeshShape(kind="mesh", file="a.stl"), 0.5, [], "is a mesh"),
+        ("ball-10", 0.5, [beside(75.0, 4.0, 5.0)], "75 deg from the dome's apex"),
+        ("ball-10", 0.5, [beside(80.0, 5.0, 5.0)], "80 deg from the dome's apex"),
+        ("ball-40", 0.5, [beside(90.0, 5.0, 20.0)], "90 deg from the dome's apex"),
     ],
 )
 def test_outside_its_domain_it_says_so(surrogate, sensor, thing, friction, poses, says):

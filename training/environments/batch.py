@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from gymnasium import spaces
 
-from scenes import RandomisationSpec, load_experiment, load_object, load_randomisation, load_sensor
+from scenes import ObjectSpec, RandomisationSpec, SensorSpec, load_experiment, load_object, load_randomisation, load_sensor
 from training.environments.observe import IMAGE_PX, KINDS, LARGEST, PICTURES, Eye, Kind, Pictures
 from training.environments.tasks import TASKS, Judged, Seen
 from training.environments.world import AXES, Surfaces, Tool, motions
@@ -16,7 +16,7 @@ from training.generation.config import draw_friction, draw_sensor
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Backend, Contact, FiniteElements
 from training.surrogate.model import MECHANICS, surrogate_of
-from twin.errors import OptionError
+from twin.errors import ContactError, OptionError
 from twin.rig.contact import contact_law
 from twin.rig.touch import Touch
 from twin.types import BoolArray, FloatArray, ImageArray, IntArray
@@ -141,6 +141,13 @@ def require_known(how: RandomisationSpec | None) -> None:
         )
 
 
+def _ends(how: RandomisationSpec | None) -> tuple[float | None, ...]:
+    """Ends of the friction that a randomisation draws; None: that of rig or object stays."""
+    if how is None or how.friction is None:
+        return (None,)
+    return how.friction.high, how.friction.stick if how.friction.stick_share else how.friction.low
+
+
 @dataclass(frozen=True)
 class Stepped:
     """What a step of B environments gives: as in gymnasium, with arrays (B,) for each number of ``info``."""
@@ -180,8 +187,14 @@ class Batch:
         self.steps = options.steps or self.task.steps
         self._surfaces = Surfaces()
         self.backend = self._make_backend()
-        if options.objects is None:  # of the task's own objects those that the backend knows
-            self.objects = {name: thing for name, thing in self.objects.items() if self.backend.knows(thing)}
+        for name, thing in list(self.objects.items()):
+            try:
+                for friction in _ends(self.randomisation):
+                    self.backend.require(self._contact(self.sensor, thing, friction))
+            except ContactError:
+                if options.objects is not None or len(self.objects) == 1:
+                    raise
+                del self.objects[name]  # of the task's own objects those remain that the backend knows
         self.eye = self._make_eye()
         self.axes = options.axes or self.task.axes
         self.action_scale = self._action_scale()
@@ -222,7 +235,7 @@ class Batch:
             friction = draw_friction(how.friction, rng)
         if how is not None and how.sensor:
             sensor, _ = draw_sensor(self.sensor, how, rng)
-        contact = Contact(sensor, touched, contact_law(sensor.rig, self.tool.mounting, touched, friction=friction))
+        contact = self._contact(sensor, touched, friction)
         self.backend.begin(row, contact)
         if self.eye is not None:
             self.eye.begin(row, sensor)
@@ -231,6 +244,9 @@ class Batch:
         self._rngs[row], self.contacts[row] = rng, contact
         self.steps_done[row] = self._good[row] = 0
         self._action[row] = 0.0
+
+    def _contact(self, sensor: SensorSpec, touched: ObjectSpec, friction: float | None) -> Contact:
+        return Contact(sensor, touched, contact_law(sensor.rig, self.tool.mounting, touched, friction=friction))
 
     def settle(self, rows: IntArray) -> None:
         """Make the first contact of some rows that ``begin`` drew, and fill their stacks of observations."""

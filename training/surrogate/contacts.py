@@ -5,11 +5,11 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from training.surrogate.contact import LinearContacts
 from training.surrogate.felt import Contact, Felt
 from training.surrogate.model import Surrogate, features, mechanics_of, outside, rest_of
+from training.surrogate.paths import unlike_drawn
 from twin.errors import ContactError
 from twin.geometry.pins import PinRest
 from twin.objects import ObjectField, build_field
@@ -59,23 +59,24 @@ class SurrogateContacts:
         self._domain = surrogate.domain
         self.felt = Felt.at_rest(count, self._caps_rest)
 
-    def knows(self, touched: ObjectSpec) -> bool:
-        """Whether an object is of a kind that the surrogate was trained on."""
-        return touched.texture is None
-
-    def begin(self, row: int, contact: Contact) -> None:
-        """See ``Backend``."""
+    def require(self, contact: Contact) -> None:
+        """See ``Backend``: objects of the drawn family, with one coefficient of friction."""
         touched, friction = contact.touched, contact.law.friction
-        if not self.knows(touched):
-            raise outside(f"{touched.name} has a texture, which lies between the surrogate's nodes")
+        unlike = unlike_drawn(touched)
+        if unlike:
+            raise outside(unlike)
         if friction.kinetic != friction.static or np.isfinite(friction.shear_strength_mpa):
             raise outside(f"{touched.name} has a kinetic friction of its own or a shear strength")
         if friction.static > self._domain["friction"]:
             raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
         if contact.sensor is not self._sensor and mechanics_of(contact.sensor) != self._surrogate.about["mechanics"]:
             raise outside("the skin, gel, lens or pins of the sensor are drawn anew; randomise friction, camera and noise only ('moves')")
-        self._contacts[row], self._fields[row] = contact, self._field(touched)
-        self._friction[row] = friction.static
+
+    def begin(self, row: int, contact: Contact) -> None:
+        """See ``Backend``."""
+        self.require(contact)
+        self._contacts[row], self._fields[row] = contact, self._field(contact.touched)
+        self._friction[row] = contact.law.friction.static
         self._compliance[row] = contact.law.compliance_mm_per_n * self._surrogate.stiffness
         self._forget(row)
         self._depth[row] = 0.0
@@ -121,6 +122,7 @@ class SurrogateContacts:
         """Solve the way to a commanded pose."""
         contact, field = self._contacts[row], self._fields[row]
         assert contact is not None and field is not None, "begin first"
+        self._require_inside(field, T)
         gaps = field.distance((self._surrogate.node_mm - T[:3, 3]) @ T[:3, :3])
         deepest = int(gaps.argmin())
         depth = -float(gaps[deepest])
@@ -128,8 +130,6 @@ class SurrogateContacts:
             self._linear.free(row)
             self._before[row], self._depth[row] = T.copy(), 0.0
             return
-        if depth > 0:
-            self._require_inside(depth, self._surrogate.node_mm[deepest], field, T)
         before = self._before[row] if self._memory else None
         if before is not None and np.array_equal(before, T):
             return
@@ -156,11 +156,19 @@ class SurrogateContacts:
         """Force (3,) of the linear skin on the object, at the true skin's stiffness."""
         return -self._surrogate.stiffness * self._linear.force_n[row].sum(axis=0)
 
-    def _require_inside(self, depth: float, place: FloatArray, field: ObjectField, T: FloatArray) -> None:
+    def _require_inside(self, field: ObjectField, T: FloatArray) -> None:
+        """Raise ``ContactError`` for a contact of the dome that is too deep, or too far from the apex.
+
+        The object's distance and direction from the dome's centre tell both exactly, for places between and beyond the nodes too.
+        """
         domain = self._domain
+        distance, outward, _ = field.probe(-T[:3, 3][None] @ T[:3, :3])
+        depth = self._radius - float(distance[0])
+        if depth <= 0:
+            return
         if depth > domain["depth_mm"]:
             raise outside(f"the object is {depth:.1f} mm inside the dome, at most {domain['depth_mm']:.1f} was trained")
-        polar = float(np.degrees(np.arccos(place[2] / self._radius)))
+        polar = float(np.degrees(np.arccos(np.clip(-T[2, :3] @ outward[0], -1.0, 1.0))))
         if polar > domain["polar_deg"]:
             raise outside(f"the contact is {polar:.0f} deg from the dome's apex, at most {domain['polar_deg']:.0f} was trained")
 

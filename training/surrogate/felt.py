@@ -74,9 +74,8 @@ class Backend(Protocol):
 
     felt: Felt
 
-    def knows(self, touched: ObjectSpec) -> bool:
-        """Whether an object is within the backend's domain."""
-        return True
+    def require(self, contact: Contact) -> None:
+        """Raise ``ContactError`` where the backend does not know such a sensor, object or friction."""
 
     def begin(self, row: int, contact: Contact) -> None:
         """Begin an environment's episode, the sensor at rest.
@@ -84,7 +83,7 @@ class Backend(Protocol):
         Raises
         ------
         ContactError
-            The backend does not know such a sensor, object or friction.
+            As of ``require``.
         """
 
     def move(self, rows: IntArray, T_sensor_object: FloatArray, time_s: FloatArray) -> None:
@@ -105,9 +104,8 @@ class FiniteElements:
         self._followers: list[Follower | None] = [None] * count
         self._solver = lru_cache(maxsize=_KEPT_SOLVERS)(SkinSolver)
 
-    def knows(self, touched: ObjectSpec) -> bool:
-        """See ``Backend``: any."""
-        return True
+    def require(self, contact: Contact) -> None:
+        """See ``Backend``: any contact can be tried."""
 
     def begin(self, row: int, contact: Contact) -> None:
         """See ``Backend``; a sensor that was drawn anew needs a solver of its own, which takes about a second."""

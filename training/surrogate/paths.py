@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.object import CylinderShape, EdgeShape, ObjectSpec, PlaneShape, PrismShape, Shape, SphereShape
+from scenes.object import CylinderShape, EdgeShape, MeshShape, ObjectSpec, PlaneShape, PrismShape, Shape, SphereShape
 from scenes.sensor import SensorSpec
 from twin.geometry.shapes import shape_of
 from twin.mechanics.path import ContactPath
@@ -34,6 +34,10 @@ BACK_SHARE = 0.2
 """Share of the others that go back along the leg before: friction's hysteresis shows there."""
 CLEAR_MM = 0.5
 """Distance to which such a leg lifts the object off."""
+LEAST_MM = {"sphere": 4.0, "cylinder": 5.0, "prism": 5.0}
+"""Smallest radii of balls and cylinders, and inradii of prisms, that are drawn. Smaller ones fit between two nodes of a surrogate."""
+LEAST_FILLET_MM = 0.45
+"""Smallest rounding of edges that is drawn. Prisms are rounded by at least 1 mm."""
 _DIRECTIONS = 2000
 """Directions on the whole sphere in which the object is looked for."""
 
@@ -57,13 +61,32 @@ def draw_shape(rng: np.random.Generator) -> Shape:
     if kind == "plane":
         return PlaneShape(kind="plane")
     if kind == "sphere":
-        return SphereShape(kind="sphere", radius_mm=sized(4.0, 45.0))
+        return SphereShape(kind="sphere", radius_mm=sized(LEAST_MM["sphere"], 45.0))
     if kind == "cylinder":
-        return CylinderShape(kind="cylinder", radius_mm=sized(5.0, 45.0))
+        return CylinderShape(kind="cylinder", radius_mm=sized(LEAST_MM["cylinder"], 45.0))
     if kind == "edge":
-        return EdgeShape(kind="edge", fillet_mm=sized(0.45, 3.0))
+        return EdgeShape(kind="edge", fillet_mm=sized(LEAST_FILLET_MM, 3.0))
     fillet = sized(1.0, 8.0)
-    return PrismShape(kind="prism", sides=int(rng.integers(3, 7)), inradius_mm=max(fillet, sized(5.0, 45.0)), fillet_mm=fillet)
+    return PrismShape(
+        kind="prism", sides=int(rng.integers(3, 7)), inradius_mm=max(fillet, sized(LEAST_MM["prism"], 45.0)), fillet_mm=fillet
+    )
+
+
+def unlike_drawn(touched: ObjectSpec) -> str:
+    """Why an object is none of the drawn family; "" for one that is. Larger ones are flatter, and count as drawn."""
+    shape = touched.shape
+    if touched.texture is not None:
+        return f"{touched.name} has a texture, which lies between the surrogate's nodes"
+    match shape:
+        case MeshShape():
+            return f"{touched.name} is a mesh, and no mesh was trained"
+        case SphereShape() | CylinderShape() if shape.radius_mm < LEAST_MM[shape.kind]:
+            return f"{touched.name} has a radius of {shape.radius_mm:g} mm, at least {LEAST_MM[shape.kind]:g} was trained"
+        case PrismShape() if shape.inradius_mm < LEAST_MM[shape.kind]:
+            return f"{touched.name} has an inradius of {shape.inradius_mm:g} mm, at least {LEAST_MM[shape.kind]:g} was trained"
+        case EdgeShape() | PrismShape() if shape.fillet_mm < LEAST_FILLET_MM:
+            return f"{touched.name} is rounded by {shape.fillet_mm:g} mm, at least {LEAST_FILLET_MM:g} was trained"
+    return ""
 
 
 def draw_path(sensor: SensorSpec, rng: np.random.Generator) -> DrawnPath:

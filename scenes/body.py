@@ -74,6 +74,9 @@ class MaterialSpec(Section):
         return self
 
 
+ASSUMED_FACTOR = 1.6
+"""By how much the forces of a specification may be larger or smaller where none was measured: printed skins have 0.4 to 1 MPa."""
+
 Shape = Literal["cap", "round-pad", "rectangular-pad"]
 _OWN_KEYS: dict[Shape, tuple[str, ...]] = {
     "cap": ("outer_radius_mm",),
@@ -104,6 +107,9 @@ class SkinSpec(MaterialSpec):
         Of the skin.
     rim_z_mm : float
         Plane of the rim. For a cap of radius R that is open to the radius r it is sqrt(R^2 - r^2).
+    stiffness_factor : float
+        Forces of this specification may be this factor larger or smaller (90 %), because its stiffness is known no better. The default is
+        for a stiffness that is assumed; ``twin calibrate contact`` finds it from weighed presses.
 
     Notes
     -----
@@ -118,6 +124,7 @@ class SkinSpec(MaterialSpec):
     height_mm: Positive | None = None
     thickness_mm: Positive = 1.0
     rim_z_mm: float = 0.0
+    stiffness_factor: Annotated[float, Field(ge=1)] = ASSUMED_FACTOR
 
     @property
     def size_keys(self) -> tuple[str, ...]:

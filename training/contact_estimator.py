@@ -101,6 +101,11 @@ class ContactEstimator:
         """The models for the sensor that took ``frame`` without contact; raises as ``PoseEstimator.at_rest``."""
         return self._with({name: part.at_rest(frame) for name, part in self.parts.items()})
 
+    @property
+    def caveats(self) -> list[str]:
+        """As of ``PoseEstimator``, of all models."""
+        return list(dict.fromkeys(line for part in self.parts.values() for line in part.caveats))
+
     def remembering(self) -> "ContactEstimator":
         """Itself: models of several kinds of contact do not tell slip."""
         return self

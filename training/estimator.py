@@ -32,6 +32,13 @@ from twin.pins import Pipeline, Reference, make_reference, measure_reference, no
 from twin.store import fingerprint
 from twin.types import Form, Frame
 
+LOST_USUAL = 0.02
+"""Share of the pins that is lost in usual frames."""
+LOST_WIDENS = 2.0
+"""Growth of the intervals with the share of lost pins: with a hidden patch of 15 or 30 % errors of depth in the twin grow by 1.2 or 1.6."""
+SIMULATED_FORCES = ("force_x", "force_y", "force_z", "torque_z")
+"""Labels that are proportional to the stiffness of the sensor that was simulated."""
+
 
 @dataclass(frozen=True)
 class PoseEstimate:
@@ -56,6 +63,8 @@ class PoseEstimate:
         The kind of contact that the frame was taken for; empty if the model does not tell kinds, or if it is none that it knows.
     touched : float
         Probability that anything is touched; NaN where no frame without contact was given (``PoseEstimator.at_rest``).
+    notes : tuple of str
+        Why the intervals of this frame are wider than those of others.
     """
 
     names: tuple[str, ...]
@@ -69,6 +78,7 @@ class PoseEstimate:
     ms: float
     contact: str = ""
     touched: float = float("nan")
+    notes: tuple[str, ...] = ()
 
 
 class PoseEstimator:
@@ -239,13 +249,57 @@ class PoseEstimator:
             The frame is not one of the model's sensor: wrong size, type or form.
         """
         started = perf_counter()
-        if self._tracker is None:
+        if not isinstance(self.part, PinModel):
             return self._as_estimate(self.part.estimate_frame(self._trained, frame), started)
         seen = self.pins_in(frame)
         if isinstance(seen, Unseen):
-            self._tracker.forget()
+            if self._tracker is not None:
+                self._tracker.forget()
             return self._as_estimate(seen, started)
         return self.estimate_one(seen, started, "")
+
+    @property
+    def caveats(self) -> list[str]:
+        """Why the intervals of all frames are wider than the model's own, a line each."""
+        found = []
+        if self._unmeasured > 1:
+            found.append(
+                f"no frame without contact shows where the camera sits: all intervals are {self._unmeasured:g} times wider; give one "
+                "(--no-contact, --at-rest)"
+            )
+        if self._force.any() and self._stiffness > 1:
+            skin, gel = self.sensor.skin.young_modulus_mpa, self.sensor.gel.young_modulus_mpa
+            found.append(
+                f"forces and torques assume a skin of {skin:.3g} MPa and a gel of {gel:.3g} MPa, and may be {self._stiffness:.3g} times "
+                "larger or smaller; their intervals hold that; 'twin calibrate contact' with 3 weighed presses or more knows it better"
+            )
+        return found
+
+    @property
+    def _unmeasured(self) -> float:
+        """Factor on all intervals for a camera that may have moved."""
+        alone = self.pipeline.reference is self._trained.reference
+        return self.part.unmeasured_widens if isinstance(self.part, PinModel) and alone else 1.0
+
+    @property
+    def _stiffness(self) -> float:
+        """Factor by which simulated forces may be larger or smaller."""
+        return self.sensor.skin.stiffness_factor
+
+    @property
+    def _force(self) -> np.ndarray:
+        """(K,) bool: labels that are forces or torques of simulated contacts, which are proportional to the sensor's stiffness."""
+        return np.array([name in SIMULATED_FORCES for name in self.config["columns"]])
+
+    def _widened(self, value: np.ndarray, half: np.ndarray, lost_share: float) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+        """Low and high ends (K,) of the intervals with all that is not known, and what is special about the frame."""
+        lost = 1.0 + LOST_WIDENS * lost_share if lost_share > LOST_USUAL else 1.0
+        half = half * lost * self._unmeasured
+        more, less = value * (self._stiffness - 1), value * (1 / self._stiffness - 1)
+        low = value - half + np.where(self._force, np.minimum(more, less), 0.0)
+        high = value + half + np.where(self._force, np.maximum(more, less), 0.0)
+        notes = (f"{lost_share:.0%} of the pins were not found: intervals are {lost:.1f} times wider",) if lost > 1 else ()
+        return low, high, notes
 
     def contact_maps(self, frame: Frame) -> tuple[PoseEstimate, ContactMaps | None]:
         """The estimate of one frame, and the pressure and shear over the skin that go with it; no maps if the estimate is not valid.
@@ -288,15 +342,18 @@ class PoseEstimator:
         inputs, rows = self.inputs_of(pins, together=not pins.measured)
         return self.ensemble.modes(inputs, rows).inputs
 
-    def _as_estimate(self, made: Prediction | Unseen, started: float, contact: str = "", slip: Slip | None = None) -> PoseEstimate:
+    def _as_estimate(
+        self, made: Prediction | Unseen, started: float, contact: str = "", slip: Slip | None = None, lost: float = 0.0
+    ) -> PoseEstimate:
         if isinstance(made, Unseen):
             none = np.full(len(self.names), np.nan)
             return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched)
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
-        value, low, high = (np.clip(each, *self._bounds) for each in (value, value - half, value + half))
+        low, high, notes = self._widened(value, half, lost)
+        value, low, high = (np.clip(each, *self._bounds) for each in (value, low, high))
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
-        return PoseEstimate(self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched)
+        return PoseEstimate(self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched, notes)
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
         """The pins of one frame, or why they can't be used; raises as a call."""
@@ -313,7 +370,7 @@ class PoseEstimator:
             The kind of contact that the frame was taken for.
         """
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
-        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip)
+        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share)
 
     def unseen(self, seen: Unseen, started: float) -> PoseEstimate:
         """The estimate of a frame that shows no pose that the model knows."""

@@ -1,14 +1,20 @@
 """Calibration of contacts on frames of the twin itself, whose numbers are known."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from small_generation import EXPERIMENT, small_config
 
 from scenes import load_experiment
+from scenes.body import ASSUMED_FACTOR
+from scenes.rig import ForceSensorSpec
 from training.generation.config import draw_label
 from twin.errors import FrameError
 from twin.fit.contact import PARAMETERS, fit_contact
 from twin.fit.contact.fit import expect, held_out_px
+from twin.fit.contact.newtons import assumed, compared, pressed_n, simulated_n
 from twin.fit.contact.parameters import changed, values_of
 from twin.fit.contact.simulate import Setup
 from twin.judge.labelled.model import ContactModel, MeasuredFrames
@@ -18,6 +24,8 @@ FITTED = tuple(p for p in PARAMETERS if p.name in ("rig.contact_offset_mm", "rig
 TRUTH = {"contact_offset_mm": 0.45, "tcp_lateral_mm": 1.1, "image_turn_deg": 84.0, "turn_sign": -1}
 NOISE_PX, FRAMES = 0.05, 7
 ACROSS = 6  # coarse, for both sides
+SAME_FORCE = 1e-3  # relative: what the solver leaves
+SAME_PX = 0.02
 
 
 def telling(home):
@@ -107,3 +115,40 @@ def test_too_few_frames_are_refused(calibrated):
     few = MeasuredFrames(measured.form, measured.names[:2], measured.labels[:2], measured.pins_px[:2], measured.no_contact_px, [])
     with pytest.raises(FrameError, match="2 frames with pins are too few"):
         fit_contact(setup, few)
+
+
+def test_weighed_presses_fix_the_scale_of_forces_and_leave_the_pins_where_they_are(tmp_path):
+    config = small_config(tmp_path, experiment=load_experiment(telling(tmp_path)))
+    sensor = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update={"compliance_mm_per_n": 0.1})})
+    labels = [replace(draw_label(config.experiment, np.random.default_rng(seed)), executed=False) for seed in range(3)]
+    simulated = simulated_n(sensor, config.experiment, config.object, labels, across=ACROSS)
+    weighed = 1.4 * simulated * np.exp([0.02, -0.02, 0.0])
+    found = compared(weighed, simulated, sensor)
+    assert found.presses == 3 and found.scale == pytest.approx(1.4, rel=0.02) and 1.0 < found.factor < 1.1
+    stiffer = found.of(sensor)
+    assert stiffer.skin.stiffness_factor == found.factor
+    np.testing.assert_allclose(
+        simulated_n(stiffer, config.experiment, config.object, labels[:1], across=ACROSS), found.scale * simulated[:1], rtol=SAME_FORCE
+    )
+    models = [ContactModel(each, config.experiment, config.object, Form.RECORDING, across=ACROSS) for each in (sensor, stiffer)]
+    before, after = (model.displacement_px(labels[0]) for model in models)
+    np.testing.assert_allclose(after, before, atol=SAME_PX)
+
+
+def test_without_enough_weighed_presses_it_says_which_stiffness_is_assumed(tmp_path):
+    sensor = small_config(tmp_path).sensor
+    for found in (assumed(sensor, "none was measured"), compared([1.0, 2.0, 0.01], [1.0, 2.0, 0.01], sensor)):
+        assert (found.presses, found.scale, found.factor) == (0, 1.0, ASSUMED_FACTOR)
+        assert f"skin {sensor.skin.young_modulus_mpa:.3g} MPa" in found.said and "weigh 3 presses" in found.said
+    wide, narrow = (compared(np.exp(spread * np.linspace(-1, 1, 5)), np.ones(5), sensor).factor for spread in (0.3, 0.03))
+    assert wide > 1.2 > narrow > 1.0
+
+
+def test_forces_are_read_along_the_approach_as_the_rigs_sensor_reads_them(tmp_path):
+    config = small_config(tmp_path)
+    labels = {"Fz": np.array(["1.5", "", "2"]), "Fy": np.array(["3", "7", "-1"])}
+    recording = SimpleNamespace(labels=labels, __len__=lambda: 3)
+    np.testing.assert_array_equal(pressed_n(recording, config.sensor, config.experiment), [1.5, np.nan, 2.0])
+    reads = ForceSensorSpec(gain=(1.0, 2.0, 1.0), offset_n=(0.0, 1.0, 0.0))
+    sensor = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update={"force_sensor": reads})})
+    np.testing.assert_array_equal(pressed_n(recording, sensor, config.experiment), [1.0, 3.0, -1.0])  # the approach is y

@@ -8,6 +8,8 @@ import pytest
 from training.contact_maps import MAPS, judge_maps, read_maps, write_maps
 from training.dataset import load_dataset
 from training.estimator import PoseEstimator
+from training.models.part import OneFrame
+from training.models.touch.model import TOUCH
 from training.packed import pack
 from training.recipes import TrainingError
 from training.studies.evaluation import write_frame_maps
@@ -105,3 +107,25 @@ def test_maps_are_written_as_arrays_and_as_a_picture(contacts, tmp_path):
 def test_a_model_of_recordings_says_that_it_makes_no_maps(trained):
     with pytest.raises(TrainingError, match="makes no contact maps.*train touch on simulated contacts"):
         PoseEstimator.load(trained).require_maps()
+
+
+def test_lost_pins_an_unknown_place_of_the_camera_and_an_assumed_stiffness_widen_the_intervals_in_words(contacts):
+    folder, run, sensor = contacts
+    estimator = PoseEstimator.load(run)
+    data = load_dataset(folder, sensor, estimator.names)
+    pins = data.pins.rows(np.array([int(data.targets.raw[:, estimator.names.index("force_z")].argmax())]))
+    made = estimator.predict_table(pins)
+    whole, holed = (estimator.estimate_one(OneFrame(pins, lost_share=share), 0.0, "") for share in (0.0, 0.3))
+    force = np.array([name.startswith(("force", "torque")) for name in estimator.names])
+    bounded = np.array([name in ("contact_area", "slip_share") for name in estimator.names])
+    plain = ~force & ~bounded
+    np.testing.assert_allclose((whole.high - whole.value)[plain], TOUCH.unmeasured_widens * made.half_width[0][plain], rtol=1e-6)
+    np.testing.assert_allclose((holed.high - holed.low)[plain], 1.6 * (whole.high - whole.low)[plain], rtol=1e-6)
+    assert not whole.notes and "30% of the pins were not found" in holed.notes[0]
+    z = estimator.names.index("force_z")
+    assert whole.high[z] > 1.6 * whole.value[z] and whole.low[z] < whole.value[z] / 1.6
+    assert len(estimator.caveats) == 2 and "no frame without contact" in estimator.caveats[0] and "1.6 times larger" in estimator.caveats[1]
+    estimator.sensor = sensor.model_copy(update={"skin": sensor.skin.model_copy(update={"stiffness_factor": 1.0})})
+    known = estimator.estimate_one(OneFrame(pins), 0.0, "")
+    np.testing.assert_allclose((known.high - known.value)[force], TOUCH.unmeasured_widens * made.half_width[0][force], rtol=1e-6)
+    assert len(estimator.caveats) == 1

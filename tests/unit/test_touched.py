@@ -82,7 +82,12 @@ def test_a_frame_without_contact_gives_no_pose_and_says_why():
     reference, answer, none = answer_of("mg400-127")
     frame = Frame(np.zeros((256, 256), np.uint8), Form.RECORDING, "f")
     seen = SimpleNamespace(
-        valid=True, graph=SimpleNamespace(nodes_px=reference.pins_px, area_px2=reference.area_px2), pins_px=reference.pins_px, reason=""
+        valid=True,
+        graph=SimpleNamespace(nodes_px=reference.pins_px, area_px2=reference.area_px2),
+        pins_px=reference.pins_px,
+        reason="",
+        found=127,
+        expected=127,
     )
     pipeline = SimpleNamespace(form=Form.RECORDING, reference=reference)
     trained = replace(estimator._trained, pipeline=Seeing(seen, **vars(pipeline)), touched=answer)
@@ -97,7 +102,7 @@ def test_what_only_some_models_use_is_computed_for_them_alone_and_once(monkeypat
     estimator = PoseEstimator.load("mg400-127")
     reference, _, _ = answer_of("mg400-127")
     graph = SimpleNamespace(nodes_px=reference.pins_px, area_px2=reference.area_px2)
-    seen = SimpleNamespace(valid=True, graph=graph, pins_px=reference.pins_px, reason="")
+    seen = SimpleNamespace(valid=True, graph=graph, pins_px=reference.pins_px, reason="", found=127, expected=127)
     asked = []
     monkeypatch.setattr(part, "cap_light", lambda frame, nodes_px, reference: asked.append("light") or np.zeros(len(nodes_px)))
     trained = replace(

@@ -85,10 +85,12 @@ class Prediction:
 
 @dataclass(frozen=True)
 class OneFrame:
-    """The pins of one frame, a table of one row, and the probability that they show a contact; ``touched`` as in ``Prediction``."""
+    """The pins of one frame, a table of one row; the probability that they show a contact, ``touched`` as in ``Prediction``; and the share
+    of the pins in view that were not found."""
 
     pins: PinTable
     touched: float = float("nan")
+    lost_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -292,9 +294,12 @@ class PinModel(Model):
     ----------
     sees_light : bool
         Whether it also uses the gray level at each pin.
+    unmeasured_widens : float
+        Factor on the intervals where no frame without contact shows where the camera sits.
     """
 
     sees_light: ClassVar[bool] = False
+    unmeasured_widens: ClassVar[float] = 1.0
 
     @abstractmethod
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> Inputs:
@@ -352,7 +357,7 @@ class PinModel(Model):
             measured=reference is not trained.reference,
             light=cap_light(frame, seen.graph.nodes_px, reference)[None] if self.sees_light else np.zeros((1, len(lost))),
         )
-        return OneFrame(pins, touched)
+        return OneFrame(pins, touched, 1 - seen.found / max(seen.expected, 1))
 
     def estimate_one(self, trained: Trained, seen: OneFrame) -> Prediction:
         """Estimate the labels of one frame."""

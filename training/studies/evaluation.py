@@ -79,7 +79,7 @@ class Predictions:
             At the end, if no frame gave a pose.
         """
         told, poses, reasons = len(self.recording.problems), 0, []
-        yield from (f"note: {problem}" for problem in self.recording.problems)
+        yield from (f"note: {problem}" for problem in [*self.recording.problems, *self.estimator.caveats])
         for name, made in self:
             yield f"{name}: {_said(made)}"
             poses += made.valid
@@ -199,7 +199,8 @@ def _said(made: PoseEstimate) -> str:
     pose = ", ".join(f"{name} {value:.3f} {unit} [{low:.3f}, {high:.3f}]" for name, unit, value, low, high in rows)
     moved = "" if made.executed != made.executed else f", move executed {made.executed:.2f}"  # NaN: the model does not estimate it
     kind = f"{made.contact}: " if made.contact else ""
-    return f"{kind}{pose}{moved} ({made.ms:.1f} ms)"
+    notes = "".join(f"; {note}" for note in made.notes)
+    return f"{kind}{pose}{moved} ({made.ms:.1f} ms){notes}"
 
 
 @dataclass(frozen=True)

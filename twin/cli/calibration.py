@@ -173,6 +173,10 @@ the skin and how much its volume yields, thickness of the skin, length of the pi
 when it was taken is found along with them. A frame that fits neither case gets a small weight. As many other frames, at most 20,
 are kept out of the fit, and the error is stated on them.
 
+Pins do not tell newtons. Where the table has a column of forces along the approach (N; Fz, or the one that rig.force_sensor names) with 3
+presses or more, weighed with a kitchen scale for example, the stiffness of skin and gel is scaled to them; other rows may be empty. It
+says how far forces may still be off (skin.stiffness_factor), or which stiffness is assumed.
+
 \b
 Writes: SPEC.toml, to be used as --sensor SPEC.toml; beside it SPEC-contact/
 with index.html (parameters with their uncertainty and what the frames tell of

@@ -132,12 +132,13 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
         raise OptionError(
             "no label of a contact varies in the table; expected pose_1..6 and move_1..6, or pose_x..pose_Rz and shear_x..shear_Rz"
         )
-    found: list[tuple[float, str]] = []
+    found: list[tuple[float, bool, int, str]] = []
     for name in list_experiments():
         plan = load_experiment(name)
         own = {label for label, (low, high) in plan.ranges().items() if high - low > VARIES}
-        found.append((len(own & varying) / len(own | varying), name))
-    share, name = max(found, key=lambda each: (each[0], -len(each[1])))
+        # of those that are equally like it, one that somebody recorded (it has a source); then the plainest
+        found.append((len(own & varying) / len(own | varying), bool(plan.source), -len(name), name))
+    share, *_, name = max(found, key=lambda each: each[:3])
     if share < ALIKE:
         raise OptionError(
             f"no experiment has contacts whose labels vary like the table's ({', '.join(sorted(varying))}); name one with --experiment "

@@ -1,7 +1,7 @@
 """A contact calibration from a folder of frames to a page."""
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,16 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import OptionError
 from twin.fit.contact.fit import fit_contact, held_out_px, simulate
+from twin.fit.contact.newtons import MOST_PRESSES, Newtons, assumed, compared, pressed_n, simulated_n
 from twin.fit.contact.parameters import PARAMETERS, Parameter
 from twin.fit.contact.report import summary_of, write_calibration
 from twin.fit.contact.simulate import Setup
 from twin.fit.sensor_file import folder_beside, write_sensor
+from twin.frames import open_recording
 from twin.judge.labelled.model import MeasuredFrames, measure_frames
 from twin.progress import Progress, Step, silent, stage
 from twin.rig.kinematics import rig_of
+from twin.rig.labels import read_arm_labels
 from twin.store import output, writes_file
 from twin.types import FINE, Form
 
@@ -64,10 +67,28 @@ def calibrate_contact(
     setup = Setup(spec, experiment, touched, measured.form, across, folder / "contacts", workers, parameters)
     fit = fit_contact(setup, fitted, progress=progress)
     error = held_out_px(setup, fit, held, progress=progress) if len(held) else None
-    summary = summary_of(setup, fitted, fit, error, len(held))
+    newtons = weighed(frames, fit.sensor, experiment, touched, seed, across=across, form=form)
+    summary = summary_of(setup, fitted, fit, error, len(held)) | {"newtons": asdict(newtons)}
     pairs = ((fit.start, rig_of(spec).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign))
     moved = np.stack([simulate(setup, fitted, [values], sign)[0] for values, sign in pairs]).swapaxes(1, 2)
-    return fit.sensor, summary, write_calibration(folder, fitted, moved, fit, summary)
+    return newtons.of(fit.sensor), summary, write_calibration(folder, fitted, moved, fit, summary)
+
+
+def weighed(
+    frames: Path, sensor: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, seed: int, *, across: int, form: Form | None = None
+) -> Newtons:
+    """The scale of a sensor's forces from all frames of a recording that have one, ``MOST_PRESSES`` at most.
+
+    Its contact should be fitted before. The forces are along the approach, in N: the column that ``rig.force_sensor`` names, else ``Fz``.
+    """
+    recording = open_recording(frames, sensor, form)
+    measured = pressed_n(recording, sensor, experiment)
+    rows = np.flatnonzero(np.isfinite(measured))
+    if not len(rows):
+        return assumed(sensor, "none was measured")
+    labels = read_arm_labels(recording)
+    rows = np.sort(np.random.default_rng([seed, 6]).permutation(rows)[:MOST_PRESSES])
+    return compared(measured[rows], simulated_n(sensor, experiment, touched, [labels[row] for row in rows], across=across), sensor)
 
 
 def _part(measured: MeasuredFrames, rows: np.ndarray) -> MeasuredFrames:
@@ -103,6 +124,7 @@ class ContactCalibration:
         for title, key in (("fitted frames", "fitted_px"), ("frames kept out", "held_out_px")):
             if part := self.summary[key]:
                 lines.append(f"{title}: {part['before']:.2f} -> {part['after']:.2f} px over {part['frames']}")
+        lines.append(self.summary["newtons"]["said"])
         lines += self.summary["warnings"]
         if self.summary["distrusted"]:
             lines.append(f"not trusted: {', '.join(self.summary['distrusted'])}")
@@ -172,5 +194,5 @@ def calibrate_to_file(
             progress=step,
         )
     said = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."
-    write_sensor(out, fitted, "\n".join([said, *summary["warnings"]]))
+    write_sensor(out, fitted, "\n".join([said, summary["newtons"]["said"], *summary["warnings"]]))
     return ContactCalibration(fitted, summary, [out, page])

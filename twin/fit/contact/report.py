@@ -93,7 +93,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
     page = Page(f"Contact of {summary['sensor']}", "twin calibrate contact", topic="TacTip twin: contact calibration", lead=_lead(summary))
     page.notice("Not trusted, as neither story fits them", [", ".join(summary["distrusted"])] if summary["distrusted"] else [], tone="bad")
     page.notice("Warnings", summary["warnings"], tone="bad")
-    page.notice("Noted", summary["problems"])
+    page.notice("Noted", [summary["newtons"]["said"], *summary["problems"]])
     _parameters_section(page, summary)
     page.section("Frames")
     page.table(

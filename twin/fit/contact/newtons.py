@@ -1,0 +1,139 @@
+"""The scale of forces. Pins do not tell how stiff a sensor is: one that is twice as stiff moves its pins alike and pushes twice as hard.
+
+Some weighed presses fix it. With the contact fitted to the pins, each press is simulated, and the logarithm of measured over simulated
+force has the mean ln(s) and the standard error e. Both moduli are multiplied by s, and what gives way under forces is divided by it, so
+that the pins stay where they are. Forces are then known within a factor exp(t e) either way, with t the 95 % quantile of Student's
+distribution: 90 % of such intervals hold the truth.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import t as student
+
+from scenes.body import ASSUMED_FACTOR
+from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
+from scenes.rig import ForceSensorSpec
+from scenes.sensor import SensorSpec
+from twin.errors import ContactError
+from twin.frames import Recording
+from twin.frames.tables import numbers
+from twin.geometry.solid import Resolution
+from twin.mechanics.solver import SkinSolver
+from twin.rig.contact import RigContact
+from twin.rig.kinematics import rig_of
+from twin.rig.labels import ArmLabel
+
+FEWEST_PRESSES = 3
+"""Presses that are needed: of two nobody can say how far they are apart by chance."""
+MOST_PRESSES = 20
+"""Presses that are simulated; each takes a second or two."""
+LEAST_N = 0.2
+"""Force from which on a press counts: scales and zeros are wrong by some hundredths of a newton."""
+COVERED = 0.95
+"""Quantile of Student's distribution at each end of the interval."""
+ALONG = ("Fz", "force_z")
+"""Columns of the force along the approach, in N, where the rig has no force sensor of its own."""
+
+
+@dataclass(frozen=True)
+class Newtons:
+    """How stiff a sensor is, as forces tell it.
+
+    Attributes
+    ----------
+    presses : int
+        Presses that were compared; 0 where the stiffness is assumed.
+    scale : float
+        Measured over simulated force.
+    factor : float
+        Forces may be this factor larger or smaller.
+    said : str
+        The same in words.
+    """
+
+    presses: int
+    scale: float
+    factor: float
+    said: str
+
+    def of(self, sensor: SensorSpec) -> SensorSpec:
+        """The sensor with this stiffness; what gives way does so by as much as before."""
+        skin = sensor.skin.model_copy(
+            update={"young_modulus_mpa": self.scale * sensor.skin.young_modulus_mpa, "stiffness_factor": self.factor}
+        )
+        gel = sensor.gel.model_copy(update={"young_modulus_mpa": self.scale * sensor.gel.young_modulus_mpa})
+        rig = sensor.rig and sensor.rig.model_copy(
+            update={
+                "compliance_mm_per_n": sensor.rig.compliance_mm_per_n / self.scale,
+                "turn_compliance_deg_per_n": sensor.rig.turn_compliance_deg_per_n / self.scale,
+            }
+        )
+        return sensor.model_copy(update={"skin": skin, "gel": gel, "rig": rig})
+
+
+def assumed(sensor: SensorSpec, why: str) -> Newtons:
+    """Where no forces were measured: the specification's own stiffness."""
+    skin, gel, factor = sensor.skin.young_modulus_mpa, sensor.gel.young_modulus_mpa, sensor.skin.stiffness_factor
+    return Newtons(
+        0,
+        1.0,
+        factor,
+        f"forces: {why}, so the stiffness is assumed (skin {skin:.3g} MPa, gel {gel:.3g} MPa), and every force may be {factor:.2g} "
+        f"times larger or smaller; to fix it, weigh {FEWEST_PRESSES} presses or more and give their newtons in a column {ALONG[0]}",
+    )
+
+
+def compared(measured_n: ArrayLike, simulated_n: ArrayLike, sensor: SensorSpec) -> Newtons:
+    """The stiffness from measured and simulated forces (K,) along the approach; presses below ``LEAST_N`` do not count."""
+    measured, simulated = np.abs(np.asarray(measured_n, float)), np.abs(np.asarray(simulated_n, float))
+    usable = (measured >= LEAST_N) & (simulated >= LEAST_N / ASSUMED_FACTOR**2)
+    count = int(usable.sum())
+    if count < FEWEST_PRESSES:
+        return assumed(sensor, f"{count} presses with a force are too few")
+    ratio = np.log(measured[usable] / simulated[usable])
+    error = float(ratio.std(ddof=1) / np.sqrt(count) * student.ppf(COVERED, count - 1))
+    scale, factor = float(np.exp(ratio.mean())), float(np.exp(error))
+    return Newtons(
+        count,
+        scale,
+        factor,
+        f"forces: {count} presses fix the stiffness: {scale:.3g} times that of before, and every force may be {factor:.3g} times larger or "
+        f"smaller; single presses scatter by {100 * (np.exp(ratio.std(ddof=1)) - 1):.0f} %",
+    )
+
+
+def pressed_n(recording: Recording, sensor: SensorSpec, experiment: ExperimentSpec) -> np.ndarray:
+    """Measured forces (M,) along the approach, N, of a recording's frames; NaN where none was measured."""
+    reads = None if sensor.rig is None else sensor.rig.force_sensor
+    if reads is None:
+        name = next((name for name in ALONG if name in recording.labels), "")
+        return numbers(recording.labels[name]) if name else np.full(len(recording), np.nan)
+    return _read(recording, reads, experiment.axis)
+
+
+def _read(recording: Recording, reads: ForceSensorSpec, axis: int) -> np.ndarray:
+    """Forces (M,) along an axis of the rig from what its force sensor reads."""
+    name = reads.columns[axis]
+    if name not in recording.labels:
+        return np.full(len(recording), np.nan)
+    found: np.ndarray = (numbers(recording.labels[name]) - reads.offset_n[axis]) / reads.gain[axis]
+    return found
+
+
+def simulated_n(
+    sensor: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, labels: Sequence[ArmLabel], *, across: int
+) -> np.ndarray:
+    """Simulated forces (K,) along the approach, N, of contacts with these labels; NaN where a contact fails."""
+    contact = RigContact(SkinSolver(sensor, resolution=Resolution(across)), experiment, touched, rig=rig_of(sensor))
+    found = np.full(len(labels), np.nan)
+    for k, label in enumerate(labels):
+        try:
+            state = contact.end(label)
+        except ContactError:
+            continue
+        found[k] = state.force_n @ state.T_sensor_object[:3, 2]
+    return found

@@ -43,7 +43,7 @@ def _tables() -> list[Entry]:
     for command in ("audit", "evaluate"):
         call = READ_LABELS[command]
         for what, edit in given.SAME_TABLE.items():
-            found.append(Entry("tables", what, call, _table(edit), ANY, same=True, sample=command == "evaluate" and what == "semicolons"))
+            found.append(Entry("tables", what, call, _table(edit), ANY, same=True))
         for what, edit in given.TOLD_TABLE.items():
             found.append(Entry("tables", what, call, _table(edit), ANY, (f"{LABELS}|pose_",)))
         for what, value in given.TOLD_CELLS.items():

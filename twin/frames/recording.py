@@ -14,6 +14,7 @@ from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
 from twin.frames.forms import FrameKind, KnownFrames, common_kind, form_of, known_frames, times
 from twin.frames.images import read_image
+from twin.frames.lerobot import INFO, RESTS, LeRobotFrames, is_lerobot, open_lerobot
 from twin.frames.tables import TABLES, order_by_table, read_metadata
 from twin.frames.videos import Video, open_video
 from twin.types import Form, Frame
@@ -91,6 +92,7 @@ class Recording:
     failed: list[BadFrame] = field(default_factory=list)
     _files: list[Path] = field(default_factory=list, repr=False)
     _video: Video | None = field(default=None, repr=False)
+    _dataset: LeRobotFrames | None = field(default=None, repr=False)
     _bits: int = field(default=0, repr=False)
     _noted: set[str] = field(default_factory=set, repr=False)
 
@@ -103,7 +105,7 @@ class Recording:
     def some(self, chosen: Collection[int]) -> Iterator[Frame]:
         """The readable frames of some indices of ``names``, in order; the others of these are added to ``failed``."""
         self.failed.clear()
-        for index, frame in self._video_frames(self._video, chosen) if self._video is not None else self._pictures(chosen):
+        for index, frame in self._chosen(chosen):
             if isinstance(frame, str):
                 self.failed.append({"image_name": self.names[index], "reason": frame.removeprefix(f"{self.names[index]}: ")})
             else:
@@ -117,8 +119,8 @@ class Recording:
         FrameError
             The frame can't be read, or its size differs from the recording's.
         """
-        if self._video is not None:
-            for _, frame in self._video_frames(self._video, {index}):
+        if not self._files:
+            for _, frame in self._chosen({index}):
                 if isinstance(frame, str):
                     raise FrameError(f"{self.names[index]}: {frame}")
                 return frame
@@ -149,6 +151,20 @@ class Recording:
             expected, got = times(self.size_px), times(image.shape[1::-1])
             raise FrameError(f"{name}: expected {expected} as the recording's other frames, got {got}; leave it out or record it again")
         return Frame(image, self.form, name, time_s, index)
+
+    def _chosen(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
+        """Index and frame, or why it can't be read, of chosen frames, wherever they are kept."""
+        if self._dataset is not None:
+            return self._dataset_frames(self._dataset, chosen)
+        return self._video_frames(self._video, chosen) if self._video is not None else self._pictures(chosen)
+
+    def _dataset_frames(self, dataset: LeRobotFrames, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
+        """The same of a LeRobot data set."""
+        for index, image in dataset.frames(chosen):
+            try:
+                yield index, image if isinstance(image, str) else self._frame(image, index)
+            except FrameError as error:
+                yield index, str(error)
 
     def _pictures(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
         """Index and frame, or why it can't be read, of chosen pictures."""
@@ -212,6 +228,18 @@ def _open_video(path: Path, known: KnownFrames | None, form: Form | None) -> Rec
     return Recording(path, form_of(video.first, path.name, known, form), names, size_px, problems=video.problems, _video=video)
 
 
+def _open_dataset(path: Path, known: KnownFrames | None, form: Form | None, table: Path | None) -> Recording:
+    if table is not None and not Path(table).is_relative_to(path):
+        raise FrameError(f"{path}: a LeRobot data set holds its own labels; leave out {table}")
+    found = open_lerobot(path)
+    size_px = (found.first.shape[1], found.first.shape[0])
+    told = form_of(found.first, path.name, known, form)
+    recording = Recording(path, told, found.names, size_px, found.labels, problems=found.problems, _dataset=found)
+    recording.take_metadata([path / INFO.parent])
+    recording.take_reference([*references_in(path), *sorted((path / RESTS).glob("*.png"))])
+    return recording
+
+
 def _choose_folder(
     path: Path, folders: list[Path], known: KnownFrames | None, form: Form | None, problems: list[str]
 ) -> tuple[Path, list[Path], FrameKind]:
@@ -268,7 +296,7 @@ def open_recording(
     Parameters
     ----------
     path : path
-        A picture, a folder of pictures, a recording's folder, or a video or a folder with one. ``frames_at`` adds
+        A picture, a folder of pictures, a recording's folder, a LeRobot data set, or a video or a folder with one. ``frames_at`` adds
         a table and a no-contact frame from elsewhere.
     spec : SensorSpec, optional
         The sensor; frames must have the size of one of its forms. The size of most frames is the recording's.
@@ -282,7 +310,7 @@ def open_recording(
     """
     table, no_contact = (path.table, path.no_contact) if isinstance(path, FramesAt) else (None, None)
     path = Path(path)
-    if table is not None and not table.is_file():
+    if table is not None and not table.is_file() and not is_lerobot(table):
         raise FrameError(f"{shown(table, LONGEST_PATH)}: no such table; give the path of a CSV file with --table")
     recording = _opened(path, None if spec is None else known_frames(spec), form, table)
     if no_contact is not None:
@@ -295,6 +323,8 @@ def _opened(path: Path, known: KnownFrames | None, form: Form | None, table: Pat
     if not os.path.exists(path):  # unlike ``Path.exists`` also False for what is no path at all
         link = "a link to nothing" if os.path.islink(path) else "no such file or folder"
         raise FrameError(f"{shown(path, LONGEST_PATH)}: {link}; give a picture, a folder of frames, a recording or a video")
+    if path.is_dir() and is_lerobot(path):
+        return _open_dataset(path, known, form, table)
     if path.is_dir():
         return _open_folder(path, known, form, table)
     if not path.is_file():

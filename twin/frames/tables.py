@@ -23,6 +23,7 @@ CALLED_HERE = {
     **{f"pose_{axis}": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
     **{f"shear_{axis}": f"move_{k}" for k, axis in enumerate(_AXES, 1)},
     **{f"observation.state.{axis}": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
+    **{f"observation.tactile.move.{axis}": f"move_{k}" for k, axis in enumerate(_AXES, 1)},
     **{f"observation.state.{axis}.pos": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
     **{axis: f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
 }
@@ -221,8 +222,12 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
         problems.append(f"{table.name}: {counted(len(unlisted), what, [p.name for p in unlisted])}")
     rows = sorted(pairing.files)
     labels = {c: _as_array([cells[k] for k in rows] + [""] * len(unlisted)) for c, cells in table.columns.items()}
-    labels |= {here: labels[c] for c in table.columns if (here := CALLED_HERE.get(c.casefold())) and here not in labels}
-    return [pairing.files[k] for k in rows] + unlisted, labels
+    return [pairing.files[k] for k in rows] + unlisted, called_here(labels)
+
+
+def called_here(labels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns (M,), those of other conventions also under the names used here."""
+    return labels | {here: cells for name, cells in labels.items() if (here := CALLED_HERE.get(name.casefold())) and here not in labels}
 
 
 def _as_array(cells: list[str]) -> np.ndarray:

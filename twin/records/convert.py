@@ -12,9 +12,10 @@ from scenes import SensorSpec, SpecError, load_sensor
 from scenes.files import LONGEST_PATH, shown
 from twin.errors import FrameError
 from twin.frames.forms import frame_size, times
+from twin.frames.lerobot import RESTS
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.progress import Progress, silent, stage
-from twin.records.folder import HELD_STEPS, RESTS, SIDECAR, FolderWriter, format_of
+from twin.records.folder import HELD_STEPS, SIDECAR, FolderWriter, format_of
 from twin.records.huggingface import HuggingFaceWriter, huggingface_records
 from twin.records.lerobot import DATA_MB, INFO, LeRobotWriter, lerobot_records
 from twin.records.record import About, Episode, RecordError, Records, Step, library

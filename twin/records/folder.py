@@ -19,12 +19,13 @@ import numpy as np
 from scenes.files import read_regular, shown
 from twin.errors import FrameError
 from twin.frames.images import read_image
+from twin.frames.lerobot import RESTS
 from twin.records.record import About, Episode, RecordError, Records, Step, digest, library
 from twin.store import contents, output, write_bytes, write_json
 from twin.types import ImageArray
 
-SIDECAR, RESTS = "tactip.json", "rest"
-"""File that says what the folder is, and folder of the pictures without contact."""
+SIDECAR = "tactip.json"
+"""File that says what the folder is."""
 VERSION = 1
 """Version of what is written."""
 HELD_STEPS = 1000

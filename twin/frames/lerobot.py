@@ -1,0 +1,249 @@
+"""LeRobot data sets of version 3 as frames and labels: the tables in ``data``, and pictures in them or in videos.
+
+A column of a feature with several numbers is named after the feature and the number, as ``observation.state.x``.
+"""
+
+import json
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from scenes.files import read_regular
+from twin.errors import FrameError
+from twin.frames.images import picture_of
+from twin.frames.tables import LARGEST_BYTES, called_here
+from twin.frames.videos import open_video
+
+INFO, DATA, EPISODES = Path("meta", "info.json"), "data/chunk-*/*.parquet", "meta/episodes/chunk-*/*.parquet"
+"""What a data set says of itself, its tables of frames, and its tables of episodes."""
+RESTS = "rest"
+"""Folder of the pictures without contact in records that this program writes, whatever their format."""
+VERSION = "v3."
+"""Beginning of the version that is read."""
+PICTURES = ("image", "video")
+"""Types of features that are pictures."""
+OURS = ("tactip", "tactile", "tacpad")
+"""What the name of a feature with a tactile sensor's pictures may hold; of several cameras the first such counts."""
+COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+"""LeRobot's own columns of whole numbers."""
+NUMBERS = ("float", "int", "uint", "bool")
+"""Beginnings of the types of features that are labels."""
+DAMAGED = "give the data set whole, as it was written"
+Episode = dict[str, Any]
+
+
+@dataclass
+class LeRobotFrames:
+    """Frames of a data set, each read when it is needed.
+
+    Attributes
+    ----------
+    names : list of str
+    first : (H, W) or (H, W, 3) uint8
+        The first frame. Pictures whose three channels are alike are gray.
+    labels : dict of str to (M,) float
+    problems : list of str
+        What is odd, one line each.
+    """
+
+    path: Path
+    names: list[str]
+    labels: dict[str, np.ndarray]
+    problems: list[str]
+    first: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.uint8))
+    _places: list[tuple[Path, int, int]] = field(
+        default_factory=list, repr=False
+    )  # of each frame: file, row group or -1 (video), number in it
+    _feature: str = field(default="", repr=False)
+    _group: tuple[Path, int] | None = field(default=None, repr=False)
+    _cells: list[Any] = field(default_factory=list, repr=False)
+
+    def frames(self, chosen: Collection[int]) -> Iterator[tuple[int, np.ndarray | str]]:
+        """Index and picture of chosen frames, in order; instead of the picture of a damaged frame how it is damaged."""
+        wanted = sorted(chosen)
+        if wanted and self._places[wanted[0]][1] < 0:
+            yield from self._from_videos(wanted)
+            return
+        for index in wanted:
+            try:
+                yield index, self._as_first(picture_of(self._stored(*self._places[index]))[0])
+            except FrameError as error:
+                yield index, str(error)
+
+    def _from_videos(self, wanted: list[int]) -> Iterator[tuple[int, np.ndarray | str]]:
+        for path in dict.fromkeys(self._places[index][0] for index in wanted):
+            number = {self._places[index][2]: index for index in wanted if self._places[index][0] == path}
+            for k, _, image in open_video(path).frames():
+                if k in number:
+                    yield number.pop(k), image if isinstance(image, str) else self._as_first(image)
+                if not number:
+                    break
+            for index in number.values():
+                yield index, f"{path.name} ends before it"
+
+    def _stored(self, path: Path, group: int, row: int) -> bytes:
+        """A picture's file from a table."""
+        if self._group != (path, group):
+            cells = _read(path, lambda parquet: parquet.ParquetFile(path).read_row_group(group, columns=[self._feature]))
+            self._group, self._cells = (path, group), cells.column(self._feature).to_pylist()
+        cell = self._cells[row]
+        data = cell.get("bytes") if isinstance(cell, dict) else cell
+        if isinstance(data, bytes):
+            return data
+        named = cell.get("path") if isinstance(cell, dict) else None
+        if not named:
+            raise FrameError("no picture in its row")
+        try:
+            return read_regular(self.path / named, LARGEST_BYTES)
+        except OSError as error:
+            raise FrameError(f"{named}: can't be read ({error.strerror})") from error
+
+    def _as_first(self, image: np.ndarray) -> np.ndarray:
+        return image[..., 0] if image.ndim == 3 and self.first.ndim == 2 and self.first.size else image
+
+
+def is_lerobot(path: Path) -> bool:
+    """Whether a folder is a LeRobot data set."""
+    return (path / INFO).is_file()
+
+
+def open_lerobot(path: Path) -> LeRobotFrames:
+    """Open a data set; of a set that is still being written the episodes that it states.
+
+    Raises
+    ------
+    FrameError
+        It is of another version, damaged or has no pictures; or pyarrow is missing.
+    """
+    info = _info(path)
+    _library("pyarrow.parquet")
+    problems: list[str] = []
+    features: dict[str, dict[str, Any]] = {name: each for name, each in info["features"].items() if isinstance(each, dict)}
+    pictured = [name for name, each in features.items() if each.get("dtype") in PICTURES]
+    if not pictured:
+        raise FrameError(f"{path}: a LeRobot data set without pictures ({', '.join(list(features)[:5])}); give one with a camera's frames")
+    feature = next((name for name in pictured if any(word in name.lower() for word in OURS)), pictured[0])
+    if len(pictured) > 1:
+        problems.append(f"{path.name}: read {feature}, not {', '.join(name for name in pictured if name != feature)}")
+    numbered = [name for name, each in features.items() if str(each.get("dtype")).startswith(NUMBERS) and name not in COUNTERS]
+    rows, places = _rows(path, info, numbered)
+    if not places:
+        raise FrameError(f"{path}: a LeRobot data set without frames; {DAMAGED}")
+    if features[feature]["dtype"] == "video":
+        places = _in_videos(path, info, feature, rows)
+    labels: dict[str, np.ndarray] = {}
+    for name in numbered:
+        labels |= _columns(name, features[name].get("names"), rows[name])
+    labels = called_here(labels)
+    names = [f"episode-{e:06d}-frame-{k:06d}" for e, k in zip(rows["episode_index"], rows["frame_index"], strict=True)]
+    found = LeRobotFrames(path, names, labels, problems, _places=places, _feature=feature)
+    reason = ""
+    for _, image in found.frames(range(len(names))):
+        if not isinstance(image, str):
+            alike = image.ndim == 3 and bool((image == image[..., :1]).all())
+            found.first = image[..., 0] if alike else image
+            return found
+        reason = reason or image
+    raise FrameError(f"{path}: no picture of {feature} can be read ({reason}); {DAMAGED}")
+
+
+def _info(path: Path) -> dict[str, Any]:
+    try:
+        info = json.loads(read_regular(path / INFO, LARGEST_BYTES))
+    except (OSError, ValueError, RecursionError) as error:
+        raise FrameError(f"{path / INFO}: can't be read ({error}); {DAMAGED}") from error
+    if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
+        raise FrameError(f"{path / INFO}: names no features; {DAMAGED}")
+    if not str(info.get("codebase_version")).startswith(VERSION):
+        raise FrameError(
+            f"{path}: a LeRobot data set of version {info.get('codebase_version')!r}; only version 3 is read: convert it with LeRobot "
+            "(lerobot.datasets.v30.convert_dataset_v21_to_v30)"
+        )
+    return info
+
+
+def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[str, list[Any]], list[tuple[Path, int, int]]]:
+    """Cells of the columns with numbers, and each row's file, row group and place in it; only of the episodes that the set states."""
+    columns = ["episode_index", "frame_index", *numbered]
+    rows: dict[str, list[Any]] = {name: [] for name in columns}
+    places: list[tuple[Path, int, int]] = []
+    total = info.get("total_episodes")
+    for file in sorted(path.glob(DATA)):
+        groups = _read(file, lambda parquet, file=file: parquet.ParquetFile(file).num_row_groups)
+        for group in range(groups):
+            table = _read(file, lambda parquet, file=file, group=group: parquet.ParquetFile(file).read_row_group(group, columns=columns))
+            if missing := [name for name in columns if name not in table.column_names]:
+                raise FrameError(f"{file}: has no column {', '.join(missing[:3])}, though {INFO} names it; {DAMAGED}")
+            cells = {name: table.column(name).to_pylist() for name in columns}
+            for k, episode in enumerate(cells["episode_index"]):
+                if isinstance(total, int) and episode >= total:
+                    continue
+                places.append((file, group, k))
+                for name in columns:
+                    rows[name].append(cells[name][k])
+    return rows, places
+
+
+def _in_videos(path: Path, info: dict[str, Any], feature: str, rows: dict[str, list[Any]]) -> list[tuple[Path, int, int]]:
+    """Each frame's video, -1, and number in it."""
+    episodes: dict[int, Episode] = {}
+    at = f"videos/{feature}"
+    keys = [f"{at}/chunk_index", f"{at}/file_index", f"{at}/from_timestamp"]
+    for file in sorted(path.glob(EPISODES)):
+        table = _read(file, lambda parquet, file=file: parquet.read_table(file, columns=["episode_index", *keys]))
+        episodes |= {row["episode_index"]: row for row in table.to_pylist()}
+    try:
+        files = {
+            number: (
+                path / info["video_path"].format(video_key=feature, chunk_index=row[keys[0]], file_index=row[keys[1]]),
+                round(row[keys[2]] * info["fps"]),
+            )
+            for number, row in episodes.items()
+        }
+        return [
+            (files[episode][0], -1, files[episode][1] + frame)
+            for episode, frame in zip(rows["episode_index"], rows["frame_index"], strict=True)
+        ]
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise FrameError(f"{path}: does not say where the video of an episode is ({error!r}); {DAMAGED}") from error
+
+
+def _columns(feature: str, names: object, cells: list[Any]) -> dict[str, np.ndarray]:
+    """A feature's numbers as columns (M,); nothing for one of more than two dimensions, or whose length changes."""
+    if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}
+        (names,) = names.values()
+    try:
+        values = np.array(cells, float)
+    except (TypeError, ValueError):
+        return {}
+    if values.ndim == 1:
+        return {feature: values}
+    if values.ndim != 2:
+        return {}
+    if values.shape[1] == 1:
+        return {feature: values[:, 0]}
+    named = isinstance(names, list) and len(names) == values.shape[1]
+    return {f"{feature}.{names[k] if named else k}": values[:, k] for k in range(values.shape[1])}  # type: ignore[index]
+
+
+def _read(file: Path, how: Any) -> Any:
+    """What ``how`` makes of pyarrow's reader of tables; a damaged file is an error in words."""
+    parquet, arrow = _library("pyarrow.parquet"), _library("pyarrow")
+    try:
+        return how(parquet)
+    except (OSError, KeyError, ValueError, arrow.ArrowException) as error:
+        raise FrameError(f"{file}: damaged ({str(error).splitlines()[0]}); {DAMAGED}") from error
+
+
+def _library(name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise FrameError(
+            "a LeRobot data set needs the library pyarrow, which is not installed; pip install 'tactip-twin[records]'"
+        ) from error

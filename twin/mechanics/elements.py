@@ -29,7 +29,7 @@ import numpy as np
 
 from twin.compiled import compiled
 from twin.geometry.solid import Cells
-from twin.mechanics.material import distortion, distortion_stiffness, invariants
+from twin.mechanics.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants
 from twin.types import FloatArray, IntArray
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks
@@ -100,19 +100,42 @@ class Elements:
 
 
 @compiled(fastmath=True)
-def _kinematics(
-    x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatArray, g: FloatArray, det: FloatArray
-) -> tuple[float, float, float, float]:
-    """F, F^-T and det F at all points; (level volumes at rest, and deformed), or a negative first volume if inside out."""
-    v0, v1, r0, r1 = 0.0, 0.0, 0.0, 0.0
+def _gradient(x: FloatArray, grad: FloatArray, f: FloatArray) -> None:
+    """F at all points."""
     for q in range(8):
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for a in range(x.shape[1]):
-                    total += x[i, a] * grad[q, j, a]
-                f[q, i, j] = total
-        det[q] = invariants(f[q], g[q])
+        for j in range(3):
+            f0, f1, f2 = 0.0, 0.0, 0.0
+            for a in range(x.shape[1]):
+                slope = grad[q, j, a]
+                f0 += x[0, a] * slope
+                f1 += x[1, a] * slope
+                f2 += x[2, a] * slope
+            f[q, 0, j], f[q, 1, j], f[q, 2, j] = f0, f1, f2
+
+
+@compiled(fastmath=True)
+def _push(grad: FloatArray, weights: FloatArray, stress: FloatArray, out: FloatArray) -> None:
+    """The first Piola-Kirchhoff stress' work on the controls' moves, into ``out`` (3, b)."""
+    out[:] = 0.0
+    for q in range(8):
+        w = weights[q]
+        s00, s01, s02 = w * stress[q, 0, 0], w * stress[q, 0, 1], w * stress[q, 0, 2]
+        s10, s11, s12 = w * stress[q, 1, 0], w * stress[q, 1, 1], w * stress[q, 1, 2]
+        s20, s21, s22 = w * stress[q, 2, 0], w * stress[q, 2, 1], w * stress[q, 2, 2]
+        for a in range(out.shape[1]):
+            g0, g1, g2 = grad[q, 0, a], grad[q, 1, a], grad[q, 2, a]
+            out[0, a] += s00 * g0 + s01 * g1 + s02 * g2
+            out[1, a] += s10 * g0 + s11 * g1 + s12 * g2
+            out[2, a] += s20 * g0 + s21 * g1 + s22 * g2
+
+
+@compiled(fastmath=True)
+def _kinematics(x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatArray, det: FloatArray) -> tuple[float, float, float, float]:
+    """F and det F at all points; (level volumes at rest, and deformed), or a negative first volume if inside out."""
+    v0, v1, r0, r1 = 0.0, 0.0, 0.0, 0.0
+    _gradient(x, grad, f)
+    for q in range(8):
+        det[q] = determinant(f[q])
         if det[q] <= 0:
             return -1.0, 0.0, 0.0, 0.0
         if q < 4:
@@ -122,6 +145,30 @@ def _kinematics(
             r1 += weights[q]
             v1 += weights[q] * det[q]
     return r0, r1, v0, v1
+
+
+@compiled(fastmath=True)
+def _add_second(c01: float, f: FloatArray, weights: FloatArray, stress: FloatArray) -> float:
+    """Add the c01 part of the law to the first Piola-Kirchhoff stress at all points; its energy."""
+    energy = 0.0
+    for q in range(8):
+        energy += weights[q] * add_second_stress(c01, f[q], stress[q])
+    return energy
+
+
+@compiled(fastmath=True)
+def _add_given(given: FloatArray, f: FloatArray, weights: FloatArray, stress: FloatArray) -> float:
+    """Add a given second Piola-Kirchhoff stress to the first at all points; its energy."""
+    energy = 0.0
+    for q in range(8):
+        for i in range(3):
+            for j in range(3):
+                total = 0.0
+                for k in range(3):
+                    total += f[q, i, k] * given[q, k, j]
+                stress[q, i, j] += total
+                energy += weights[q] * total * f[q, i, j] / 2
+    return energy
 
 
 @compiled(fastmath=True)
@@ -138,39 +185,27 @@ def _forces(
 ) -> float:
     count = elements.shape[1]
     x, push = np.zeros((3, count)), np.zeros((3, count))
-    f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
-    det, stress = np.zeros(8), np.zeros((3, 3))
+    f, det, stress = np.zeros((8, 3, 3)), np.zeros(8), np.zeros((8, 3, 3))
     energy = 0.0
     for m in range(len(elements)):
         for a in range(count):
             for i in range(3):
                 x[i, a] = control[elements[m, a], i]
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, g, det)
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
         if r0 < 0:
             return np.inf
         rest = r0 + r1
         mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
         more = extra[m] if len(extra) else 0.0
         energy += rest * (law[4] / 2 * mean**2 + law[5] / 2 * half**2 + sealing * mean + more * half)
-        push[:] = 0.0
+        pressure, lean = sealing + law[4] * mean, (law[5] * half + more) * rest / 2
         for q in range(8):
-            w = weights[m, q]
-            pressure = sealing + law[4] * mean + (law[5] * half + more) * (rest / (2 * r0) if q < 4 else -rest / (2 * r1))
-            energy += w * distortion(law, f[q], det[q], g[q], stress)
-            if len(given):
-                for i in range(3):
-                    for j in range(3):
-                        total = 0.0
-                        for k in range(3):
-                            total += f[q, i, k] * given[m, q, k, j]
-                        stress[i, j] += total
-                        energy += w * total * f[q, i, j] / 2
-            for i in range(3):
-                s0 = w * (stress[i, 0] + pressure * det[q] * g[q, i, 0])
-                s1 = w * (stress[i, 1] + pressure * det[q] * g[q, i, 1])
-                s2 = w * (stress[i, 2] + pressure * det[q] * g[q, i, 2])
-                for a in range(count):
-                    push[i, a] += s0 * gradients[m, q, 0, a] + s1 * gradients[m, q, 1, a] + s2 * gradients[m, q, 2, a]
+            energy += weights[m, q] * first_piola(law, f[q], det[q], pressure + (lean / r0 if q < 4 else -lean / r1), stress[q])
+        if law[1] != 0:
+            energy += _add_second(law[1], f, weights[m], stress)
+        if len(given):
+            energy += _add_given(given[m], f, weights[m], stress)
+        _push(gradients[m], weights[m], stress, push)
         for a in range(count):
             for i in range(3):
                 out[elements[m, a], i] += push[i, a]
@@ -202,7 +237,7 @@ def _stiffness(
             for i in range(3):
                 x[i, a] = control[elements[m, a], i]
         grad = gradients[m].reshape(24, count)
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, g, det)
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
         rest = r0 + r1
         mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
         more = extra[m] if len(extra) else 0.0
@@ -210,6 +245,7 @@ def _stiffness(
         for q in range(8):
             w = weights[m, q]
             lean = rest / (2 * r0) if q < 4 else -rest / (2 * r1)
+            invariants(f[q], g[q])
             push = (sealing + law[4] * mean + (law[5] * half + more) * lean) * det[q]
             distortion_stiffness(law, f[q], det[q], g[q], tangent)
             for p in range(6):
@@ -245,20 +281,24 @@ def _stiffness(
 def _distortion_stress(elements: IntArray, gradients: FloatArray, weights: FloatArray, law: FloatArray, control: FloatArray) -> FloatArray:
     count = elements.shape[1]
     x = np.zeros((3, count))
-    f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
-    det, stress = np.zeros(8), np.zeros((3, 3))
+    f, det, stress = np.zeros((8, 3, 3)), np.zeros(8), np.zeros((8, 3, 3))
+    g = np.zeros((3, 3))
     out = np.zeros((len(elements), 8, 3, 3))
     for m in range(len(elements)):
         for a in range(count):
             for i in range(3):
                 x[i, a] = control[elements[m, a], i]
-        _kinematics(x, gradients[m], weights[m], f, g, det)
+        _kinematics(x, gradients[m], weights[m], f, det)
         for q in range(8):
-            distortion(law, f[q], det[q], g[q], stress)
+            first_piola(law, f[q], det[q], 0.0, stress[q])
+        if law[1] != 0:
+            _add_second(law[1], f, weights[m], stress)
+        for q in range(8):
+            invariants(f[q], g)
             for i in range(3):
                 for j in range(3):
                     for k in range(3):  # S = F^-1 P, and g is F^-T
-                        out[m, q, i, j] += g[q, k, i] * stress[k, j]
+                        out[m, q, i, j] += g[k, i] * stress[q, k, j]
     return out
 
 
@@ -266,12 +306,12 @@ def _distortion_stress(elements: IntArray, gradients: FloatArray, weights: Float
 def _half_difference(elements: IntArray, gradients: FloatArray, weights: FloatArray, control: FloatArray) -> FloatArray:
     count = elements.shape[1]
     x = np.zeros((3, count))
-    f, g, det = np.zeros((8, 3, 3)), np.zeros((8, 3, 3)), np.zeros(8)
+    f, det = np.zeros((8, 3, 3)), np.zeros(8)
     out = np.zeros(len(elements))
     for m in range(len(elements)):
         for a in range(count):
             for i in range(3):
                 x[i, a] = control[elements[m, a], i]
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, g, det)
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
         out[m] = (v0 / r0 - v1 / r1) / 2
     return out

@@ -55,27 +55,51 @@ def invariants(f: FloatArray, g: FloatArray) -> float:
 
 
 @compiled(fastmath=True)
-def distortion(law: FloatArray, f: FloatArray, det: float, g: FloatArray, stress: FloatArray) -> float:
-    """Energy density of the part of the law without kappa; its derivative by F into ``stress`` (3, 3), MPa."""
-    trace, scale, first = _first_invariant(f, det)
-    slope = law[0] + first * (2 * law[2] + 3 * law[3] * first)
+def determinant(f: FloatArray) -> float:
+    """det F."""
+    minor_0 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
+    minor_1 = f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
+    minor_2 = f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0]
+    return f[0, 0] * minor_0 + f[0, 1] * minor_1 + f[0, 2] * minor_2
+
+
+@compiled(fastmath=True)
+def first_piola(law: FloatArray, f: FloatArray, det: float, pressure: float, out: FloatArray) -> float:
+    """Energy density of the law without kappa and c01; into ``out`` (3, 3) its derivative by F plus ``pressure`` d det F / dF, MPa."""
+    f00, f01, f02, f10, f11, f12, f20, f21, f22 = f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2], f[2, 0], f[2, 1], f[2, 2]
+    trace = f00 * f00 + f01 * f01 + f02 * f02 + f10 * f10 + f11 * f11 + f12 * f12 + f20 * f20 + f21 * f21 + f22 * f22
+    scale = det ** (-2 / 3)
+    first = scale * trace - 3
+    a = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
     energy = first * (law[0] + first * (law[2] + law[3] * first))
-    for i in range(3):
-        for j in range(3):
-            stress[i, j] = 2 * slope * scale * (f[i, j] - trace / 3 * g[i, j])
-    if law[1] != 0:
-        second, slopes = _second_invariant(f, trace)
-        scale *= scale
-        energy += law[1] * (scale * second - 3)
-        for i in range(3):
-            for j in range(3):
-                stress[i, j] += law[1] * scale * (slopes[i, j] - 4 / 3 * second * g[i, j])
+    b = pressure - a * trace / (3 * det)
+    out[0, 0] = a * f00 + b * (f11 * f22 - f12 * f21)
+    out[0, 1] = a * f01 + b * (f12 * f20 - f10 * f22)
+    out[0, 2] = a * f02 + b * (f10 * f21 - f11 * f20)
+    out[1, 0] = a * f10 + b * (f02 * f21 - f01 * f22)
+    out[1, 1] = a * f11 + b * (f00 * f22 - f02 * f20)
+    out[1, 2] = a * f12 + b * (f01 * f20 - f00 * f21)
+    out[2, 0] = a * f20 + b * (f01 * f12 - f02 * f11)
+    out[2, 1] = a * f21 + b * (f02 * f10 - f00 * f12)
+    out[2, 2] = a * f22 + b * (f00 * f11 - f01 * f10)
     return energy
 
 
 @compiled(fastmath=True)
+def add_second_stress(c01: float, f: FloatArray, out: FloatArray) -> float:
+    """Add to a first Piola-Kirchhoff stress (3, 3) the c01 part of the law; its energy density."""
+    g = np.zeros((3, 3))
+    scale = invariants(f, g) ** (-4 / 3)
+    second, slopes = _second_invariant(f, (f * f).sum())
+    for i in range(3):
+        for j in range(3):
+            out[i, j] += c01 * scale * (slopes[i, j] - 4 / 3 * second * g[i, j])
+    return c01 * (scale * second - 3)
+
+
+@compiled(fastmath=True)
 def distortion_stiffness(law: FloatArray, f: FloatArray, det: float, g: FloatArray, out: FloatArray) -> None:
-    """Second derivative of ``distortion`` by F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
+    """Second derivative of that energy density by F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
     trace, scale, first = _first_invariant(f, det)
     slope = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
     bend = 4 * scale * scale * (2 * law[2] + 6 * law[3] * first)

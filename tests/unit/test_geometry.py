@@ -12,7 +12,7 @@ from twin.geometry.chart import Chart, Focus
 from twin.geometry.mesh import GEL, SKIN, NodeView, build_mesh, skin_surface, to_pyvista
 from twin.geometry.pins import rest_pins
 from twin.geometry.shapes import shape_of
-from twin.geometry.solid import Resolution, body_points, build_solid, pin_pose, surface_operators
+from twin.geometry.solid import Resolution, body_points, build_solid, pin_pose, rotations, surface_operators
 
 ROUNDING_MM = 1e-9
 SPLINE_MM = 0.075  # how far a spline surface of 16 elements across lies from its sphere of 20 mm (measured 0.069)
@@ -402,3 +402,10 @@ def test_exported_skin_is_a_closed_surface(mesh):
     grid = to_pyvista(mesh)
     assert grid.n_cells == len(mesh.hexes)
     assert grid.compute_cell_sizes().cell_data["Volume"].min() > 0
+
+
+def test_rotations_are_those_of_the_polar_decomposition():
+    matrices = np.eye(3) + 0.4 * np.random.default_rng(5).normal(size=(300, 3, 3))
+    matrices = matrices[np.linalg.det(matrices) > 0.05]
+    left, _, right = np.linalg.svd(matrices)
+    assert np.abs(rotations(matrices) - left @ right).max() < 1e-12

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from scenes.sensor import GeometrySpec
+from twin.compiled import compiled
 from twin.geometry.bspline import Basis
 from twin.geometry.chart import Chart, Focus, RectangleChart
 from twin.geometry.pins import rest_pins
@@ -21,6 +23,10 @@ from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _GEL_GRADING = 1.5
 """Boundary k of n elements through the gel lies at the depth (k / n)^1.5: elements are thin below the skin."""
+_MOST_POLAR_ITERATIONS = 50
+"""Most iterations for a rotation; five are usual."""
+_POLAR_CHANGE = 1e-9
+"""The iteration for a rotation ends at a change below this: the next change would be its square."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,11 @@ class Solid:
     pin_cap_length_mm: float
 
     @cached_property
+    def pin_operator(self) -> csr_array:
+        """``pin_value``, ``pin_slope_u`` and ``pin_slope_v`` one below the other, (3 N, side^2); nine numbers in a row are not zero."""
+        return csr_array(np.concatenate([self.pin_value, self.pin_slope_u, self.pin_slope_v]))
+
+    @cached_property
     def pin_rest(self) -> tuple[FloatArray, FloatArray]:
         """Foot (N, 3) and inverse frame (N, 3, 3) of the skin's inside under each pin at rest."""
         foot, frame = _surface(self, self.control_mm)
@@ -198,8 +209,7 @@ def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
     """
     rest_foot, rest_inverse = solid.pin_rest
     foot, frame = _surface(solid, control_mm)
-    left, _, right = np.linalg.svd(frame @ rest_inverse)
-    turn = left @ right
+    turn = rotations(frame @ rest_inverse)
     base = foot + np.einsum("kij,kj->ki", turn, solid.pin_base_mm - rest_foot)
     axis = np.einsum("kij,kj->ki", turn, solid.pin_axis)
     return base, axis, base + solid.pin_cap_length_mm * axis
@@ -268,8 +278,36 @@ def _boxes(count: int, size: int) -> IntArray:
 
 def _surface(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Foot (N, 3) and frame [t_u t_v n] (N, 3, 3) of the inner surface under each pin."""
-    inner = control_mm[solid.inner]
-    along_u, along_v = solid.pin_slope_u @ inner, solid.pin_slope_v @ inner
+    place, along_u, along_v = (solid.pin_operator @ control_mm[solid.inner]).reshape(3, -1, 3)
     normal = np.cross(along_u, along_v)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return solid.pin_value @ inner, np.stack([along_u, along_v, normal], axis=2)
+    return place, np.stack([along_u, along_v, normal], axis=2)
+
+
+@compiled()
+def rotations(matrices: FloatArray) -> FloatArray:
+    """The rotations (k, 3, 3) of the polar decompositions of matrices (k, 3, 3) of positive determinant.
+
+    Newton's iteration R -> (R + R^-T) / 2 (Higham 1986), whose convergence is quadratic.
+    """
+    out = np.empty_like(matrices)
+    cofactor = np.zeros((3, 3))
+    for k in range(len(matrices)):
+        r = out[k]
+        r[:] = matrices[k]
+        for _ in range(_MOST_POLAR_ITERATIONS):
+            for i in range(3):
+                j, m = (i + 1) % 3, (i + 2) % 3
+                for a in range(3):
+                    b, c = (a + 1) % 3, (a + 2) % 3
+                    cofactor[i, a] = r[j, b] * r[m, c] - r[j, c] * r[m, b]
+            det = r[0, 0] * cofactor[0, 0] + r[0, 1] * cofactor[0, 1] + r[0, 2] * cofactor[0, 2]
+            change = 0.0
+            for i in range(3):
+                for a in range(3):
+                    new = (r[i, a] + cofactor[i, a] / det) / 2
+                    change = max(change, abs(new - r[i, a]))
+                    r[i, a] = new
+            if change < _POLAR_CHANGE:
+                break
+    return out

@@ -8,7 +8,7 @@ from scipy.sparse.linalg import spsolve
 from scenes.load import load_sensor
 from twin.geometry.chart import Focus
 from twin.geometry.solid import Resolution, build_solid
-from twin.mechanics.elements import Elements
+from twin.mechanics.elements import Elements, KeptStiffness
 from twin.mechanics.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants, law_coefficients
 
 UNEVEN = [0.0, 0.2, 0.5, 0.6, 1.0]
@@ -319,3 +319,40 @@ def test_no_volumetric_locking_in_bending(kind):
     block = build_block(kind, breaks=np.linspace(0, 1, 9), depths=DEPTHS[kind], size_mm=(10, 4, 1))
     moved = [end_deflection(block, block.elements(material(young_mpa=2 * (1 + nu), poisson=nu)), [0, 0, 1]) for nu in (0.3, 0.4999)]
     assert moved[0] / moved[1] == pytest.approx((1 - 0.3) / (1 - 0.4999), rel=0.03)
+
+
+# --- blocks that are kept
+
+
+def test_kept_stiffness_is_made_anew_where_the_body_has_changed_and_nowhere_else(body):
+    elements, rest = elements_of(body, material()), body[0]
+    kept, none = KeptStiffness(elements), np.zeros((0, 8, 3, 3))
+    kept.update(elements, rest, none, 0.0, anew=False)
+    first = kept.blocks.copy()
+    near = {"rtol": 1e-5, "atol": 1e-6 * np.abs(first).max()}
+    assert np.allclose(first, stiffness_blocks(elements, rest), **near)
+    one = len(first) // 2 + 2  # amid the skin
+    corner = elements.cells.controls[one, 0]
+    moved = rest.copy()
+    moved[corner] += 0.2 * np.ptp(rest[elements.cells.controls[one]], axis=0).min()
+    touched = (elements.cells.controls == corner).any(axis=1)
+    kept.update(elements, moved, none, 0.0, anew=False)
+    exact = stiffness_blocks(elements, moved)
+    assert np.array_equal(kept.blocks[~touched], first[~touched])
+    assert np.allclose(kept.blocks[one], exact[one], **near) and not np.allclose(kept.blocks[one], first[one], **near)
+    slightly = rest + 1e-3 * (moved - rest)
+    kept.update(elements, rest, none, 0.0, anew=True)
+    kept.update(elements, slightly, none, 0.0, anew=False)
+    assert np.array_equal(kept.blocks, first)
+    kept.update(elements, slightly, none, 0.0, anew=True)
+    assert not np.array_equal(kept.blocks[one], first[one])
+
+
+def test_kept_stiffness_follows_a_changed_pressure_law_or_stress(body):
+    elements, rest = elements_of(body, material()), body[0]
+    other = elements_of(body, material(young_mpa=1.4))
+    kept, none, given = KeptStiffness(elements), np.zeros((0, 8, 3, 3)), given_stress(elements.cells)
+    for kind, stress, pressure in ((elements, none, 0.0), (elements, none, 0.2), (other, none, 0.2), (other, given, 0.2)):
+        kept.update(kind, rest, stress, pressure, anew=False)
+        exact = stiffness_blocks(kind, rest, given=stress, pressure_mpa=pressure)
+        assert np.allclose(kept.blocks, exact, rtol=1e-5, atol=1e-6 * np.abs(exact).max())

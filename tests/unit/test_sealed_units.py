@@ -31,8 +31,8 @@ class Rescaled(Elements):
     def add_forces(self, control_mm, stress, out, pressure_mpa=0.0):
         return super().add_forces(control_mm, stress, out, self.per_mm3 * pressure_mpa)
 
-    def stiffness(self, control_mm, stress, pressure_mpa, out):
-        super().stiffness(control_mm, stress, self.per_mm3 * pressure_mpa, out)
+    def stiffness(self, control_mm, stress, pressure_mpa, out, **options):
+        super().stiffness(control_mm, stress, self.per_mm3 * pressure_mpa, out, **options)
 
     @property
     def rest_volume_mm3(self):

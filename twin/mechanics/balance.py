@@ -6,7 +6,7 @@ import numpy as np
 
 from twin.errors import ContactError
 from twin.mechanics.contact import ContactForces, ContactPoints, contact_forces, positions, spread_forces
-from twin.mechanics.elements import Elements
+from twin.mechanics.elements import Elements, KeptStiffness
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -225,10 +225,10 @@ class Problem:
             elastic, residual[body.free].ravel(), border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3
         )
 
-    def stiffness(self, control: FloatArray, border: FloatArray, blocks: list[FloatArray]) -> None:
-        """The elements' tangents into ``blocks``."""
-        for number, (kind, given, block) in enumerate(zip(self.body.kinds, self._given, blocks, strict=True)):
-            kind.stiffness(control, given, border[1] if number else 0.0, block)
+    def stiffness(self, control: FloatArray, border: FloatArray, kept: list[KeptStiffness], *, anew: bool) -> None:
+        """Bring the elements' tangents to a state; ``anew``: leave none as it was."""
+        for number, (kind, given, blocks) in enumerate(zip(self.body.kinds, self._given, kept, strict=True)):
+            blocks.update(kind, control, given, border[1] if number else 0.0, anew=anew)
 
     def volume(self, control: FloatArray, out: FloatArray) -> float:
         """How much the gel's volume has grown, mm^3; adds its gradient to ``out``."""

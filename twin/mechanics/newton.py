@@ -11,6 +11,7 @@ import numpy as np
 from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
 from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
 from twin.mechanics.contact import touching_mm2
+from twin.mechanics.elements import KeptStiffness
 from twin.mechanics.linear import FrontalSolver, NotPositiveDefinite, whole
 from twin.mechanics.path import carried
 from twin.objects import ObjectField
@@ -94,8 +95,7 @@ class LoadStepper:
     def __init__(self, body: Body, boxes: list[IntArray], field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
         self._body, self._boxes, self._field, self._friction = body, boxes, field, friction
         self._compliance = compliance_mm_per_n
-        shapes = [(len(kind.cells.controls), 6, *2 * kind.cells.controls.shape[1:]) for kind in body.kinds]
-        self._blocks = [np.empty(shape, np.float32) for shape in shapes]
+        self._stiffness = [KeptStiffness(kind) for kind in body.kinds]
         self._frontal: FrontalSolver | None = None
         self._kept: BoolArray = np.zeros(len(body.free), bool)
         self._local: IntArray = np.zeros((0, 9), int)
@@ -257,10 +257,11 @@ class LoadStepper:
         assert self._frontal is not None, "provide first"
         self.eliminations += 1
         self._tangent = None  # its memory is overwritten below
-        problem.stiffness(control, border, self._blocks)
+        problem.stiffness(control, border, self._stiffness, anew=shift > 0)
+        blocks = [kept.blocks for kept in self._stiffness]
         while True:
             try:
-                eliminated = self._frontal.eliminate(self._blocks, shift=shift)
+                eliminated = self._frontal.eliminate(blocks, shift=shift)
                 break
             except NotPositiveDefinite:
                 shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)

@@ -50,6 +50,14 @@ def test_a_mono_specification_refuses_colour_frames_by_name(drawn, tmp_path):
         fit_photometry(mono, [aligned(mono, image)], quiet)
 
 
+def test_gray_frames_stored_as_colour_suit_a_mono_specification(drawn, tmp_path):
+    spec, image = drawn
+    mono = revised(spec, camera={"channels": "mono"})
+    cv2.imwrite(str(tmp_path / "seen.png"), np.repeat(image[..., 1:2], 3, axis=2))
+    ((_, found, _),) = read_frames(tmp_path, mono, 6, quiet)
+    np.testing.assert_array_equal(found, image[..., 1])
+
+
 def test_a_colour_specification_refuses_gray_frames_by_name(drawn):
     spec, image = drawn
     with pytest.raises(FrameError, match=r'seen.png: a gray frame.*channels = "mono"'):

@@ -1,5 +1,6 @@
 """From labels to the experiment that makes such contacts, and from a live camera to a folder of frames."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -42,6 +43,16 @@ def test_labels_of_unknown_contacts_are_refused_before_anything_is_written(tmp_p
     (tmp_path / "mine" / "labels.csv").write_text("image_name,pose_1,pose_4\nf0.png,1,2\nf1.png,2,3\nf2.png,3,1\n")
     with pytest.raises(OptionError, match="no experiment has contacts"):
         whole_sensor(tmp_path / "mine", tmp_path / "mine.toml", labels=tmp_path / "mine" / "labels.csv")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
+
+
+def test_light_is_not_sought_in_thresholded_frames(tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for k in range(2):
+        cv2.imwrite(str(folder / f"f{k}.png"), np.where(np.indices((60, 80)).sum(axis=0) % 9 < 3, 255, 0).astype(np.uint8))
+    with pytest.raises(OptionError, match="thresholded frames.*leave out --optics"):
+        whole_sensor(folder, tmp_path / "mine.toml", optics=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
 
 

@@ -100,6 +100,8 @@ def whole_sensor(
         As ``new_sensor``, ``calibrate_optics`` and ``calibrate_to_file``; or no experiment has labels like the table's.
     """
     at = frames_at(frames, labels or table, no_contact)
+    if optics and open_recording(at, form=form).form == Form.RECORDING:
+        raise OptionError(f"{frames}: thresholded frames tell nothing of light and colours; leave out --optics, or give raw camera frames")
     if labels is not None and experiment is None:
         experiment = experiment_like(open_recording(at, form=form).labels)
     made = new_sensor(frames, out, layout=layout, no_contact=no_contact, table=labels or table, form=form, limit=limit, progress=progress)

@@ -47,9 +47,16 @@ def read_frames(folder: Path, spec: SensorSpec, limit: int, progress: Step) -> l
         message names the first such frame and the reason.
     """
     real = read_real(folder, spec, lens_disc(spec.view, spec.housing), limit=limit, progress=progress)
-    for found in real.frames:
-        require_cameras_own(found.frame.image, found.frame.name, spec.camera)
-    return [(found.frame.name, found.frame.image, found.pins_px) for found in real.frames]
+    read = [(found.frame.name, in_channels(found.frame.image, spec.camera), found.pins_px) for found in real.frames]
+    for name, image, _ in read:
+        require_cameras_own(image, name, spec.camera)
+    return read
+
+
+def in_channels(image: np.ndarray, camera: CameraSpec) -> np.ndarray:
+    """A frame (H, W[, C]) with one channel for a mono camera, if its channels are alike: files often hold gray frames as colour."""
+    alike = image.ndim == 3 and bool((image == image[..., :1]).all())
+    return image[..., 0] if alike and camera.channels == "mono" else image
 
 
 def require_cameras_own(image: np.ndarray, name: str, camera: CameraSpec) -> None:

@@ -62,7 +62,9 @@ def read_real(path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = N
     """
     recording = open_recording(path, spec)
     if recording.form is not Form.RAW:
-        raise FrameError(f"{path}: these are thresholded recordings; realism is judged on raw camera frames, give a folder of those")
+        raise FrameError(
+            f"{path}: these are thresholded recordings; light, colours and pictures show in raw camera frames only, give a folder of those"
+        )
     pipeline, count = Pipeline(spec, Form.RAW), len(recording)
     chosen = np.unique(np.linspace(0, count - 1, min(limit or count, count)).round().astype(int)).tolist()
     frames: list[RealFrame] = []

@@ -15,6 +15,7 @@ from training.studies.objects import Plan, verdicts
 from training.studies.tac_vgnn import page as study_report
 from training.studies.tac_vgnn.contacts import AreaChange
 from training.studies.tac_vgnn.models import plan_run
+from training.targets import PRESETS
 from twin.demo.page import ContactContent
 from twin.demo.page import write_page as write_demo_page
 from twin.demo.stages import DepthRow
@@ -173,7 +174,8 @@ def audit(out: Path) -> Path:
         load_sensor(SENSOR), Form.RECORDING, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(frames, bool)
     )
     raw = rng.uniform(-3, 3, (frames, 4))
-    data = Rows(count=frames, pins=table, targets=SimpleNamespace(raw=raw), problems=[HOSTILE], folder=Path(f"/recordings/{HOSTILE}"))
+    targets = SimpleNamespace(names=PRESETS["surface-2d-shear"], raw=raw)
+    data = Rows(count=frames, pins=table, targets=targets, problems=[HOSTILE], folder=Path(f"/recordings/{HOSTILE}"))
     flags = {name: np.arange(frames) % 7 == k for k, name in enumerate(("no_contact", "wrong_sign", "odd"))}
     found = Audit(
         executed=np.ones(frames),

@@ -10,13 +10,20 @@ from scenes import load_sensor
 from training.audit import audit_labels
 from training.dataset import Dataset
 from training.pins import PinTable
-from training.studies.label_audit import NAMES, LabelAudit, summary_of, write_audit
-from training.targets import Targets
+from training.studies.label_audit import LabelAudit, summary_of, write_audit
+from training.targets import PRESETS, Targets
 from twin.pins import nominal_reference
 from twin.rig.labels import read_executed
 from twin.types import Form
 
 FRAMES = 600
+
+
+def arm(labels):
+    """Pose and move (M, 6) each, from depth, angle and both shears."""
+    pose, move = np.zeros((2, len(labels), 6))
+    pose[:, [1, 5]], move[:, [0, 5]] = labels[:, :2], labels[:, 2:]
+    return pose, move
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +53,7 @@ def planted():
 
 def test_planted_faults_are_found(planted):
     pins, labels, executed, sign, untouched = planted
-    found = audit_labels(pins, *labels.T)
+    found = audit_labels(pins, *arm(labels))
     assert np.flatnonzero(found.no_contact).tolist() == untouched.tolist()
     assert found.twins[411] == 410 and (found.twins == np.arange(FRAMES)).sum() == FRAMES - 1
     clear = (np.abs(labels[:, 2:]).max(axis=1) > 1) & ~found.no_contact & ~sign
@@ -63,7 +70,7 @@ def test_a_clean_recording_has_nothing_to_find(planted):
     rng = np.random.default_rng(2)
     nodes = drawn_pins(labels, reference) + rng.normal(0, 0.05, (FRAMES, 127, 2))
     clean = PinTable(pins.sensor, pins.form, reference, pins.image_name, nodes, pins.area_px2, pins.lost, pins.valid)
-    found = audit_labels(clean, *labels.T)
+    found = audit_labels(clean, *arm(labels))
     clear = np.abs(labels[:, 2:]).max(axis=1) > 1
     assert (found.executed > 0.5)[clear].mean() > 0.98
     assert not found.no_contact.any() and found.wrong_sign.mean() < 0.01 and found.drift["r2_of_row_number_beyond_labels"] < 0.1
@@ -76,7 +83,7 @@ def test_drift_is_seen_beyond_what_the_labels_tell(planted):
     order = np.argsort(time)
     nodes = drawn_pins(labels, pins.reference) + rng.normal(0, 0.05, (FRAMES, 127, 2)) + time[:, None, None] * [2.0, 0.0]
     drifting = PinTable(pins.sensor, pins.form, pins.reference, pins.image_name, nodes, pins.area_px2, pins.lost, pins.valid).rows(order)
-    found = audit_labels(drifting, *labels[order].T)
+    found = audit_labels(drifting, *arm(labels[order]))
     assert found.drift["r2_of_row_number_beyond_labels"] > 0.5
     assert abs(found.drift["px_first_to_last"]["x"] - 2.0) < 0.6
 
@@ -86,10 +93,10 @@ def test_too_few_frames_are_an_answer_and_not_a_clean_bill(planted, frames):
     pins, labels, _, _, _ = planted
     touching = np.setdiff1d(np.arange(FRAMES), [100, 300])
     rows = touching[:frames]
-    found = audit_labels(pins.rows(rows), *labels[rows].T)
+    found = audit_labels(pins.rows(rows), *arm(labels[rows]))
     assert f"{frames} frames in contact are too few to tell which moves were executed" in found.untold and "280 are needed" in found.untold
     assert np.isnan(found.executed).all() and np.isnan(found.chi2).all() and np.isnan(found.depth_per_move)
-    enough = audit_labels(pins.rows(touching[:280]), *labels[touching[:280]].T)
+    enough = audit_labels(pins.rows(touching[:280]), *arm(labels[touching[:280]]))
     assert not enough.untold and np.isfinite(enough.executed).all()
 
 
@@ -98,9 +105,9 @@ def test_of_too_few_frames_no_corrected_labels_are_written(planted, tmp_path):
     for count in (30, 600):
         rows, out = np.arange(count), tmp_path / str(count)
         out.mkdir()
-        targets = Targets(NAMES, labels[rows], labels[rows], executed[rows].astype(float), labels[rows, 2:])
+        targets = Targets(PRESETS["surface-2d-shear"], labels[rows], labels[rows], executed[rows].astype(float), labels[rows, 2:])
         data = Dataset(pins.rows(rows), targets, (tmp_path / "taps",))
-        found = audit_labels(data.pins, *labels[rows].T)
+        found = audit_labels(data.pins, *arm(labels[rows]))
         summary = summary_of(found, data)
         written = write_audit(out, found, data, summary)
         said = " ".join(LabelAudit(found, summary, count, written).lines())
@@ -111,3 +118,31 @@ def test_of_too_few_frames_no_corrected_labels_are_written(planted, tmp_path):
             problems: list[str] = []
             assert len(read_executed(out, data.pins.image_name.tolist(), problems)) == count and not problems
         assert ("too few" in said) == ("too few" in page) == (count == 30)
+
+
+def test_a_recording_of_an_edge_around_the_circle_is_audited_as_a_plate_is():
+    """Pins that follow the edge as the turned tool sees it; a third of the moves were not made, some directions have the other sign."""
+    rng = np.random.default_rng(4)
+    pose, move = np.zeros((2, 900, 6))
+    pose[:, [1, 2]] = rng.uniform([-6, 3], [6, 5], (900, 2))
+    pose[:, 5] = np.linspace(-179, 179, 900)
+    move[:, [0, 1, 5]] = rng.uniform(-5, 5, (900, 3))
+    executed = rng.random(900) < 0.67
+    before = pose - ~executed[:, None] * move
+    turn = np.exp(1j * np.radians(before[:, 5]))
+    dragged = (move[:, 0] + 1j * move[:, 1]) / turn * executed
+    columns = [before[:, 2], before[:, 1], turn.real, turn.imag, before[:, 1] * turn.real, before[:, 1] * turn.imag]
+    columns += [dragged.real, dragged.imag, move[:, 5] * executed]
+    spec = load_sensor("mg400-127")
+    reference = nominal_reference(spec, Form.RECORDING)
+    nodes = reference.pins_px + np.einsum("mc,cnd->mnd", np.array(columns).T, rng.normal(0, 0.4, (9, 127, 2)))
+    nodes += rng.normal(0, 0.05, nodes.shape)
+    pose[[40, 500], 5] *= -1
+    names, shape = np.array([f"f_{k}.png" for k in range(900)]), (900, 127)
+    pins = PinTable(spec, Form.RECORDING, reference, names, nodes, np.ones(shape), np.zeros(shape, bool), np.ones(900, bool))
+    found = audit_labels(pins, pose, move)
+    assert not found.untold and set(np.flatnonzero(found.wrong_sign)) >= {40, 500} and found.wrong_sign.sum() < 5
+    clear = (np.abs(move[:, :2]).max(axis=1) > 1) & ~found.wrong_sign
+    assert ((found.executed > 0.5) == executed)[clear].mean() > 0.98
+    taps = audit_labels(pins.rows(np.flatnonzero(executed)), pose[executed], 0 * move[executed])
+    assert (taps.executed == 1).all()

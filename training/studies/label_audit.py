@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from scenes import SensorSpec
 from training.audit import STORIES, Audit, audit_labels
 from training.dataset import Dataset, load_dataset
-from training.targets import PRESETS, corrected
+from training.targets import CONTACT, UNITS, unit_of
+from twin.errors import FrameError
 from twin.progress import Progress, silent, stage
 from twin.report.charts import muted, new_figure, write_chart
 from twin.report.numbers import number
@@ -21,10 +22,8 @@ from twin.report.table import Column
 from twin.store import made_by, write_json, write_text, writes
 from twin.types import Form
 
-# Preset of the labels that an audit needs.
-TARGET = "surface-2d-shear"
-# Columns of depth (mm), angle (deg), shear (mm) and shear (deg).
-NAMES = PRESETS[TARGET]
+# Columns of a table that an audit reads.
+NAMES = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, len(UNITS) + 1))
 # Findings that are lists of frames.
 LISTS = ("no_contact", "wrong_sign", "fit_no_story", "same_pins_as_an_earlier_frame")
 # Number of frames of each list that are named on the terminal.
@@ -76,20 +75,41 @@ class LabelAudit:
 
 @writes("labels_corrected.csv", "audit.json", "audit.png", "audit-dark.png", "audit.html")
 def audit_recording(data: Path, sensor: SensorSpec, out: Path, *, form: Form | None = None, progress: Progress = silent) -> LabelAudit:
-    """Audit the labels of a flat-surface recording, and write the result to a folder.
+    """Audit the labels of a recording of one object, and write the result to a folder.
 
     A recording of too few frames is not judged: the result says so (``Audit.untold``), and no corrected labels are written.
 
     Raises
     ------
     FrameError
-        The recording lacks one of the labels pose_2, pose_6, move_1 and move_6.
+        No label pose_1..6 of the recording varies.
     """
     with stage(progress, "frames") as step:
-        found = load_dataset(data, sensor, TARGET, form=form, progress=step)
-    made = audit_labels(found.pins, *found.targets.raw.T)
+        found = load_dataset(data, sensor, CONTACT, form=form, progress=step)
+    if not any(name.startswith("pose_") for name in found.targets.names):
+        raise FrameError(f"{data}: none of pose_1..6 varies ({', '.join(found.targets.names)} do), so there is nothing to audit")
+    made = audit_labels(found.pins, *_pose_and_move(found))
     summary = summary_of(made, found)
     return LabelAudit(made, summary, len(found), write_audit(out, made, found, summary))
+
+
+def _pose_and_move(data: Dataset) -> np.ndarray:
+    """(2, M, 6) ``pose_1..6`` and ``move_1..6``; 0 where the data set has none."""
+    columns = dict(zip(data.targets.names, data.targets.raw.T, strict=True))
+    none = np.zeros(len(data))
+    return np.array([columns.get(name, none) for name in NAMES]).reshape(2, len(UNITS), len(data)).swapaxes(1, 2)
+
+
+def _corrected(data: Dataset, executed: np.ndarray, depth_per_move: float) -> dict[str, np.ndarray]:
+    """The labels that vary, without moves that were not executed (M,), by their names."""
+    pose, move = _pose_and_move(data)
+    undone = (1 - executed)[:, None]
+    before = pose - undone * move
+    depth = max((k for k in range(3) if f"pose_{k + 1}" in data.targets.names), default=None)
+    if depth is not None:
+        before[:, depth] += depth_per_move * undone[:, 0] * move[:, 0]
+    every = dict(zip(NAMES, np.hstack([before, (1 - undone) * move]).T, strict=True))
+    return {name: every[name] for name in data.targets.names if name in every}
 
 
 def summary_of(audit: Audit, data: Dataset) -> dict:
@@ -110,7 +130,7 @@ def summary_of(audit: Audit, data: Dataset) -> dict:
 
 
 def _moves(audit: Audit, data: Dataset) -> dict:
-    large = np.abs(data.targets.raw[:, 2:]).max(axis=1) > LARGE_MOVE
+    large = np.abs(_pose_and_move(data)[1]).max(axis=1) > LARGE_MOVE
     undone = audit.executed < 0.5
     second = np.sort(audit.chi2[:, :2], axis=1)
     return {
@@ -155,7 +175,7 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
 
 def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[Path]:
     """Write the corrected labels and the picture, and show the picture on the page."""
-    labels = corrected(NAMES, data.targets.raw, audit.executed.round(), data.targets.raw[:, 2:], audit.depth_per_move)
+    labels = _corrected(data, audit.executed.round(), audit.depth_per_move)
     chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
     page.figures(
         Picture(chart, "Evidence for the findings: which story fits each frame, corrections of the angle, moves along the table, drift")
@@ -188,32 +208,33 @@ def _some(names: list[str]) -> str:
     return f"{', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''}" or "none"
 
 
-def _labels_csv(audit: Audit, data: Dataset, labels: np.ndarray) -> str:
+def _labels_csv(audit: Audit, data: Dataset, labels: dict[str, np.ndarray]) -> str:
     text = io.StringIO(newline="")
     writer = csv.writer(text)
-    writer.writerow(["image_name", "executed", *NAMES, *(f"chi2_{story.replace(' ', '_')}" for story in STORIES), "findings"])
+    writer.writerow(["image_name", "executed", *labels, *(f"chi2_{story.replace(' ', '_')}" for story in STORIES), "findings"])
     for k, name in enumerate(data.pins.image_name):
         flags = {"no contact": audit.no_contact, "wrong sign": audit.wrong_sign, "fits no story": audit.odd}
         said = [flag for flag, rows in flags.items() if rows[k]]
         if audit.twins[k] != k:
             said.append(f"same pins as {data.pins.image_name[audit.twins[k]]}")
-        numbers = [f"{v:.6g}" for v in (*labels[k], *audit.chi2[k])]
+        numbers = [f"{v:.6g}" for v in (*(column[k] for column in labels.values()), *audit.chi2[k])]
         writer.writerow([name, f"{audit.executed[k]:.4g}", *numbers, "; ".join(said)])
     return text.getvalue()
 
 
-def _evidence_figure(audit: Audit, data: Dataset, labels: np.ndarray) -> Figure:
-    raw = data.targets.raw
+def _evidence_figure(audit: Audit, data: Dataset, labels: dict[str, np.ndarray]) -> Figure:
+    raw = dict(zip(data.targets.names, data.targets.raw.T, strict=True))
+    shown = [name for name in labels if name.startswith("pose_")][-1]
     figure, axes = new_figure(2, 2, panel_inch=4.4)
     difference = audit.chi2[:, 1] - audit.chi2[:, 0]
-    size = np.hypot(raw[:, 2], raw[:, 3])
+    size = np.linalg.norm(_pose_and_move(data)[1], axis=1)
     axes[0].plot(size, np.sign(difference) * np.log10(1 + np.abs(difference)), ".", markersize=2)
     axes[0].axhline(0, color=muted(), linewidth=0.8)
     axes[0].set(title="which story fits better", xlabel="size of the move, mm and deg", ylabel="log10 chi² for (+) executed")
-    axes[1].plot(raw[:, 1], raw[:, 1] - labels[:, 1], ".", markersize=2)
-    axes[1].set(title="angle label less what the pins say", xlabel="pose_6, deg", ylabel="deg")
+    axes[1].plot(raw[shown], raw[shown] - labels[shown], ".", markersize=2)
+    axes[1].set(title=f"{shown} less what the pins say", xlabel=f"{shown}, {unit_of(shown)}", ylabel=unit_of(shown))
     undone = audit.executed < 0.5
-    width = max(len(raw) // 40, 1)
+    width = max(len(data) // 40, 1)
     share = np.convolve(undone, np.ones(width) / width, mode="valid")
     axes[2].plot(np.arange(len(share)) + width / 2, share)
     axes[2].set(title="moves not executed, along the table", xlabel="row", ylabel="share", ylim=(0, 1))

@@ -464,13 +464,13 @@ def robustness(
 
 HELP_AUDIT = """Find what is wrong with the labels of a recording.
 
-It needs a recording of a flat surface with the labels pose_2, pose_6, move_1 and move_6, and uses its pins and targets.csv alone. It
-looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames that fit no label,
-frames that occur twice, drift along the table, and faults of the files.
+It needs a recording of one object (a plate, an edge) with labels pose_1..6 and move_1..6, of which some vary, and uses its pins and
+targets.csv alone. It looks for moves that were not executed when the frame was taken, sign errors, frames without contact, frames
+that fit no label, frames that occur twice, drift along the table, and faults of the files.
 
 \b
 Writes:
-  labels_corrected.csv  image_name, executed, the four corrected labels, the
+  labels_corrected.csv  image_name, executed, the corrected labels, the
                         misfit to each explanation, findings
   audit.json, audit.png, audit.html
 

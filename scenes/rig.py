@@ -1,6 +1,8 @@
 """How a robot holds a sensor, and where its object is. This decides which contact a label in robot coordinates means."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
+
+from pydantic import model_validator
 
 from scenes.base import NonNegative, NotTruth, Section
 
@@ -30,6 +32,30 @@ class ForceSensorSpec(Section):
     offset_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+class PlacedSpec(Section):
+    """Where one object stood, and what else differs before it; keys that are not given are those of the rig.
+
+    Attributes
+    ----------
+    object : str
+        Name of the object.
+    contact_offset_mm, plate_tilt_deg, object_turn_deg, friction : float, optional
+        As in ``RigSpec``.
+    object_shift_mm : two numbers, optional
+        As in ``RigSpec``.
+    turn_offset_deg : three numbers, optional
+        As in ``RigSpec``.
+    """
+
+    object: str
+    contact_offset_mm: float | None = None
+    plate_tilt_deg: float | None = None
+    object_shift_mm: tuple[float, float] | None = None
+    object_turn_deg: float | None = None
+    turn_offset_deg: tuple[float, float, float] | None = None
+    friction: NonNegative | None = None
+
+
 class RigSpec(Section):
     """One sensor on one robot before one plate; calibrated from labelled frames (``twin calibrate contact``).
 
@@ -56,6 +82,10 @@ class RigSpec(Section):
     plate_tilt_deg : float
         Rise of the object's surface towards the sensor's far side, along the direction across. The twin's contacts, and therefore the
         labels of simulated contacts, are computed with it.
+    object_shift_mm : two numbers
+        Place of the object's origin in the robot's coordinates along the direction across, and along approach x across.
+    object_turn_deg : float
+        Turn of the object about the approach, right-handed: 90 lays what lies along approach x across along the direction across.
     label_depth_per_move : float or None
         Change of a contact's depth in mm for each mm of a move across that the label has but the arm had not made yet, as
         ``twin audit`` finds it in the recording. Labels of recordings are corrected with it. None: the tangent of ``plate_tilt_deg``.
@@ -80,6 +110,8 @@ class RigSpec(Section):
         sign is that of the label in the plane of approach and across.
     force_sensor : ForceSensorSpec, optional
         Where the recordings' tables hold measured forces: how they are read.
+    placed : list of PlacedSpec
+        Objects that stood elsewhere than the plate; ``before`` gives the rig before one of them.
     """
 
     contact_offset_mm: float = 0.0
@@ -89,9 +121,25 @@ class RigSpec(Section):
     turn_offset_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_sign: Annotated[Literal[1, -1], NotTruth] = 1
     plate_tilt_deg: float = 0.0
+    object_shift_mm: tuple[float, float] = (0.0, 0.0)
+    object_turn_deg: float = 0.0
     label_depth_per_move: float | None = None
     image_turn_deg: float = 0.0
     friction: NonNegative = 0.5
     compliance_mm_per_n: NonNegative = 0.0
     turn_compliance_deg_per_n: float = 0.0
     force_sensor: ForceSensorSpec | None = None
+    placed: tuple[PlacedSpec, ...] = ()
+
+    def before(self, name: str) -> "RigSpec":
+        """The rig before the object of this name, without ``placed``."""
+        own = next((each for each in self.placed if each.object == name), None)
+        known = {} if own is None else own.model_dump(exclude_none=True, exclude={"object"})
+        return self.model_copy(update=known | {"placed": ()})
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names = [each.object for each in self.placed]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"placed: '{twice}' is given twice; give every object once")
+        return self

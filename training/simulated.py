@@ -127,9 +127,10 @@ def touched_labels(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         if int(path_id) not in draws:
             raise FrameError(f"{folder / DRAWS}: has no row of contact {path_id}; {AGAIN}")
         sensor = _rigged(config.sensor, draws[int(path_id)])
-        sent = np.stack([object_pose(rig_of(sensor), config.experiment, each, sensor.skin.apex_mm) for each in pose[mine]])
+        rig = rig_of(sensor, config.object.name)
+        sent = np.stack([object_pose(rig, config.experiment, each, sensor.skin.apex_mm) for each in pose[mine]])
         sent[:, 2, 3] += config.object.compliance_mm_per_n * force_n[mine, 2]
-        for label, values in surface_labels(config.experiment, Mounting.of(sensor, config.experiment), surface, sent).items():
+        for label, values in surface_labels(config.experiment, Mounting.on(rig, config.experiment, sensor.skin), surface, sent).items():
             found.setdefault(label, np.full(len(rows), np.nan))[mine] = values
     return found
 

@@ -152,3 +152,17 @@ def test_forces_are_read_along_the_approach_as_the_rigs_sensor_reads_them(tmp_pa
     reads = ForceSensorSpec(gain=(1.0, 2.0, 1.0), offset_n=(0.0, 1.0, 0.0))
     sensor = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update={"force_sensor": reads})})
     np.testing.assert_array_equal(pressed_n(recording, sensor, config.experiment), [1.0, 3.0, -1.0])  # the approach is y
+
+
+@pytest.mark.slow
+def test_pins_at_rest_that_no_frame_shows_are_fitted_with_the_contact(calibrated):
+    """Every pin of the unit stands a little beside where the specification has it."""
+    setup, measured, _, _, held = calibrated
+    off_px = np.random.default_rng(3).normal(scale=1.0, size=measured.no_contact_px.shape)
+    seen = replace(measured, pins_px=measured.pins_px + off_px, at_rest_seen=False)
+    fit = fit_contact(setup, seen)
+    away_px = np.linalg.norm(fit.rest_px - measured.no_contact_px - off_px, axis=1)
+    assert np.median(away_px) < 0.1 * np.median(np.linalg.norm(off_px, axis=1))
+    assert np.allclose(fit.sensor.pipeline.recording.rest_px, fit.rest_px, atol=1e-3)
+    before, after = held_out_px(setup, fit, replace(held, pins_px=held.pins_px + off_px, at_rest_seen=False))
+    assert after < 0.25 * before

@@ -5,6 +5,7 @@ import pytest
 
 from scenes import RigSpec, load_experiment, load_object, load_sensor
 from scenes.body import SkinSpec
+from scenes.rig import PlacedSpec
 from twin.errors import ContactError
 from twin.objects import build_field
 from twin.objects.analytic import Plane
@@ -171,3 +172,22 @@ def test_a_tap_of_the_tool_goes_along_the_sensor_s_own_axis_and_ends_where_anoth
     way, normal = own[1, :3, 3] - own[0, :3, 3], straight[1, :3, 3] - straight[0, :3, 3]
     assert way / np.linalg.norm(way) == pytest.approx([0, 0, -1], abs=1e-9)
     assert normal / np.linalg.norm(normal) == pytest.approx(-straight[0, :3, 2], abs=1e-9)
+
+
+def test_an_object_is_turned_about_the_approach_and_shifted_in_the_robots_axes():
+    """An edge along robot x that begins at y = 1: from y < 1 the arm taps beside it, from y > 1 on it, wherever the tool is turned to."""
+    plan = load_experiment("edge-circle")
+    placed = PlacedSpec(object="edge", contact_offset_mm=0.5, object_shift_mm=(0.0, 1.0), object_turn_deg=90.0)
+    rig = RigSpec(tcp_to_dome_mm=-RADIUS_MM, placed=(placed,))
+    before, field = rig.before("edge"), build_field(load_object("edge"))
+    assert before.placed == () and before.contact_offset_mm == 0.5 and rig.before("plane") == rig.model_copy(update={"placed": ()})
+    for turn in (0.0, 77.0, -150.0):
+        for y, beside in ((-14.0, True), (9.0, False)):
+            T = object_pose(before, plan, np.array([3.0, y, 2.0, 0, 0, turn]), RADIUS_MM)
+            indent_mm = RADIUS_MM - field.distance(np.linalg.inv(T)[None, :3, 3])[0]
+            assert (indent_mm < 0) if beside else (indent_mm == pytest.approx(2.5, abs=1e-6)), (turn, y, indent_mm)
+
+
+def test_an_object_that_is_placed_twice_is_refused():
+    with pytest.raises(ValueError, match="'edge' is given twice"):
+        RigSpec(tcp_to_dome_mm=0.0, placed=(PlacedSpec(object="edge"), PlacedSpec(object="edge")))

@@ -141,7 +141,7 @@ def config_for(
         object=thing,
         experiment=experiment,
         randomisation=randomisation,
-        friction=friction_between(sensor.rig, thing).static,
+        friction=friction_between(sensor.rig and sensor.rig.before(thing.name), thing).static,
         seed=experiment.seed if seed is None else seed,
         images=images,
         states=states,

@@ -112,10 +112,10 @@ class RigContact:
 
     def __init__(self, solver: SkinSolver, experiment: ExperimentSpec, touched: ObjectSpec, *, rig: RigSpec | None = None) -> None:
         self.solver, self.experiment = solver, experiment
-        self.rig = rig or rig_of(solver.spec)
+        self.rig = rig or rig_of(solver.spec, touched.name)
         self.field = build_field(touched)
         mounting = Mounting.on(self.rig, experiment, solver.spec.skin)
-        self.law = contact_law(rig or solver.spec.rig, mounting, touched)
+        self.law = contact_law(self.rig if rig or solver.spec.rig else None, mounting, touched)
 
     def way(self, label: ArmLabel) -> ArmPath:
         """The object's way as commanded (see ``arm_path``, also for errors)."""

@@ -6,8 +6,9 @@ where the approach is x. It appears in the image at the azimuth ``image_turn``. 
 
     origin of the sensor = p + R (tcp_to_dome a0 + tcp_lateral b0 + tcp_aside c0)
 
-The object's frame has z along the approach and leans by ``plate_tilt``. The object stands where an unturned sensor at the robot's
-origin indents it by ``zero + contact_offset``. An arm taps along a0, then makes the move in one straight line.
+The object's frame has z along the approach, is turned about it by ``object_turn``, and leans by ``plate_tilt``. The object stands where
+an unturned sensor at the robot's origin indents it by ``zero + contact_offset``, shifted by ``object_shift`` along b0 and c0.
+An arm taps along a0, then makes the move in one straight line.
 
 These are poses as commanded. What a force does to them is in ``twin.rig.contact``.
 """
@@ -67,21 +68,26 @@ class ArmPath:
         return ArmLabel(pose, move)
 
 
-def rig_of(sensor: SensorSpec) -> RigSpec:
-    """The sensor's rig. A sensor without one gets the plainest: the tool point is the tip, and nothing gives way."""
-    return sensor.rig or RigSpec(tcp_to_dome_mm=-sensor.skin.apex_mm)
+def rig_of(sensor: SensorSpec, before: str | None = None) -> RigSpec:
+    """The sensor's rig, as it is before an object of this name (``RigSpec.before``).
+
+    A sensor without a rig gets the plainest: the tool point is the tip, and nothing gives way.
+    """
+    rig = sensor.rig or RigSpec(tcp_to_dome_mm=-sensor.skin.apex_mm)
+    return rig if before is None else rig.before(before)
 
 
 def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex_mm: float) -> np.ndarray:
     """``T_sensor_object`` (4, 4) with the arm at a pose (6,), mm and deg; ``apex_mm`` is that of the skin."""
     unturned = _UNTURNED[experiment.approach]
-    approach = unturned[:, 2]
     turn = tool_turn(rig, pose)
     centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_aside_mm, rig.tcp_to_dome_mm]
-    surface = (apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm) * approach
+    height_mm = apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm
+    surface = unturned @ [*rig.object_shift_mm, height_mm]
     sensor = turn @ unturned
     T = np.eye(4)
-    T[:3, :3] = sensor.T @ unturned @ Rotation.from_euler("y", -rig.plate_tilt_deg, degrees=True).as_matrix()
+    stands = Rotation.from_euler("y", -rig.plate_tilt_deg, degrees=True) * Rotation.from_euler("z", rig.object_turn_deg, degrees=True)
+    T[:3, :3] = sensor.T @ unturned @ stands.as_matrix()
     T[:3, 3] = sensor.T @ (surface - centre)
     in_image = np.eye(4)
     in_image[:3, :3] = Rotation.from_euler("z", rig.image_turn_deg, degrees=True).as_matrix()

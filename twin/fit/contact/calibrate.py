@@ -64,6 +64,7 @@ def calibrate_contact(
     measured = measure_frames(frames, spec, count + min(count, MOST_HELD_OUT), seed, form=form)
     order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
     fitted, held = _part(measured, np.sort(order[:count])), _part(measured, np.sort(order[count:]))
+    spec = spec.model_copy(update={"rig": rig_of(spec, touched.name)})
     setup = Setup(spec, experiment, touched, measured.form, across, folder / "contacts", workers, parameters)
     fit = fit_contact(setup, fitted, progress=progress)
     error = held_out_px(setup, fit, held, progress=progress) if len(held) else None
@@ -71,6 +72,7 @@ def calibrate_contact(
     summary = summary_of(setup, fitted, fit, error, len(held)) | {"newtons": asdict(newtons)}
     pairs = ((fit.start, rig_of(spec).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign))
     moved = np.stack([simulate(setup, fitted, [values], sign)[0] for values, sign in pairs]).swapaxes(1, 2)
+    fitted = replace(fitted, no_contact_px=fit.rest_px)
     return newtons.of(fit.sensor), summary, write_calibration(folder, fitted, moved, fit, summary)
 
 

@@ -9,6 +9,9 @@ of executed moves, and theta the parameters with their prior:
 n is the number of independent observations in a frame. It is smaller than the number of pins, because the model's errors are common to all
 pins. c_k is smaller for frames that neither story (move executed, or not) fits. The M-step is one Gauss-Newton step with difference
 quotients. The uncertainty is the inverse of its matrix at the end.
+
+Where no frame shows the pins at rest, their places are fitted, too: for every theta they are the mean over the frames of what the simulated
+displacements miss, so errors and slopes are counted from their means over the frames.
 """
 
 from dataclasses import dataclass
@@ -20,9 +23,11 @@ from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.fit.contact.parameters import changed, values_of
 from twin.fit.contact.simulate import Setup
+from twin.frames.forms import blob_spec
 from twin.judge.labelled.model import MeasuredFrames
 from twin.progress import Step
 from twin.rig.kinematics import rig_of
+from twin.types import Form
 
 INDEPENDENT = 6.0
 """n above: the number of modes that contain nearly all of the displacement."""
@@ -66,6 +71,8 @@ class ContactFit:
         Mean pin error of each frame for the story that fits it better.
     share : float
         Share of the moves that were executed.
+    rest_px : (N, 2) float
+        Pins at rest, from which displacements are counted. If no frame shows them, they are fitted, and ``sensor`` has them.
     """
 
     sensor: SensorSpec
@@ -79,6 +86,7 @@ class ContactFit:
     before_px: np.ndarray
     after_px: np.ndarray
     share: float
+    rest_px: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -112,13 +120,17 @@ def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Step | None
     prior = np.array([p.prior for p in setup.parameters])
     value, moved, weights = _searched(setup, measured, target, start, sign, progress)
     slopes = _slopes(setup, measured, value, sign, moved, progress)
-    matrix, _ = _normal(slopes, target[:, None] - moved, weights)
+    seen_at_rest = measured.at_rest_seen
+    shift = np.zeros_like(measured.no_contact_px) if seen_at_rest else _mean(target[:, None] - moved, weights)
+    matrix, _ = _normal(slopes, target[:, None] - moved, weights, seen_at_rest)
     covariance = np.linalg.inv(matrix + np.diag(prior**-2))
     sd = np.sqrt(np.diag(covariance))
     shipped = values_of(setup.sensor, setup.experiment, setup.parameters)
     first = simulate(setup, measured, [shipped], rig_of(setup.sensor).turn_sign, progress)[0]
+    sensor = changed(setup.sensor, setup.experiment, value, sign, setup.parameters)
+    rest_px = measured.no_contact_px + shift
     return ContactFit(
-        sensor=changed(setup.sensor, setup.experiment, value, sign, setup.parameters),
+        sensor=sensor if seen_at_rest else at_rest(sensor, measured.form, rest_px),
         start=shipped,
         value=value,
         sd=sd,
@@ -127,8 +139,9 @@ def fit_contact(setup: Setup, measured: MeasuredFrames, *, progress: Step | None
         executed=weights.executed,
         trust=weights.trust,
         before_px=likelier_px(first, target),
-        after_px=likelier_px(moved, target),
+        after_px=likelier_px(moved, target - shift),
         share=weights.share,
+        rest_px=rest_px,
     )
 
 
@@ -138,25 +151,31 @@ def _searched(
     """The values (P,) with the least cost, their displacements (M, 2, N, 2) px, and the weights of the E-step for them."""
     prior = np.array([p.prior for p in setup.parameters])
     value = start.copy()
+    seen_at_rest = measured.at_rest_seen
     moved = simulate(setup, measured, [value], sign, progress)[0]
-    weights = expect(mean_squared(moved, target))
+    weights = expect(mean_squared(moved, target if seen_at_rest else target - np.nanmedian(target - moved[:, 1], axis=0)))
+
+    def squared_of(displacements: np.ndarray) -> np.ndarray:
+        shift = 0.0 if seen_at_rest else _mean(target[:, None] - displacements, weights)
+        return mean_squared(displacements, target - shift)
+
     for _ in range(ROUNDS):
         slopes = _slopes(setup, measured, value, sign, moved, progress)
-        matrix, force = _normal(slopes, target[:, None] - moved, weights)
+        matrix, force = _normal(slopes, target[:, None] - moved, weights, seen_at_rest)
         step = np.linalg.solve(matrix + np.diag(prior**-2), force + (start - value) / prior**2)
-        squared = mean_squared(moved, target)
+        squared = squared_of(moved)
         now, solved = weights.cost(squared) + np.sum(((value - start) / prior) ** 2), np.isfinite(squared).sum()
         length = 1.0
         while length >= SHORTEST:
             tried = value + length * step
             there = simulate(setup, measured, [tried], sign, progress)[0]
-            squared = mean_squared(there, target)
+            squared = squared_of(there)
             cost = weights.cost(squared) + np.sum(((tried - start) / prior) ** 2)
             if cost < now and np.isfinite(squared).sum() >= solved:
                 value, moved = tried, there
                 break
             length /= 2
-        weights = expect(mean_squared(moved, target))
+        weights = expect(squared_of(moved))
         if length < SHORTEST:
             break
     return value, moved, weights
@@ -166,8 +185,10 @@ def held_out_px(setup: Setup, fit: ContactFit, measured: MeasuredFrames, *, prog
     """Mean pin error, before and after, on frames that were not fitted. Each frame's error is that of the story that fits it better."""
     target = measured.pins_px - measured.no_contact_px
     errors = []
-    for values, sign in ((fit.start, rig_of(setup.sensor).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign)):
-        errors.append(float(np.nanmean(likelier_px(simulate(setup, measured, [values], sign, progress)[0], target))))
+    ends = ((fit.start, rig_of(setup.sensor).turn_sign, measured.no_contact_px), (fit.value, rig_of(fit.sensor).turn_sign, fit.rest_px))
+    for values, sign, rest_px in ends:
+        moved = simulate(setup, measured, [values], sign, progress)[0]
+        errors.append(float(np.nanmean(likelier_px(moved, target - (rest_px - measured.no_contact_px)))))
     return errors[0], errors[1]
 
 
@@ -235,10 +256,31 @@ def mean_squared(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.where(seen, each, 0.0).sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
 
 
-def _normal(slopes: np.ndarray, missing: np.ndarray, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+def at_rest(sensor: SensorSpec, form: Form, pins_px: np.ndarray) -> SensorSpec:
+    """The sensor with these places (N, 2) of its pins at rest in frames of a form."""
+    blob = blob_spec(sensor.pipeline, form).model_copy(update={"rest_px": tuple(map(tuple, pins_px.round(3).tolist()))})
+    return sensor.model_copy(update={"pipeline": sensor.pipeline.model_copy(update={str(form): blob})})
+
+
+def _shares(weights: Weights) -> np.ndarray:
+    """(M, 2) weight of each frame's two stories."""
+    return np.stack([1 - weights.executed, weights.executed], axis=1) * weights.trust[:, None]
+
+
+def _mean(missing: np.ndarray, weights: Weights) -> np.ndarray:
+    """(..., N, 2) mean over frames and stories of (..., M, 2, N, 2); NaN values are left out."""
+    share = _shares(weights)[..., None, None] * np.isfinite(missing)
+    mean: np.ndarray = (share * np.nan_to_num(missing)).sum(axis=(-4, -3)) / np.maximum(share.sum(axis=(-4, -3)), 1e-12)
+    return mean
+
+
+def _normal(slopes: np.ndarray, missing: np.ndarray, weights: Weights, seen_at_rest: bool) -> tuple[np.ndarray, np.ndarray]:
     """Matrix (P, P) and right-hand side (P,) of the Gauss-Newton step. Lost pins are left out."""
     seen = np.isfinite(missing)
-    share = np.stack([1 - weights.executed, weights.executed], axis=1) * weights.trust[:, None]
+    share = _shares(weights)
+    if not seen_at_rest:
+        missing = missing - _mean(missing, weights)
+        slopes = slopes - _mean(np.where(seen, slopes, np.nan), weights)[:, None, None]
     pins = np.maximum(seen[..., 0].sum(axis=-1), 1)
     each = (INDEPENDENT / weights.variance_px2 * share / pins)[..., None, None] * seen
     weighted = slopes * each

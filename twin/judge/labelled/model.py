@@ -19,7 +19,7 @@ from twin.frames.forms import from_raw
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline
-from twin.pins.batch import recording_reference
+from twin.pins.batch import UNMEASURED, recording_reference
 from twin.progress import Step
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
@@ -43,6 +43,8 @@ class MeasuredFrames:
     no_contact_px : (N, 2) float
     problems : list of str
         Irregularities and what was left out, one line each.
+    at_rest_seen : bool
+        Whether the pins at rest were seen in a frame, or measured before on this unit; otherwise they are those of the specification.
     """
 
     form: Form
@@ -51,6 +53,7 @@ class MeasuredFrames:
     pins_px: np.ndarray
     no_contact_px: np.ndarray
     problems: list[str]
+    at_rest_seen: bool = True
 
     def __len__(self) -> int:
         return len(self.names)
@@ -68,7 +71,7 @@ def measure_frames(
     """
     recording = open_recording(folder, spec, form)
     labels, problems = read_arm_labels(recording), list(recording.problems)
-    reference, _ = recording_reference(spec, recording, problems)
+    reference, named = recording_reference(spec, recording, problems)
     pipeline = Pipeline(spec, recording.form, reference)
     chosen = np.random.default_rng(seed).permutation(len(recording))[:count]
     kept, pins = [], []
@@ -87,8 +90,8 @@ def measure_frames(
             progress(done + 1, len(chosen))
     if not kept:
         raise FrameError(f"{folder}: no frame with pins among {len(chosen)}; {problems[-1] if problems else 'is it the right --sensor?'}")
-    names = [recording.names[row] for row in kept]
-    return MeasuredFrames(recording.form, names, [labels[row] for row in kept], np.stack(pins), reference.pins_px, problems)
+    names, told = [recording.names[row] for row in kept], [labels[row] for row in kept]
+    return MeasuredFrames(recording.form, names, told, np.stack(pins), reference.pins_px, problems, named != UNMEASURED)
 
 
 class ContactModel:
@@ -104,7 +107,7 @@ class ContactModel:
 
     def __init__(self, spec: SensorSpec, experiment: ExperimentSpec, touched: ObjectSpec, form: Form, *, across: int = FINE) -> None:
         self.spec, self.experiment, self.form = spec, experiment, form
-        self.rig = rig_of(spec)
+        self.rig = rig_of(spec, touched.name)
         self.solver = SkinSolver(spec, resolution=Resolution(across))
         self.contact = RigContact(self.solver, experiment, touched)
         self.rest_px = self._pixels(self.solver.rest().caps_mm)

@@ -11,7 +11,6 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +53,13 @@ FRAME_TIMEOUT_S = 5.0
 MOST_CONTACTS = 1_000_000
 # Files of a collection, as in the published recordings: labels, description, times, and the frame without contact.
 TABLE, META, LOG, REST = "targets.csv", "meta.json", "contacts.jsonl", "init_0.png"
-# How contacts are spread over an experiment's ranges: each at random, or so that the first ones fill the ranges evenly.
-DESIGNS = ("random", "even")
+# How contacts are spread over an experiment's ranges: each at random; so that the first ones fill the ranges evenly; or evenly at first,
+# and then where the contacts so far leave a model least sure.
+DESIGNS = ("random", "even", "unsure")
+# Contacts of the design "unsure" that fill the ranges evenly, for each label that varies.
+EVEN_AT_FIRST = 2
+# What chooses such a contact: from the collection's folder, the experiment, a seed and the contact's number to its pose and move (12,).
+Chooser = Callable[[Path, ExperimentSpec, int, int], np.ndarray]
 COLUMNS = ("image_name", "data_name", "obj_id", "pose_id", *LABELS)
 
 
@@ -178,7 +182,8 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     """Pose and move of contact ``index`` within the experiment's ranges. It depends on these arguments alone.
 
     With the design "even" the first contacts fill the ranges evenly, however many are made: they are a scrambled sequence of Sobol (1967;
-    scrambled by Owen 1998). In recordings of a plate a model from 10 such contacts errs in depth as one from nearly 20 random ones.
+    scrambled by Owen 1998). In recordings of a plate a model from 10 such contacts errs in depth as one from nearly 20 random ones. The
+    design "unsure" begins like this.
     """
     low, high = np.array(list(experiment.ranges().values())).T
     if design == "random":
@@ -190,6 +195,24 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     numbers = low.copy()
     numbers[varied] += shares * (high - low)[varied]
     return Contact(numbers[:6], numbers[6:])
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """Which contact is made next in a collection."""
+
+    experiment: ExperimentSpec
+    seed: int
+    design: str
+    folder: Path
+    chooser: Chooser | None
+
+    def __call__(self, index: int) -> Contact:
+        varied = sum(high > low for low, high in self.experiment.ranges().values())
+        if self.chooser is None or self.design != "unsure" or index < EVEN_AT_FIRST * varied:
+            return draw_contact(self.experiment, self.seed, index, self.design)
+        numbers = self.chooser(self.folder, self.experiment, self.seed, index)
+        return Contact(numbers[:6], numbers[6:])
 
 
 class WorkFrame:
@@ -235,6 +258,7 @@ def collect(
     *,
     seed: int,
     design: str = "random",
+    chooser: Chooser | None = None,
     speed: tuple[float, float],
     guards: tuple[Guard, ...] = (),
     frame_timeout_s: float = FRAME_TIMEOUT_S,
@@ -251,8 +275,10 @@ def collect(
         Contacts in the collection at the end.
     seed : int
         Seed of the drawn contacts.
-    design : {"random", "even"}
+    design : {"random", "even", "unsure"}
         See ``draw_contact``.
+    chooser : callable, optional
+        Chooses the contacts of the design "unsure" after the first ones.
     speed : (float, float)
         Speed of the arm in mm/s and deg/s.
     guards : tuple of Guard
@@ -282,7 +308,7 @@ def collect(
         raise DeviceError(f"{source.name}: a recording shows nothing of this arm; give a live --camera")
     rig = _Stops(source, arm, placed, WorkFrame(experiment, placed), speed, guards, frame_timeout_s, ArmWatch(arm))
     with output(collection.folder), rig.watch.watched():
-        ask = partial(draw_contact, experiment, seed, design=design)
+        ask = _Asked(experiment, seed, design, collection.folder, chooser)
         failed = _collect_all(rig, experiment, collection, ask=ask, count=count, progress=progress, on_rest=on_rest, speed=speed)
     if failed:
         raise DeviceError("; ".join(failed))
@@ -430,8 +456,10 @@ class CollectPlan:
         Contacts in the folder at the end.
     seed : int or None
         Seed of the drawn contacts. None: the experiment's own seed.
-    design : {"random", "even"}
+    design : {"random", "even", "unsure"}
         How the contacts are spread over the experiment's ranges.
+    chooser : callable or None
+        Chooses the contacts of the design "unsure" after the first ones: ``training.design.LeastSure(sensor)``.
     form : Form or None
         Form of the frames. None: the form of the sensor's recordings if it has one.
     limits : str or None
@@ -451,6 +479,7 @@ class CollectPlan:
     count: int
     seed: int | None = None
     design: str = "random"
+    chooser: Chooser | None = None
     form: Form | None = None
     limits: str | None = None
     plain_light: bool = False
@@ -461,6 +490,8 @@ class CollectPlan:
             raise DeviceError(f"--count {self.count}: a collection has 1 to {MOST_CONTACTS} contacts")
         if self.design not in DESIGNS:
             raise DeviceError(f"--design {self.design}: must be {' or '.join(DESIGNS)}")
+        if self.design == "unsure" and self.chooser is None:
+            raise DeviceError('the design "unsure" needs a chooser, as training.design.LeastSure(sensor) is one')
 
     @property
     def drawn_with(self) -> int:
@@ -543,6 +574,7 @@ def _collect_on_rig(
             plan.count,
             seed=plan.drawn_with,
             design=plan.design,
+            chooser=plan.chooser,
             speed=(plan.servo.linear_mm_s, plan.servo.angular_deg_s),
             frame_timeout_s=rig.frame_timeout_s,
             on_rest=require_rest,

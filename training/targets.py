@@ -155,7 +155,13 @@ def choose_targets(
     if known:
         executed = np.array([known.get(recording.names[row], np.nan) for row in rows])
     x_mm = _numbers(recording.labels["pose_1"], "pose_1", [])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))
-    return Targets(names, raw, corrected(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm)), executed, move)
+    right = corrected(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm))
+    undone = 1.0 - np.where(np.isnan(executed), 1.0, executed)
+    for k, name in enumerate(names):  # labels that no published recording needs: a move that was not made is missing in each of them
+        made = f"move_{name.removeprefix('pose_')}"
+        if name.startswith("pose_") and name != "pose_6" and made in recording.labels:
+            right[:, k] -= undone * np.nan_to_num(_numbers(recording.labels[made], made, [])[rows])
+    return Targets(names, raw, right, executed, move)
 
 
 def contact_columns(recording: Recording) -> tuple[str, ...]:

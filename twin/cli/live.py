@@ -103,8 +103,9 @@ def tell_view(url: str) -> None:
 HELP_COLLECT = """Collect labelled frames with a camera and an arm.
 
 Each contact has a random pose and shear, a tap, and one frame. With --design even the first contacts fill the experiment's ranges evenly,
-however many are made: choose it where each label costs time. This frame was exposed after the arm reported that it stands at the
-commanded pose. The label is the reported pose.
+however many are made: choose it where each label costs time. With --design unsure the later contacts are made where those so far leave a
+model of the pins least sure. The frame was exposed after the arm reported that it stands at the commanded pose. The label is the
+reported pose.
 
 The arm goes around the object to a place 50 mm in front of it. If the object has no end (a plane, an edge), the arm goes straight and
 stays in front of it. It lifts off between contacts; at the end it stands 50 mm away, disabled. The program does not know the arm's
@@ -138,7 +139,7 @@ def collect_command(
     form: FormOrAuto = None,
     limits: Limits = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="seed of the drawn contacts; the experiment's own if not given")] = None,
-    design: Annotated[str, typer.Option("--design", help="random, or even: the first contacts fill the ranges evenly")] = "random",
+    design: Annotated[str, typer.Option("--design", help="random, even (fill the ranges) or unsure (where they tell most)")] = "random",
     plain_light: PlainLight = False,
     also: Also = None,
     force: Force = False,
@@ -146,12 +147,13 @@ def collect_command(
     from hardware.collect import CollectPlan, collect_frames
     from hardware.rig import signals_as_ctrl_c
     from scenes import load_experiment, load_object, load_sensor, load_servo
+    from training.design import LeastSure
     from twin.cli.progress import shown
     from twin.store import overwriting
 
-    asked = load_experiment(experiment)
+    asked, spec = load_experiment(experiment), load_sensor(sensor)
     plan = CollectPlan(
-        sensor=load_sensor(sensor),
+        sensor=spec,
         stimulus=load_object(object_name or asked.object),
         experiment=asked,
         servo=load_servo(parameters),
@@ -160,6 +162,7 @@ def collect_command(
         count=count,
         seed=seed,
         design=design,
+        chooser=LeastSure(spec) if design == "unsure" else None,
         form=form,
         limits=limits,
         plain_light=plain_light,

@@ -109,6 +109,8 @@ def measure_residuals(
     logarithm of friction. Friction differs from frame to frame, and simulated data sets draw it. Therefore each frame is compared at its
     best friction: otherwise the residuals would include the effect of friction, and it would be simulated twice.
 
+    Frames of taps alone are simulated with the rig's friction only.
+
     Raises
     ------
     TrainingError
@@ -116,6 +118,8 @@ def measure_residuals(
     """
     labels, real_px = measured.labels, measured.pins_px - measured.no_contact_px
     setup = replace(setup, parameters=(FRICTION,))
+    if not any(label.move.any() for label in labels):
+        frictions = (rig_of(setup.sensor).friction,)
     moved = simulate(setup, measured, [[np.log(friction)] for friction in frictions], rig_of(setup.sensor).turn_sign, progress)
     moved, friction, friction_px = _likeliest(moved, real_px, frictions)
     weights = expect(mean_squared(moved, real_px))

@@ -229,7 +229,10 @@ def _prepare(plan: Plan, out: Path, progress: Progress) -> _Ground:
     with stage(progress, "labelled frames") as step:
         residuals = measure_residuals(_labelled(plan, sensor, measured, out, plan.across), measured, step)
     moves = load_randomisation("moves")
-    seen = moves.model_copy(update={"friction": residuals.friction_spread() or moves.friction})
+    sheared = any(label.move.any() for label in measured.labels)
+    seen = moves.model_copy(update={"friction": (residuals.friction_spread() or moves.friction) if sheared else None})
+    if all(label.executed for label in measured.labels):
+        seen = seen.model_copy(update={"executed_share": 1.0})
     full = Twin(FULL, "simulated", "sim", sensor, plan.wider, seen, plan.across)
     others = without_one_ingredient(full, as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
     return _Ground(plan, out, progress, sensor, real, few, chosen, measured, residuals, full, [full, *others])

@@ -1,0 +1,99 @@
+"""Where the next labelled contact tells most: active learning by the least expected variance (Cohn 1994).
+
+The pins' leading modes are Gaussian processes of the labels that vary. A contact at a label lowers their posterior variance everywhere
+around it. The next contact is the candidate that lowers the mean variance over the experiment's ranges most.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.stats.qmc import Sobol
+
+from scenes.experiment import LABELS, ExperimentSpec
+from scenes.sensor import SensorSpec
+from training.gaussian_process import Points, Posterior, fit_smooth_processes
+from training.label_code import LabelCode, goes_round
+from training.targets import unit_of
+from twin.frames import open_recording
+from twin.frames.tables import numbers
+from twin.pins import Pipeline
+from twin.pins.batch import recording_reference
+
+CANDIDATES = 256
+"""Contacts among which the next one is chosen, spread evenly over the ranges."""
+WHERE = 128
+"""Contacts over which the variance is averaged, spread evenly as well."""
+MODES = 12
+"""Leading modes of the pins' displacement that are looked at; they hold nearly all of it."""
+
+
+class LeastSure:
+    """Chooses the next contact of a collection; called with its folder, its experiment, a seed and the number of the contact.
+
+    Parameters
+    ----------
+    sensor : SensorSpec
+    """
+
+    def __init__(self, sensor: SensorSpec) -> None:
+        self.sensor = sensor
+        self._moved: dict[str, np.ndarray] = {}
+
+    def __call__(self, folder: Path, experiment: ExperimentSpec, seed: int, index: int) -> np.ndarray:
+        """The next contact's pose and move (12,), mm and deg.
+
+        Raises
+        ------
+        FrameError
+            The folder holds no labelled frames of the sensor.
+        """
+        recording = open_recording(folder, self.sensor)
+        reference, _ = recording_reference(self.sensor, recording, [])
+        pipeline = Pipeline(self.sensor, recording.form, reference)
+        for row, name in enumerate(recording.names):
+            if name not in self._moved:
+                seen = pipeline(recording.read(row))
+                nothing = np.zeros_like(reference.pins_px)
+                self._moved[name] = nothing if seen.graph is None else seen.graph.nodes_px - reference.pins_px
+        told = np.column_stack([numbers(recording.labels[name]) for name in LABELS])
+        return least_sure(experiment, told, np.stack([self._moved[name] for name in recording.names]), seed=seed + index)
+
+
+def least_sure(experiment: ExperimentSpec, labels: np.ndarray, moved_px: np.ndarray, *, seed: int) -> np.ndarray:
+    """The next contact's pose and move (12,) after contacts with these labels (M, 12) and displacements (M, N, 2), px.
+
+    Parameters
+    ----------
+    seed : int
+        Chooses the candidates.
+    """
+    low, high = np.array(list(experiment.ranges().values())).T
+    varied = np.flatnonzero(high > low)
+    units = [unit_of(LABELS[k]) for k in varied]
+    code = LabelCode(goes_round(units, np.stack([low[varied], high[varied]])))
+    middle, half = (low + high)[varied] / 2, (high - low)[varied] / 2
+    round_trip = np.array(code.circular)
+
+    def scaled(those: np.ndarray) -> np.ndarray:
+        return code.encode(np.where(round_trip, those[:, varied], (those[:, varied] - middle) / half))
+
+    def spread(count: int, own_seed: int) -> np.ndarray:
+        shares = Sobol(len(varied), scramble=True, rng=np.random.default_rng([seed, own_seed])).random(count)
+        contacts = np.tile(low, (count, 1))
+        contacts[:, varied] += shares * (high - low)[varied]
+        return contacts
+
+    flat = moved_px.reshape(len(moved_px), -1)
+    left, sizes, _ = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+    kept = min(MODES, len(labels) - 1)
+    amplitudes = (left * sizes)[:, :kept]
+    spreads = np.maximum(amplitudes.std(axis=0), 1e-9)
+    processes, _ = fit_smooth_processes(scaled(labels), amplitudes / spreads)
+    candidates = spread(CANDIDATES, 0)
+    asked = Points.of(scaled(np.concatenate([candidates, spread(WHERE, 1)])))
+    gain = np.zeros(CANDIDATES)
+    for kernel, size in zip(processes.kernels, spreads, strict=True):
+        shared = Posterior(kernel, processes.points, np.zeros(len(labels))).covariance(asked)
+        own = np.diag(shared)[:CANDIDATES] + kernel.noises[0] ** 2
+        gain += size**2 * (shared[:CANDIDATES, CANDIDATES:] ** 2).mean(axis=1) / own
+    return np.asarray(candidates[int(np.argmax(gain))])

@@ -22,6 +22,8 @@ def poses_of(sensor, count=40):
 @pytest.mark.parametrize("name", ["mg400-331", "mg400-127", "ur5-331"])
 def test_on_the_flat_plate_labels_are_the_arms_own(name):
     sensor = load_sensor(name)
+    level = {"turn_offset_deg": (0.0, 0.0, rig_of(sensor).turn_offset_deg[2])}  # not out of the angle's plane
+    sensor = sensor.model_copy(update={"rig": rig_of(sensor).model_copy(update=level)})
     poses, T = poses_of(sensor)
     found = surface_labels(SURFACE, Mounting.of(sensor, SURFACE), Surface(load_object("plane")), T)
     slope = np.tan(np.radians(rig_of(sensor).plate_tilt_deg))

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from scenes import load_experiment
 from twin.errors import FrameError
 from twin.frames import open_recording
 from twin.rig.labels import read_arm_labels
@@ -33,3 +34,11 @@ def test_what_is_missing_is_said(tmp_path):
         read_arm_labels(recording(tmp_path, "image_name,pose_2\na.png,1\nb.png,nan\n"))
     with pytest.raises(FrameError, match=r"1 rows hold no number in a pose or move \(b.png\)"):  # not all rows, where one cell is text
         read_arm_labels(recording(tmp_path, "image_name,pose_2\na.png,1\nb.png,1 mm\n"))
+
+
+def test_a_label_that_the_experiment_varies_must_not_be_missing(tmp_path):
+    """Without the edge's direction every contact would be simulated along the same edge."""
+    found = recording(tmp_path, "image_name,pose_2,pose_3\na.png,1,4\nb.png,2,4\n")
+    with pytest.raises(FrameError, match=r"no label pose_6, which the experiment edge-circle varies \(found .*pose_3\).*--experiment"):
+        read_arm_labels(found, load_experiment("edge-circle"))
+    assert len(read_arm_labels(found)) == 2

@@ -87,7 +87,7 @@ def validate_contacts(
         The recording has no labels, or no frame with pins.
     """
     with stage(progress, "pins") as step:
-        measured = measure_frames(frames, sensor, limit, seed, form=form, progress=step)
+        measured = measure_frames(frames, sensor, limit, seed, experiment=experiment, form=form, progress=step)
     model = ContactModel(sensor, experiment, touched or load_object(experiment.object), measured.form, across=across)
     with stage(progress, "contacts") as step:
         found = compare(model, measured, friction_frames=friction_frames, progress=step)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scenes.experiment import ExperimentSpec
 from scenes.rig import RigSpec
 from twin.errors import FrameError
 from twin.frames import Recording
@@ -38,16 +39,21 @@ class ArmLabel:
     executed: bool = True
 
 
-def read_arm_labels(recording: Recording) -> list[ArmLabel]:
+def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = None) -> list[ArmLabel]:
     """Label of each of the recording's frames, in its order.
 
     A column that is missing counts as zero, because recordings leave out what they never move. A move counts as executed
     unless a file says otherwise.
 
+    Parameters
+    ----------
+    experiment : ExperimentSpec, optional
+        How the recording was made: no column of a pose that it varies may be missing.
+
     Raises
     ------
     FrameError
-        There is no table, it has no pose, or a cell of a pose or move holds no number.
+        There is no table, it has no pose or not those that the experiment varies, or a cell of a pose or move holds no number.
     """
     columns = {
         kind: [(axis, recording.labels[f"{kind}_{axis}"]) for axis in range(1, 7) if f"{kind}_{axis}" in recording.labels]
@@ -56,6 +62,12 @@ def read_arm_labels(recording: Recording) -> list[ArmLabel]:
     if not columns["pose"]:
         found = recording.labels_found()
         raise FrameError(f"{recording.path}: no labels pose_1..6 ({found}); targets.csv with them is expected beside the frames")
+    varied = [] if experiment is None else [name for name, (low, high) in experiment.pose.model_dump().items() if high > low]
+    if experiment is not None and (missing := [name for name in varied if name not in recording.labels]):
+        raise FrameError(
+            f"{recording.path}: no label {', '.join(missing)}, which the experiment {experiment.name} varies ({recording.labels_found()}); "
+            "add the column, or give the experiment that the frames were recorded with (--experiment)"
+        )
     values = {kind: np.zeros((len(recording), 6)) for kind in columns}
     for kind, named in columns.items():
         for axis, cells in named:

@@ -61,7 +61,7 @@ def calibrate_contact(
     FrameError
         No labels, no pins, too few frames.
     """
-    measured = measure_frames(frames, spec, count + min(count, MOST_HELD_OUT), seed, form=form)
+    measured = measure_frames(frames, spec, count + min(count, MOST_HELD_OUT), seed, experiment=experiment, form=form)
     order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
     fitted, held = _part(measured, np.sort(order[:count])), _part(measured, np.sort(order[count:]))
     spec = spec.model_copy(update={"rig": rig_of(spec, touched.name)})

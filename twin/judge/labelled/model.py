@@ -60,17 +60,24 @@ class MeasuredFrames:
 
 
 def measure_frames(
-    folder: Path, spec: SensorSpec, count: int | None, seed: int, *, form: Form | None = None, progress: Step | None = None
+    folder: Path,
+    spec: SensorSpec,
+    count: int | None,
+    seed: int,
+    *,
+    experiment: ExperimentSpec | None = None,
+    form: Form | None = None,
+    progress: Step | None = None,
 ) -> MeasuredFrames:
     """Find the pins of ``count`` random frames of a labelled recording (None: of all frames). The frames have the order of the table.
 
     Raises
     ------
     FrameError
-        There are no labels, or the pins were found in no frame.
+        There are no labels, one that the experiment varies is missing, or the pins were found in no frame.
     """
     recording = open_recording(folder, spec, form)
-    labels, problems = read_arm_labels(recording), list(recording.problems)
+    labels, problems = read_arm_labels(recording, experiment), list(recording.problems)
     reference, named = recording_reference(spec, recording, problems)
     pipeline = Pipeline(spec, recording.form, reference)
     chosen = np.random.default_rng(seed).permutation(len(recording))[:count]

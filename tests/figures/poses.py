@@ -107,7 +107,7 @@ def never_touched(work: Path) -> Measured:
 
 
 def shipped_on_frames(work: Path) -> Measured:
-    """The shipped weights of ``ur5-331``, trained in the twin and on what it misses of 40 labelled frames, on the 30 published raw frames."""
+    """The shipped weights of ``ur5-331`` on the 30 published raw frames: of the twin, and what it misses of 40 labelled frames."""
     run_twin(work, "evaluate", "ur5-331", "--data", real_folder("ur5-331-raw"), "--rows", "all", "--out", work / "judged")
     metrics = json.loads((work / "judged" / "metrics.json").read_text())
     return {name: Value(metrics["corrected"][name]["mae"], "mm" if name == "pose_3" else "deg") for name in ("pose_3", "pose_4", "pose_5")}

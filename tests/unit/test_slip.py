@@ -1,18 +1,24 @@
 """Slip over time: what simulated drags tell, that it is learnt from them, and that memory begins anew with every contact."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from scenes import load_sensor
-from training import slip
+from training import slip, train
 from training.dataset import load_dataset
 from training.estimator import PoseEstimator
+from training.models import recipe_of
 from training.models.part import OneFrame, Unseen
+from training.packed import pack
 from training.recipes import TrainingError
+from training.run import RunConfig
 from training.slip import NAMES, Drag, SlipTracker, drags_of, gone_through, judge_slip, learn_slip, random_places, read_slip, write_slip
+from training.studies.evaluation import evaluate_run
 from training.surrogate.symmetry import symmetries
+from training.train import add_slip
 from twin.geometry.pins import rest_pins
 from twin.types import Form, Frame
 
@@ -137,3 +143,33 @@ def test_a_network_for_slip_is_kept_and_a_damaged_one_refused(learnt, tmp_path):
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "slip.safetensors").read_bytes()[:-100])
     with pytest.raises(TrainingError, match="cut.safetensors"):
         read_slip(tmp_path / "cut.safetensors")
+
+
+def test_a_run_that_learnt_from_drags_remembers_them_and_its_small_copy_does(contacts, tmp_path, monkeypatch):
+    folder, run, sensor = contacts
+    shutil.copytree(run, tmp_path / "run")
+    estimator = PoseEstimator.load(run)
+    parts = [load_dataset(folder, sensor, estimator.names)]
+    config = RunConfig("touch", recipe_of("touch", members=1, kernel=False, epochs=20), split=None)
+    assert "30 are needed to learn slip from" in add_slip(tmp_path / "run", config, parts)[0]
+    for name, small in (("WAYS", 20), ("EPOCHS", 2)):
+        monkeypatch.setattr(slip, name, small)
+    monkeypatch.setattr(train, "FEWEST_DRAGS", 0)
+    assert add_slip(tmp_path / "run", config, parts) == []
+    pack(tmp_path / "run", tmp_path / "small")
+    for place in ("run", "small"):
+        made = PoseEstimator.load(tmp_path / place).remembering().estimate_one(OneFrame(parts[0].pins.rows(np.array([5]))), 0.0, "")
+        told = dict(zip(made.names, made.value, strict=True))
+        assert 0 <= told["slip_begins"] <= 1 and told["slip_left"] >= 0 and -180 <= told["slip_direction"] <= 180
+
+
+def test_slip_of_simulated_drags_is_judged_and_said(contacts, tmp_path):
+    folder, run, sensor = contacts
+    estimator = PoseEstimator.load(run)
+    data = load_dataset(folder, sensor, estimator.names)
+    network = slip.SlipNetwork(2 * estimator.modes_of(data.pins).shape[1]).eval()
+    shutil.copytree(run, tmp_path / "run")
+    write_slip(tmp_path / "run" / slip.SLIP, slip.SlipModel(network, 1.0, np.ones(network.enter.in_features // 2), 0.5, 1.0))
+    found = evaluate_run(tmp_path / "run", [folder], tmp_path / "out", rows="all")
+    assert found.metrics["slip"]["contacts"] == 10 and found.metrics["maps"]["states"] > 20
+    assert sum("slip of 10 contacts" in line or "contact maps of" in line for line in found.lines()) == 2

@@ -283,6 +283,37 @@ def test_a_picture_of_the_sensor_is_rendered():
     assert picture.dtype == np.uint8 and picture.shape == (360, 360, 3) and picture.std() > 10
 
 
+CAMERAS = """description = "two cameras and lights"
+[sensor]
+"camera.cx_px" = {add = [-4.0, 4.0]}
+"leds.power" = {scale = [0.3, 0.9]}
+"""
+
+
+def test_pictures_show_the_light_that_was_drawn(tmp_path):
+    (tmp_path / "cameras.toml").write_text(CAMERAS)
+    batch = Batch("SurfaceFollow", 1, Options(observation="oracle", objects=("plane",), randomise=str(tmp_path / "cameras.toml")))
+    shown = []
+    for seed in (0, 1):  # the second episode after the first was shown
+        batch.begin(0, np.random.default_rng(seed))
+        batch.settle(np.zeros(1, int))
+        shown.append((batch.contacts[0].sensor.leds.power, batch.picture(0).mean()))
+    (dark, first), (bright, second) = shown
+    assert dark < 0.8 * bright and first < second - 0.2  # gray levels; most of a picture is black
+
+
+def test_pins_found_in_pictures_of_a_drawn_camera_are_counted_from_its_own_rest(tmp_path):
+    (tmp_path / "cameras.toml").write_text(CAMERAS)
+    told = []
+    for pictures in ("none", "preview"):
+        batch = Batch("SurfaceFollow", 1, Options(pictures=pictures, objects=("plane",), randomise=str(tmp_path / "cameras.toml")))
+        batch.begin(0, np.random.default_rng(3))
+        batch.settle(np.zeros(1, int))
+        told.append(batch.observation()["tactile"])
+    assert abs(batch.contacts[0].sensor.camera.cx_px - batch.sensor.camera.cx_px) > 2.0
+    assert np.abs(told[0]).max() > 0.3 and np.abs(told[0] - told[1]).mean() < 0.05  # spacings
+
+
 def test_pins_found_in_drawn_frames_are_near_the_projected_ones():
     told = []
     for pictures in ("none", "preview"):

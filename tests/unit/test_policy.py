@@ -95,9 +95,9 @@ def test_a_frame_gives_the_action_that_its_observation_gives(policy):
     env = gymnasium.make("tactip/SurfaceFollow-v0", pictures="preview", disable_env_checker=True).unwrapped
     seen, _ = env.reset(seed=4)
     eye = env.batch.eye
-    rest = eye.frame(rest_pins(eye.sensor.geometry), np.random.default_rng(0))
+    rest = eye.frame(0, rest_pins(eye.sensor.geometry), np.random.default_rng(0))
     model = PolicyModel(with_goal(policy, seen["goal"])).at_rest(rest)
-    frame = eye.frame(env.batch.backend.attitude(0), np.random.default_rng(1))
+    frame = eye.frame(0, env.batch.backend.attitude(0), np.random.default_rng(1))
     told = model(frame)
     assert told.valid and told.names == policy.axes
     assert np.allclose(told.value, policy.act(seen["tactile"][None], seen["goal"][None])[0], atol=0.15)

@@ -195,7 +195,7 @@ class Batch:
                 if options.objects is not None or len(self.objects) == 1:
                     raise
                 del self.objects[name]  # of the task's own objects those remain that the backend knows
-        self.eye = self._make_eye()
+        self.eye = self._shows = self._make_eye()
         self.axes = options.axes or self.task.axes
         self.action_scale = self._action_scale()
         self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
@@ -237,8 +237,8 @@ class Batch:
             sensor, _ = draw_sensor(self.sensor, how, rng)
         contact = self._contact(sensor, touched, friction)
         self.backend.begin(row, contact)
-        if self.eye is not None:
-            self.eye.begin(row, sensor)
+        if self._shows is not None:
+            self._shows.begin(row, sensor)
         start = self.task.begin(row, self.tool, touched, self._surfaces, rng)
         self.T_work[row], self.T_object[row], self.goal[row] = start.T_work, start.T_object, start.goal
         self._rngs[row], self.contacts[row] = rng, contact
@@ -293,8 +293,11 @@ class Batch:
 
     def picture(self, row: int) -> ImageArray:
         """(H, W, 3) uint8: the sensor's frame of one environment."""
-        eye = self.eye or Eye(self.sensor, self.count, "pins", pictures="none", pin_noise_px=0.0)
-        image = eye.frame(self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row]))).image
+        if self._shows is None:
+            self._shows = Eye(self.sensor, self.count, "pins", pictures="none", pin_noise_px=0.0)
+            for begun, contact in enumerate(self.contacts):
+                self._shows.begin(begun, contact.sensor if contact else self.sensor)
+        image = self._shows.frame(row, self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row]))).image
         return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
     def object_name(self, row: int) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import cv2
@@ -14,7 +15,7 @@ from training.pins import PinTable
 from training.surrogate.felt import Backend, Felt
 from twin.camera.capture import expose, record
 from twin.camera.projection import project
-from twin.errors import OptionError
+from twin.errors import FrameError, OptionError
 from twin.frames.forms import frame_size, from_raw, gray_levels
 from twin.geometry.pins import rest_pins
 from twin.optics.preview import Preview
@@ -38,10 +39,38 @@ POSE_SCALES = {"mm": 1.0, "deg": 10.0}
 
 @dataclass(frozen=True)
 class View:
-    """How an episode's sensor sees: its specification as drawn, and the pins at rest in px of its frames, (N, 2)."""
+    """How an episode's sensor sees: its specification as drawn, its frames' form, and how they are made."""
 
     sensor: SensorSpec
-    rest_px: FloatArray
+    form: Form
+    pictures: Pictures
+
+    @cached_property
+    def rest_px(self) -> FloatArray:
+        """The pins at rest in px of the sensor's frames, (N, 2)."""
+        return caps_px(self.sensor, self.form, rest_pins(self.sensor.geometry).caps_mm)
+
+    @cached_property
+    def paint(self) -> Callable[[PinState, np.random.Generator], Frame]:
+        """Makes a frame of a state."""
+        return _painter(self.sensor, self.form, self.pictures)
+
+    @cached_property
+    def pipeline(self) -> Pipeline:
+        """Finds the pins in the sensor's frames, counted from a frame without contact.
+
+        Raises
+        ------
+        OptionError
+            The pins can't be found at rest.
+        """
+        rest = self.paint(rest_pins(self.sensor.geometry), np.random.default_rng(0))
+        try:
+            return Pipeline(self.sensor, self.form, measure_reference(self.sensor, self.form, rest))
+        except FrameError as error:
+            raise OptionError(
+                f"the pins of {self.sensor.name} as drawn can't be found at rest ({error}); narrow the randomisation"
+            ) from error
 
 
 class Eye:
@@ -54,7 +83,7 @@ class Eye:
     pictures : {"none", "preview", "traced"}
         With pictures the pins are found by the real pipeline in frames, otherwise they are the projected caps. Kind "image" needs them.
     pin_noise_px : float
-        Standard deviation of the noise of pins without pictures.
+        Standard deviation of the noise of pins without pictures. Pins that are found in pictures have the noise of the pictures.
 
     Raises
     ------
@@ -75,12 +104,8 @@ class Eye:
         self.form = self._estimator.form if self._estimator else Form.RECORDING if sensor.recording else Form.RAW
         self.reference = nominal_reference(sensor, self.form)
         self._spacing = float(self.reference.spacing_px.mean())
-        self._views: list[View] = [View(sensor, caps_px(sensor, self.form, rest_pins(sensor.geometry).caps_mm))] * count
-        self._nominal = self._views[0]
-        self._painter: Callable[[PinState, np.random.Generator], Frame] | None = None
-        self._pipeline: Pipeline | None = None
-        if pictures != "none":
-            self._painter = _painter(sensor, self.form, pictures)
+        self._nominal = View(sensor, self.form, pictures)
+        self._views: list[View] = [self._nominal] * count
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -94,24 +119,20 @@ class Eye:
         return (pins, 2) if self.kind == "pins" else (pins, 5)
 
     def begin(self, row: int, sensor: SensorSpec) -> None:
-        """Look through the camera that was drawn for an environment's episode."""
-        self._views[row] = (
-            self._nominal if sensor is self.sensor else View(sensor, caps_px(sensor, self.form, rest_pins(sensor.geometry).caps_mm))
-        )
+        """Look through the camera, in the light, that were drawn for an environment's episode."""
+        self._views[row] = self._nominal if sensor is self.sensor else View(sensor, self.form, self.pictures)
 
-    def frame(self, pins: PinState, rng: np.random.Generator) -> Frame:
-        """The frame of one environment, drawn where no kind of pictures was chosen."""
-        if self._painter is None:
-            self._painter = _painter(self.sensor, self.form, "preview")
-        return self._painter(pins, rng)
+    def frame(self, row: int, pins: PinState, rng: np.random.Generator) -> Frame:
+        """The frame of one environment's sensor as drawn for the episode; a preview where no kind of pictures was chosen."""
+        return self._views[row].paint(pins, rng)
 
     def look(self, backend: Backend, rows: IntArray, rngs: list[np.random.Generator]) -> tuple[FloatArray | ImageArray, BoolArray]:
         """Observations of some rows (R, ...), and which of them could be made (R,); the others are zero."""
         if self.kind == "image" or self.pictures != "none":
-            frames = [self.frame(backend.attitude(row), rngs[row]) for row in rows.tolist()]
+            frames = [self.frame(row, backend.attitude(row), rngs[row]) for row in rows.tolist()]
             if self.kind == "image":
                 return np.stack([_small(frame.image) for frame in frames]), np.ones(len(rows), bool)
-            return self._of_frames(frames)
+            return self._of_frames(rows, frames)
         pins_px = self.pins_px(backend.felt, rows)
         if self._noise_px:
             pins_px = pins_px + self._noise_px * np.stack([rngs[row].standard_normal(pins_px.shape[1:]) for row in rows.tolist()])
@@ -149,16 +170,14 @@ class Eye:
         told = self._estimator.predict_table(table)
         return self._scaled(told.mean, told.executed)
 
-    def _of_frames(self, frames: list[Frame]) -> tuple[FloatArray, BoolArray]:
-        """The same from frames, through the real pipeline."""
-        if self._pipeline is None:
-            rest = self.frame(rest_pins(self.sensor.geometry), np.random.default_rng(0))
-            self._pipeline = Pipeline(self.sensor, self.form, measure_reference(self.sensor, self.form, rest))
-        seen = [self._pipeline(frame) for frame in frames]
+    def _of_frames(self, rows: IntArray, frames: list[Frame]) -> tuple[FloatArray, BoolArray]:
+        """The same from frames, through the real pipeline of each row's sensor."""
+        pipelines = [self._views[row].pipeline for row in rows.tolist()]
+        seen = [pipeline(frame) for pipeline, frame in zip(pipelines, frames, strict=True)]
         valid = np.array([one.valid for one in seen])
-        reference = self._pipeline.reference
-        places = np.stack([one.graph.nodes_px if one.graph is not None else reference.pins_px for one in seen])
-        return self._of_pins(self.reference.pins_px + (places - reference.pins_px)), valid
+        rest = [pipeline.reference.pins_px for pipeline in pipelines]
+        moved = [one.graph.nodes_px - at if one.graph is not None else np.zeros_like(at) for one, at in zip(seen, rest, strict=True)]
+        return self._of_pins(self.reference.pins_px + np.stack(moved)), valid
 
     def _scaled(self, value: FloatArray, executed: FloatArray) -> FloatArray:
         assert self._estimator is not None

@@ -13,9 +13,12 @@ from stable_baselines3.common.env_checker import check_env as check_for_baseline
 from scenes import load_experiment, load_object, load_sensor
 from training.environments import ids
 from training.environments.batch import Batch, Options
+from training.environments.observe import Eye
 from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
 from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, work_frame
-from training.surrogate.felt import Felt
+from training.estimator import PoseEstimator
+from training.packed import shipped_names
+from training.surrogate.felt import Felt, FiniteElements
 from twin.errors import ContactError, OptionError
 
 PLACE_TOLERANCE_MM = 1e-6  # of geometry computed in double precision
@@ -320,6 +323,19 @@ def test_pins_found_in_drawn_frames_are_near_the_projected_ones():
         env = gymnasium.make("tactip/SurfaceFollow-v0", pictures=pictures, disable_env_checker=True).unwrapped
         told.append(env.reset(seed=2)[0]["tactile"])
     assert np.abs(told[0]).max() > 0.3 and np.abs(told[0] - told[1]).mean() < 0.05  # spacings
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_every_shipped_estimator_can_be_observed(name):
+    """All that it tells has a scale; where it learnt from the light on the caps as well, it needs pictures."""
+    sensor, pictures = load_sensor(name), "none"
+    if PoseEstimator.load(name).part.sees_light:
+        with pytest.raises(OptionError, match="pictures='preview'"):
+            Eye(sensor, 1, "pose", pictures="none", pin_noise_px=0.0)
+        pictures = "preview"
+    eye = Eye(sensor, 1, "pose", pictures=pictures, pin_noise_px=0.0)
+    seen, valid = eye.look(FiniteElements(sensor, 1), np.zeros(1, int), [np.random.default_rng(0)])
+    assert seen.shape == (1, *eye.shape) and np.isfinite(seen).all() and valid.all()
 
 
 def test_goals_of_a_follower_lie_in_its_range():

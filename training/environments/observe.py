@@ -11,7 +11,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from training.estimator import PoseEstimator
 from training.packed import shipped_names
-from training.pins import PinTable
+from training.pins import PinTable, cap_light
 from training.surrogate.felt import Backend, Felt
 from twin.camera.capture import expose, record
 from twin.camera.projection import project
@@ -33,8 +33,8 @@ IMAGE_PX = 128
 """Side of the pictures that an agent sees, as in Tactile Gym."""
 LARGEST = 10.0
 """Observations are clipped to this: no pin moves by ten spacings."""
-POSE_SCALES = {"mm": 1.0, "deg": 10.0}
-"""What counts as 1 in an estimated pose."""
+POSE_SCALES = {"mm": 1.0, "deg": 10.0, "N": 1.0, "Nmm": 10.0, "mm2": 100.0, "": 1.0}
+"""What counts as 1 in an estimate, by the labels' units."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Eye:
     Raises
     ------
     OptionError
-        The sensor has no estimator for kind "pose".
+        The sensor has no estimator for kind "pose", or one that needs pictures.
     """
 
     def __init__(self, sensor: SensorSpec, count: int, kind: Kind, *, pictures: Pictures, pin_noise_px: float) -> None:
@@ -101,6 +101,10 @@ class Eye:
                     f"observation 'pose' needs weights that go with the package; {sensor.name} has none (those of {known} have)"
                 )
             self._estimator = PoseEstimator.load(sensor.name)
+            if self._estimator.part.sees_light and pictures == "none":
+                raise OptionError(
+                    f"observation 'pose': the weights of {sensor.name} learnt from the light on the caps as well; give pictures='preview'"
+                )
         self.form = self._estimator.form if self._estimator else Form.RECORDING if sensor.recording else Form.RAW
         self.reference = nominal_reference(sensor, self.form)
         self._spacing = float(self.reference.spacing_px.mean())
@@ -146,8 +150,8 @@ class Eye:
             return caps_px(self.sensor, self.form, caps)
         return np.stack([caps_px(self._views[row].sensor, self.form, seen) for row, seen in zip(rows.tolist(), caps, strict=True)])
 
-    def _of_pins(self, pins_px: FloatArray) -> FloatArray:
-        """Observations (R, ...) of pins (R, N, 2) counted from the nominal layout."""
+    def _of_pins(self, pins_px: FloatArray, light: FloatArray | None = None) -> FloatArray:
+        """Observations (R, ...) of pins (R, N, 2) counted from the nominal layout, and of the light (R, N) on their caps."""
         if self.kind == "pins":
             return np.clip((pins_px - self.reference.pins_px) / self._spacing, -LARGEST, LARGEST).astype(np.float32)
         graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost) for pins in pins_px]
@@ -166,6 +170,7 @@ class Eye:
             np.zeros(pins_px.shape[:2], bool),
             np.ones(count, bool),
             measured=True,
+            light=np.zeros(0) if light is None else light,
         )
         told = self._estimator.predict_table(table)
         return self._scaled(told.mean, told.executed)
@@ -177,7 +182,12 @@ class Eye:
         valid = np.array([one.valid for one in seen])
         rest = [pipeline.reference.pins_px for pipeline in pipelines]
         moved = [one.graph.nodes_px - at if one.graph is not None else np.zeros_like(at) for one, at in zip(seen, rest, strict=True)]
-        return self._of_pins(self.reference.pins_px + np.stack(moved)), valid
+        light = None
+        if self._estimator is not None and self._estimator.part.sees_light:
+            light = np.stack(
+                [cap_light(frame, m + at, p.reference) for frame, m, at, p in zip(frames, moved, rest, pipelines, strict=True)]
+            )
+        return self._of_pins(self.reference.pins_px + np.stack(moved), light), valid
 
     def _scaled(self, value: FloatArray, executed: FloatArray) -> FloatArray:
         assert self._estimator is not None

@@ -10,6 +10,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.estimator import PoseEstimator
+from training.models.part import PinModel
 from training.packed import shipped_names
 from training.pins import PinTable, cap_light
 from training.surrogate.felt import Backend, Felt
@@ -101,7 +102,7 @@ class Eye:
                     f"observation 'pose' needs weights that go with the package; {sensor.name} has none (those of {known} have)"
                 )
             self._estimator = PoseEstimator.load(sensor.name)
-            if self._estimator.part.sees_light and pictures == "none":
+            if self._sees_light and pictures == "none":
                 raise OptionError(
                     f"observation 'pose': the weights of {sensor.name} learnt from the light on the caps as well; give pictures='preview'"
                 )
@@ -110,6 +111,12 @@ class Eye:
         self._spacing = float(self.reference.spacing_px.mean())
         self._nominal = View(sensor, self.form, pictures)
         self._views: list[View] = [self._nominal] * count
+
+    @property
+    def _sees_light(self) -> bool:
+        """Whether the estimator sees the light on the caps."""
+        part = None if self._estimator is None else self._estimator.part
+        return isinstance(part, PinModel) and part.sees_light
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -183,7 +190,7 @@ class Eye:
         rest = [pipeline.reference.pins_px for pipeline in pipelines]
         moved = [one.graph.nodes_px - at if one.graph is not None else np.zeros_like(at) for one, at in zip(seen, rest, strict=True)]
         light = None
-        if self._estimator is not None and self._estimator.part.sees_light:
+        if self._sees_light:
             light = np.stack(
                 [cap_light(frame, m + at, p.reference) for frame, m, at, p in zip(frames, moved, rest, pipelines, strict=True)]
             )

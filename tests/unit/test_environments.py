@@ -13,6 +13,7 @@ from stable_baselines3.common.env_checker import check_env as check_for_baseline
 from scenes import load_experiment, load_object, load_sensor
 from training.environments import ids
 from training.environments.batch import Batch, Options
+from training.environments.environment import TactileEnv
 from training.environments.observe import Eye
 from training.environments.tasks import TASKS, ObjectPush, ObjectRoll, SurfaceFollow
 from training.environments.world import Surfaces, Tool, inverse, motions, standing_on, work_frame
@@ -147,6 +148,14 @@ def test_a_state_without_touch_is_not_good_and_a_lost_object_ends_the_episode(ta
         ({"steps": -1}, "steps=-1"),
         ({"pictures": "photo"}, "pictures='photo'"),
         ({"backend": "fem", "friction_memory": False}, "friction_memory"),
+        ({"friction_memory": "no"}, "friction_memory='no'"),
+        ({"objects": 5}, "objects=5"),
+        ({"objects": ("can", 5)}, "objects="),
+        ({"axes": 1.0}, "axes=1.0"),
+        ({"sensor": None}, "sensor=None"),
+        ({"surrogate": 3}, "surrogate=3"),
+        ({"randomise": True}, "randomise=True"),
+        ({"stack": True}, "stack=True"),
     ],
 )
 def test_an_option_that_cannot_be_meant_is_named(given, named):
@@ -166,6 +175,10 @@ def test_wrong_calls_are_named():
         env.step(np.zeros(2))
     with pytest.raises(OptionError, match="'colour'"):
         env.reset(options={"colour": "red"})
+    with pytest.raises(OptionError, match="object=3"):
+        env.reset(options={"object": 3})
+    with pytest.raises(OptionError, match="did you mean 'SurfaceFollow'"):
+        TactileEnv("surfacefollow")
     env.reset(seed=0)
     with pytest.raises(OptionError, match="NaN"):
         env.step(np.array([np.nan, 0.0]))

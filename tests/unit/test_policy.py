@@ -11,7 +11,7 @@ from hardware.policy_law import load_for_outlines, policy_law
 from hardware.rig_geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.environments import learn
-from training.environments.batch import Options
+from training.environments.batch import Batch, Options
 from training.environments.learn import LearnPlan, judge_policy, learn_policy
 from training.environments.world import Surfaces, standing_on
 from twin.errors import FrameError, OptionError
@@ -161,9 +161,33 @@ def test_judging_counts_long_episodes_as_well_as_short_ones(policy, monkeypatch)
     assert [judge_policy(policy, "SurfaceFollow", SMALL, episodes) for episodes in (2, 8, 24)] == [0.5] * 3
 
 
+def test_a_policy_is_kept_where_judging_it_is_interrupted(tmp_path, monkeypatch):
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(learn, "judge_policy", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        learn_policy(LearnPlan("SurfaceFollow", SMALL, minutes=0.001, environments=2, episodes=2), tmp_path)
+    assert load_policy(tmp_path / "policy.safetensors").axes == ("z", "Ry") and (tmp_path / "learning.csv").is_file()
+
+
+def test_finite_elements_judge_with_the_objects_that_were_learnt_from():
+    batch = Batch("ContourFollow", 1, Options())
+    true = learn.on_finite_elements(batch.options, tuple(batch.objects))
+    assert true.objects == tuple(batch.objects) and "mesh-can" not in true.objects
+    assert (true.backend, true.pictures, true.surrogate) == ("fem", "preview", None)
+
+
+WRONG = [
+    ("EdgeFollow", {"minutes": float("nan")}, "minutes=nan"),
+    ("EdgeFollow", {"fem_episodes": -1}, "fem_episodes=-1"),
+    ("EdgeFollow", {"seed": 0.5}, "seed=0.5"),
+]
+
+
 @pytest.mark.parametrize(
     ("task", "more", "says"),
-    [("Juggle", {}, "Juggle"), ("EdgeFollow", {"minutes": 0}, "minutes"), ("EdgeFollow", {"environments": 1}, "2 env")],
+    [("Juggle", {}, "Juggle"), ("EdgeFollow", {"minutes": 0}, "minutes"), ("EdgeFollow", {"environments": 1}, "environments=1"), *WRONG],
 )
 def test_a_plan_that_cannot_be_meant_is_refused(task, more, says):
     with pytest.raises(OptionError, match=says):

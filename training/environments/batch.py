@@ -1,8 +1,9 @@
 """Several environments of one task, stepped together; a single environment is a batch of one."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
+from os import PathLike
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -39,8 +40,24 @@ MOST_STACK = 16
 """Most observations that can be stacked."""
 MOST_ORACLE = 100.0
 """What only a simulation knows is clipped to this."""
+EXAMPLES = {"axes": ("z", "Ry"), "objects": ("plane", "can")}
+"""Of options that take several names."""
 RESET_OPTIONS = ("object",)
 """What ``reset(options=...)`` takes."""
+
+
+def require_whole(name: str, given: Any, least: int) -> None:
+    """Raise ``OptionError`` for anything but a whole number of at least ``least``."""
+    if not isinstance(given, int) or isinstance(given, bool) or given < least:
+        raise OptionError(f"{name}={given!r}: expected a whole number of at least {least}")
+
+
+def require_task(task: str) -> None:
+    """Raise ``OptionError`` for the name of no task."""
+    if task not in TASKS:
+        near = get_close_matches(str(task).lower(), [name.lower() for name in TASKS], n=1)
+        hint = "".join(f"did you mean {name!r}? " for name in TASKS if name.lower() in near)
+        raise OptionError(f"there is no task {task!r}; {hint}tasks are {', '.join(TASKS)}")
 
 
 @dataclass(frozen=True)
@@ -98,14 +115,26 @@ class Options:
         for name, values in known:
             if getattr(self, name) not in values:
                 raise OptionError(f"{name}={getattr(self, name)!r}: expected one of {', '.join(values)}")
-        if not isinstance(self.stack, int) or not 1 <= self.stack <= MOST_STACK:
-            raise OptionError(f"stack={self.stack!r}: expected a whole number from 1 to {MOST_STACK}")
-        if self.steps is not None and (not isinstance(self.steps, int) or self.steps < 1):
-            raise OptionError(f"steps={self.steps!r}: expected a whole number of at least 1")
+        require_whole("stack", self.stack, 1)
+        if self.stack > MOST_STACK:
+            raise OptionError(f"stack={self.stack!r}: expected at most {MOST_STACK}")
+        if self.steps is not None:
+            require_whole("steps", self.steps, 1)
+        if not isinstance(self.friction_memory, bool):
+            raise OptionError(f"friction_memory={self.friction_memory!r}: expected True or False")
+        for name in ("sensor", "surrogate", "randomise"):
+            given = getattr(self, name)
+            if isinstance(given, PathLike):
+                object.__setattr__(self, name, str(given))
+            elif not (isinstance(given, str) or (given is None and name != "sensor")):
+                raise OptionError(f"{name}={given!r}: expected a name or a file")
         for name in ("axes", "objects"):
             given = getattr(self, name)
             if given is not None:
-                object.__setattr__(self, name, (given,) if isinstance(given, str) else tuple(given))
+                parts = (given,) if isinstance(given, str | PathLike) else tuple(given) if isinstance(given, Iterable) else (given,)
+                if not all(isinstance(part, str | PathLike) for part in parts):
+                    raise OptionError(f"{name}={given!r}: expected names, such as {name}={EXAMPLES[name]!r}")
+                object.__setattr__(self, name, tuple(str(part) for part in parts))
         if self.axes is not None and (not self.axes or len(set(self.axes)) < len(self.axes) or not set(self.axes) <= set(AXES)):
             raise OptionError(f"axes={self.axes!r}: expected some of {', '.join(AXES)}, each once")
         if self.objects is not None and not self.objects:
@@ -175,6 +204,7 @@ class Batch:
     """
 
     def __init__(self, task: str, count: int, options: Options) -> None:
+        require_task(task)
         self.options, self.count = options, count
         self.task = TASKS[task]()
         self.task.prepare(count)
@@ -227,7 +257,9 @@ class Batch:
         for name in asked:
             if name not in RESET_OPTIONS:
                 raise OptionError(f"reset(options=...) has no {name!r}; it takes {', '.join(RESET_OPTIONS)}")
-        name = asked.get("object") or str(rng.choice(list(self.objects)))
+        if not isinstance(asked.get("object", ""), str | PathLike):
+            raise OptionError(f"reset(options=...): object={asked['object']!r}: expected a name or a file")
+        name = str(asked.get("object") or rng.choice(list(self.objects)))
         touched = self.objects.get(name) or load_object(name)
         self.task.require(touched)
         how, sensor, friction = self.randomisation, self.sensor, None

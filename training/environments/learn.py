@@ -17,9 +17,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from training.environments.batch import Options
+from training.environments.batch import Options, require_task, require_whole
 from training.environments.environment import TactileVectorEnv
-from training.environments.tasks import TASKS
+from training.environments.observe import Pictures
 from twin.errors import OptionError
 from twin.policy import Policy
 from twin.progress import Progress, Step, silent, stage
@@ -74,12 +74,13 @@ class LearnPlan:
     fem_episodes: int = 0
 
     def __post_init__(self) -> None:
-        if self.task not in TASKS:
-            raise OptionError(f"--task {self.task}: expected one of {', '.join(TASKS)}")
+        require_task(self.task)
         if self.options.observation not in ("pins", "oracle", "pose", "graph"):
             raise OptionError(f"observation={self.options.observation!r}: this example learns from pins, graph, pose or oracle")
-        if self.environments < 2 or self.minutes <= 0 or self.episodes < 1:
-            raise OptionError("expected at least 2 environments, 1 episode and more than 0 minutes")
+        if not (self.minutes > 0 and np.isfinite(self.minutes)):
+            raise OptionError(f"minutes={self.minutes!r}: expected more than 0")
+        for name, least in (("environments", 2), ("episodes", 1), ("fem_episodes", 0), ("seed", 0)):
+            require_whole(name, getattr(self, name), least)
 
 
 @dataclass(frozen=True)
@@ -212,25 +213,34 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
         watch = _Watch(plan, step)
         ppo.learn(10**9, callback=watch)
     made = replace(blank, layers=_layers_of(ppo))
+    written = [out / "policy.safetensors", out / "learning.csv", out / "learning.png", out / "result.json"]
+    made.save(written[0])  # before it is judged, which takes long and may be interrupted
+    _write_curve(watch.curve, written[1], written[2])
     success: dict[str, float] = {
         str(plan.options.backend): judge_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
     }
     if plan.fem_episodes:
-        seen: Any = "preview" if plan.options.observation != "oracle" else "none"
-        true = replace(plan.options, backend="fem", surrogate=None, friction_memory=True, pictures=seen)
+        true = on_finite_elements(plan.options, tuple(vector.batch.objects))
         success["finite elements, drawn frames"] = judge_policy(made, plan.task, true, plan.fem_episodes, seed=20_000 + plan.seed)
-    written = [out / "policy.safetensors", out / "learning.csv", out / "learning.png", out / "result.json"]
-    made.save(written[0])
-    with text_file(written[1]) as file:
-        file.write("steps,seconds,success,reward\n")
-        file.writelines(f"{steps},{seconds:.1f},{share:.4f},{reward:.4f}\n" for steps, seconds, share, reward in watch.curve)
-    figure, axes = new_figure(2, 1)
-    for ax, column, name in zip(axes, (2, 3), ("episodes solved", "mean reward of a step"), strict=True):
-        ax.plot([row[0] for row in watch.curve], [row[column] for row in watch.curve])
-        ax.set(xlabel="steps", ylabel=name)
-    save_figure(written[2], figure)
     write_json(written[3], {"task": plan.task, "options": asdict(plan.options), "success": success, "steps": ppo.num_timesteps})
     return Learnt(made, watch.curve, success, written)
+
+
+def on_finite_elements(options: Options, objects: tuple[str, ...]) -> Options:
+    """The same environment on finite elements, with drawn frames through the real pipeline, of the same objects."""
+    seen: Pictures = "preview" if options.observation != "oracle" else "none"
+    return replace(options, backend="fem", surrogate=None, friction_memory=True, pictures=seen, objects=objects)
+
+
+def _write_curve(curve: Sequence[tuple[int, float, float, float]], table: Path, picture: Path) -> None:
+    with text_file(table) as file:
+        file.write("steps,seconds,success,reward\n")
+        file.writelines(f"{steps},{seconds:.1f},{share:.4f},{reward:.4f}\n" for steps, seconds, share, reward in curve)
+    figure, axes = new_figure(2, 1)
+    for ax, column, name in zip(axes, (2, 3), ("episodes solved", "mean reward of a step"), strict=True):
+        ax.plot([row[0] for row in curve], [row[column] for row in curve])
+        ax.set(xlabel="steps", ylabel=name)
+    save_figure(picture, figure)
 
 
 def judge_policy(policy: Policy, task: str, options: Options, episodes: int, *, seed: int = 0) -> float:

@@ -155,7 +155,7 @@ def test_judging_counts_long_episodes_as_well_as_short_ones(policy, monkeypatch)
         def step(self, actions):
             self.steps += 1
             ended = self.steps % self.lasts == 0
-            return self.seen(), 0.0, ended, np.zeros_like(ended), {"is_success": ended & (self.lasts > 1)}
+            return self.seen(), 0.0, ended, np.zeros_like(ended), {"final_info": {"is_success": ended & (self.lasts > 1)}}
 
     monkeypatch.setattr(learn, "TactileVectorEnv", Rows)
     assert [judge_policy(policy, "SurfaceFollow", SMALL, episodes) for episodes in (2, 8, 24)] == [0.5] * 3

@@ -179,12 +179,12 @@ def _ends(how: RandomisationSpec | None) -> tuple[float | None, ...]:
 
 @dataclass(frozen=True)
 class Stepped:
-    """What a step of B environments gives: as in gymnasium, with arrays (B,) for each number of ``info``."""
+    """What a step of B environments gives: as in gymnasium, with arrays (B,) of all that ``info`` tells, None where a row tells nothing."""
 
     reward: FloatArray
     terminated: BoolArray
     truncated: BoolArray
-    info: dict[str, FloatArray | BoolArray]
+    info: dict[str, Any]
 
 
 class Batch:
@@ -332,10 +332,9 @@ class Batch:
         image = self._shows.frame(row, self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row]))).image
         return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
-    def object_name(self, row: int) -> str:
-        """Name of the object of one environment's episode."""
-        contact = self.contacts[row]
-        return "" if contact is None else contact.touched.name
+    def begun(self) -> dict[str, Any]:
+        """What ``info`` tells of the beginning of the episodes: names (B,) of the objects."""
+        return {"object": np.array([None if contact is None else contact.touched.name for contact in self.contacts], object)}
 
     def touch(self) -> Touch:
         """What rigid sensors would touch in all rows."""
@@ -354,9 +353,11 @@ class Batch:
 
     def _judged(self, rows: IntArray) -> Stepped:
         seen = self._seen_now()
-        judged: Judged = self.task.judge(seen)
         active = np.zeros(self.count, bool)
         active[rows] = True
+        kept = self.task.kept.copy()
+        judged: Judged = self.task.judge(seen)
+        self.task.kept[~active] = kept[~active]  # of rows that only begin, or rest, the task has seen no step
         lost = np.array([bool(why) for why in self.backend.felt.lost])
         failed, reached = (judged.failed | lost) & active, judged.reached & active & ~lost
         late = self.steps_done > self.steps // 2
@@ -365,13 +366,16 @@ class Batch:
         enough = self._good >= self.task.success_share * np.maximum(self.steps_done - self.steps // 2, 1)
         success = reached | (ended & ~failed & enough & (self.task.success_share > 0))
         reward = np.where(active, np.where(lost, np.minimum(judged.reward, -5.0), judged.reward), 0.0)
-        info: dict[str, FloatArray | BoolArray] = {
+        why = np.full(self.count, None, object)
+        for row in np.flatnonzero(lost & active):
+            why[row] = self.backend.felt.lost[row]
+        info: dict[str, Any] = {
             "indent_mm": seen.touch.indent_mm,
             "angle_deg": seen.touch.angle_deg,
             "force_n": np.linalg.norm(seen.felt.force_n, axis=1),
             "slip": seen.felt.slip.copy(),
             "is_success": success,
-            "outside": lost & active,
+            "outside": why,
         }
         return Stepped(reward, failed | reached, ended & ~(failed | reached), info)
 

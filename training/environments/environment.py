@@ -61,7 +61,7 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         self.batch.begin(0, self.np_random, options)
         self.batch.settle(np.zeros(1, int))
         self._state = "begun"
-        return _row(self.batch.observation()), {"object": self.batch.object_name(0)}
+        return _row(self.batch.observation()), _row(self.batch.begun())
 
     def step(self, action: FloatArray) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         """Move the tool; see gymnasium."""
@@ -69,9 +69,9 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         if self._state == "new":
             raise OptionError("step() before reset(); call reset() first")
         done = self.batch.step(np.asarray(action, float)[None], np.zeros(1, int))
-        info = {name: values[0].item() for name, values in done.info.items()}
-        if info.pop("outside"):
-            info["outside"] = self.batch.backend.felt.lost[0]
+        info = {
+            name: value.item() if isinstance(value, np.generic) else value for name, value in _row(done.info).items() if value is not None
+        }
         return _row(self.batch.observation()), float(done.reward[0]), bool(done.terminated[0]), bool(done.truncated[0]), info
 
     def render(self) -> ImageArray | None:
@@ -145,7 +145,7 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         self._restart(rows, options)
         self._ended[:] = False
         self._begun = True
-        return self.batch.observation(), {}
+        return self.batch.observation(), _of_rows(self.batch.begun(), np.ones(self.num_envs, bool))
 
     def step(self, actions: FloatArray) -> tuple[Seen, FloatArray, Any, Any, dict[str, Any]]:
         """Step every row; a row whose episode ended in the last step begins the next one instead (see ``autoreset_mode``)."""
@@ -157,25 +157,27 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         if len(again):
             self._restart(again, None)
         done = self.batch.step(actions, rows) if len(rows) else None
+        begun = self._ended
+        info = _of_rows(self.batch.begun(), begun)
         if done is None:
             nothing = np.zeros(self.num_envs, bool)
             self._ended = nothing.copy()
-            return self.batch.observation(), np.zeros(self.num_envs), nothing, nothing.copy(), {}
-        here = np.zeros(self.num_envs, bool)
-        here[rows] = True
-        info: dict[str, Any] = {}
-        for name, values in done.info.items():
-            info[name], info[f"_{name}"] = np.where(here, values, np.zeros_like(values)), here.copy()
+            return self.batch.observation(), np.zeros(self.num_envs), nothing, nothing.copy(), info
         ended = done.terminated | done.truncated
         if self._mode is AutoresetMode.NEXT_STEP:
+            info |= _of_rows(done.info, ~begun)
             self._ended = ended
-        elif ended.any():
+        else:
+            info |= _of_rows(done.info, ~ended)
+        if self._mode is AutoresetMode.SAME_STEP and ended.any():
             last = self.batch.observation()
             final = np.full(self.num_envs, None, object)
             for row in np.flatnonzero(ended):
                 final[row] = {key: values[row] for key, values in last.items()}
             info["final_obs"], info["_final_obs"] = final, ended.copy()
+            info["final_info"], info["_final_info"] = _of_rows(done.info, ended), ended.copy()
             self._restart(np.flatnonzero(ended), None)
+            info |= _of_rows(self.batch.begun(), ended)
         return self.batch.observation(), done.reward, done.terminated, done.truncated, info
 
     def render(self) -> tuple[ImageArray, ...] | None:
@@ -196,6 +198,16 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
             raise OptionError("the environments are closed; make new ones")
 
 
+def _of_rows(told: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
+    """What some rows (B,) tell, as gymnasium gathers it: each array with the mask of the rows that tell it, if there are any."""
+    info: dict[str, Any] = {}
+    for name, values in told.items():
+        has = rows & np.array([value is not None for value in values]) if values.dtype == object else rows.copy()
+        if has.any():
+            info[name], info[f"_{name}"] = np.where(has, values, None if values.dtype == object else np.zeros_like(values)), has
+    return info
+
+
 def _row(seen: Seen) -> Seen:
-    """The observation of the only environment."""
+    """What belongs to the only environment."""
     return {key: values[0] for key, values in seen.items()}

@@ -129,7 +129,7 @@ class SteppedTogether(VecEnv):
             infos[row] = {
                 "terminal_observation": self.policy.reduced(last["tactile"][None], last["goal"][None])[0],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
-                "is_success": bool(told["is_success"][row]),
+                "is_success": bool(told["final_info"]["is_success"][row]),
             }
         return self._reduced(seen), reward.astype(np.float32), done, infos
 
@@ -256,7 +256,8 @@ def judge_policy(policy: Policy, task: str, options: Options, episodes: int, *, 
     while (ended < share).any():
         seen, _, terminated, truncated, told = vector.step(policy.act(seen["tactile"], seen["goal"]))
         counted = (terminated | truncated) & (ended < share)
-        ended, solved = ended + counted, solved + (counted & told["is_success"])
+        if counted.any():
+            ended, solved = ended + counted, solved + (counted & told["final_info"]["is_success"])
     return float(solved.sum() / episodes)
 
 

@@ -280,6 +280,13 @@ def test_a_randomised_skin_needs_finite_elements():
         Batch("SurfaceFollow", 1, Options(randomise="contact"))
 
 
+def test_what_only_the_optics_need_can_be_drawn_with_a_surrogate(tmp_path):
+    (tmp_path / "haze.toml").write_text('description = "haze"\n[sensor]\n"gel.haze" = {value = [0.0, 0.05]}\n')
+    batch = Batch("SurfaceFollow", 1, Options(objects=("plane",), randomise=str(tmp_path / "haze.toml")))
+    batch.begin(0, np.random.default_rng(0))
+    assert batch.contacts[0].sensor.gel.haze > 0
+
+
 def test_of_the_papers_objects_the_surrogate_leaves_out_the_wire_mesh():
     assert set(Batch("ContourFollow", 1, Options()).objects) == set(TASKS["ContourFollow"].objects) - {"mesh-can"}
     with pytest.raises(ContactError, match="mesh-can.*domain|domain.*mesh-can"):

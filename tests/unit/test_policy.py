@@ -6,14 +6,16 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hardware.policy_law import load_for_outlines, policy_law
 from hardware.rig_geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from training.environments import learn
 from training.environments.batch import Batch, Options
-from training.environments.learn import LearnPlan, judge_policy, learn_policy
+from training.environments.learn import LearnPlan, Learnt, judge_policy, learn_policy
 from training.environments.world import Surfaces, standing_on
+from twin.cli import command_line
 from twin.errors import FrameError, OptionError
 from twin.geometry.pins import rest_pins
 from twin.policy import PolicyError, PolicyModel, load_policy, with_goal
@@ -176,6 +178,21 @@ def test_finite_elements_judge_with_the_objects_that_were_learnt_from():
     true = learn.on_finite_elements(batch.options, tuple(batch.objects))
     assert true.objects == tuple(batch.objects) and "mesh-can" not in true.objects
     assert (true.backend, true.pictures, true.surrogate) == ("fem", "preview", None)
+
+
+def test_the_command_takes_a_surrogate_and_objects_of_ones_own(tmp_path, monkeypatch):
+    """As the refusal of a sensor without a surrogate advises."""
+    asked = []
+
+    def learnt(plan, out, **options):
+        asked.append(plan.options)
+        return Learnt(None, [], {"surrogate": 1.0}, [])
+
+    monkeypatch.setattr(learn, "learn_policy", learnt)
+    given = ["learn", "--task", "SurfaceFollow", "--sensor", "mg400-127", "--surrogate", "mine.safetensors", "--objects", "can,plane"]
+    ended = CliRunner().invoke(command_line(), [*given, "--out", str(tmp_path / "out")])
+    assert ended.exit_code == 0, ended.output
+    assert asked[0].surrogate == "mine.safetensors" and asked[0].objects == ("can", "plane")
 
 
 WRONG = [

@@ -16,7 +16,7 @@ from training.environments.world import AXES, Surfaces, Tool, motions
 from training.generation.config import draw_friction, draw_sensor
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.felt import Backend, Contact, FiniteElements
-from training.surrogate.model import MECHANICS, surrogate_of
+from training.surrogate.model import is_mechanical, surrogate_of
 from twin.errors import ContactError, OptionError
 from twin.rig.contact import contact_law
 from twin.rig.touch import Touch
@@ -25,15 +25,10 @@ from twin.types import BoolArray, FloatArray, ImageArray, IntArray
 BackendName = Literal["surrogate", "fem"]
 BACKENDS: tuple[str, ...] = get_args(BackendName)
 """What solves the contacts."""
-Control = Literal["increment", "velocity"]
-CONTROLS: tuple[str, ...] = get_args(Control)
-"""What actions mean: the motion of a step, or a speed during a step."""
 PERIOD_S = 0.1
 """Time that a step stands for: an agent decides ten times a second."""
 LARGEST_MM, LARGEST_DEG = 1.0, 5.0
-"""Motion of a step by an increment of 1, along and about each axis."""
-LARGEST_MM_S, LARGEST_DEG_S = 10.0, 50.0
-"""Speed that a velocity of 1 means."""
+"""Motion of a step by an action of 1, along and about each axis."""
 MOST_TRIALS = 4
 """Trials in which an object that is pushed finds its place in a step."""
 MOST_STACK = 16
@@ -75,7 +70,6 @@ class Options:
         Newest observations that are given together, the newest last.
     axes : tuple of str, optional
         Axes that are moved, of x, y, z, Rx, Ry, Rz in the tool's work frame; the task's by default.
-    action : {"increment", "velocity"}
     backend : {"surrogate", "fem"}
         A fast stand-in with a stated error, or finite elements.
     surrogate : str, optional
@@ -96,7 +90,6 @@ class Options:
     observation: Kind = "pins"
     stack: int = 1
     axes: tuple[str, ...] | None = None
-    action: Control = "increment"
     backend: BackendName = "surrogate"
     surrogate: str | None = None
     objects: tuple[str, ...] | None = None
@@ -108,7 +101,6 @@ class Options:
     def __post_init__(self) -> None:
         known: list[tuple[str, tuple[str, ...]]] = [
             ("observation", KINDS),
-            ("action", CONTROLS),
             ("backend", BACKENDS),
             ("pictures", PICTURES),
         ]
@@ -162,7 +154,7 @@ class Options:
 
 def require_known(how: RandomisationSpec | None) -> None:
     """Raise ``OptionError`` for a randomisation that draws what a surrogate holds fixed."""
-    drawn = [] if how is None else [key for key in how.sensor if key.split(".")[0] in MECHANICS]
+    drawn = [] if how is None else [key for key in how.sensor if is_mechanical(*key.split("."))]
     if how is not None and drawn:
         raise OptionError(
             f"randomise={how.name!r} draws {drawn[0]}, which the surrogate holds fixed; use backend='fem', "
@@ -227,7 +219,7 @@ class Batch:
                 del self.objects[name]  # of the task's own objects those remain that the backend knows
         self.eye = self._shows = self._make_eye()
         self.axes = options.axes or self.task.axes
-        self.action_scale = self._action_scale()
+        self.action_scale = np.array([LARGEST_DEG if axis.startswith("R") else LARGEST_MM for axis in self.axes])
         self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
         self.contacts: list[Contact | None] = [None] * count
         self.T_work, self.T_object = np.tile(np.eye(4), (2, count, 1, 1))
@@ -397,10 +389,6 @@ class Batch:
             return
         kept = np.where(valid.reshape(-1, *[1] * (newest.ndim - 1)), newest, self._seen[rows, -1])
         self._seen[rows] = np.concatenate([self._seen[rows, 1:], kept[:, None]], axis=1)
-
-    def _action_scale(self) -> FloatArray:
-        mm, deg = (LARGEST_MM, LARGEST_DEG) if self.options.action == "increment" else (LARGEST_MM_S * PERIOD_S, LARGEST_DEG_S * PERIOD_S)
-        return np.array([deg if axis.startswith("R") else mm for axis in self.axes])
 
     def _make_backend(self) -> Backend:
         if self.options.backend == "fem":

@@ -29,6 +29,8 @@ GATE_MM = 0.3
 """Depth at which the network has three quarters of its say."""
 MECHANICS = ("skin", "gel", "lens", "pins")
 """Sections of a specification that a surrogate stands for; camera, light and rig may differ."""
+OPTICAL = ("refractive_index", "absorption_per_mm", "haze", "haze_sigma_px", "thickness_mm", "diameter_mm", "cap_diameter_mm")
+"""Keys of these sections that only the optics need; the skin's thickness is not among them."""
 FEATURES = 12
 """Numbers beside the modes that the network sees."""
 WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
@@ -168,10 +170,12 @@ def load_surrogate(path: Path) -> Surrogate:
 def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:
     """The sections of a specification that decide its mechanics, without what only the optics need."""
     plain = sensor.model_dump(mode="json")
-    optical = {"refractive_index", "absorption_per_mm", "haze", "haze_sigma_px", "thickness_mm", "diameter_mm", "cap_diameter_mm"}
-    found = {part: {key: value for key, value in plain[part].items() if key not in optical} for part in MECHANICS}
-    found["skin"]["thickness_mm"] = plain["skin"]["thickness_mm"]
-    return found
+    return {part: {key: value for key, value in plain[part].items() if is_mechanical(part, key)} for part in MECHANICS}
+
+
+def is_mechanical(section: str, key: str) -> bool:
+    """Whether a number of a specification decides its mechanics."""
+    return section in MECHANICS and ((section, key) == ("skin", "thickness_mm") or key not in OPTICAL)
 
 
 def surrogate_of(sensor: SensorSpec, file: str | Path | None = None) -> Surrogate:

@@ -34,8 +34,10 @@ from twin.cli.options import (
     Threads,
     Tuning,
     Workers,
+    each_once,
     finite,
     if_given,
+    names_in,
     one_recording,
     say,
     sensor_with,
@@ -199,7 +201,7 @@ Example:
 
 @app.command("train", help=HELP_TRAIN)
 def train(
-    model: Annotated[str, typer.Option("--model", help="vgnn, touch, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
+    model: Annotated[str, typer.Option("--model", help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
     sensor: Sensor,
     data: Annotated[list[Path], typer.Option("--data", metavar="DIR", help="labelled recording; give it once for each of several")],
     out: Annotated[Path, typer.Option("--out", metavar="RUN", help="folder of the run; made if missing")],
@@ -355,7 +357,7 @@ Example:
 
 
 @app.command("pack", help=HELP_PACK)
-def pack(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn or touch")], out: Out, force: Force = False) -> None:
+def pack(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, touch or steered")], out: Out, force: Force = False) -> None:
     from training.estimator import PoseEstimator
     from training.packed import WEIGHTS, pack
     from twin.store import overwriting
@@ -424,6 +426,8 @@ def learn(
     out: Out,
     observation: Annotated[str, typer.Option("--observation", help="pins, graph, pose or oracle")] = "pins",
     randomise: Annotated[str | None, typer.Option("--randomise", metavar="R", help="what differs between episodes, e.g. moves")] = None,
+    surrogate: Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="for a sensor of one's own")] = None,
+    objects: Annotated[str | None, typer.Option("--objects", callback=each_once, help="in place of the task's, commas between")] = None,
     memory: Annotated[bool, typer.Option("--memory/--no-memory", help="whether friction remembers; to see what that is worth")] = True,
     minutes: Annotated[float, typer.Option("--minutes", min=0, callback=finite, help="most time")] = 30.0,
     environments: Annotated[int, typer.Option("--environments", min=2, help="stepped together")] = 32,
@@ -436,7 +440,14 @@ def learn(
     from twin.cli.progress import shown
     from twin.store import overwriting
 
-    asked = {"sensor": sensor, "observation": observation, "randomise": randomise, "friction_memory": memory}
+    asked = {
+        "sensor": sensor,
+        "observation": observation,
+        "randomise": randomise,
+        "friction_memory": memory,
+        "surrogate": surrogate,
+        "objects": names_in(objects) if objects else None,
+    }
     plan = LearnPlan(task, Options.given(asked), minutes=minutes, environments=environments, fem_episodes=fem, seed=seed)
     with overwriting(force), shown() as progress:
         made = learn_policy(plan, out, progress=progress)

@@ -41,8 +41,10 @@ FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the fra
 Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
 
 
-def each_once(text: str) -> str:
-    """The names between commas, if there are some and none is there twice."""
+def each_once(text: str | None) -> str | None:
+    """The names between commas, if there are some and none is there twice; None if there is no text."""
+    if text is None:
+        return None
     names = names_in(text)
     if not names or len(set(names)) < len(names):
         raise typer.BadParameter(f"give one name or several with commas between, each once, got {text!r}")

@@ -271,6 +271,11 @@ def test_outside_its_domain_it_says_so(surrogate, sensor, thing, friction, poses
     assert says in told and "domain" in told and "fem" in told
 
 
+def test_a_surrogate_does_not_depend_on_how_sure_the_stiffness_is(sensor, surrogate):
+    surer = sensor.model_copy(update={"skin": sensor.skin.model_copy(update={"stiffness_factor": 1.1})})
+    assert surrogate_of(surer).about == surrogate.about
+
+
 def test_sensors_that_remember_time_are_refused(sensor):
     gel = sensor.gel.model_copy(update={"sealed": True})
     with pytest.raises(OptionError, match="sealed"):

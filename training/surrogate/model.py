@@ -31,6 +31,8 @@ MECHANICS = ("skin", "gel", "lens", "pins")
 """Sections of a specification that a surrogate stands for; camera, light and rig may differ."""
 OPTICAL = ("refractive_index", "absorption_per_mm", "haze", "haze_sigma_px", "thickness_mm", "diameter_mm", "cap_diameter_mm")
 """Keys of these sections that only the optics need; the skin's thickness is not among them."""
+UNFELT = ("stiffness_factor",)
+"""Keys that say how sure the others are: no contact depends on them."""
 FEATURES = 12
 """Numbers beside the modes that the network sees."""
 WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
@@ -175,7 +177,7 @@ def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:
 
 def is_mechanical(section: str, key: str) -> bool:
     """Whether a number of a specification decides its mechanics."""
-    return section in MECHANICS and ((section, key) == ("skin", "thickness_mm") or key not in OPTICAL)
+    return section in MECHANICS and ((section, key) == ("skin", "thickness_mm") or key not in OPTICAL + UNFELT)
 
 
 def surrogate_of(sensor: SensorSpec, file: str | Path | None = None) -> Surrogate:

@@ -44,8 +44,8 @@ def filled_area(images: Sequence[np.ndarray]) -> np.ndarray | None:
     height, width = flat.shape
     top, left = int(MIDDLE * height), int(MIDDLE * width)
     middle = np.s_[top : max(height - top, top + 1), left : max(width - left, left + 1)]
-    flat_there = max(float(_flat(image, image)[middle].mean()) for image in images)
-    white_there = max(float((image[middle] >= WHITE_LEVEL).mean()) for image in images)
+    flat_there = float(np.median([_flat(image, image)[middle].mean() for image in images]))
+    white_there = float(np.median([(image[middle] >= WHITE_LEVEL).mean() for image in images]))
     return flat if flat.any() and flat_there < FLAT_IN_THE_MIDDLE and white_there < WHITE_IN_THE_MIDDLE else None
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -11,6 +12,9 @@ import torch
 from bench_training import drawn_table, inputs_of
 
 from figures.jobs import FiguresError, Measured, Value, job, read, real_folder, run_twin
+from training.dataset import load_dataset
+from training.estimator import PoseEstimator
+from training.evaluate import judge
 from training.studies.tac_vgnn.models import measure_training
 
 SETS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
@@ -21,6 +25,7 @@ MODELS = {"vgnn": 40.0, "tac-vgnn-release": 25.0, "gnn": 20.0}  # on three split
 SLOW_MODELS = {"cnn-v2": 35.0, "cnn-v1": 27.0}  # on one split, stopped after as many minutes
 PARTS = ("vgnn", "vgnn-without-graph", "vgnn-without-modes", "vgnn-without-kernel")
 LABELS = 40
+WITHHELD_ON = 400  # frames on which the no-contact frame is withheld
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -113,6 +118,34 @@ def shipped_on_frames(work: Path) -> Measured:
     return {name: Value(metrics["corrected"][name]["mae"], "mm" if name == "pose_3" else "deg") for name in ("pose_3", "pose_4", "pose_5")}
 
 
+def without_no_contact(work: Path, *, sensor: str) -> Measured:
+    """Shipped weights on some frames of their recording: with its no-contact frame, with the rest places that were measured on this unit
+    before, and with the specification's alone, as of a unit that was never measured; and the two ratios."""
+    source, estimator = real_folder(SETS[sensor]), PoseEstimator.load(sensor)
+    frames = sorted((source / "frames_bw").glob("*.png"))
+    chosen = np.random.default_rng(5).choice(len(frames), WITHHELD_ON, replace=False)
+    errors = {}
+    for case, known in (
+        ("given", estimator.recorded_sensor),
+        ("withheld", estimator.recorded_sensor),
+        ("never_measured", estimator.sensor),
+    ):
+        folder = work / case
+        (folder / "frames_bw").mkdir(parents=True, exist_ok=True)
+        for k in chosen:
+            shutil.copy2(frames[k], folder / "frames_bw")
+        beside = ["targets.csv", "move_executed.csv", *(["init_0.png"] if case == "given" else [])]
+        for name in beside:
+            shutil.copy2(source / name, folder)
+        data = load_dataset(folder, known, estimator.names, form=estimator.form)
+        rows = np.flatnonzero(data.pins.valid)
+        judged = judge(estimator.predict_rows(data, rows), data, rows)["corrected"]
+        errors[case] = {unit: judged[name]["mae"] for name, unit in UNITS.items()}
+    found = {f"{case}_{unit}": Value(error, unit) for case, by in errors.items() for unit, error in by.items()}
+    times = {f"{case}_{unit}_times": Value(errors[case][unit] / errors["given"][unit]) for case in errors for unit in UNITS.values()}
+    return found | times
+
+
 def seconds_an_epoch(work: Path) -> Measured:
     """Of models on 3763 drawn graphs, batches of 128, two threads."""
     torch.set_num_threads(2)
@@ -169,6 +202,11 @@ def register() -> None:
         recordings=("ur5-331-raw",),
         minutes=1,
     )(shipped_on_frames)
+    for sensor in SETS:
+        command = f"twin evaluate {sensor} --data DIR --rows all, DIR with init_0.png and without it"
+        job(f"training.withheld.{sensor}", command, sensors=(sensor,), code=CODE, recordings=(SETS[sensor],), minutes=2)(
+            partial(without_no_contact, sensor=sensor)
+        )
 
 
 register()

@@ -31,7 +31,7 @@ GRAY = (28, 32, 38)
 FULL_CHANGE = 0.3
 """Relative change of a cell's area at both ends of the colour scale."""
 NO_REFERENCE = (
-    "no no-contact frame was used: the pins at rest are those of the specification, which makes errors of a pose up to three times larger; "
+    "no no-contact frame was used: the pins at rest are those of the specification, which makes errors of a pose up to four times larger; "
     "record one frame without contact (init_0.png beside the frames, or --no-contact FRAME)"
 )
 """What is said where a recording has no usable no-contact frame."""

@@ -1,5 +1,7 @@
 """Frames and pins that do not fit the specification are refused by name, with what to do, before anything is fitted."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -8,12 +10,14 @@ from plain_sensor import plain
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc, project
 from twin.errors import FrameError
+from twin.fit.optics import _stages
 from twin.fit.photometry import fit_photometry
 from twin.fit.surroundings import fit_surroundings
 from twin.geometry.pins import rest_pins
 from twin.judge.pictures.aligned import Aligned, read_frames, require_cameras_own, revised
 from twin.mechanics.skin_fit import FittedPins
 from twin.optics.preview import Preview
+from twin.progress import silent, stage
 
 
 def quiet(*_):
@@ -81,16 +85,28 @@ def test_pins_outside_the_picture_are_refused_by_number(drawn, beside_px):
         fit_surroundings(spec, np.stack([image] * 4), pins_px)
 
 
-def test_frames_that_grow_brighter_to_their_border_have_no_ring(drawn):
-    """Where the brightest place is the last one that is looked at, nothing tells where a ring begins."""
+@pytest.fixture(scope="module")
+def ringless(drawn):
+    """A frame that grows brighter to its border: where the brightest place is the last one, nothing tells where a ring begins."""
     spec, image = drawn
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     disc = lens_disc(spec.view, spec.housing)
     beyond_px = np.hypot(x - disc.center_px[0], y - disc.center_px[1]) - 1.3 * disc.radius_px
     slope = np.clip(240 * np.exp(beyond_px / 20), 1, 254).astype(np.uint8)
+    return np.repeat(slope[..., None], 3, axis=2)
+
+
+def test_frames_that_grow_brighter_to_their_border_have_no_ring(drawn, ringless):
+    spec, _ = drawn
     pins_px = project(spec.view, rest_pins(spec.geometry).caps_mm)[None]
     with pytest.raises(FrameError, match="no bright ring"):
-        fit_surroundings(spec, np.repeat(slope[None, ..., None], 3, axis=3), pins_px)
+        fit_surroundings(spec, ringless[None], pins_px)
+
+
+def test_where_no_ring_is_seen_the_housing_is_held_and_the_fit_goes_on(drawn, ringless):
+    spec, _ = drawn
+    surroundings, *later = _stages([aligned(spec, ringless)], np.ones(ringless.shape[:2], bool), None, partial(stage, silent))
+    assert surroundings(spec).housing == spec.housing and later
 
 
 def test_a_cap_too_few_in_the_appearance_is_refused_where_it_enters(drawn):

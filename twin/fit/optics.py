@@ -20,6 +20,7 @@ from twin.fit.caps import fit_caps
 from twin.fit.photometry import fit_photometry
 from twin.fit.response import fit_blur, fit_focus, fit_noise, fit_response, sharpness
 from twin.fit.rim import fit_rim
+from twin.fit.ring import NoRing
 from twin.fit.sensor_file import folder_beside, write_sensor
 from twin.fit.surroundings import fit_surroundings
 from twin.frames import distinct_stems
@@ -56,6 +57,8 @@ ALWAYS = (
     "the window's thickness and index, and the skin's thickness: held",
 )
 """Parameters that no set of frames determines."""
+RING_HELD = "ring, LEDs' places and reflections: held; the frames show no bright ring around the disc (a crop, or a sensor without one)"
+"""What is said where frames show no ring."""
 Stage = Callable[[SensorSpec], SensorSpec]
 """One stage of the fit: a function from a specification to a better one."""
 
@@ -209,8 +212,11 @@ def fit_optics(
         frames = log.aligned(spec, raw, step)
     inside, studio = lens_disc(spec.view, spec.housing).inside, _Studio(bar)
     first = studio.shots(spec, frames, "render the start")
+    held = spec.housing
     for number, fit in enumerate(_stages(frames, inside, studio, bar)):
         spec = log.stage(f"{number:02d}-{fit.__name__}", fit, spec)
+        if number == 0 and spec.housing == held:
+            notes.append(RING_HELD)
     last = studio.shots(spec, frames, "render the result")
     before, after = (_mean_figures(frames, shots, inside) for shots in (first, last))
     return Calibration(spec, before, after, notes, frames, first, last)
@@ -221,7 +227,10 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
 
     def surroundings(spec: SensorSpec) -> SensorSpec:
         with bar("fit the ring, the reflections, the specks") as step:
-            found = fit_surroundings(spec, np.stack([f.image for f in frames]), np.stack([f.pins_px for f in frames]), progress=step)
+            try:
+                found = fit_surroundings(spec, np.stack([f.image for f in frames]), np.stack([f.pins_px for f in frames]), progress=step)
+            except NoRing:  # a crop, or a sensor without a ring: all else can still be fitted
+                found = spec
         return found if found.gel.haze else revised(found, gel={"haze_sigma_px": HAZE_SIGMA_PX})
 
     def photometry(spec: SensorSpec) -> SensorSpec:

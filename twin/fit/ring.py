@@ -68,6 +68,10 @@ NO_STEP = -1e-6
 """Lower bound of the logarithm of ``wall_fraction`` where there is no step: the wall is as bright as the lip."""
 
 
+class NoRing(FrameError):
+    """Frames show no bright ring around the disc."""
+
+
 def fit_disc_edge(spec: SensorSpec, still: Still) -> SensorSpec:
     """The specification with the centre and radius of the housing's opening as the still picture shows them.
 
@@ -75,7 +79,7 @@ def fit_disc_edge(spec: SensorSpec, still: Still) -> SensorSpec:
 
     Raises
     ------
-    FrameError
+    NoRing
         There is no bright ring around a darker disc.
     """
     light = to_light(still.gray, spec.response)
@@ -101,7 +105,7 @@ def _edge_places(light: np.ndarray, center_px: np.ndarray, radius_px: float, rea
     seen = sampled(light, center_px + along_px[:, None] * outward[:, None])  # (rays, steps)
     mean = np.median(seen, axis=0)
     top = int(np.argmax(mean > RING_BEGINS * mean.max())) + round(TOP_PX / STEP_PX)
-    no_ring = FrameError(
+    no_ring = NoRing(
         f"{name}: no bright ring around the disc, {along_px[0]:.0f} to {along_px[-1]:.0f} px from its centre; "
         "check [camera] and [housing] of the specification, or the frames"
     )

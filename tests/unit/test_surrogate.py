@@ -220,7 +220,12 @@ def test_the_stated_errors_meet_the_bounds_and_the_files_are_small():
 def test_a_file_gives_back_what_was_saved(surrogate, tmp_path):
     path = tmp_path / "mine.safetensors"
     assert surrogate.save(path) < 1_000_000
-    again = load_surrogate(path)
+    again, kept = load_surrogate(path), surrogate.as_kept()
+    for name in ("node_mm", "answer", "modes", "read", "mean", "scale", "out_scale"):
+        assert np.array_equal(getattr(again, name), getattr(kept, name))
+    assert all(
+        np.array_equal(a, b) for ours, theirs in zip(again.layers, kept.layers, strict=True) for a, b in zip(ours, theirs, strict=True)
+    )
     assert np.allclose(again.answer, surrogate.answer, rtol=ANSWER_TOLERANCE, atol=ANSWER_TOLERANCE * np.abs(surrogate.answer).max())
     assert again.stiffness == pytest.approx(surrogate.stiffness) and again.about == surrogate.about
 

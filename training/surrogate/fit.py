@@ -196,7 +196,7 @@ def fit(
         scale,
         layers,
         out_scale,
-    )
+    ).as_kept()  # so that the errors are those of the file, which rounds
     about["errors"] = judge(made, sensor, kept)
     return made
 

@@ -9,6 +9,7 @@ rest. The features are depth, friction, nodes that press and slide, force and to
 alone, so the network has no memory of its own that could drift.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,12 +108,20 @@ class Surrogate:
 
     def save(self, path: Path) -> int:
         """Write it to a file; its size in bytes. Large arrays have half precision, and the answers of symmetric nodes are left out."""
+        return FILE.write(path, self._arrays(), self.about)
+
+    def as_kept(self) -> "Surrogate":
+        """The surrogate that a file of this one gives back."""
+        return _of_arrays(self.about, {key: value.astype(np.float32) for key, value in self._arrays().items()})
+
+    def _arrays(self) -> dict[str, FloatArray]:
         whole = {"stiffness": np.array([self.stiffness]), "mean": self.mean, "scale": self.scale, "out_scale": self.out_scale}
         half = {"modes": self.modes, "read": self.read, "answer": self.answer[representatives(self.phase_deg)]}
         for key, value in layers_to(self.layers).items():
             (half if key.endswith("weights") else whole)[key] = value
-        arrays = {key: value.astype(np.float32) for key, value in whole.items()}
-        return FILE.write(path, arrays | {key: value.astype(np.float16) for key, value in half.items()}, self.about)
+        return {key: value.astype(np.float32) for key, value in whole.items()} | {
+            key: value.astype(np.float16) for key, value in half.items()
+        }
 
 
 def features(depth_mm: FloatArray, friction: FloatArray, held: FloatArray, slip: FloatArray, wrench: FloatArray) -> FloatArray:
@@ -153,20 +162,25 @@ def load_surrogate(path: Path) -> Surrogate:
         There is no such file, or it is no surrogate of this version.
     """
     with FILE.opened(path) as (about, arrays):
-        radius = float(about["mechanics"]["skin"]["outer_radius_mm"])
-        phase = float(about["mechanics"]["pins"]["phase_deg"])
-        return Surrogate(
-            about,
-            radius * ring_directions(NODE_RINGS, POLAR_DEG, phase),
-            unfolded(arrays["answer"], phase),
-            arrays["modes"],
-            arrays["read"],
-            float(arrays["stiffness"][0]),
-            arrays["mean"],
-            arrays["scale"],
-            layers_from(arrays),
-            arrays["out_scale"],
-        )
+        return _of_arrays(about, arrays)
+
+
+def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surrogate:
+    """The surrogate of a file's arrays, as float32."""
+    radius = float(about["mechanics"]["skin"]["outer_radius_mm"])
+    phase = float(about["mechanics"]["pins"]["phase_deg"])
+    return Surrogate(
+        about,
+        radius * ring_directions(NODE_RINGS, POLAR_DEG, phase),
+        unfolded(arrays["answer"], phase),
+        arrays["modes"],
+        arrays["read"],
+        float(arrays["stiffness"][0]),
+        arrays["mean"],
+        arrays["scale"],
+        layers_from(arrays),
+        arrays["out_scale"],
+    )
 
 
 def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:

@@ -253,7 +253,7 @@ def test_a_surrogate_of_another_skin_is_refused(surrogate, sensor, tmp_path):
     ("thing", "friction", "poses", "says"),
     [
         ("mesh-can", 0.5, [], "texture"),
-        ("plane", 4.0, [], "friction of 4"),
+        ("plane", 4.0, [], "friction of 4, at most 3 is taken (0.05 to 1.5 was trained)"),
         ("plane", 0.5, [pose(0.0), pose(7.0)], "7.0 mm inside"),
         (SphereShape(kind="sphere", radius_mm=1.0), 0.5, [], "radius of 1 mm, at least 4"),
         (CylinderShape(kind="cylinder", radius_mm=2.0), 0.5, [], "radius of 2 mm, at least 5"),

@@ -68,7 +68,10 @@ class SurrogateContacts:
         if friction.kinetic != friction.static or np.isfinite(friction.shear_strength_mpa):
             raise outside(f"{touched.name} has a kinetic friction of its own or a shear strength")
         if friction.static > self._domain["friction"]:
-            raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
+            low, high = self._surrogate.about["trained_friction"]
+            raise outside(
+                f"a friction of {friction.static:g}, at most {self._domain['friction']:g} is taken ({low:g} to {high:g} was trained)"
+            )
         if contact.sensor is not self._sensor and mechanics_of(contact.sensor) != self._surrogate.about["mechanics"]:
             raise outside("the skin, gel, lens or pins of the sensor are drawn anew; randomise friction, camera and noise only ('moves')")
 
@@ -167,7 +170,7 @@ class SurrogateContacts:
         if depth <= 0:
             return
         if depth > domain["depth_mm"]:
-            raise outside(f"the object is {depth:.1f} mm inside the dome, at most {domain['depth_mm']:.1f} was trained")
+            raise outside(f"the object is {depth:.1f} mm inside the dome, at most {domain['depth_mm']:.1f} is taken")
         polar = float(np.degrees(np.arccos(np.clip(-T[2, :3] @ outward[0], -1.0, 1.0))))
         if polar > domain["polar_deg"]:
             raise outside(f"the contact is {polar:.0f} deg from the dome's apex, at most {domain['polar_deg']:.0f} was trained")

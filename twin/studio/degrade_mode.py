@@ -16,11 +16,11 @@ from twin.optics.preview import Shading
 from twin.pins import make_detector, nominal_reference, shipped_detector
 from twin.pins.pipeline import Pipeline
 from twin.studio.contact import Answer
+from twin.studio.mode import PageMode
 from twin.studio.page import Page, put
 from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, paragraph
 from twin.studio.pose import ObjectPose
 from twin.studio.twin_mode import TwinMode
-from twin.studio.worker import Newest
 from twin.types import Form, Frame, Observation
 
 SLIDERS = 3
@@ -90,7 +90,7 @@ class Judge:
         return raw if form is Form.RAW else self.contact.camera.recorded(raw)
 
 
-class DegradeMode:
+class DegradeMode(PageMode):
     """The mode 'Degrade'.
 
     Parameters
@@ -102,17 +102,16 @@ class DegradeMode:
     title = "Degrade"
 
     def __init__(self, page: Page, twin: TwinMode) -> None:
-        self._page, self._twin = page, twin
+        super().__init__(page)
+        self._twin = twin
         self._judge: Judge | None = None
-        self._active = False
         self._edge, self._finding = "", False
         self._pose: ObjectPose | None = None
-        self._wanted: Newest[None] = Newest(self._show, "studio-degrade", lambda text: page.say(text, bad=True))
+        self._wanted = self.newest(self._show, "degrade")
         conditions = offered()
         titles = (NO_CONDITION, *conditions)
         by_name = {c.name: title for title, c in conditions.items()}
         self._conditions, self._choices, self._severities = conditions, [], []
-        self.folder = page.gui.add_folder("Degrade", visible=False)
         with self.folder:
             for k in range(SLIDERS):
                 first = by_name.get(FIRST[k], NO_CONDITION)
@@ -127,23 +126,10 @@ class DegradeMode:
         edge.on_click(lambda event: self._find())
         none.on_click(lambda event: self._reset())
 
-    def start(self) -> None:
-        """Begin."""
-        self._wanted.start()
-
-    def stop(self) -> None:
-        """End."""
-        self._wanted.stop()
-
-    def enter(self) -> None:
+    def show(self) -> None:
         """Show the twin's contact, degraded."""
-        self._active = True
         self._page.show_nothing("The contact is drawn as a sensor sees it that something is wrong with ...")
         self._wanted.give(None)
-
-    def leave(self) -> None:
-        """Leave the pictures to another mode."""
-        self._active = False
 
     def follow(self, answer: Answer) -> None:
         """The twin's contact has changed."""
@@ -198,13 +184,7 @@ class DegradeMode:
             paragraph(self._edge, "said"),
             paragraph(f"{ms:.0f} ms for this answer", "note"),
         ]
-
-        def change() -> None:
-            if self._active:
-                self._page.show_pictures(camera, cells, "camera, raw frame, degraded")
-                self._page.show_numbers(*numbers)
-
-        self._page.together(change)
+        self.put_up((camera, cells), "camera, raw frame, degraded", numbers)
 
     def _edge_of(self, judge: Judge, answer: Answer, shading: Shading) -> str:
         """Where this contact leaves the envelope as the first chosen condition grows, in words."""

@@ -13,10 +13,10 @@ from twin.estimate import SensorModel
 from twin.pins.check import Grade, examine
 from twin.pins.pipeline import Pipeline
 from twin.studio.live_page import LiveShot, charted, live_chart, shot_numbers, shot_pictures
+from twin.studio.mode import PageMode
 from twin.studio.page import Page, put
 from twin.studio.pictures import badge, paragraph
 from twin.studio.twin_mode import TwinMode
-from twin.studio.worker import Newest
 
 NUDGES = ("x -1", "x +1", "y -1", "y +1", "z -1", "z +1")
 """Moves of an armed arm, mm in its base frame."""
@@ -77,7 +77,7 @@ FeedOpener = Callable[[str, str, SensorModel], LiveFeed]
 """From what a user writes for camera and arm ("" for none), and a model, to a feed that is not started yet."""
 
 
-class LiveMode:
+class LiveMode(PageMode):
     """The mode 'Live'.
 
     Parameters
@@ -95,15 +95,14 @@ class LiveMode:
     title = "Live"
 
     def __init__(self, page: Page, twin: TwinMode, open_feed: FeedOpener, out: Path, *, camera: str = "", arm: str = "") -> None:
-        self._page, self._twin, self._open_feed, self._out = page, twin, open_feed, out
+        super().__init__(page)
+        self._twin, self._open_feed, self._out = twin, open_feed, out
         self._feed: LiveFeed | None = None
         self._pipeline: Pipeline | None = None
-        self._active = False
         self._health: list[str] = []
         self._last: LiveShot | None = None
-        self._newest: Newest[LiveShot] = Newest(self._show, "studio-live", self._failed)
+        self._shots = self.newest(self._show, "live")
         gui = page.gui
-        self.folder = gui.add_folder("Live", visible=False)
         with self.folder:
             self._camera = gui.add_text("camera", camera, hint="a number, /dev/videoN, http://..., a folder or a video")
             self._arm = gui.add_text("arm", arm, hint="simulated, mg400:ADDRESS, magician:PORT, or empty")
@@ -126,30 +125,18 @@ class LiveMode:
         gui.add_command("Emergency stop of the arm", hotkey="space", modifier="shift").on_trigger(page.guarded(self.emergency_stop))
         self._chart = live_chart(page)
 
-    def _failed(self, text: str) -> None:
-        self._page.say(text, bad=True)
-
-    def start(self) -> None:
-        """Begin."""
-        self._newest.start()
-
     def stop(self) -> None:
         """End; camera and arm are let go of."""
         self.disconnect()
-        self._newest.stop()
+        super().stop()
 
-    def enter(self) -> None:
+    def show(self) -> None:
         """Show the camera, which is connected now if the command named it."""
-        self._active = True
         self._page.show_nothing("Give a camera and press 'Connect'.")
         if self._feed is None and self._camera.value:
             self._page.guarded(self.connect)(self)
         elif self._last is not None:  # it came before the mode was entered, or since the mode was left
-            self._newest.give(self._last)
-
-    def leave(self) -> None:
-        """Leave the pictures to another mode. The camera goes on, and a recording too."""
-        self._active = False
+            self._shots.give(self._last)
 
     def connect(self) -> None:
         """Connect what the user has written.
@@ -168,7 +155,7 @@ class LiveMode:
         feed = self._open_feed(self._camera.value.strip(), self._arm.value.strip(), model)
         self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
         self._feed = feed
-        feed.start(self._newest.give, self._failed)
+        feed.start(self._shots.give, self.complain)
         self._limits.content = "" if feed.robot is None else paragraph(f"{feed.robot.name}: {feed.robot.limits()}", "note")
 
     def disconnect(self) -> None:
@@ -242,11 +229,5 @@ class LiveMode:
             "" if robot is None else paragraph(robot.words(), "note"),
             *(paragraph(line, "said") for line in self._health),
         ]
-
-        def change() -> None:
-            if self._active:
-                self._page.show_pictures(*pictures, f"live {shot.frame.form} frame {shot.frame.sequence}")
-                self._page.show_numbers(*numbers)
-                self._chart.add(charted(shot.estimate))
-
-        self._page.together(change)
+        label = f"live {shot.frame.form} frame {shot.frame.sequence}"
+        self.put_up(pictures, label, numbers, also=lambda: self._chart.add(charted(shot.estimate)))

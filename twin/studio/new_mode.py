@@ -13,11 +13,11 @@ from twin.errors import TwinError
 from twin.fit.new_sensor import NewSensor, new_sensor
 from twin.frames import Recording, frames_at, open_recording
 from twin.pins.pipeline import Pipeline
+from twin.studio.mode import PageMode
 from twin.studio.page import Page, put
 from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, number_table, paragraph
 from twin.studio.state import next_path
 from twin.studio.twin_mode import TwinMode
-from twin.studio.worker import Newest
 
 LARGER, SMALLER = "one larger", "one smaller"
 """Corrections of a layout: a ring more or less; for a grid a row and a column."""
@@ -60,7 +60,7 @@ def corrected(pins: PinsSpec, by: int) -> str:
     return text
 
 
-class NewMode:
+class NewMode(PageMode):
     """The mode 'Your own sensor'.
 
     Parameters
@@ -75,15 +75,14 @@ class NewMode:
     title = "Your own sensor"
 
     def __init__(self, page: Page, twin: TwinMode, out: Path) -> None:
-        self._page, self._twin, self._out = page, twin, out
+        super().__init__(page)
+        self._twin, self._out = twin, out
         self._made: NewSensor | None = None
         self._recording: Recording | None = None
         self._pipeline: Pipeline | None = None
-        self._active = False
-        self._making: Newest[Wish] = Newest(self._make, "studio-new", self._failed)
-        self._looking: Newest[int] = Newest(self._look, "studio-new-frame", self._failed)
+        self._making = self.newest(self._make, "new")
+        self._looking = self.newest(self._look, "new-frame")
         gui, guarded = page.gui, page.guarded
-        self.folder = gui.add_folder(self.title, visible=False)
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
@@ -97,27 +96,12 @@ class NewMode:
         use.on_click(guarded(self.use))
         self._number.on_update(self._slid)
 
-    def start(self) -> None:
-        """Begin."""
-        self._making.start()
-        self._looking.start()
-
-    def stop(self) -> None:
-        """End."""
-        self._making.stop()
-        self._looking.stop()
-
-    def enter(self) -> None:
+    def show(self) -> None:
         """Show the newest proposal."""
-        self._active = True
         if self._made is None:
             self._page.show_nothing("Give the folder of your sensor's frames, in contact or not, and press 'Propose a specification'.")
         else:
             self._looking.give(int(self._number.value))
-
-    def leave(self) -> None:
-        """Leave the pictures to another mode."""
-        self._active = False
 
     def propose(self) -> None:
         """Make a specification from what the user has written. The answer takes from some seconds to half a minute.
@@ -159,9 +143,6 @@ class NewMode:
             raise TwinError("nothing has been proposed yet; press 'Propose a specification' first")
         return self._made
 
-    def _failed(self, text: str) -> None:
-        self._page.say(text, bad=True)
-
     def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
         if event.client is not None:  # else it is this program that moves the slider
             self._looking.give(int(event.target.value))
@@ -197,13 +178,7 @@ class NewMode:
         camera = camera_picture(frame, seen, pipeline.reference.pins_px, Drawn.GRAPH)
         cells = cell_picture(frame, seen, pipeline.reference.area_px2)
         numbers = _numbers(made, f"{frame.name} ({index + 1} of {len(recording)})", f"{seen.found} of {seen.expected}", pipeline.spec)
-
-        def change() -> None:
-            if self._active:
-                self._page.show_pictures(camera, cells, f"frame {frame.name} with the proposed layout")
-                self._page.show_numbers(*numbers)
-
-        self._page.together(change)
+        self.put_up((camera, cells), f"frame {frame.name} with the proposed layout", numbers)
 
 
 def _numbers(made: NewSensor, frame: str, found: str, sensor: SensorSpec) -> list[str]:

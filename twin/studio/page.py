@@ -46,16 +46,13 @@ SAID_S = 12.0
 
 
 class Mode(Protocol):
-    """One of the page's modes."""
+    """What the page knows of a mode."""
 
-    title: str
+    @property
+    def title(self) -> str:
+        """By which the user chooses it."""
+
     folder: viser.GuiFolderHandle
-
-    def start(self) -> None:
-        """Begin to work."""
-
-    def stop(self) -> None:
-        """End threads, processes and connections."""
 
     def enter(self) -> None:
         """The user has chosen the mode: show its state."""

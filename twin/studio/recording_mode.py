@@ -16,10 +16,10 @@ from twin.pins.pipeline import Pipeline
 from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel, read_arm_labels
 from twin.studio.contact import MovingContact, experiment_of
+from twin.studio.mode import PageMode
 from twin.studio.page import CELLS, Page, put
 from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.twin_mode import TwinMode
-from twin.studio.worker import Newest
 from twin.types import FloatArray, Form, Frame, Observation
 
 UNSURE = 0.5
@@ -159,7 +159,7 @@ def _told(label: ArmLabel) -> dict[str, float]:
     }
 
 
-class RecordingMode:
+class RecordingMode(PageMode):
     """The mode 'Recording'.
 
     Parameters
@@ -173,12 +173,11 @@ class RecordingMode:
     title = "Recording"
 
     def __init__(self, page: Page, twin: TwinMode, first: str = "") -> None:
-        self._page, self._twin, self._first = page, twin, first
+        super().__init__(page)
+        self._twin, self._first = twin, first
         self._view: RecordingView | None = None
-        self._active = False
-        self._wanted: Newest[int] = Newest(self._show, "studio-recording", lambda text: page.say(text, bad=True))
+        self._wanted = self.newest(self._show, "recording")
         gui = page.gui
-        self.folder = gui.add_folder("Recording", visible=False)
         with self.folder:
             self._path = gui.add_text("folder or video", first, hint="any recording that 'twin preprocess' reads, on the studio's machine")
             opened = gui.add_button("Open")
@@ -192,17 +191,8 @@ class RecordingMode:
         doubt.on_click(lambda event: self._wanted.give(-1))
         self._against.on_update(lambda event: self._wanted.give(int(self._number.value)))
 
-    def start(self) -> None:
-        """Begin."""
-        self._wanted.start()
-
-    def stop(self) -> None:
-        """End."""
-        self._wanted.stop()
-
-    def enter(self) -> None:
+    def show(self) -> None:
         """Show the recording; the one given to the command is opened now."""
-        self._active = True
         self._page.show_nothing("Give a recording's folder or video and press 'Open'.")
         if self._view is None and self._first:
             self.open(self._first)
@@ -211,10 +201,6 @@ class RecordingMode:
         elif self._view is not None:
             self._wanted.give(int(self._number.value))
 
-    def leave(self) -> None:
-        """Leave the pictures to another mode."""
-        self._active = False
-
     def open(self, path: str) -> None:
         """Show another recording; what is wrong with it is said on the page."""
         try:
@@ -222,7 +208,7 @@ class RecordingMode:
                 raise TwinError("give a recording's folder or video first")
             self._view = RecordingView(path.strip(), self._twin.contact)
         except TwinError as error:
-            self._page.say(str(error), bad=True)
+            self.complain(str(error))
             return
         self._number.max = max(1, len(self._view) - 1)
         self._number.disabled = False
@@ -289,13 +275,7 @@ class RecordingMode:
             paragraph(note, "said"),
             *(paragraph(text, "note") for text in [*view.recording.problems, *view.notes][:4]),
         ]
-
-        def change() -> None:
-            if self._active:
-                self._page.show_pictures(camera, view.crop(beside), f"recorded frame {looked.frame.name}", label)
-                self._page.show_numbers(*numbers)
-
-        self._page.together(change)
+        self.put_up((camera, view.crop(beside)), f"recorded frame {looked.frame.name}", numbers, below=label)
 
 
 def _six(values: np.ndarray) -> str:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from twin.studio.degrade_mode import DegradeMode
 from twin.studio.live_mode import FeedOpener, LiveMode
+from twin.studio.mode import PageMode
 from twin.studio.new_mode import NewMode
-from twin.studio.page import LOCAL, Mode, Page
+from twin.studio.page import LOCAL, Page
 from twin.studio.recording_mode import RecordingMode
 from twin.studio.state import StudioState
 from twin.studio.twin_mode import ModelOf, TwinMode
@@ -81,7 +82,7 @@ class Studio:
         self.twin.followers.append(degrade.follow)
         live = LiveMode(self.page, self.twin, open_feed, plan.out, camera=plan.camera, arm=plan.arm)
         recording, new = RecordingMode(self.page, self.twin, plan.recording), NewMode(self.page, self.twin, plan.out)
-        self.modes: list[Mode] = [self.twin, degrade, recording, live, new]
+        self.modes: list[PageMode] = [self.twin, degrade, recording, live, new]
         self.page.set_modes(self.modes)
 
     def __enter__(self) -> "Studio":

@@ -15,6 +15,7 @@ from twin.estimate import SensorModel
 from twin.frames.images import write_image
 from twin.pins import nominal_reference
 from twin.studio.contact import Answer, Light, MovingContact, Setup
+from twin.studio.mode import PageMode
 from twin.studio.page import Chart, Page, put
 from twin.studio.pictures import Drawn, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, spoken, unit_of
@@ -22,7 +23,7 @@ from twin.studio.scene import FULL_SCALE, Scene, Shown
 from twin.studio.state import StudioState, Way, next_path, read_way, save_way, tap_and_shear
 from twin.studio.tracing import Tracer
 from twin.studio.video import FilmWriter
-from twin.studio.worker import Newest, Worker
+from twin.studio.worker import Worker
 from twin.types import Form
 
 ModelOf = Callable[[str], SensorModel | None]
@@ -56,7 +57,7 @@ MOST_FRICTION = 2.0
 """End of the friction's slider."""
 
 
-class TwinMode:
+class TwinMode(PageMode):
     """The mode 'Twin'.
 
     Parameters
@@ -79,7 +80,8 @@ class TwinMode:
     title = "Twin"
 
     def __init__(self, page: Page, state: StudioState, out: Path, model_of: ModelOf, *, traces: bool = True) -> None:
-        self._page, self._out, self._model_of, self._traces = page, out, model_of, traces
+        super().__init__(page)
+        self._out, self._model_of, self._traces = out, model_of, traces
         self._state = state
         self._shown, self._drawn = Shown(state.colour), Drawn(state.drawn)
         self._wish, self._wished_s = state.object_pose(), 0.0
@@ -89,11 +91,9 @@ class TwinMode:
         self._path_s = 0.0
         self._film: FilmWriter | None = None
         self.followers: list[Callable[[Answer], None]] = []
-        self._active = False
         self._rebuilding = threading.Lock()
-        self.folder = page.gui.add_folder("Twin", visible=False)
         self.contact, self.worker, self._tracer, self._scene = self._build(state)
-        self._publisher = Newest(self._publish, "studio-page")
+        self._publisher = self.newest(self._publish, "page")
         self._build_controls()
         with page.charts_tab:
             self._forces = Chart(page.gui, "force on the object, N", ("x", "y", "z"))
@@ -115,7 +115,7 @@ class TwinMode:
 
     def start(self) -> None:
         """Begin to answer. The first wish is the state's pose; the model is loaded beside it."""
-        self._publisher.start()
+        super().start()
         self._begin()
 
     def _begin(self) -> None:
@@ -130,7 +130,7 @@ class TwinMode:
         self.worker.__exit__(None, None, None)
         if self._tracer is not None:
             self._tracer.__exit__(None, None, None)
-        self._publisher.stop()
+        super().stop()
 
     def _load_model(self, name: str) -> None:
         try:
@@ -147,15 +147,10 @@ class TwinMode:
         self._model_note = "no model goes with this sensor; give one with --model"
         self.worker.do(use)
 
-    def enter(self) -> None:
+    def show(self) -> None:
         """Show the twin's newest answer."""
-        self._active = True
         if self.worker.newest is not None:
             self._publisher.give(self.worker.newest)
-
-    def leave(self) -> None:
-        """Leave pictures and numbers to another mode. The 3D scene stays the twin's."""
-        self._active = False
 
     @property
     def state(self) -> StudioState:

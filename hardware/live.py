@@ -22,7 +22,7 @@ from hardware.rig import counting_from_first, given_frame
 from hardware.session import SessionSource
 from hardware.timing import Spread, Timing
 from twin.errors import FrameError, OptionError, TwinError
-from twin.estimate import Estimate, Estimator, SensorModel
+from twin.estimate import Estimate, Estimator, SensorModel, seen_in
 from twin.pins import Pipeline
 from twin.records import KeptAlso
 from twin.records.session import SESSION_FILES, SessionWriter
@@ -140,12 +140,12 @@ def estimate_line(estimate: Estimate) -> dict:
     }
 
 
-def same_estimates(steps: list[dict], estimates: list[Estimate]) -> int:
-    """How many of a session's steps hold exactly the estimates that its frames give now."""
+def same_estimates(steps: list[dict], values: list[np.ndarray]) -> int:
+    """How many of a session's steps hold exactly the estimates (K,) that its frames give now."""
     same = 0
-    for step, estimate in zip(steps, estimates, strict=False):
+    for step, value_now in zip(steps, values, strict=False):
         kept = np.array([np.nan if value is None else value for value in step.get("value", [])], float)
-        same += np.array_equal(kept, np.asarray(estimate.value, float), equal_nan=True)
+        same += np.array_equal(kept, value_now, equal_nan=True)
     return same
 
 
@@ -217,7 +217,7 @@ class Shower:
                 except RuntimeError:  # the session added a time while it was read
                     continue
                 shown = newest
-                view.show(LiveShot(*newest, tuple(lines[1:])), self._pipeline(newest[0]))
+                view.show(LiveShot(*newest, tuple(lines[1:])), seen_in(*newest, self._pipeline))
 
 
 @dataclass(frozen=True)
@@ -336,11 +336,11 @@ def watch(
     source = SessionSource(plan.replay) if plan.replay is not None else open_camera(plan.camera, model.sensor, model.form)
     model.check(model.sensor, source.form)
     rest = source.rest if isinstance(source, SessionSource) else given_frame(plan.at_rest, model)
-    found: list[Estimate] = []
+    found: list[np.ndarray] = []
 
     def keep(frame: Frame, estimate: Estimate) -> None:
         if plan.replay is not None:
-            found.append(estimate)
+            found.append(np.asarray(estimate.value, float))
         if on_estimate is not None:
             on_estimate(frame, estimate)
 

@@ -30,7 +30,7 @@ from twin.frames.forms import blob_spec
 from twin.mechanics.skin_map import ContactMaps
 from twin.pins import Pipeline, Reference, make_reference, measure_reference, nominal_reference
 from twin.store import fingerprint
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Observation
 
 LOST_USUAL = 0.02
 """Share of the pins that is lost in usual frames."""
@@ -65,6 +65,8 @@ class PoseEstimate:
         Probability that anything is touched; NaN where no frame without contact was given (``PoseEstimator.at_rest``).
     notes : tuple of str
         Why the intervals of this frame are wider than those of others.
+    seen : Observation or None
+        The pins that the estimate was made from; None if the model looks at the picture itself, or several kinds of contact are told apart.
     """
 
     names: tuple[str, ...]
@@ -79,6 +81,7 @@ class PoseEstimate:
     contact: str = ""
     touched: float = float("nan")
     notes: tuple[str, ...] = ()
+    seen: Observation | None = None
 
 
 class PoseEstimator:
@@ -347,13 +350,16 @@ class PoseEstimator:
     ) -> PoseEstimate:
         if isinstance(made, Unseen):
             none = np.full(len(self.names), np.nan)
-            return PoseEstimate(self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched)
+            told = (False, made.reason, _ms(started), contact, made.touched, made.seen)
+            return PoseEstimate(self.names, self.units, none, none, none, np.nan, *told)
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
         low, high, notes = self._widened(value, half, lost)
         value, low, high = (np.clip(each, *self._bounds) for each in (value, low, high))
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
-        return PoseEstimate(self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched, notes)
+        return PoseEstimate(
+            self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched, notes, made.seen
+        )
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
         """The pins of one frame, or why they can't be used; raises as a call."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.pins.pipeline import Pipeline
-from twin.types import Form, Frame
+from twin.types import Form, Frame, Observation
 
 
 class Estimate(Protocol):
@@ -35,6 +35,10 @@ class Estimate(Protocol):
     def reason(self) -> str:
         """Why it is not valid; "" if it is."""
 
+    @property
+    def seen(self) -> Observation | None:
+        """The pins that it was made from, as the model's pipeline found them; None if they are not known."""
+
 
 Estimator = Callable[[Frame], Estimate]
 
@@ -57,3 +61,8 @@ class SensorModel(Protocol):
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Raise an error if the model was not trained on frames of this sensor and form."""
+
+
+def seen_in(frame: Frame, estimate: Estimate | None, pipeline: Pipeline) -> Observation:
+    """The pins that a frame's estimate was made from; a pipeline looks for them only where they are not known."""
+    return pipeline(frame) if estimate is None or estimate.seen is None else estimate.seen

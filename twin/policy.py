@@ -13,7 +13,7 @@ from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
 from twin.pins import Pipeline, Reference, measure_reference, nominal_reference
 from twin.store import ArrayFile, Layers, layers_from, layers_to
-from twin.types import FloatArray, Form, Frame
+from twin.types import FloatArray, Form, Frame, Observation
 
 
 class PolicyError(TwinError):
@@ -97,6 +97,7 @@ class Action:
     value: FloatArray
     valid: bool
     reason: str
+    seen: Observation
 
     @property
     def low(self) -> FloatArray:
@@ -160,12 +161,12 @@ class PolicyModel:
         """The action for a frame; not valid if too few pins are found."""
         seen = self.pipeline(frame)
         if seen.graph is None:
-            return Action(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, seen.reason)
+            return Action(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, seen.reason, seen)
         moved = (seen.graph.nodes_px - self.pipeline.reference.pins_px) / float(self._nominal.spacing_px.mean())
         count = int(self.policy.about["stack"])
         self._stack = [*(self._stack or [moved] * count), moved][-count:]
         action = self.policy.act(np.array(self._stack)[None], self._goal[None])[0]
-        return Action(self.policy.axes, action, True, "")
+        return Action(self.policy.axes, action, True, "", seen)
 
 
 def with_goal(policy: Policy, goal: FloatArray) -> Policy:

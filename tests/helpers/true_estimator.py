@@ -15,6 +15,7 @@ class TrueEstimate:
     high: np.ndarray
     valid: bool = True
     reason: str = ""
+    seen: None = None
 
 
 class TrueEstimator:

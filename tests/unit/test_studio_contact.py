@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from scenes import load_experiment, load_object, load_sensor
+from training.estimator import PoseEstimator
 from twin.camera.capture import expose
 from twin.errors import ContactError, FrameError
 from twin.mechanics.path import deepest_mm
@@ -185,3 +186,16 @@ def test_depth_and_both_tilts_are_the_inverse_of_the_arms_way():
             found = tilted_labels(rig, experiment, surface, radius, object_pose(rig, experiment, pose, radius))
             assert list(found.values()) == pytest.approx(pose[2:5], abs=1e-9)
     assert tilted_labels(odd, load_experiment("surface-2d"), surface, radius, np.eye(4)) == {}
+
+
+def test_the_pins_of_a_frame_are_sought_once(monkeypatch):
+    """Where the model takes the frame that is shown, what is drawn over it is what the estimate was made from."""
+    model = PoseEstimator.load("mg400-127")
+    contact = MovingContact(Setup(model.sensor, SPHERE, form=model.form), model)
+    sought = []
+    monkeypatch.setattr(Pipeline, "__call__", lambda self, frame, seek=Pipeline.__call__: sought.append(frame) or seek(self, frame))
+    answer = pressed(contact, ObjectPose(depth_mm=0.5))
+    assert len(sought) == answer.number and answer.seen is answer.estimate.seen and answer.seen.found == 127
+    contact.change(form=Form.RAW)
+    answer = contact.again()
+    assert len(sought) == answer.number + 1 and answer.seen is not answer.estimate.seen

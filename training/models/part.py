@@ -23,7 +23,7 @@ from training.pins import PinTable, cap_light
 from training.recipes import Recipe, TrainingError
 from twin.pins import Pipeline
 from twin.pins.reference import Reference
-from twin.types import Frame
+from twin.types import Frame, Observation
 
 LIKELY = 0.5  # probability of a contact below which a frame gives no estimate
 SEEN_DECIMALS = 3  # of pins (px) and areas (px^2) that tell frames apart: the last bits of a centroid may differ between machines
@@ -74,6 +74,8 @@ class Prediction:
         Probability that the shear move was executed; NaN if the model does not estimate it.
     touched : float
         Of a single frame, the probability that anything is touched; NaN if there is no frame without contact to tell it by.
+    seen : Observation or None
+        Of a single frame, the pins that the labels were estimated from; None if the model looks at the picture itself.
     """
 
     mean: np.ndarray
@@ -81,24 +83,27 @@ class Prediction:
     half_width_raw: np.ndarray
     executed: np.ndarray
     touched: float = float("nan")
+    seen: Observation | None = None
 
 
 @dataclass(frozen=True)
 class OneFrame:
-    """The pins of one frame, a table of one row; the probability that they show a contact, ``touched`` as in ``Prediction``; and the share
-    of the pins in view that were not found."""
+    """The pins of one frame, a table of one row; the probability that they show a contact, ``touched`` as in ``Prediction``; the share
+    of the pins in view that were not found; and what the pipeline saw in the frame, if it is known."""
 
     pins: PinTable
     touched: float = float("nan")
     lost_share: float = 0.0
+    seen: Observation | None = None
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """A frame that shows too little for an estimate, and the reason; ``touched`` as in ``Prediction``."""
+    """A frame that shows too little for an estimate, and the reason; ``touched`` and ``seen`` as in ``Prediction``."""
 
     reason: str
     touched: float = float("nan")
+    seen: Observation | None = None
 
 
 @dataclass(frozen=True)
@@ -339,11 +344,11 @@ class PinModel(Model):
         """The pins of one frame; raises as ``estimate_frame``."""
         seen = trained.pipeline(frame)
         if not seen.valid or seen.graph is None:
-            return Unseen(seen.reason)
+            return Unseen(seen.reason, seen=seen)
         lost = np.isnan(seen.pins_px[:, 0])
         touched = trained.likely_touched(seen.graph.nodes_px, lost)
         if touched < LIKELY:
-            return Unseen(f"nothing is touched (probability of a contact {touched:.0%})", touched)
+            return Unseen(f"nothing is touched (probability of a contact {touched:.0%})", touched, seen)
         reference = trained.pipeline.reference
         pins = PinTable(
             trained.sensor,
@@ -357,11 +362,11 @@ class PinModel(Model):
             measured=reference is not trained.reference,
             light=cap_light(frame, seen.graph.nodes_px, reference)[None] if self.sees_light else np.zeros((1, len(lost))),
         )
-        return OneFrame(pins, touched, 1 - seen.found / max(seen.expected, 1))
+        return OneFrame(pins, touched, 1 - seen.found / max(seen.expected, 1), seen)
 
     def estimate_one(self, trained: Trained, seen: OneFrame) -> Prediction:
         """Estimate the labels of one frame."""
-        return replace(self._estimated(trained, seen.pins, together=False), touched=seen.touched)
+        return replace(self._estimated(trained, seen.pins, together=False), touched=seen.touched, seen=seen.seen)
 
     def estimate_rows(self, trained: Trained, data: Dataset, rows: np.ndarray) -> Prediction:
         """See ``Model``."""

@@ -17,7 +17,7 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
 from twin.errors import ContactError
-from twin.estimate import Estimate, SensorModel
+from twin.estimate import Estimate, SensorModel, seen_in
 from twin.frames.forms import from_raw
 from twin.geometry.solid import Resolution
 from twin.mechanics.follow import STEP_MM, Follower
@@ -402,10 +402,11 @@ class MovingContact:
         needs_recorded = self.setup.form is Form.RECORDING or (self.model is not None and self.model.form is Form.RECORDING)
         frames = {Form.RAW: raw} | ({Form.RECORDING: self.camera.recorded(raw)} if needs_recorded else {})
         frame = frames[self.setup.form]
-        seen = self._pipeline(frame)
-        looked = time.perf_counter()
         estimate = None if self.model is None else self.model(frames[self.model.form])
-        times = {"picture": now - started, "pins": looked - now, "estimate": time.perf_counter() - looked}
+        estimated = time.perf_counter()
+        of_frame = self.model is not None and self.model.form is self.setup.form
+        seen = seen_in(frame, estimate if of_frame else None, self._pipeline)
+        times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
         self._last = Answer(
             self._count,
             ObjectPose.of(T, self._apex_mm),

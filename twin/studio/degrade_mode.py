@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import TwinError
-from twin.estimate import Estimate
+from twin.estimate import Estimate, seen_in
 from twin.judge.degradation.condition import Case, Condition
 from twin.judge.degradation.conditions import CONDITIONS, condition
 from twin.judge.degradation.measures import MEASURES, judge_shot
@@ -84,7 +84,8 @@ class Judge:
         failed = tuple(m.title for m in MEASURES if m.failed(figures[m.name], self.limits[m.name]))
         model = self.contact.model
         estimate = None if model is None else model(self._in_form(shot.frame, model.form))
-        return Judged(shot, self._pipeline(shot.frame), figures, failed, estimate)
+        of_frame = model is not None and model.form is Form.RAW
+        return Judged(shot, seen_in(shot.frame, estimate if of_frame else None, self._pipeline), figures, failed, estimate)
 
     def _in_form(self, raw: Frame, form: Form) -> Frame:
         return raw if form is Form.RAW else self.contact.camera.recorded(raw)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from twin.errors import TwinError
-from twin.estimate import SensorModel
+from twin.estimate import SensorModel, seen_in
 from twin.pins.check import Grade, examine
 from twin.pins.pipeline import Pipeline
 from twin.studio.live_page import LiveShot, charted, live_chart, shot_numbers, shot_pictures
@@ -218,7 +218,7 @@ class LiveMode(PageMode):
         self._last = shot
         if feed is None or pipeline is None or not self._active:
             return
-        seen = pipeline(shot.frame)
+        seen = seen_in(shot.frame, shot.estimate, pipeline)
         pictures = shot_pictures(feed.model.sensor, pipeline.reference, shot.frame, seen)
         robot = feed.robot
         numbers = [

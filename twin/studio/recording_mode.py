@@ -9,7 +9,7 @@ import viser
 from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from twin.errors import ContactError, FrameError, TwinError
-from twin.estimate import Estimate, SensorModel
+from twin.estimate import Estimate, SensorModel, seen_in
 from twin.frames import Recording, open_recording
 from twin.pins.batch import recording_reference
 from twin.pins.pipeline import Pipeline
@@ -113,8 +113,8 @@ class RecordingView:
             It can't be read, or is another sensor's.
         """
         frame = self.recording.read(index)
-        seen = self._pipeline(frame)
         estimate = None if self._model is None else self._model(frame)
+        seen = seen_in(frame, estimate, self._pipeline)
         label = self._labels[index] if self._labels else None
         told = {} if label is None else _told(label)
         doubts = [] if label is None or label.executed else ["the audit says that the move was not executed"]

@@ -8,6 +8,7 @@ from plain_sensor import changed, plain
 from scenes import load_sensor
 from scenes.sensor import RecordingSpec
 from twin.camera.capture import (
+    WIDE_PX,
     amplified,
     blurred,
     compressed,
@@ -168,6 +169,16 @@ def test_blur_widens_an_edge_by_its_sigma():
     width = np.interp(0.9, row, np.arange(200)) - np.interp(0.1, row, np.arange(200))
     sampling_px = 0.052  # of kernel and step; measured: 0.047
     assert width == pytest.approx(2.563 * 4.0, abs=sampling_px)
+
+
+@pytest.mark.parametrize("shape", [(90, 120), (70, 50, 3)])
+def test_a_wide_blur_is_that_of_the_kernel(shape):
+    """OpenCV cuts its kernel at four standard deviations, so that it is as near as that."""
+    cut = 1e-4
+    light, sigma_px = np.random.default_rng(0).random(shape).astype(np.float32), 1.5 * WIDE_PX
+    kernel = cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT)
+    np.testing.assert_allclose(blurred(light, sigma_px), kernel, atol=cut)
+    assert blurred(light, sigma_px).dtype == np.float32
 
 
 def test_blur_and_haze_keep_the_light():

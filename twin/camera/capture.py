@@ -5,6 +5,8 @@ differences are in 16 to 240. The conversion uses the usual integer arithmetic (
 about 18 % of all 8-bit colours can be the result.
 """
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
@@ -31,6 +33,10 @@ CLIPPED = (2, 253)
 """Gray levels at or beyond which a pixel is not used to recognise a stream, because its colour may be clipped."""
 MOST_PIXELS = 20_000
 """Most pixels that are used to recognise a stream."""
+WIDE_PX = 8.0
+"""Standard deviation, px, from which on a blur is computed with the few cosines that it leaves, not with a kernel."""
+LEAST_KEPT = 1e-5
+"""Cosines of which a blur leaves a smaller share are left out."""
 JPEG_BLOCK_PX = 16
 """Side of the blocks of a JPEG whose chroma has half the resolution."""
 WEIGHTS = {"gaussian": cv2.ADAPTIVE_THRESH_GAUSSIAN_C, "mean": cv2.ADAPTIVE_THRESH_MEAN_C}
@@ -95,7 +101,25 @@ def blurred(light: FloatArray, sigma_px: float) -> FloatArray:
     """Gaussian blur. The frame is mirrored at its border, so that the sum of the light stays the same."""
     if sigma_px <= 0:
         return light
-    return np.asarray(cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT), light.dtype)
+    if sigma_px < WIDE_PX:
+        return np.asarray(cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT), light.dtype)
+    height, width = light.shape[:2]
+    (down, up), (across, back) = _wide_blur(height, sigma_px), _wide_blur(width, sigma_px)
+    rows = back @ (across @ (down @ light.reshape(height, -1)).reshape(len(down), width, -1))
+    return np.asarray((up @ rows.reshape(len(down), -1)).reshape(light.shape), light.dtype)
+
+
+@lru_cache(maxsize=16)
+def _wide_blur(length: int, sigma_px: float) -> tuple[FloatArray, FloatArray]:
+    """A Gaussian blur of a mirrored line of pixels as two matrices, (m, length) and (length, m), that are applied one after the other.
+
+    The cosines of the DCT-II are the eigenvectors of such a blur. Their eigenvalues ``exp(-(sigma w)^2 / 2)`` fall so fast that few count.
+    """
+    w = np.pi * np.arange(length) / length
+    kept = np.exp(-0.5 * (sigma_px * w) ** 2)
+    w, kept = w[kept > LEAST_KEPT], kept[kept > LEAST_KEPT]
+    waves = np.cos(w[:, None] * (np.arange(length) + 0.5)) * np.sqrt(np.where(w == 0, 1, 2) / length)[:, None]
+    return (kept[:, None] * waves).astype(np.float32), np.ascontiguousarray(waves.T, np.float32)
 
 
 def vignetted(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
